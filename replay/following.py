@@ -1,4 +1,4 @@
-"""What quantity of the world each module's output follows, for figures and for the view."""
+"""The quantity of the world that each module's output follows, for figures and views."""
 
 from __future__ import annotations
 

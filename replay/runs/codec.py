@@ -46,7 +46,7 @@ _VARINT, _FIXED64, _LENGTH_DELIMITED = 0, 1, 2
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Type:
-    """How values of a numpy type are stored: protobuf type, wire type, numpy and struct code."""
+    """Storage of a numpy type: protobuf type, wire type, numpy type and struct code."""
 
     field: int
     wire: int
@@ -75,7 +75,7 @@ The length is a varint of five bytes, which any reader takes and which has a fix
 
 
 class Layout:
-    """Where messages that are alike hold their values.
+    """Places of the values in messages of the same shapes.
 
     Args:
         fields: of each value its name, numpy type and shape, and the bytes that stand before it.
@@ -119,7 +119,7 @@ class Layout:
 
 @lru_cache
 def _layout(shapes: tuple[tuple[int, ...], ...], version: int) -> tuple[Layout, struct.Struct, Any]:
-    """How records whose arrays have these shapes are stored, by `Layout` and by `struct`.
+    """Layout of records whose arrays have these shapes, for reading and for writing.
 
     Args:
         shapes: of the arrays, in the order of `_STORED`.

@@ -60,7 +60,7 @@ class SignalColumns:
 
 @dataclass(frozen=True, slots=True)
 class Blocks:
-    """Where the blocks of consecutive iterations began.
+    """First frames, iterations and streams of consecutive blocks.
 
     The iteration of a frame cannot be computed from its number: there may be gaps between blocks.
 

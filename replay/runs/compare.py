@@ -1,4 +1,4 @@
-"""Whether runs are the same, bit for bit, and what many of them came to, side by side."""
+"""Comparison of runs: the first difference of two, and a table of many."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def _row(x: NDArray[Any], y: NDArray[Any], rounding: float) -> int:
 
 
 def differing(x: NDArray[Any], y: NDArray[Any], rounding: float = 0.0) -> NDArray[np.bool_]:
-    """Where two arrays of one shape differ in a bit; one NaN is as good as another.
+    """Mask of the elements of two arrays that differ in a bit; all NaN are equal.
 
     Or where they differ by more than `rounding` times the largest number in both.
     """
@@ -157,7 +157,7 @@ def differing(x: NDArray[Any], y: NDArray[Any], rounding: float = 0.0) -> NDArra
 
 
 def computed_otherwise(first: Path, second: Path) -> tuple[str, ...]:
-    """What may explain a difference of two runs beside what they were told.
+    """Differences of two runs in arithmetic, versions and machine, which may explain others.
 
     The version of their arithmetic, of packages, and the machine, as far as both say it in
     run.json: from one machine to another scenes may be rendered differently.
@@ -176,7 +176,7 @@ def computed_otherwise(first: Path, second: Path) -> tuple[str, ...]:
 
 
 def told_otherwise(first: Path, second: Path) -> tuple[tuple[str, Any, Any], ...]:
-    """What of configuration, seed and source two runs were told otherwise: key and both values."""
+    """Differences of two runs in configuration, seed and source: key and both values."""
     logs = [run_log(run) for run in (first, second)]
     a, b = ({key: read_header(log).manifest.get(key) for key in ("config", "seed")} for log in logs)
     a["source"], b["source"] = known_to_both(*map(stated_source, logs))
@@ -248,7 +248,7 @@ class Row:
         return self.name, str(found["seed"]), str(found["iterations"]), learned, same
 
     def explanation(self) -> str:
-        """What explains its difference, in words; "" where nothing known does."""
+        """Explanation of its difference in words; "" where nothing known explains it."""
         found = []
         if self.told:
             both = [(key, a, b) for key, a, b in self.told if a is not None and b is not None]
@@ -273,7 +273,7 @@ HEAD = ("run", "seed", "iterations", "modules", "against the first run")
 
 
 def side_by_side(runs: Sequence[Path]) -> tuple[Row, ...]:
-    """What each run came to, and its `first_difference` from the first one."""
+    """Outline of each run, and its `first_difference` from the first one."""
     rows: list[Row] = []
     for run in runs:
         name, outline = run_log(run).resolve().parent.name, read_outline(run)

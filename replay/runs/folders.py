@@ -1,4 +1,4 @@
-"""Where runs lie on disk, and which of them are in a folder."""
+"""Folders of runs: names of their files, and the runs in a folder."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def is_run(path: Path) -> bool:
 
 
 def read_run_json(folder: Path) -> Mapping[str, Any]:
-    """How a run was begun and what came of it; empty where nothing readable says so."""
+    """The run.json of a run; empty where there is none that can be read."""
     try:
         document = read_json(folder / RUN_JSON, "learn again")
     except CdmisfaError:

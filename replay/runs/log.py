@@ -45,7 +45,7 @@ PHI_EVERY = 50
 
 @dataclass(frozen=True, slots=True)
 class RunHeader:
-    """What stands at the beginning of a run's log.
+    """Header of a run's log.
 
     Attributes:
         schema: version of `BlockSignals` it was written with.
@@ -105,7 +105,7 @@ class RunHeader:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened, in words, at the end of an iteration's block."""
+    """An event in words, at the end of an iteration's block."""
 
     t: int
     iteration: int
@@ -114,7 +114,7 @@ class Event:
 
 
 def read_header(path: Path) -> RunHeader:
-    """What stands at the beginning of a run's log.
+    """Read the header of a run's log.
 
     Raises:
         UsageError: the file is no run's log, or of a later version of this software.
@@ -167,7 +167,7 @@ _ITERATION = re.compile(r"iteration (\d{1,18})")
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What a log holds of some consecutive iterations.
+    """Messages of some consecutive iterations, decoded.
 
     Attributes:
         blocks: of the records, after the last one before them, which the first of the other
@@ -280,7 +280,7 @@ class BatchReader:
         return self._bytes >= MAX_BYTES or len(self._data[topic]) >= BATCH_ITERATIONS
 
     def rest(self) -> Batch:
-        """What was taken since the last batch ended, as one."""
+        """The messages since the last batch ended, as one batch."""
         spec, data = self._spec, self._data
         watched = self._images() if spec.images else self._rows(WATCHED_TOPIC, spec.frame_shape)
         signals = self._records()

@@ -181,7 +181,7 @@ class SlowFeatures:
         )
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """What it was made with, as scikit-learn asks for it."""
+        """Its parameters, as scikit-learn asks for them."""
         return {"module": self.module}
 
     def set_params(self, **params: Any) -> Self:

@@ -30,16 +30,16 @@ LINES = (
 """Signals whose values an outline keeps for every iteration, to choose ranges from."""
 
 _FILES: Final = ("files", "views")
-"""Where sources state their files, each as a table."""
+"""Keys under which sources list their files, each as a table."""
 
 _WHOLE: Final = "sha256"
 _HASHES: Final = {_WHOLE, "sample_sha256"}
 _KNOWN: Final = {*_HASHES, "bytes"}
-"""What is known of a file before all of it was read, or only then."""
+"""What may be stated of a file, before all of it was read or after."""
 
 
 class Run:
-    """What a run left behind, read where it is needed and only then.
+    """A run on disk, of which is read what is asked for.
 
     Args:
         path: the run's folder, or its log.
@@ -61,12 +61,12 @@ class Run:
 
     @cached_property
     def result(self) -> Mapping[str, Any] | None:
-        """What `learn --json` said at its end, None where the run was broken off."""
+        """The document of `learn --json`; None where the run was broken off."""
         return read_run_json(self.log.parent).get("result")
 
     @cached_property
     def modules(self) -> tuple[Module, ...]:
-        """What it learned, in order.
+        """Its modules, in order.
 
         Raises:
             LogDamagedError: the modules are of other streams, or cannot be read.
@@ -200,7 +200,7 @@ class Tally:
         self._states = tuple(columns["state"][-1].tolist())
 
     def outline(self) -> Outline:
-        """What was taken in, in short."""
+        """The outline of all records so far."""
         blocks, streams = Blocks.concatenated(self._blocks), len(self._states)
         visits = self._tau * np.bincount(blocks.streams, minlength=streams)
         last = None
@@ -271,7 +271,7 @@ def facts_sha256(document: Mapping[str, Any]) -> str:
 
 
 def stated_source(log: Path) -> Any:
-    """What a run states of its source: in its log, and of large files once it ended in run.json.
+    """The source of a run as its log states it, with hashes of large files from run.json.
 
     Args:
         log: of the run.
@@ -295,7 +295,7 @@ def states_whole(source: Any) -> bool:
 
 
 def known_to_both(one: Any, other: Any) -> tuple[Any, Any]:
-    """What two sources state, less what only one of them knows of a file and the other does not."""
+    """Two sources without what only one of them states of a file."""
 
     def known(file: Mapping[str, Any], to: Mapping[str, Any]) -> Mapping[str, Any]:
         shared = file.keys() & to.keys()

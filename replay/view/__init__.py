@@ -1,1 +1,1 @@
-"""What Rerun shows of runs and recordings."""
+"""Rerun views of runs and recordings."""

@@ -306,7 +306,7 @@ def write_unwatched(
 
 
 def _hashes(described: Any) -> list[str]:
-    """What tells the files of views from others: the SHA-256 of all of each, or of its sample."""
+    """Identity of the files of views: the SHA-256 of each, or of a sample of it."""
     views = described.get("views", ()) if isinstance(described, Mapping) else ()
     found = (view.get("sha256", view.get("sample_sha256")) for view in views)
     return [str(known) for known in found if known is not None]

@@ -37,7 +37,7 @@ MOST_STREAMS = 16
 """Streams with lines and lanes of their own: the most watched ones."""
 
 AGGREGATION = rr.components.AggregationPolicy.MinMax
-"""How a line of more values than the screen has columns is drawn: from the least to the most.
+"""Lines with more values than the screen has columns are drawn from the least to the most.
 
 Their mean, which the viewer draws where nothing is said, may be a value that never was.
 """
@@ -165,7 +165,7 @@ class Target:
     spec: SourceSpec
 
     def times(self, frames: IntArray, iterations: IntArray | None = None) -> list[rr.TimeColumn]:
-        """Where rows at these frames stand on each timeline."""
+        """The times of rows at these frames, on each timeline."""
         times = times_of(frames, self.spec.fps, self.spec.start_ns)
         found = [
             rr.TimeColumn(FRAME, sequence=frames.copy()),

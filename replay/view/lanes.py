@@ -31,7 +31,7 @@ ATTENDS, LEARNS, NOVELTY, DOES, EXPLORES = "attends", "learns", "novelty", "does
 """Entities of lanes."""
 
 MOSTLY = "mostly"
-"""Where the lanes of the state of most blocks are."""
+"""Parent entity of lanes with the state of most blocks."""
 
 PIECES = 80
 """Pieces of a run for each of which such a lane has one state."""
@@ -102,7 +102,7 @@ class Lanes:
             lane.add(columns.frames, columns.iterations, codes(columns), columns.tau)
 
     def _states(self, s: int, columns: SignalColumns) -> IntArray:
-        """What became of a stream; where it is known, by which module."""
+        """Codes of a stream's state; of a known one with the module that knows it."""
         known = columns["state"][:, s] == _KNOWN
         told = known & (columns["stream"] == s) & (columns["known_by"] > 0)
         last = np.maximum.accumulate(np.where(told, np.arange(len(told)), -1))

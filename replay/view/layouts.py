@@ -31,7 +31,7 @@ MARGIN = 0.018
 """Part of a time axis that the numbers of a plot take; lanes have none, and begin as much later."""
 
 PLAY_SECONDS = 60
-"""What it takes to play a run."""
+"""Time in which a run is played."""
 
 LANE = 35
 """Height of a lane, beside plots of 100 to 200."""
@@ -109,7 +109,7 @@ class Tab:
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """What a module has learned.
+    """Panel of what a module has learned.
 
     Attributes:
         title: of its panel.
@@ -124,7 +124,7 @@ class Lesson:
 
 @dataclass(frozen=True, slots=True)
 class WorldTab:
-    """What the first tab shows of the world.
+    """The world on the first tab.
 
     Attributes:
         scene: there is a world in 3D.
@@ -219,7 +219,7 @@ def near_axis(frames: int, *, room: bool = True) -> rrb.archetypes.TimeAxis:
 
 
 def near(frames: int) -> list[rr.VisibleTimeRange]:
-    """What is drawn in such a window."""
+    """The frames that are drawn in such a window."""
     start = rr.TimeRangeBoundary.cursor_relative(seq=-frames)
     return [rr.VisibleTimeRange(FRAME, start=start, end=rr.TimeRangeBoundary.cursor_relative())]
 

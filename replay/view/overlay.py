@@ -93,7 +93,7 @@ def table_text(rows: Sequence[Row]) -> str:
 
 
 def _fork(row: Row) -> str:
-    """What a fork is one of; "" of another run."""
+    """The parent of a fork and its changes, in words; "" of another run."""
     header = row.outline.header
     ancestry = header.manifest.get("fork")
     if header.forked_at is None or not isinstance(ancestry, Mapping):
@@ -177,7 +177,7 @@ def _curves(columns: SignalColumns, names: Sequence[str], shown: Sequence[int]) 
 
 
 def _entity(name: str) -> str:
-    """Where a signal's curve is, below its run."""
+    """Entity of a signal's curve, below its run's."""
     return f"log_{name}" if name in POWERS else name
 
 

@@ -282,7 +282,7 @@ class Panels:
         return rrb.Horizontal(weights, *output, column_shares=shares[: 1 + len(output)])
 
     def all_views(self, *, head: bool) -> rrb.Container:
-        """What every stream showed, watched or not."""
+        """All streams, watched or not."""
         names = self._spec.streams
         places = [(label(name), f"/views/{part(names, s)}") for s, name in enumerate(names)]
         if not self._spec.images:
@@ -300,7 +300,7 @@ class Panels:
         return rrb.Vertical(*rows, row_shares=[3, 1, 2][: len(rows)], name="All views")
 
     def _sees(self) -> rrb.Container:
-        """What the learner sees, what came of the run, and weights.
+        """Input of the learner, summary of the run, and weights.
 
         The weights are those of now, or of the first modules of the progress learner.
         """
@@ -330,7 +330,7 @@ class Panels:
         return rrb.Vertical(self._watched("Input x"), *output, weights, row_shares=shares)
 
     def _watched(self, name: str) -> rrb.View | rrb.Container:
-        """What the learner was shown: an image with the name of its stream, or the last values."""
+        """Input of the learner: an image with the name of its stream, or the last values."""
         if self._spec.images:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
@@ -377,7 +377,7 @@ class Panels:
 
 
 def _events(name: str) -> rrb.View:
-    """What happened, in words, with the iteration."""
+    """Events in words, with their iterations."""
     columns = rrb.archetypes.TextLogColumns(timeline_columns=[ITERATION], text_log_columns=["body"])
     return rrb.TextLogView(origin="/events", name=name, columns=columns)
 

@@ -1,4 +1,4 @@
-"""What a run was and came to: the columns that the viewer's tables of runs show.
+"""Properties of a run, its configuration and result: the columns of the viewer's tables of runs.
 
 Rows are written without Rerun's package, which takes half a second to import.
 """
@@ -146,7 +146,7 @@ def _configuration(manifest: Mapping[str, Any]) -> Sections:
 def _result(
     counts: tuple[Any, int, int], learned: Sequence[str], document: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What a run came to, and why it ended, where its run.json says it."""
+    """Result of a run, and why it ended, where its run.json says it."""
     found = dict(zip(("seed", "iterations", "frames"), counts, strict=True))
     found |= {"modules": len(learned), "learned": label(", ".join(learned))}
     with contextlib.suppress(KeyError, TypeError):

@@ -269,7 +269,7 @@ class RunView:
             yield Curve(f"gate/band/{i + 1}", labels, edges[:, i], [GREY] * len(labels), width=1.0)
 
     def _attention(self, columns: SignalColumns) -> Iterator[Curve]:
-        """How much of the recent blocks each shown stream was watched."""
+        """Share of the recent blocks in which each shown stream was watched."""
         watched = columns["stream"][:, None] == np.array(self._streams)
         all_of_them = np.concatenate([self._recent, watched])
         sums = np.cumsum(all_of_them, axis=0)

@@ -37,13 +37,13 @@ SCENE = "scene"
 WATCHING = f"{SCENE}/watching"
 
 REACH = 0.6
-"""How far the pyramid of a view reaches, metres."""
+"""Length of a view's pyramid, metres."""
 
 THIN, THICK = 0.0015, 0.005
 """Radii of the edges of a view's pyramid, and of that of the watched one."""
 
 LIGHT = 0.25
-"""What is added to the greys of objects: the viewer's background is as dark as they are."""
+"""Added to the greys of objects: the viewer's background is as dark as they are."""
 
 
 def _places(values: NDArray[Any]) -> Any:
@@ -189,7 +189,7 @@ BODY = "body"
 """The entity of all that it looks like, in that of the scene."""
 
 PACKAGE = "package://iCub/"
-"""How the models name their meshes."""
+"""Prefix of the meshes' names in the models."""
 
 
 def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Any:

@@ -14,7 +14,7 @@ from replay.view.columns import MOST_STREAMS
 from replay.view.labels import text_table
 
 ENDED = "ended:"
-"""How the event begins that says why a run ended."""
+"""Start of the event that says why a run ended."""
 
 TOLD = ("nu", "tau", "sigma", "delta")
 """Settings of CD-MISFA that are told."""
@@ -27,7 +27,7 @@ NAMED = 4
 
 
 def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str:
-    """What was learned, when, and where the learner stayed for it, as Markdown.
+    """Summary of a run as Markdown: modules or streams learned, why it ended, settings.
 
     Args:
         outline: the run in short.
@@ -70,7 +70,7 @@ def _of_modules(outline: Outline) -> list[str]:
 
 
 def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
-    """What became of each stream in a run of the progress learner, as the run itself said it."""
+    """State of each stream of a run of the progress learner, in the words of the run's events."""
     names = outline.names()
     said: dict[str, str] = {}
     for text in events:
@@ -92,7 +92,7 @@ def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
 def decision_text(
     names: Sequence[str], reward: NDArray[np.float64], value: NDArray[np.float64]
 ) -> str:
-    """What is expected of staying and switching as Markdown tables, in thousandths.
+    """R and Q as Markdown tables, in thousandths.
 
     Args:
         names: of the streams.
@@ -114,7 +114,7 @@ def decision_text(
 
 
 def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:
-    """Where a policy stays, as "stay on left"; the rest switches."""
+    """A policy in words, as "stay on left"."""
     stays = [streams[s] for s, action in enumerate(policy) if action == 0]
     if len(stays) == len(streams):
         return "stay everywhere"
@@ -124,7 +124,7 @@ def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:
 
 
 def _unfinished(outline: Outline) -> str:
-    """What became of the abstraction that was not saved."""
+    """A sentence about the abstraction that was not saved."""
     last = outline.last
     if last is None or any(save.module == last.module for save in outline.saved):
         return ""

@@ -20,7 +20,7 @@ WALL = "wall"
 FRAME = f"{WALL}/frame"
 
 SHAPE = 1.7
-"""How much wider than high the wall is, as near as whole pictures allow."""
+"""Width of the wall over its height, as near as whole pictures allow."""
 
 ROOM, BETWEEN = 0.3, 0.06
 """Room below a picture for its words, and between two, in heights of a picture."""
@@ -113,7 +113,7 @@ class WallView:
             self._target.send(path, columns.frames[rows], columns.iterations[rows], words)
 
     def _states(self, columns: SignalColumns, s: int) -> list[tuple[int, str]]:
-        """Where a stream's state may change, and how it is told from there on."""
+        """Rows at which a stream's state may change, and its words from there on."""
         name = label(self._spec.streams[s])
         if self._by_progress:
             codes = columns["state"][:, s].astype(np.int64)
@@ -133,7 +133,7 @@ def bounds(count: int, height: int, width: int) -> Bounds:
 
 
 def places_of(count: int, width: int, height: int) -> list[tuple[float, float]]:
-    """Where on a wall so many pictures of a size hang, in rows: x and y of their corners."""
+    """Corners (x, y) of so many pictures of a size on a wall, in rows."""
     across, down = width + BETWEEN * height, (1 + ROOM) * height
 
     def badness(columns: int) -> float:

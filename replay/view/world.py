@@ -38,7 +38,7 @@ PRESET = (
 def world_of_run(
     header: RunHeader, run: Path, recording: Path | None = None
 ) -> tuple[Scenery | None, str | None]:
-    """What stood where in a run, and what is not sure about it.
+    """Scenery of a run, and what is uncertain about it.
 
     Args:
         header: of its log.
@@ -63,7 +63,7 @@ def world_of_run(
 
 
 def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
-    """What stood where in a recording.
+    """Scenery of a recording.
 
     Args:
         path: of the recording.
@@ -92,7 +92,7 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
 
 
 def _places(header: RunHeader, run: Path, recording: Path | None) -> Iterator[Path]:
-    """Where the recording may be that a run learned from."""
+    """Places where the recording may be that a run learned from."""
     if recording is not None:
         yield recording
     named = _table(header.manifest.get("command")).get("source")
@@ -114,7 +114,7 @@ def _table(value: Any) -> Mapping[str, Any]:
 
 
 def world_tab(header: RunHeader, scenery: Scenery | None, streams: Sequence[int]) -> WorldTab:
-    """What the first tab of a run shows of its world, of which some scenery is known, or none."""
+    """The world on the first tab of a run with this scenery, or with none that is known."""
     if scenery is not None or not header.spec.images:
         return WorldTab(scene=scenery is not None)
     return WorldTab(wall=bounds(len(streams), *header.spec.frame_shape))
@@ -169,7 +169,7 @@ class WorldView:
             self._view.flush()
 
     def tab(self, lessons: Sequence[Lesson] = ()) -> WorldTab:
-        """What the first tab shows of it, and of what was learned of it."""
+        """The first tab: the world, and what was learned of it."""
         return replace(self._tab, lessons=lessons)
 
 
