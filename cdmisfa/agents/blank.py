@@ -1,4 +1,4 @@
-"""The record of an iteration of a learner that says less than those that are built in."""
+"""The signals of an iteration, for learners that have only some of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cdmisfa.core.signals import DENSE_STREAMS, NO_STATE, SIGNALS, BlockSignals
 def signals_of_block(
     block: Block, spec: SourceSpec, iteration: int, *, outputs: int, modules: int, **said: Any
 ) -> BlockSignals:
-    """A record of a learner that says little: numbers that are not `said` are NaN.
+    """The signals of a block; numbers that are not `said` are NaN.
 
     Args:
         block: that was watched.

@@ -66,8 +66,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 """Each command with its module in this package and its line of help."""
 
 CREATED = 10_000
-"""Objects after which garbage is looked for: imports create many and leave none, and with Python's
-700 the looking was a seventh of a short command's time."""
+"""Objects after which Python collects garbage: imports create many and leave none, and with the
+default of 700 collecting took a seventh of a short command's time."""
 
 
 class LazyGroup(click.Group):
@@ -130,12 +130,12 @@ def main() -> NoReturn:
 
 
 def _open_standard_streams() -> None:
-    """Let what was closed, as a daemon's are, lead nowhere: the next file would take its place."""
+    """Open closed standard streams on /dev/null, or the next file would get their number."""
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(number)
         except OSError:
-            # the lowest that is free is this one
+            # the lowest free descriptor is this one
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
@@ -173,7 +173,7 @@ def run(args: Sequence[str]) -> int:
 
 
 def _refuse_odd_names(args: Sequence[str]) -> None:
-    """Refuse what no log and no line of output can name, before any work is done."""
+    """Refuse arguments that are not UTF-8, before any work is done."""
     for arg in args:
         try:
             arg.encode()

@@ -15,7 +15,7 @@ from typing import Any
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _AGAIN = 0.02
-"""Seconds after which an interrupt comes again that was raised where nothing passes it on."""
+"""Seconds after which an interrupt that was dropped is sent again."""
 
 
 class Stop:
@@ -55,7 +55,7 @@ def interruptible() -> Iterator[Stop]:
 
 
 def end_at_once(code: int | None = None) -> None:
-    """Let a signal that comes from now on end this process, where nothing handles it otherwise.
+    """Make signals end this process at once from now on, where nothing else handles them.
 
     Args:
         code: to end with; None for that of the signal.
@@ -85,7 +85,7 @@ def stoppable(
 
 
 def ignore_at_the_end() -> None:
-    """Let no signal change the exit code once Python ends, where it handles none any more."""
+    """Ignore signals while Python shuts down, so that they cannot change the exit code."""
     for number in SIGNALS:
         atexit.register(signal.signal, number, signal.SIG_IGN)
 
@@ -109,15 +109,15 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
 
 
 def _ignored() -> set[signal.Signals]:
-    """What nohup has ignored."""
+    """The signals that nohup ignores."""
     return {n for n in (signal.SIGHUP,) if signal.getsignal(n) == signal.SIG_IGN}
 
 
 @contextmanager
 def _not_lost(stop: Stop) -> Iterator[None]:
-    """Bring an interrupt again that Python dropped: in a destructor, in a callback of C.
+    """Send an interrupt again that Python dropped in a destructor or a callback of C.
 
-    What an interrupt left half made, and whose destructor fails, is not spoken of.
+    Errors of destructors of what an interrupt left unfinished are not shown.
     """
     before = sys.unraisablehook
 
@@ -137,7 +137,7 @@ def _not_lost(stop: Stop) -> Iterator[None]:
 
 
 def _let_go_of_terminal() -> None:
-    """Let standard streams of a terminal that is no more lead nowhere: to write there fails."""
+    """Point stdout and stderr to /dev/null where their terminal was closed: writing there fails."""
     for number in (1, 2):
         try:
             os.write(number, b"")

@@ -1,4 +1,4 @@
-"""Packages that hand on many names, of which a command needs few: each is imported when used."""
+"""Lazy imports in packages that export many names, of which a command needs few."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Any
 
 
 def names_on_demand(package: str) -> None:
-    """Import what a package and those within it take from their modules when it is first used.
+    """Import the names that a package and its subpackages export when they are first used.
 
-    A package that is imported already stays as it is.
+    A package that is already imported stays as it is.
     """
     if package not in sys.modules:
         sys.meta_path.insert(0, _Finder(package))
@@ -43,7 +43,7 @@ class _Loader(SourceFileLoader):
     """Loads the `__init__` of a package."""
 
     def exec_module(self, module: ModuleType) -> None:
-        """Run all of it but imports of names that it does not use itself."""
+        """Execute the module, but for imports of names that it does not use itself."""
         tree = ast.parse(self.get_data(self.path))
         used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         homes: dict[str, tuple[str, str]] = {}
@@ -74,7 +74,7 @@ class _Loader(SourceFileLoader):
             setattr(module, name, value)
             return value
 
-        module.__dict__["__getattr__"] = take  # its own modules take names from it while it begins
+        module.__dict__["__getattr__"] = take  # its own modules import names from it meanwhile
         exec(compile(tree, self.path, "exec", dont_inherit=True), module.__dict__)
         if module.__dict__["__getattr__"] is not take:
             own = module.__dict__["__getattr__"]

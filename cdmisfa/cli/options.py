@@ -133,7 +133,7 @@ def path(
 
 
 def _hold(ctx: click.Context, param: click.Parameter, value: float) -> None:
-    """Hold to a limit while the command runs; those of its arguments that are fetched, too."""
+    """Set a time limit for the command, and for fetching its arguments."""
     ctx.with_resource(limited(dataclasses.replace(limits(), **{str(param.name): value})))
 
 
@@ -143,7 +143,7 @@ server_limits = together(
         for field in dataclasses.fields(Limits)
     )
 )
-"""How long the servers of URLs are waited for; a command with a URL among its arguments has it."""
+"""Time limits of servers, for commands that take URLs."""
 
 
 def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]:

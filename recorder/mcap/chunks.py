@@ -41,7 +41,7 @@ Few, because reading moves forward, and memory that is used again is still in th
 _WINDOW: Final = MAX_CHUNK // 2
 """Most memory that zstd may take for its window, in bytes."""
 _PIECE: Final = 1 << 17
-_LONG: Final = 64 * 1024
+_LONG: Final = 256 * 1024
 """Fewest stored bytes of a chunk that is decoded ahead, as handing less over takes as long."""
 _LARGE: Final = 8 * 1024 * 1024
 """Most bytes of one, because of the memory that this takes."""

@@ -56,7 +56,9 @@ class MessageTable:
 
     def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
         """The messages of some rows, given by number, (k,), or by a truth value each, (n,)."""
-        return MessageTable(self.data, self.records[rows])
+        # As indexing does, in a third of its time.
+        pick = self.records.compress if rows.dtype == np.bool_ else self.records.take
+        return MessageTable(self.data, pick(rows))
 
     def rows(self) -> Iterator[tuple[int, int, int, int, bytes]]:
         """Each message: channel, sequence, log time, publish time and payload."""

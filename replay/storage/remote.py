@@ -24,8 +24,8 @@ _MOST: Final = 1024 * 1024
 """Bytes that are read ahead where reads go forward, at first and at most."""
 _BUNDLE: Final = 128 * 1024
 """Bytes of expected spans that touch and are asked for together; a longer span is by itself."""
-_DEEPEST: Final = 8
-"""Bundles that are asked for ahead, at most."""
+_DEEPEST: Final = 16
+"""Bundles that are asked for ahead, at most; and no further one once `_MOST` bytes are."""
 
 
 class RemoteStore(Store):
@@ -105,9 +105,12 @@ class RemoteStore(Store):
             coming = self._server.begin(start, stop)
         else:
             self._depth = min(2 * self._depth, _DEEPEST)
+        asked = sum(high - low for low, high in (self._bundles[n] for n in self._ahead))
         for after in range(number + 1, min(number + 1 + self._depth, len(self._bundles))):
-            if after not in self._ahead:
-                self._ahead[after] = self._server.begin(*self._bundles[after])
+            if after not in self._ahead and asked < _MOST:
+                begin, end = self._bundles[after]
+                self._ahead[after] = self._server.begin(begin, end)
+                asked += end - begin
         return start, self._fetched(coming, start, stop)
 
     def _drop_ahead(self) -> None:

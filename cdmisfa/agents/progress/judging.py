@@ -164,7 +164,7 @@ def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
 
 
 def stale(candidate: Candidate, config: ProgressConfig) -> bool:
-    """Whether what a candidate found stands firm and is seen no more: it was a single event."""
+    """Whether what a candidate found is settled but seen no more: it was a single event."""
     return (
         candidate.tests >= FULL * candidate.test_window
         and candidate.change < config.settled
@@ -216,7 +216,7 @@ def _still_there(
 def strange(steps: float, power: float, blocks: int, window: int) -> bool:
     """Whether a stream's module gives something else there than when the stream was decided.
 
-    Told soon and roughly: the stream is then learned again, and only that decides whether it
+    A quick, rough test: the stream is then learned again, and only that decides whether it
     shows anything new.
 
     Args:

@@ -118,7 +118,7 @@ def learn_command(
     if resume and force:
         raise click.UsageError("--force starts anew and --resume goes on: use one of them")
     if not source:
-        learn_as_begun(ctx, out if resume else None)
+        resume_as_started(ctx, out if resume else None)
         return
     from cdmisfa.experiments.loop import INTERRUPTED
     from cdmisfa.experiments.resume import command_of
@@ -245,8 +245,8 @@ def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:
     return (*told["settings"], *named)
 
 
-def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
-    """Resume a run with the command that began it; options that are given win."""
+def resume_as_started(ctx: click.Context, run: Path | None) -> None:
+    """Resume a run with the source and options it was started with; options given now win."""
     from cdmisfa.experiments.resume import read_command
 
     if run is None:
