@@ -18,10 +18,9 @@ from cdmisfa.core.blocks import PIXEL
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.studies.arena import arena
-from cdmisfa.studies.arena.arena import plan_arena
+from cdmisfa.studies.arena.arena import arena_results, plan_arena
 from cdmisfa.studies.arena.library import ArenaSource, Library, linear
 from cdmisfa.studies.arena.pictures import LEARNED_FROM
-from cdmisfa.studies.arena.results import arena_results
 from cdmisfa.studies.arena.trial import (
     Course,
     Judge,

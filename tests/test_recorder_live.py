@@ -15,8 +15,8 @@ from cdmisfa.testing.sources import SourceContract
 from recorder.config import RecordConfig
 from recorder.recording import save_picture
 from recorder.world.icub.config import EyesConfig, IcubConfig, SphereConfig
-from recorder.world.icub.motions import Motions
 from recorder.world.icub.source import LUMA, eye_matrix, grey, look, perspective
+from recorder.world.icub.world import Motions
 from recorder.world.scenes import SCENES, open_scene
 
 pytest.importorskip("pybullet")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cdmisfa.core.errors import UsageError
 from recorder.world.icub.config import BoxConfig, IcubConfig, SphereConfig
-from recorder.world.icub.motions import CHUNK, Motions, reflect
+from recorder.world.icub.world import CHUNK, Motions, reflect
 
 SCENE = IcubConfig()
 WHOLE = Motions(SCENE, 3).positions(0, 2 * CHUNK + 100)

@@ -11,10 +11,192 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.experiments.statistics import MeanSd, summary
 from cdmisfa.experiments.store import DONE, FAILED, ROWS, read_rows
 from replay.runs.folders import REQUEST, read_request
+
+CHI_SQUARE_95 = 3.841458820694124
+"""95 % quantile of the chi-square distribution with one degree of freedom."""
+
+NORMAL_95 = 1.959963984540054
+"""97.5 % quantile of the normal distribution: 95 % lie within this."""
+
+STUDENT_95 = (
+    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
+    2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086,
+    2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
+)  # fmt: skip
+"""97.5 % quantiles of Student's t distribution, from one degree of freedom on."""
+
+STEEPEST = 1e4
+"""Largest slope a logistic fit may have, per unit of x."""
+
+FLATTEST = 1e-2
+"""Smallest slope a logistic fit may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeanSd:
+    """Mean and standard deviation (n - 1) of n values; NaN where there is none."""
+
+    mean: float
+    sd: float
+    n: int
+
+
+def summary(values: ArrayLike) -> MeanSd:
+    """Mean and standard deviation of the values that are numbers.
+
+    Example:
+        >>> summary([1.0, 3.0, float("nan")])
+        MeanSd(mean=2.0, sd=1.4142135623730951, n=2)
+    """
+    x = np.asarray(values, dtype=float).ravel()
+    x = x[np.isfinite(x)]
+    if not len(x):
+        return MeanSd(math.nan, math.nan, 0)
+    return MeanSd(float(x.mean()), float(x.std(ddof=1)) if len(x) > 1 else math.nan, len(x))
+
+
+def wilson(successes: int, n: int) -> tuple[float, float]:
+    """95 % interval of a proportion (Wilson 1927), within [0, 1].
+
+    Example:
+        >>> [round(bound, 3) for bound in wilson(20, 20)]
+        [0.839, 1.0]
+    """
+    if n == 0:
+        return 0.0, 1.0
+    share, z = successes / n, NORMAL_95
+    centre = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def mean_interval(values: ArrayLike) -> tuple[float, float]:
+    """95 % interval of the mean of the values that are numbers (Student); infinite for one.
+
+    Example:
+        >>> [round(bound, 2) for bound in mean_interval([1.0, 2.0, 3.0])]
+        [-0.48, 4.48]
+    """
+    found = summary(values)
+    if found.n < 2:
+        return -math.inf, math.inf
+    freedom = found.n - 1
+    beyond = NORMAL_95 + (NORMAL_95**3 + NORMAL_95) / (4 * freedom)
+    t = STUDENT_95[freedom - 1] if freedom <= len(STUDENT_95) else beyond
+    half = t * found.sd / math.sqrt(found.n)
+    return found.mean - half, found.mean + half
+
+
+@dataclass(frozen=True, slots=True)
+class Midpoint:
+    """Where a yes-or-no answer turns, from a logistic fit.
+
+    Attributes:
+        value: x at which yes and no are equally likely; NaN where only one answer was seen, or
+            the question was asked at one x alone.
+        low, high: 95 % profile likelihood interval; infinite where the data bound no side.
+        slope: of the fit, per unit of x; positive where yes lies at large x.
+        n: number of answers.
+    """
+
+    value: float
+    low: float
+    high: float
+    slope: float
+    n: int
+
+
+def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> Midpoint:
+    """Fit P(yes) = 1 / (1 + exp(-k (x - m))), k > 0, and say where m lies.
+
+    The likelihood is penalised with Jeffreys' prior (Firth 1993), so that answers that part
+    cleanly have a finite fit; the interval is that of the penalised profile likelihood.
+
+    Args:
+        x: (n,) where the question was asked.
+        yes: (n,) true or false.
+    """
+    at, answer = np.asarray(x, dtype=float), np.asarray(yes, dtype=float)
+    n = len(at)
+    if n == 0 or answer.min() == answer.max():
+        never = n > 0 and answer.max() == 0
+        low = float(at.max()) if never else -math.inf
+        high = float(at.min()) if n > 0 and not never else math.inf
+        return Midpoint(math.nan, low, high, math.nan, n)
+    levels, inverse = np.unique(at, return_inverse=True)
+    total: FloatArray = np.bincount(inverse).astype(np.float64)
+    hits = np.asarray(np.bincount(inverse, weights=answer), dtype=np.float64)
+    if len(levels) == 1:
+        return Midpoint(math.nan, -math.inf, math.inf, math.nan, n)
+    span = float(levels[-1] - levels[0])
+    slopes = np.geomspace(FLATTEST / span, STEEPEST / span, 61)
+    low, high = float(levels[0] - 2 * span), float(levels[-1] + 2 * span)
+    bounds = (-math.inf, math.inf)
+    for _ in range(4):
+        m = np.linspace(low, high, 121)
+        used = slopes
+        heights = _log_likelihood(levels, hits, total, m, used)
+        profile = heights.max(axis=1)
+        top = int(np.argmax(profile))
+        inside = np.flatnonzero(profile > profile[top] - CHI_SQUARE_95 / 2)
+        first, last = int(inside[0]), int(inside[-1])
+        bounds = (
+            float(m[first]) if first > 0 else bounds[0],
+            float(m[last]) if last < len(m) - 1 else bounds[1],
+        )
+        low, high = float(m[max(first - 1, 0)]), float(m[min(last + 1, len(m) - 1)])
+        likely = np.flatnonzero(heights[inside].max(axis=0) > profile[top] - CHI_SQUARE_95)
+        slopes = np.geomspace(
+            slopes[max(likely[0] - 1, 0)], slopes[min(likely[-1] + 1, len(slopes) - 1)], 61
+        )
+        slope = float(used[int(np.argmax(heights[top]))])
+    return Midpoint(float(m[top]), bounds[0], bounds[1], slope, n)
+
+
+def _log_likelihood(
+    x: FloatArray, hits: FloatArray, total: FloatArray, m: FloatArray, k: FloatArray
+) -> FloatArray:
+    """Log likelihood plus half the log determinant of the information, (M, K).
+
+    Of M midpoints and K slopes, for answers at L levels of x, `total` at each and `hits` of them
+    yes.
+    """
+    u = x - m[:, None, None]
+    z = np.clip(k[:, None] * u, -700.0, 700.0)
+    softplus = np.logaddexp(0.0, z)
+    likelihood = (hits * z - total * softplus).sum(axis=-1)
+    w = total * np.exp(z - 2 * softplus)
+    determinant = w.sum(-1) * (w * u * u).sum(-1) - (w * u).sum(-1) ** 2
+    return np.asarray(likelihood + 0.5 * np.log(np.maximum(determinant, 1e-300)))
+
+
+def correlation(a: FloatArray, b: FloatArray) -> float:
+    """Absolute Pearson correlation of two (n,) series; 0 where one does not vary."""
+    if a.max() == a.min() or b.max() == b.min():
+        return 0.0
+    a, b = a - a.mean(), b - b.mean()
+    lengths = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return abs(float(a @ b)) / lengths if lengths > 0 else 0.0
+
+
+def stays_above(values: Sequence[float] | FloatArray, threshold: float) -> int:
+    """First index from which on all values are above a threshold; -1 where the last is not.
+
+    Example:
+        >>> stays_above([0.1, 0.99, 0.2, 0.96, 0.97], 0.95)
+        3
+    """
+    below = np.flatnonzero(~(np.asarray(values) > threshold))
+    first = int(below[-1]) + 1 if len(below) else 0
+    return first if first < len(values) else -1
+
 
 SCHEMA = 1
 

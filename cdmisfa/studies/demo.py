@@ -15,10 +15,10 @@ from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import ACTIONS, BlockSignals
+from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure, open_source
-from cdmisfa.experiments.statistics import correlation
 
 SCENE = "icub"
 MODULES = 2

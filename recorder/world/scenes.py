@@ -40,7 +40,7 @@ Request = tuple[int, int, int]
 """Stream, first frame and number of frames of a block."""
 
 BLOCK = 64
-"""Frames rendered at a time; divides `motions.CHUNK`, so no block needs two chunks."""
+"""Frames rendered at a time; divides `world.CHUNK`, so no block needs two chunks."""
 
 _AHEAD = 3
 """Blocks a process may be ahead of the writer."""

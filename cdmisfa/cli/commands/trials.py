@@ -280,8 +280,8 @@ def arena_command(
     are run, or, with --page, the page made from the results that are there. Most sets need the
     extra [arena]; the set small needs nothing.
     """
+    from cdmisfa.studies.arena.arena import arena_results
     from cdmisfa.studies.arena.page import arena_table, draw_curves, write_arena_page
-    from cdmisfa.studies.arena.results import arena_results
 
     folder = out or Path("arena")
     failed = () if page is not None and not sets else _run_arena(folder, sets, **each)

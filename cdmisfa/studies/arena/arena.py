@@ -7,19 +7,34 @@ progress learner with every other rule for choosing the stream to watch.
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from cdmisfa.agents.progress.config import ATTENTIONS
 from cdmisfa.core.config import section_table
-from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.registry import Registry
-from cdmisfa.experiments.documents import plain
+from cdmisfa.experiments.documents import plain, versions, write_json
+from cdmisfa.experiments.results import mean_interval, summary, wilson
 from cdmisfa.experiments.sources import configure
-from cdmisfa.experiments.store import SweepReport, answer, code, run_trials, trial_id
+from cdmisfa.experiments.store import (
+    DONE,
+    SweepReport,
+    answer,
+    code,
+    read_rows,
+    run_trials,
+    trial_id,
+)
 from cdmisfa.studies.arena.library import Library
 from cdmisfa.studies.arena.streams import SETS, SUITE, parse
 from cdmisfa.studies.arena.trial import ArenaTrial, run_arena_trial
@@ -165,3 +180,150 @@ def make_streams(task: Task) -> None:
     folder, wanted = task
     for each in wanted:
         Library(folder).prepare(*each)
+
+
+FIRST, POINTS = 400, 60
+"""First frame of a learning curve, and how many points it has, evenly on a logarithmic scale."""
+
+Row = Mapping[str, Any]
+
+
+def arena_results(folder: Path) -> dict[str, Any]:
+    """What every learner came to on every set, of all trials in a folder; also its results.json.
+
+    Where a trial was computed by several versions of the code, that of now counts, or else the
+    last; how many are not of now is said.
+
+    Raises:
+        UsageError: there are no trials.
+        LogDamagedError: a row is damaged.
+    """
+    now = code(*COMPUTED)
+    found: dict[tuple[tuple[str, str], ...], dict[int, Row]] = {}
+    for row in read_rows(folder):
+        of_seeds = found.setdefault(tuple(row["point"].items()), {})
+        if row["code"] == now or of_seeds.get(row["seed"], {}).get("code") != now:
+            of_seeds[row["seed"]] = row
+    if not found:
+        raise UsageError(f"{folder} holds no trials: run cdmisfa arena -o {folder} first")
+    entries = [
+        _entry(dict(point), [of_seeds[seed] for seed in sorted(of_seeds)])
+        for point, of_seeds in found.items()
+    ]
+    outdated = sum(row["code"] != now for of_seeds in found.values() for row in of_seeds.values())
+    used = {**versions(), **_versions_of_streams()}
+    entries.sort(key=lambda entry: _place(**entry["point"]))
+    document: dict[str, Any] = plain(
+        {"schema": 1, "entries": entries, "outdated": outdated, "versions": used}
+    )
+    write_json(folder / "results.json", document)
+    return document
+
+
+def _place(set: str, learner: str, **more: str) -> tuple[Any, ...]:
+    """Where a point stands in a table: by set, by what else was set, by learner."""
+    sets, learners = list(SETS), list(CONTESTANTS)
+    at = sets.index(set) if set in sets else len(sets)
+    by = learners.index(learner) if learner in learners else len(learners)
+    return at, set, tuple(more.items()), by, learner
+
+
+def _entry(point: Mapping[str, str], rows: Sequence[Row]) -> dict[str, Any]:
+    found = [row["result"] for row in rows if row["status"] == DONE]
+    wrong = [m["signal"] for row in found for m in row["modules"] if not m["learnable"]]
+    return {
+        "point": point,
+        "seeds": [row["seed"] for row in rows],
+        "failed": [row["error"] for row in rows if row["status"] != DONE],
+        "measures": _measures(found),
+        "targets": _targets(found),
+        "wrong": {name: wrong.count(name) for name in sorted({*wrong})},
+        "probes": _probes(found),
+        "curve": _curve(found),
+    }
+
+
+MEASURES: Final[Mapping[str, Callable[[Row], float | None]]] = {
+    "learned": lambda row: _share(row, math.inf),
+    "modules": lambda row: len(row["modules"]),
+    "wrong": lambda row: row["wrong"],
+    "doubles": lambda row: row["doubles"],
+    "ended": lambda row: None if row["ended"] is None else bool(row["ended"]),
+    "blocks": lambda row: row["blocks"] if row["ended"] else None,
+    "blocks_learned": lambda row: _last_block(row),
+    "probe": lambda row: _probe(row, "modules"),
+    "probe_components": lambda row: _probe(row, "components"),
+}
+"""What a trial came to, None where that says nothing; see `page.DEFINITIONS`."""
+
+
+def _measures(found: Sequence[Row]) -> dict[str, Any]:
+    values = {name: [measure(row) for row in found] for name, measure in MEASURES.items()}
+    measures = {name: _measure([v for v in of if v is not None]) for name, of in values.items()}
+    ends = [ended for ended in values["ended"] if ended is not None]
+    return measures | {"ended": _measure(ends, wilson(int(sum(ends)), len(ends)))}
+
+
+def _measure(values: ArrayLike, interval: tuple[float, float] | None = None) -> dict[str, Any]:
+    """Mean, SD, number of trials and 95 % interval."""
+    low, high = interval or mean_interval(values)
+    return {**asdict(summary(values)), "low": low, "high": high}
+
+
+def _share(row: Row, frame: float) -> float:
+    """Share of what can be learned that was learned by a frame."""
+    frames = [t["frame"] for t in row["targets"]]
+    return float(np.mean([f is not None and f <= frame for f in frames]))
+
+
+def _last_block(row: Row) -> int | None:
+    """The block by which everything was learned."""
+    blocks = [t["block"] for t in row["targets"]]
+    return None if None in blocks else max(blocks)
+
+
+def _probe(row: Row, key: str) -> float | None:
+    values = [p[key] for p in row["probes"] if p[key] is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _targets(found: Sequence[Row]) -> list[dict[str, Any]]:
+    """Of everything that can be learned, with how many seeds it was, and how soon."""
+    tables = []
+    for same in zip(*(row["targets"] for row in found), strict=True):
+        learned = [t for t in same if t["frame"] is not None]
+        table = {"stream": same[0]["stream"], "signal": same[0]["signal"]}
+        table |= {"learned": len(learned), "trials": len(same)}
+        tables.append(table | {k: _measure([t[k] for t in learned]) for k in ("block", "watched")})
+    return tables
+
+
+def _probes(found: Sequence[Row]) -> dict[str, Any]:
+    """Of each signal that a module was saved of, what the modules tell of the world."""
+    told = [probe for row in found for probe in row["probes"] if probe["modules"] is not None]
+    return {
+        signal: {
+            key: _measure([p[key] for p in told if p["signal"] == signal])
+            for key in ("outputs", "modules", "components")
+        }
+        for signal in sorted({p["signal"] for p in told})
+    }
+
+
+def _curve(found: Sequence[Row]) -> dict[str, list[float]]:
+    """Share learned by frames seen: mean and standard deviation over trials."""
+    if not found:
+        return {"frames": [], "mean": [], "sd": []}
+    last = max(FIRST + 1, *(row["frames"] for row in found))
+    frames = np.geomspace(FIRST, last, POINTS)
+    shares = np.array([[_share(row, frame) for frame in frames] for row in found])
+    mean, sd = shares.mean(axis=0), shares.std(axis=0)
+    return {"frames": frames.round().tolist(), "mean": mean.tolist(), "sd": sd.tolist()}
+
+
+def _versions_of_streams() -> dict[str, str]:
+    found = {}
+    for name in ("gymnasium", "ale-py", "scikit-video"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found

@@ -21,7 +21,7 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.loop import ending
-from cdmisfa.experiments.statistics import correlation
+from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.store import StoredTrial
 from cdmisfa.features.sfa import slowness
 from cdmisfa.studies.arena.library import ArenaSource, Library, Reference

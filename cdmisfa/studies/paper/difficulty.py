@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
-from cdmisfa.experiments.statistics import correlation, stays_above
+from cdmisfa.experiments.results import correlation, stays_above
 from cdmisfa.features.incsfa import IncSFA
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
 from cdmisfa.studies import pages

@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import ArrayLike, NDArray
 
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments.statistics import MeanSd, summary, wilson
+from cdmisfa.experiments.results import MeanSd, summary, wilson
 
 Settings = Mapping[str, Any]
 Output = tuple[dict[str, Any], Mapping[str, NDArray[Any]]]

@@ -19,7 +19,7 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.documents import plain, write_json
 from cdmisfa.experiments.loop import learn
-from cdmisfa.experiments.statistics import correlation
+from cdmisfa.experiments.results import correlation
 from cdmisfa.studies import pages
 from cdmisfa.studies.paper.experiment import (
     Experiment,

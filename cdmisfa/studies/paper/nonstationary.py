@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.experiments.statistics import MeanSd, Midpoint, logistic_midpoint
+from cdmisfa.experiments.results import MeanSd, Midpoint, logistic_midpoint
 from cdmisfa.experiments.trial import Swap, run_trial
 from cdmisfa.studies import pages
 from cdmisfa.studies.paper.experiment import (

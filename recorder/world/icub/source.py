@@ -19,8 +19,7 @@ from cdmisfa.core.blocks import Block, ClockedSource, HeadPose, SourceSpec, chec
 from cdmisfa.core.config import section_table
 from recorder.config import RecordConfig
 from recorder.world.icub.config import EyesConfig, IcubConfig, TableConfig
-from recorder.world.icub.motions import Motions
-from recorder.world.icub.world import World
+from recorder.world.icub.world import Motions, World
 
 if TYPE_CHECKING:
     from PIL import Image
