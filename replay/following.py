@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.arrays import FloatArray, IntArray
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import (
@@ -50,7 +49,7 @@ class OutputHistory:
 
     module: int
     stream: int
-    t: NDArray[np.int64]
+    t: IntArray
     y: FloatArray
     truth: FloatArray
     angles: tuple[int, ...] | None = None
@@ -196,7 +195,7 @@ def read_outputs(
 
 
 def _of_kept_modules(
-    path: Path, header: RunHeader, silent: Mapping[int, NDArray[np.int64]]
+    path: Path, header: RunHeader, silent: Mapping[int, IntArray]
 ) -> dict[int, Frames]:
     """Outputs of modules that were kept on frames that the log holds."""
     log = run_log(path)
@@ -210,14 +209,15 @@ def _of_kept_modules(
                 own = np.isin(frames, silent[number])
                 if own.any():
                     found[number].append((frames[own], module.transform(shown[own])[:, 0]))
-    return {
-        number: (np.concatenate([t for t, _ in parts]), np.concatenate([y for _, y in parts]))
-        for number, parts in found.items()
-        if parts
-    }
+    return {number: _in_one(parts) for number, parts in found.items() if parts}
 
 
-def _truth_at(t: NDArray[np.int64], truth: Frames | None) -> FloatArray:
+def _in_one(parts: Sequence[Frames]) -> Frames:
+    frames, values = zip(*parts, strict=True)
+    return np.concatenate(frames), np.concatenate(values)
+
+
+def _truth_at(t: IntArray, truth: Frames | None) -> FloatArray:
     """(n, D) ground truth at n frames; D is 0 where not all of them have it."""
     if truth is not None and len(t):
         frames, values = truth
@@ -233,10 +233,7 @@ def _read_truth(path: Path, header: RunHeader) -> Frames | None:
         return None
     batches = read_batches(path, header, topics=(TRUTH_TOPIC,))
     pieces = [piece for batch in batches for piece in batch.truth]
-    if not pieces:
-        return None
-    frames, values = zip(*pieces, strict=True)
-    return np.concatenate(frames), np.concatenate(values)
+    return _in_one(pieces) if pieces else None
 
 
 class _OutputCollector:
@@ -269,5 +266,4 @@ class _OutputCollector:
     def last(self, most: int) -> Frames:
         """The last `most` frames, and the output at each."""
         blocks = self.blocks[-max(most // max(len(self.blocks[0][1]), 1), 1) :]
-        t = np.concatenate([start + np.arange(len(y)) for start, y in blocks])
-        return t, np.concatenate([y for _, y in blocks])
+        return _in_one([(start + np.arange(len(y)), y) for start, y in blocks])
