@@ -172,8 +172,13 @@ class FileStore(Store):
         """Let the system read spans, if they are few bytes, all at once and not one by one."""
         if sys.platform == "linux" and sum(stop - start for start, stop in spans) <= _AHEAD:
             number = self._open().number
-            for start, stop in spans:
-                os.posix_fadvise(number, start, stop - start, os.POSIX_FADV_WILLNEED)
+            begin = end = 0
+            for start, stop in (*spans, (-1, -1)):
+                if start != end:  # spans that touch are one call
+                    if begin < end:
+                        os.posix_fadvise(number, begin, end - begin, os.POSIX_FADV_WILLNEED)
+                    begin = start
+                end = stop
 
     def is_at(self, path: Path) -> bool:
         try:
