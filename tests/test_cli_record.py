@@ -70,16 +70,6 @@ def test_a_terminal_that_is_closed_ends_it_like_a_signal(tmp_path: Path, jobs: i
         record_scene("oscillatory", folder, frames=100000000, resume=True, stop=lambda: True)
 
 
-def test_going_on_with_a_complete_recording_says_so(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    words = ("record", "oscillatory", "-o", tmp_path / "rec", "--json")
-    first = cdmisfa(*words, "--frames", 120)
-    again = cdmisfa(*words, "--resume")
-    assert (again.code, again.json) == (0, first.json)
-    assert again.err == f"{tmp_path / 'rec'} is complete: nothing was left to record\n"
-    longer = cdmisfa(*words, "--resume", "--frames", 150)
-    assert (longer.json["frames"], longer.err) == (150, "")
-
-
 def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     words = ("--frames", 400, "--seed", 7, "--split", "5s")
     cdmisfa("record", "oscillatory", "-o", tmp_path / "whole", *words)
@@ -114,6 +104,9 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
     complete = cdmisfa(*again, "--json")
     assert (complete.code, complete.json["frames"]) == (0, 400)
     assert complete.err == f"{folder} is complete: nothing was left to record\n"
+    longer = cdmisfa("record", "oscillatory", *again[1:], *words[2:], "--frames", 450, "--json")
+    assert longer.code == 0, longer.err
+    assert (longer.json["frames"], longer.err) == (450, "")
     (folder / "x2-000.mcap").unlink()
     for unknown in (again, (*again, "--frames", 9)):
         assert cdmisfa(*unknown).code == 2

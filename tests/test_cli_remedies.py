@@ -95,16 +95,6 @@ def test_a_stub_is_not_recovered_as_an_empty_log(cdmisfa: Cdmisfa, tmp_path: Pat
     assert not out.exists()
 
 
-def test_resuming_what_has_come_as_far_is_said(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    words = ("learn", "oscillatory", "-o", run, *SHORT, "--max-iterations")
-    assert cdmisfa(*words, 5).code == 0
-    again = cdmisfa(*words, 4, "--resume")
-    assert (again.code, "nothing was left to do" in again.err) == (0, True), again.err
-    more = cdmisfa(*words, 6, "--resume")
-    assert (more.code, "nothing was left to do" in more.err) == (0, False), more.err
-
-
 def test_doctor_says_how_to_get_each_extra(
     cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from message_files import START, STEP, every, write_mcap
+from message_files import START, STEP, every, write_mcap, write_table
 
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
@@ -228,17 +227,6 @@ def test_broken_messages_are_said_to_be(encoding: str) -> None:
         except CdmisfaError:
             broken += 1
     assert broken > 150
-
-
-def write_table(path: Path, columns: dict[str, Any]) -> Path:
-    table = pa.table(columns)
-    if path.suffix == ".csv":
-        from pyarrow import csv
-
-        csv.write_csv(table, path)
-    else:
-        pq.write_table(table, path)
-    return path
 
 
 @pytest.mark.parametrize("name", ["t.csv", "t.parquet"])

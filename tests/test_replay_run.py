@@ -9,7 +9,6 @@ import pytest
 from run_data import VECTOR, write_run
 
 import replay
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS
 
 ITERATIONS = 20
@@ -49,11 +48,6 @@ def test_the_result_is_there_once_the_run_has_ended(folder):
     assert replay.Run(path / "run.mcap").result == {"iterations": ITERATIONS}
     (path / "run.json").write_text("{")
     assert replay.Run(path).result is None
-
-
-def test_what_is_no_run_is_refused_at_once(tmp_path):
-    with pytest.raises(UsageError, match="holds no run"):
-        replay.Run(tmp_path)
 
 
 def test_the_packages_hand_it_on():
