@@ -123,6 +123,17 @@ def test_the_chunks_of_other_topics_are_left_where_they_are(web: WebServer, tmp_
     assert web.sent < 1.02 * sum(map(len, taken)) + 100_000
 
 
+def test_small_chunks_that_touch_are_asked_for_together(web: WebServer, tmp_path: Path) -> None:
+    write_noise(tmp_path / "a.mcap", ("/a",), 400, 5000)
+    web.files["/a.mcap"] = (tmp_path / "a.mcap").read_bytes()
+    with LogReader(open_store(web.url("/a.mcap"))) as reader:
+        web.reset()
+        assert sum(len(m.data) for m in reader.messages()) == 10_000_000
+    assert len(web.asked) < 16
+    assert max(web.asked) < (1 << 20) + 30_000
+    assert web.sent < 1.01 * len(web.files["/a.mcap"])
+
+
 def test_a_short_run_reads_only_the_beginning(web: WebServer, tmp_path: Path) -> None:
     write_cameras(tmp_path / "a.mcap", {"/left": (8000, 20), "/right": (8000, 20)})
     web.files["/a.mcap"] = (tmp_path / "a.mcap").read_bytes()
