@@ -103,9 +103,9 @@ def test_a_broken_chunk_is_walked_over_as_far_as_it_is_sound(data: st.DataObject
         # Mostly where headers and lengths stand.
         at = data.draw(st.integers(0, min(400, len(raw) - 1)))
         raw[at] = data.draw(st.sampled_from([0, 1, 5, 7, 9, 16, 31, 128, 255]))
-    messages, others, place = kernels.walk_records(np.frombuffer(bytes(raw), np.uint8))
+    messages, others, *rest = kernels.walk_records(np.frombuffer(bytes(raw), np.uint8))
     true = reference.walk_records(bytes(raw))
-    assert ([row[:6] for row in messages.tolist()], others.tolist(), place) == true
+    assert ([row[:6] for row in messages.tolist()], others.tolist(), *rest) == true
 
 
 def parts_of(path: Path, number: int) -> tuple[Segment, bytearray]:
@@ -160,17 +160,21 @@ def test_values_are_copied_from_within_the_payloads_only(data: st.DataObject) ->
     raw = data.draw(st.binary(max_size=60))
     edge = st.sampled_from([-1, 0, 1, 2**62, -(2**63), 2**63 - 1])
     place = st.integers(0, len(raw)) | edge
-    spans = data.draw(st.lists(st.tuples(place, place), max_size=3))
+    spans = data.draw(st.lists(st.tuples(place, place, st.integers(0, 1)), max_size=5))
     messages = np.zeros(len(spans), kernels.MESSAGE)
-    messages["at"], messages["size"] = [at for at, _ in spans], [size for _, size in spans]
+    for name, column in zip(("at", "size", "channel"), zip(*spans, strict=True), strict=False):
+        messages[name] = column
+    own = [(at, size) for at, size, channel in spans if channel == 1]
+    start, stop = sorted(data.draw(st.tuples(*[st.integers(0, len(own))] * 2)))
     distances, width = data.draw(st.lists(place, max_size=3)), data.draw(st.integers(0, 20))
     marks = data.draw(st.dictionaries(place, st.integers(0, 1), max_size=2))
     laid_out = data.draw(place), list(marks), list(marks.values()), distances, width
-    out = np.zeros((len(spans), len(distances) * width), np.uint8)
-    taken = kernels.gather(np.frombuffer(raw, np.uint8), messages, kernels.layout(*laid_out), out)
-    true = reference.gather(raw, spans, *laid_out)
-    assert taken == (true is not None)
-    assert not taken or out.tobytes() == true
+    out = np.zeros((stop - start, len(distances) * width), np.uint8)
+    chunk = np.frombuffer(raw, np.uint8), messages, 1, (start, stop)
+    found = kernels.gather(*chunk, kernels.layout(*laid_out), out)
+    true = reference.gather(raw, own[start:stop], *laid_out)
+    assert found == (None if true is None else len(own))
+    assert true is None or out.tobytes() == true
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

@@ -167,7 +167,7 @@ def test_nothing_is_read_twice(
 def test_a_resumed_recorder_is_followed_on(tmp_path: Path) -> None:
     """Going on with a recording replaces its unfinished files by others."""
     live = OscillatorySource()
-    half_recorded(tmp_path / "rec", 1)
+    half_recorded(tmp_path / "rec", 0)
     source = FollowedSource(tmp_path / "rec", timeout=30)
     same(source.take(0, 150), live.take(0, 150))
     record_scene("oscillatory", tmp_path / "rec", resume=True)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import http.server
-import io
 import json
 import re
 import signal
@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,12 @@ import av
 import foxglove
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, write_video
+from camera_files import HEIGHT, WIDTH, encoded, write_video
 from conftest import Cdmisfa
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage as FoxgloveRaw
-from PIL import Image
+from live_cameras import Robot
 from waiting import Clock, wait_for
 from websockets.sync.server import ServerConnection, serve
 
@@ -217,10 +217,9 @@ class Motion(http.server.BaseHTTPRequestHandler):
         self.end_headers()
         with contextlib.suppress(OSError):
             for k in range(20):
-                data = io.BytesIO()
-                Image.fromarray(np.full((48, 64), 5 * k, np.uint8)).save(data, "JPEG")
-                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {data.tell()}\r\n"
-                self.wfile.write(head.encode() + b"\r\n" + data.getvalue() + b"\r\n")
+                data = encoded(gray(5 * k), "JPEG")
+                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
+                self.wfile.write(head.encode() + b"\r\n" + data + b"\r\n")
                 time.sleep(0.1 if self.path == "/slow.mjpg" else 0.04)
 
     def log_message(self, *args: Any) -> None:
@@ -304,67 +303,29 @@ def test_a_stream_over_tcp_ends_where_that_is_asked_for(tmp_path: Path) -> None:
         thread.join()
 
 
-class Robot:
-    """foxglove-sdk's server on loopback, with two topics of images and one of something else."""
+def gray(k: int) -> np.ndarray[Any, Any]:
+    return np.full((48, 64), k % 256, np.uint8)
 
-    def __init__(self) -> None:
-        self.context = foxglove.Context()
-        self.server = foxglove.start_server(
-            name="robot", host="127.0.0.1", port=0, context=self.context
-        )
-        self.raw = RawImageChannel("/cam/left", context=self.context)
-        self.jpeg = CompressedImageChannel("/cam/right", context=self.context)
-        self.other = foxglove.Channel("/words", message_encoding="json", context=self.context)
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._show)
-        self._thread.start()
 
-    @property
-    def address(self) -> str:
-        return f"foxglove://127.0.0.1:{self.server.port}"
-
-    def _show(self) -> None:
-        k = 0
-        while not self._over.wait(0.02):
-            image = np.full((48, 64), k % 256, np.uint8)
-            data = io.BytesIO()
-            Image.fromarray(image).save(data, "PNG")
-            self.raw.log(
-                RawImage(width=64, height=48, encoding="mono8", step=64, data=image.tobytes())
-            )
-            self.jpeg.log(CompressedImage(format="png", data=data.getvalue()))
-            self.other.log({"k": k})
-            k += 1
-
-    @contextlib.contextmanager
-    def showing(self, topic: str, image: RawImage, after: Sized = "at once") -> Iterator[None]:
-        """Show an image on a further topic, again and again, once something is in `after`."""
-        over = threading.Event()
-
-        def show() -> None:
-            while not after:
-                time.sleep(0.02)
-            channel = RawImageChannel(topic, context=self.context)
-            while not over.wait(0.02):
-                channel.log(image)
-
-        thread = threading.Thread(target=show)
-        thread.start()
-        yield
-        over.set()
-        thread.join()
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-        self.server.stop()
+def raw_image(k: int) -> RawImage:
+    return RawImage(width=64, height=48, encoding="mono8", step=64, data=gray(k).tobytes())
 
 
 @pytest.fixture
 def robot() -> Iterator[Robot]:
-    robot = Robot()
-    yield robot
-    robot.close()
+    """It has two topics of images and one of something else."""
+    in_json = functools.partial(foxglove.Channel, message_encoding="json")
+    with (
+        contextlib.closing(Robot()) as robot,
+        robot.showing(RawImageChannel, "/cam/left", raw_image),
+        robot.showing(
+            CompressedImageChannel,
+            "/cam/right",
+            lambda k: CompressedImage(format="png", data=encoded(gray(k))),
+        ),
+        robot.showing(in_json, "/words", lambda k: {"k": k}),
+    ):
+        yield robot
 
 
 def test_images_of_a_running_robot_are_recorded_and_learned_from(
@@ -384,7 +345,7 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
     data = np.tile(np.array([0, 1, 2, 3, 9], "<f4"), (4, 1)).tobytes()
     image = RawImage(width=5, height=4, encoding="32FC1", step=20, data=data)
     words = [f"{robot.address}/depth"]
-    with robot.showing("/depth", image):
+    with robot.showing(RawImageChannel, "/depth", lambda _: image):
         with contextlib.closing(open_live(words, LiveOptions(depth=(1, 3)))) as source:
             assert source.take(0, 2).frames[1, 0].tolist() == [0, 0, 128, 255, 255]
             assert source.describe()["range_metres"] == [1, 3]
@@ -436,13 +397,12 @@ def test_a_topic_that_is_no_image_is_refused(
 
 def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
     said: list[str] = []
-    image = RawImage(width=5, height=4, encoding="mono8", step=5, data=bytes(20))
     words = [f"{robot.address}/cam/late"]
     with (
-        robot.showing("/cam/late", image, after=said),
+        robot.showing(RawImageChannel, "/cam/late", raw_image, after=said),
         contextlib.closing(open_live(words, LiveOptions(), say=said.append)) as source,
     ):
-        assert source.take(0, 2).frames.shape == (2, 4, 5)
+        assert source.take(0, 2).frames.shape == (2, 48, 64)
 
 
 def test_a_topic_that_the_server_does_not_know_yet_is_subscribed_to_again() -> None:
@@ -541,19 +501,20 @@ def test_what_cannot_be_is_refused_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def ended(rec: Path, number: int) -> tuple[int, str]:
-    """The exit code and words of a recording that is sent a signal once it has frames."""
+def ended(rec: Path, number: int, least: int) -> tuple[int, str]:
+    """The exit code and words of a recording that is sent a signal once it has some bytes."""
     command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(rec)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     partial = rec / "lavfi_testsrc.mcap.partial"
-    wait_for(lambda: partial.exists() and partial.stat().st_size > 8000, 60, process)
+    wait_for(lambda: partial.exists() and partial.stat().st_size > least, 60, process)
+    time.sleep(0.3)
     process.send_signal(number)
     _, said = process.communicate(timeout=60)
     return process.returncode, said
 
 
 def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
-    code, said = ended(tmp_path / "rec", signal.SIGINT)
+    code, said = ended(tmp_path / "rec", signal.SIGINT, 0)
     assert code == 0, said
     with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
         assert source.frames > 3
@@ -563,7 +524,7 @@ def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
 def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
-    ended(tmp_path / "rec", signal.SIGKILL)
+    ended(tmp_path / "rec", signal.SIGKILL, 8000)
     assert cdmisfa("info", str(tmp_path / "rec"), "--json").json["complete"] is False
     refused = cdmisfa("record", "-o", str(tmp_path / "rec"), "--resume")
     assert refused.code == 2

@@ -25,9 +25,13 @@ from message_files import STEP, every, write_mcap, write_table
 from PIL import Image
 from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
 from test_foreign import raw_json, ros1
+from video_packets import FOXGLOVE, foxglove, video
 from web_server import serving
 
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.testing.sources import SourceContract
 from recorder.images.decoding import MessageKind
+from replay.camera_logs.source import ForeignSource
 
 COUNT = 60
 STEP_MS = 20
@@ -35,8 +39,8 @@ MESSAGES_OF = ("foxglove", "compressed", "json", "ros1")
 BAGS = ("ros2 mcap folder", "bag", "db3", "db3 folder")
 PICTURES = ("png folder", "jpeg folder")
 FORMATS = (
-    *("recording", "run", *(f"{kind} mcap" for kind in MESSAGES_OF), *BAGS, "video", *PICTURES),
-    *("lerobot", "table", "url", "several", "glob"),
+    *("recording", "run", *(f"{kind} mcap" for kind in MESSAGES_OF), *BAGS, "video", "video mcap"),
+    *(*PICTURES, "lerobot", "table", "url", "several", "glob"),
 )
 COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "play")
 REFUSED = {
@@ -87,6 +91,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
         Image.fromarray(image).save(base / "jpeg" / f"{i}.jpg")
     for name, (kind, encode) in MESSAGES.items():
         write_mcap(base / name, kind, {"/cam": every(STEP, map(encode, images))})
+    packets = (foxglove(packet, "h264") for packet in video("h264"))
+    write_mcap(base / "video mcap", FOXGLOVE, {"/cam": every(STEP, packets)})
     rec = str(base / "rec")
     for words in (
         ["convert", str(base / "a.mcap"), "-o", rec],
@@ -100,7 +106,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
             "recording": [base / "rec"],
             "run": [base / "run"],
             "foxglove mcap": [base / "a.mcap"],
-            **{name: [base / name] for name in (*MESSAGES, "lerobot")},
+            **{name: [base / name] for name in (*MESSAGES, "video mcap", "lerobot")},
             "ros2 mcap folder": [ros2_mcap(base / "mcap")],
             "bag": [ros1_bag(base / "ros1")],
             "db3": [ros2_database(base / "db")],
@@ -113,6 +119,24 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
             "several": [base / "part-1.mcap", base / "part-2.mcap"],
             "glob": [base / "part-*.mcap"],
         }
+
+
+class TestSources(SourceContract):
+    """Of every kind of log that is opened otherwise than the others."""
+
+    ends = True
+
+    @pytest.fixture(
+        autouse=True,
+        params=["foxglove mcap", "bag", "video", "video mcap", "png folder", "table", "several"],
+    )
+    def _log(self, request: pytest.FixtureRequest, logs: dict[str, list[Any]]) -> None:
+        self.kind, self.paths = request.param, logs[request.param]
+
+    def open(self) -> FrameSource:
+        topics = ["/cam_*"] if self.kind in BAGS else []
+        rate = 50.0 if self.kind in (*PICTURES, "table") else None
+        return ForeignSource(self.paths, topics, rate=rate)
 
 
 def write_numbers(table: Path, log: Path) -> None:

@@ -18,9 +18,7 @@ from conftest import Cdmisfa
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from message_files import START, STEP, every, write_mcap, write_table
 
-from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.testing.sources import SourceContract
 from recorder.images.decoding import MessageKind, message_decoder
 from recorder.images.fields import Field, numbers_of
 from recorder.log.messages import descriptor_set
@@ -359,17 +357,6 @@ def test_a_few_bytes_that_are_many_rows_are_refused(tmp_path: Path) -> None:
     assert path.stat().st_size < 100_000
     with pytest.raises(LogDamagedError, match="4194305 rows are too many for its few bytes"):
         ForeignSource(path, rate=5)
-
-
-class TestTable(SourceContract):
-    ends = True
-
-    @pytest.fixture(autouse=True)
-    def _table(self, tmp_path: Path) -> None:
-        self.path = write_table(tmp_path / "t.csv", {"a": angles(500)[:, 0]})
-
-    def open(self) -> SeekableSource:
-        return ForeignSource(self.path, rate=50)
 
 
 def test_a_slow_sine_hidden_in_fields_of_noise_is_learned(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -13,9 +13,7 @@ import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_video
 from conftest import Cdmisfa
 
-from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.testing.sources import SourceContract
 from recorder.images.pixels import shrink
 from replay.camera_logs.pictures import VideoImages
 from replay.camera_logs.source import ForeignSource
@@ -34,17 +32,6 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     for seed, path in enumerate(paths):
         write_video(path, pictures(120, seed), codec="libx264", pixels="yuv420p")
     return paths
-
-
-class TestVideo(SourceContract):
-    ends = True
-
-    @pytest.fixture(autouse=True)
-    def _videos(self, videos: list[Path]) -> None:
-        self.paths = videos
-
-    def open(self) -> FrameSource:
-        return ForeignSource(self.paths, size=SIZE)
 
 
 def test_a_lossless_video_gives_its_very_pixels(tmp_path: Path) -> None:

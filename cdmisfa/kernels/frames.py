@@ -31,30 +31,28 @@ MOST_RECORDS = 1 << 20
 """Most messages of a chunk, and most other records, that are looked at."""
 
 
-def walk_records(data: ByteArray) -> tuple[NDArray[np.void], IntArray, int]:
+def walk_records(data: ByteArray) -> tuple[NDArray[np.void], IntArray, int, tuple[int, int]]:
     """Walk over the records of a chunk as far as they are sound.
 
     Args:
         data: (B,) the decompressed records.
 
     Returns:
-        (n,) of `MESSAGE`, in their order; (m, 2) first byte and end of the other records; and the
-        place where the walk ends: B, or that of the first record that is none.
+        (n,) of `MESSAGE`, in their order; (m, 2) first byte and end of the other records; the
+        place where the walk ends: B, or that of the first record that is none; and the earliest
+        and the latest log time, of no message 2**64 - 1 and 0.
 
     Raises:
         UsageError: there are more than `MOST_RECORDS` of a kind.
     """
-    found = np.empty(3, np.int64)
-    walked = _buffer("uint8_t[]", data), len(data)
-    counts = _buffer("int64_t[]", found)
-    kernels.lib.walk_records(*walked, kernels.ffi.NULL, kernels.ffi.NULL, counts)
-    n, others, place = found.tolist()
-    if max(n, others) > MOST_RECORDS:
+    found, records, null = kernels.ffi.new("walked *"), _buffer("uint8_t[]", data), kernels.ffi.NULL
+    kernels.lib.walk_records(records, len(data), null, null, found)
+    if max(found.messages, found.others) > MOST_RECORDS:
         raise UsageError(f"it holds more than {MOST_RECORDS} messages, the limit of a chunk")
-    messages, spans = np.empty(n, MESSAGE), np.empty((others, 2), np.int64)
+    messages, spans = np.empty(found.messages, MESSAGE), np.empty((found.others, 2), np.int64)
     rows = kernels.records("message", messages), _buffer("int64_t[]", spans)
-    kernels.lib.walk_records(*walked, *rows, counts)
-    return messages, spans, place
+    kernels.lib.walk_records(records, len(data), *rows, found)
+    return messages, spans, found.end, (found.earliest, found.latest)
 
 
 def layout(least: int, places: Any, marks: Any, distances: Any, width: int) -> Struct:
@@ -78,22 +76,30 @@ def layout(least: int, places: Any, marks: Any, distances: Any, width: int) -> S
 
 
 def gather(
-    data: ByteArray, messages: NDArray[np.void], laid_out: Struct, out: ByteArray | None
-) -> bool:
-    """Check how messages are laid out, and copy their values.
+    data: ByteArray,
+    messages: NDArray[np.void],
+    channel: int,
+    rows: tuple[int, int],
+    laid_out: Struct,
+    out: ByteArray | None,
+) -> int | None:
+    """Check how messages of a channel are laid out, and copy their values.
 
     Args:
         data: (B,) the decompressed records.
-        messages: (n,) of `MESSAGE`, one after the other.
+        messages: (n,) of `MESSAGE`, one after the other, of any channels.
+        channel: the channel.
+        rows: those of its messages that are wanted, [start, stop).
         laid_out: as `layout` says.
-        out: (n, R * width), written; None to check only.
+        out: (stop - start, R * width), written; None to check only.
 
     Returns:
-        Whether all are laid out so; if not, `out` holds anything.
+        How many messages of the channel there are; None where one that is wanted is not laid out
+        so, and `out` holds anything.
     """
-    held = laid_out.pointer
-    n, width = len(messages), held.values * held.width
-    into = kernels.ffi.NULL if out is None else pointer("out", out, (n, width), UINT8)
-    rows = _buffer("message[]", messages)
-    code = kernels.lib.gather(_buffer("uint8_t[]", data), len(data), rows, n, held, into)
-    return int(code) == 0
+    held, (start, stop) = laid_out.pointer, rows
+    shape = stop - start, held.values * held.width
+    into = kernels.ffi.NULL if out is None else pointer("out", out, shape, UINT8)
+    chunk = _buffer("uint8_t[]", data), len(data), _buffer("message[]", messages), len(messages)
+    found = int(kernels.lib.gather(*chunk, channel, start, stop, held, into))
+    return None if found < 0 else found

@@ -134,11 +134,15 @@ typedef struct {
   uint32_t sequence;
   uint16_t channel, unused;
 } message;
-/* Walk over the records of a chunk as far as they are sound. Out messages (found[0],), others
- * (found[1], 2) first byte and end of other records, each unless NULL, and found[2] the place of
- * the walk's end. */
+/* What a walk over records found: how many, where it ended, and the range of the log times. */
+typedef struct {
+  int64_t messages, others, end;
+  uint64_t earliest, latest; /* of no message 2^64 - 1 and 0 */
+} walked;
+/* Walk over the records of a chunk as far as they are sound. Out messages (found->messages,),
+ * others (found->others, 2) first byte and end of other records, each unless NULL. */
 int walk_records(const uint8_t *data, int64_t size, message *messages, int64_t *others,
-                 int64_t *found);
+                 walked *found);
 
 /* Where payloads of at least so many bytes hold R values of a width, and M bytes that are always
  * the same: distances from a payload's end. */
@@ -147,9 +151,11 @@ typedef struct {
   const int64_t *distances, *places; /* (R,), (M,) */
   const uint8_t *bytes;              /* (M,) */
 } layout;
-/* Check the layout of messages, and copy their values to out (n, R, width) unless that is NULL. */
-int gather(const uint8_t *data, int64_t size, const message *messages, int64_t n, const layout *l,
-           uint8_t *out);
+/* Of the messages (n,) of a chunk those of a channel: check the layout of those of its rows
+ * [start, stop), and copy their values to out (stop - start, R, width) unless that is NULL. How
+ * many the channel has, or OUT_OF_ORDER. */
+int64_t gather(const uint8_t *data, int64_t size, const message *messages, int64_t n,
+               uint16_t channel, int64_t start, int64_t stop, const layout *l, uint8_t *out);
 
 /* eigen.c: matrix and vectors (n, n), values (n,), spare (3 n,) */
 void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare);

@@ -158,10 +158,9 @@ class Chunks:
         raw = ahead[1].result() if ahead is not None and known else self._records(segment)
         if not (segment.crc or segment.cut):
             self._without_crc()
-        table, definitions = walked_table(raw, cut=segment.cut)
-        times = table.log_time
-        if len(times) and not segment.cut:
-            if times.min() < segment.start or times.max() > segment.end:
+        table, definitions, (earliest, latest) = walked_table(raw, cut=segment.cut)
+        if len(table) and not segment.cut:
+            if earliest < segment.start or latest > segment.end:
                 raise MalformedRecord("it holds messages outside the time range it states")
             if self._note and segment.indexes and not table.agrees(self.index(segment)):
                 self._note(segment.name, f"its message index is not of its messages {UNUSED}")

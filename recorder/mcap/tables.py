@@ -106,8 +106,8 @@ class MessageTable:
 
 def walked_table(
     data: ByteArray, *, cut: bool = False
-) -> tuple[MessageTable, list[tuple[int, bytes]]]:
-    """The messages of a chunk, and its definitions as (opcode, content).
+) -> tuple[MessageTable, list[tuple[int, bytes]], tuple[int, int]]:
+    """The messages of a chunk, its definitions as (opcode, content), and its range of log times.
 
     Args:
         data: (B,) its decompressed records.
@@ -117,7 +117,7 @@ def walked_table(
         MalformedRecord: it holds something that is no record, or that has no place there.
     """
     try:
-        messages, others, place = walk_records(data)
+        messages, others, place, times = walk_records(data)
     except UsageError as error:
         raise MalformedRecord(str(error)) from None
     definitions: list[tuple[int, bytes]] = []
@@ -129,7 +129,7 @@ def walked_table(
             raise MalformedRecord(f"it holds a {Opcode(opcode).name} record")
     if place < len(data) and not cut:
         raise MalformedRecord(_no_record(data, place))
-    return MessageTable(data, messages), definitions
+    return MessageTable(data, messages), definitions, times
 
 
 def _no_record(data: ByteArray, at: int) -> str:

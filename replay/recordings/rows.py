@@ -47,19 +47,23 @@ class RowLayout:
         places, values = list(marks), list(marks.values())
         self._kernel = kernel_layout(least, places, values, distances, width)
 
-    def read(self, table: MessageTable, out: ByteArray | None) -> None:
-        """Check messages, and copy their values.
+    def read(
+        self, table: MessageTable, channel: int, rows: tuple[int, int], out: ByteArray | None
+    ) -> int:
+        """Check messages of a channel, and copy their values; see `gather`.
 
-        Args:
-            table: n messages.
-            out: (n, bytes of a message's values), written; None to check only.
+        Returns:
+            How many messages of the channel the chunk holds.
 
         Raises:
             MalformedRecord: one is laid out otherwise.
         """
-        if not gather(table.data, table.records, self._kernel, out):
-            wrong = "shorter than" if (table.size < self.least).any() else "laid out unlike"
+        found = gather(table.data, table.records, channel, rows, self._kernel, out)
+        if found is None:
+            sizes = table.size[table.channel == channel][slice(*rows)]
+            wrong = "shorter than" if (sizes < self.least).any() else "laid out unlike"
             raise MalformedRecord(f"{self.what} is {wrong} the others")
+        return found
 
 
 class ChannelRows:
@@ -86,7 +90,6 @@ class ChannelRows:
         self._starts = [0]
         self._seen: list[Segment] = []
         self._unconfirmed: set[int] = set()
-        self._own: tuple[int, MessageTable] | None = None
 
     def extend(self) -> None:
         """Number the messages that are there now.
@@ -127,7 +130,7 @@ class ChannelRows:
         if self._segments and self._segments[-1] is segment:
             number = len(self._segments) - 1
             if self._reader.table(segment) is not None:
-                self._check(number, self._table(number), None)
+                self._read(number, 0, self._starts[-1] - self._starts[-2], None)
 
     @property
     def ranges(self) -> list[tuple[int, int]]:
@@ -137,7 +140,7 @@ class ChannelRows:
     def payload(self, frame: int) -> bytes:
         """The message of a frame."""
         number, low, _ = next(self.pieces(frame, 1))
-        return self._table(number).payload(low)
+        return self._own(number).payload(low)
 
     def pieces(self, frame: int, count: int) -> Iterator[tuple[int, int, int]]:
         """Where the messages of `count` frames of one range are, from a frame on.
@@ -170,17 +173,21 @@ class ChannelRows:
         Raises:
             LogDamagedError: the chunk is damaged, or one is laid out otherwise than others.
         """
-        table = self._table(number)
-        own = MessageTable(table.data, table.records[low : low + len(out)])
-        self._check(number, own, out)
+        if number in self._unconfirmed:
+            self._own(number)
+        self._read(number, low, low + len(out), out)
 
-    def _check(self, number: int, table: MessageTable, out: ByteArray | None) -> None:
+    def _read(self, number: int, low: int, high: int, out: ByteArray | None) -> None:
+        if self.layout is None:
+            self._own(number)
+            return
+        table = self._table(number)
         try:
-            if self.layout is not None:
-                self.layout.read(table, out)
+            found = self.layout.read(table, self.channel.id, (low, high), out)
         except MalformedRecord as error:
             where = f"{self._reader.path}: {self._segments[number].name}"
             raise LogDamagedError(f"{where}: {error}") from None
+        self._count(number, found)
 
     def _take(self, segment: Segment) -> bool:
         """Count the channel's messages in the next chunk of the file; whether it has any."""
@@ -204,7 +211,6 @@ class ChannelRows:
             stop = self._starts[-1]
             kept = [one for one in self.row_ranges if one.row < stop]
             self.row_ranges = [r._replace(stop=min(r.stop, r.start + stop - r.row)) for r in kept]
-            self._own = None
 
     def _number(self, times: NDArray[np.uint64], row: int, found: list[RowRange]) -> None:
         """Add the frames of messages from `row` on to the ranges found."""
@@ -238,7 +244,7 @@ class ChannelRows:
         """Log times of the channel's messages in a chunk."""
         segment = self._segments[number]
         if not segment.indexes:
-            return self._table(number).log_time
+            return self._own(number).log_time
         try:
             own = [p[:, 0] for c, p in self._reader.index(segment) if c == self.channel.id]
         except MalformedRecord as error:
@@ -246,28 +252,33 @@ class ChannelRows:
         return np.concatenate(own)
 
     def _table(self, number: int) -> MessageTable:
+        """A chunk's messages; a LogDamagedError where it is damaged."""
+        table = self._reader.table(self._segments[number])
+        if table is None:
+            raise LogDamagedError(f"{self._reader.path}: {self._segments[number].name} is damaged")
+        return table
+
+    def _own(self, number: int) -> MessageTable:
         """The channel's messages in a chunk.
 
         Raises:
             LogDamagedError: the chunk is damaged, or does not hold what its index says.
         """
-        if self._own is not None and self._own[0] == number:
-            return self._own[1]
-        self._own = None  # so that its memory is used again
-        reader, segment, channel = self._reader, self._segments[number], self.channel
-        table = reader.table(segment)
-        if table is None:
-            raise LogDamagedError(f"{reader.path}: {segment.name} is damaged")
-        own = table.select(table.channel == channel.id)
-        row, stop = self._starts[number : number + 2]
-        if len(own) != stop - row:
-            raise LogDamagedError(
-                f"{reader.path}: {segment.name} holds {len(own)} messages of {channel.topic!r}, "
-                f"its index says {stop - row}; run cdmisfa recover"
-            )
+        table = self._table(number)
+        own = table.select(table.channel == self.channel.id)
+        self._count(number, len(own))
         if number in self._unconfirmed:
-            first = self._facts.first_frame
+            row, first = self._starts[number], self._facts.first_frame
             self._number(own.log_time, row, [RowRange(first, first + row, 0)] if row else [])
             self._unconfirmed.remove(number)
-        self._own = number, own
         return own
+
+    def _count(self, number: int, found: int) -> None:
+        """Compare how many messages of the channel a chunk holds with what its index says."""
+        stated = self._starts[number + 1] - self._starts[number]
+        if found != stated:
+            path, name = self._reader.path, self._segments[number].name
+            raise LogDamagedError(
+                f"{path}: {name} holds {found} messages of {self.channel.topic!r}, its index says "
+                f"{stated}; run cdmisfa recover"
+            )

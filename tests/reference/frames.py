@@ -22,11 +22,12 @@ def walk_records(data: bytes):
         else:
             others.append([at, end])
         at = end
-    return messages, others, at
+    times = [message[0] for message in messages]
+    return messages, others, at, (min(times, default=2**64 - 1), max(times, default=0))
 
 
 def gather(data: bytes, spans, least, places, marks, distances, width: int):
-    """The values of messages (place, size), one after the other; None if one is not laid out so."""
+    """The values of payloads (place, size), one after the other; None if one is not laid out so."""
     if not all(width <= d <= least for d in distances) or not all(1 <= p <= least for p in places):
         return None
     values = []

@@ -163,7 +163,7 @@ def tabled_rows(view: ViewFile, start: int, frames: np.ndarray, truth: np.ndarra
     for rows, out in zip(view._channels, outs, strict=False):
         at = 0
         for number, low, n in rows.pieces(start, len(out)):
-            own, layout = rows._table(number), rows.layout
+            own, layout = rows._own(number), rows.layout
             ends = (own.at + own.size)[low : low + n, None, None]
             places = ends - layout.distances[:, None] + np.arange(layout.width)
             out[at : at + n] = own.data[places].reshape(n, -1)
