@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Mapping
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -84,3 +85,32 @@ def write_pictures(folder: Path, count: int) -> list[int]:
         Image.fromarray(image).save(folder / f"{i}.png")
         values.append(int(image[0, 0]))
     return values
+
+
+def write_video(
+    path: Path,
+    images: Iterable[np.ndarray],
+    *,
+    codec: str = "ffv1",
+    pixels: str = "gray",
+    fps: int = 25,
+    first: int = 0,
+    drop: frozenset[int] = frozenset(),
+) -> list[np.ndarray]:
+    """Four pixels for each of an image's; `first` and `drop` move and leave out frames."""
+    import av
+
+    written = []
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=fps)
+        stream.width, stream.height, stream.pix_fmt = 4 * WIDTH, 4 * HEIGHT, pixels
+        stream.codec_context.time_base = Fraction(1, fps)
+        for i, image in enumerate(images):
+            if i in drop:
+                continue
+            frame = av.VideoFrame.from_ndarray(image.repeat(4, 0).repeat(4, 1), format="gray")
+            frame.pts = first + i
+            written.append(image)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return written

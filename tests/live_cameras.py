@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import threading
+import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from typing import Any, NamedTuple
 
+import foxglove
 import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
@@ -109,3 +113,47 @@ class Hand:
 
     def describe(self) -> Mapping[str, Any]:
         return {"camera": self.name}
+
+
+class Robot:
+    """foxglove-sdk's server on loopback; what it shows is said by `showing`."""
+
+    def __init__(self) -> None:
+        self.context = foxglove.Context()
+        self.server = foxglove.start_server(
+            name="robot", host="127.0.0.1", port=0, context=self.context
+        )
+
+    @property
+    def address(self) -> str:
+        return f"foxglove://127.0.0.1:{self.server.port}"
+
+    @contextlib.contextmanager
+    def showing(
+        self,
+        channel: Callable[..., Any],
+        topic: str,
+        message: Callable[[int], Any],
+        after: Sized = "at once",
+    ) -> Iterator[None]:
+        """Show messages on a topic, 50 a second, once something is in `after`."""
+        over, there = threading.Event(), threading.Event()
+
+        def show() -> None:
+            while not after:
+                time.sleep(0.02)
+            opened = channel(topic, context=self.context)
+            there.set()
+            for k in itertools.takewhile(lambda _: not over.wait(0.02), itertools.count()):
+                opened.log(message(k))
+
+        thread = threading.Thread(target=show)
+        thread.start()
+        if after:
+            there.wait()
+        yield
+        over.set()
+        thread.join()
+
+    def close(self) -> None:
+        self.server.stop()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from mcap.writer import Writer
 
@@ -34,4 +35,17 @@ def write_mcap(
             for time, message in messages:
                 writer.add_message(channel, time, message, time)
         writer.finish()
+    return path
+
+
+def write_table(path: Path, columns: dict[str, Any]) -> Path:
+    """A CSV or Parquet file, by its name."""
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    table = pa.table(columns)
+    if path.suffix == ".csv":
+        csv.write_csv(table, path)
+    else:
+        parquet.write_table(table, path)
     return path

@@ -15,8 +15,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.session import run
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
-from replay.recordings.poses import head_poses, yaw_of
-from replay.recordings.source import RecordedSource
+from replay.recordings.source import RecordedSource, head_poses, yaw_of
 from replay.view.build import build_view
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pty
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 from camera_files import write_cameras
 from conftest import Cdmisfa
 from folders import contents
-from waiting import wait_for
+from waiting import started, wait_for
 
 from cdmisfa.experiments.sources import convert
 from recorder.config import Split
@@ -33,17 +32,12 @@ def test_a_signal_says_how_to_go_on(
     cdmisfa: Cdmisfa, tmp_path: Path, number: int, code: int
 ) -> None:
     folder = tmp_path / "rec"
-    words = ["record", "oscillatory", "-o", str(folder), "--frames", "100000000"]
-    recorder = subprocess.Popen(
-        [sys.executable, "-m", "cdmisfa", *words], stderr=subprocess.PIPE, text=True
-    )
-    try:
+    words = ("record", "oscillatory", "-o", folder, "--frames", 100000000)
+    with started(*words) as recorder:
         wait_for((folder / "x3.mcap.partial").exists, 60, recorder)
         time.sleep(0.2)
         recorder.send_signal(number)
         error = recorder.communicate(timeout=60)[1]
-    finally:
-        recorder.kill()
     assert recorder.returncode == code
     line = f"cdmisfa: interrupted: {folder} is not finished: go on with --resume\n"
     assert error.lstrip("\n") == line  # behind the terminal's ^C
@@ -68,16 +62,6 @@ def test_a_terminal_that_is_closed_ends_it_like_a_signal(tmp_path: Path, jobs: i
             recorder.kill()
     with pytest.raises(RecordingStoppedError):
         record_scene("oscillatory", folder, frames=100000000, resume=True, stop=lambda: True)
-
-
-def test_going_on_with_a_complete_recording_says_so(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    words = ("record", "oscillatory", "-o", tmp_path / "rec", "--json")
-    first = cdmisfa(*words, "--frames", 120)
-    again = cdmisfa(*words, "--resume")
-    assert (again.code, again.json) == (0, first.json)
-    assert again.err == f"{tmp_path / 'rec'} is complete: nothing was left to record\n"
-    longer = cdmisfa(*words, "--resume", "--frames", 150)
-    assert (longer.json["frames"], longer.err) == (150, "")
 
 
 def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
@@ -114,6 +98,9 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
     complete = cdmisfa(*again, "--json")
     assert (complete.code, complete.json["frames"]) == (0, 400)
     assert complete.err == f"{folder} is complete: nothing was left to record\n"
+    longer = cdmisfa("record", "oscillatory", *again[1:], *words[2:], "--frames", 450, "--json")
+    assert longer.code == 0, longer.err
+    assert (longer.json["frames"], longer.err) == (450, "")
     (folder / "x2-000.mcap").unlink()
     for unknown in (again, (*again, "--frames", 9)):
         assert cdmisfa(*unknown).code == 2

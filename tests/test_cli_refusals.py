@@ -105,6 +105,12 @@ CASES: dict[str, tuple[str, ...]] = {
             )
         )
     },
+    # what is read from no URL, and what is the URL of no log
+    "results https://host/a/b": ("https://host/a/b is a URL: name a path on this machine",),
+    "view RUN --save a.rrd --all-views https://host/a/b": ("https://host/a/b is a URL: name a",),
+    "info gs://bucket/a.mcap": ("s3, http, https",),
+    "info https://host": ("names no file",),
+    "info http://127.0.0.1:99999/x.mcap": ("a port is a number up to 65535",),
     # a file is not taken for a folder
     "learn oscillatory --force -o file": (FOLDER,),
     "learn oscillatory --force -o file/below": (FOLDER,),

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-
-from cdmisfa.cli.interrupts import interruptible, stoppable
+from folders import contents
 
 CLOSED = ("<&-", ">&-", "2>&-", "<&- >&- 2>&-")
+RECORD = ("record", "oscillatory", "--frames", 256)
 
 
 def cdmisfa(closed: str, *words: object) -> subprocess.CompletedProcess[str]:
@@ -28,43 +26,28 @@ def cdmisfa(closed: str, *words: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("closed", CLOSED)
-def test_a_command_does_its_work_and_says_so(tmp_path: Path, closed: str) -> None:
-    words = ("record", "oscillatory", "--frames", 128)
-    open_ones = cdmisfa("", *words, "-o", tmp_path / "open")
-    ended = cdmisfa(closed, *words, "-o", tmp_path / "closed")
-    assert (open_ones.returncode, ended.returncode) == (0, 0)
-    assert ended.stderr == ""
-    assert bool(ended.stdout) == (">&-" not in closed.split())
-    for file in (tmp_path / "open").glob("*.mcap"):
-        assert (tmp_path / "closed" / file.name).read_bytes() == file.read_bytes()
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What a recording holds that a command with open streams made."""
+    folder = tmp_path_factory.mktemp("open") / "rec"
+    assert cdmisfa("", *RECORD, "-o", folder).returncode == 0
+    return contents(folder)
 
 
+@pytest.mark.parametrize("jobs", [1, 2])
 @pytest.mark.parametrize("closed", CLOSED)
-def test_processes_of_a_command_do_theirs(tmp_path: Path, closed: str) -> None:
-    words = ("record", "oscillatory", "--frames", 256, "--jobs", 2, "-o", tmp_path / "a")
-    ended = cdmisfa(closed, *words)
+def test_a_command_and_its_processes_do_their_work_and_say_so(
+    tmp_path: Path, recorded: dict[str, bytes], closed: str, jobs: int
+) -> None:
+    ended = cdmisfa(closed, *RECORD, "--jobs", jobs, "-o", tmp_path / "rec")
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert len(list((tmp_path / "a").glob("*.mcap"))) == 3
+    assert bool(ended.stdout) == (">&-" not in closed.split())
+    assert contents(tmp_path / "rec") == recorded
 
 
 @pytest.mark.parametrize("closed", CLOSED)
 def test_an_error_keeps_its_exit_code(tmp_path: Path, closed: str) -> None:
     assert cdmisfa(closed, "info", tmp_path / "nothing").returncode == 2
-
-
-def test_the_second_signal_is_the_one_that_the_exit_code_names() -> None:
-    def told_twice() -> None:
-        with stoppable(notice="") as inner:
-            os.kill(os.getpid(), signal.SIGTERM)
-            assert inner()
-            os.kill(os.getpid(), signal.SIGHUP)
-            time.sleep(5)
-
-    with interruptible() as outer:
-        with pytest.raises(KeyboardInterrupt):
-            told_twice()
-        assert outer.exit_code == 129
 
 
 def test_a_stop_inside_of_an_exec_ends_with_its_code_too(tmp_path: Path) -> None:

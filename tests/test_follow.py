@@ -72,14 +72,15 @@ class TestFollowed(SourceContract):
 
 
 def test_frames_are_waited_for_until_the_recorder_is_done(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such file or folder"):
+        FollowedSource(tmp_path / "rec", timeout=0.1)
     live, unfinished = OscillatorySource(), 0
-    with recorder(tmp_path / "rec", wait=0.1):
+    with recorder(tmp_path / "rec", wait=0.05):
         source = FollowedSource(tmp_path / "rec", timeout=30)
-        unfinished += not source.finished
         assert source.spec.length is None
         for i in range(FRAMES // 40):
-            same(source.take(i % 3, 40), live.take(i % 3, 40))
             unfinished += not source.finished
+            same(source.take(i % 3, 40), live.take(i % 3, 40))
         assert unfinished > 0
         with pytest.raises(LogExhaustedError, match="0 frames are left at frame 600"):
             source.take(0, 40)
@@ -99,34 +100,21 @@ def test_a_recorder_that_died_is_told_from_one_that_is_slow(tmp_path: Path) -> N
     same(source.take(1, 20), OscillatorySource().take(1, 20))
 
 
-def test_a_recording_that_never_comes_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such file or folder"):
-        FollowedSource(tmp_path / "rec", timeout=0.3)
-
-
-def test_learning_while_it_is_recorded_gives_the_live_signals(
+def test_a_followed_run_is_that_on_the_scene_and_on_the_finished_recording(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
-    quick = ("--set", "learner.tau=20", "--max-iterations", "25", "--json")
-    with recorder(tmp_path / "rec"):
-        followed = cdmisfa("learn", tmp_path / "rec", "--follow", "--follow-timeout", "30", *quick)
-    assert followed.code == 0, followed.err
-    live = cdmisfa("learn", "oscillatory", *quick)
-    assert followed.json["signals_sha256"] == live.json["signals_sha256"]
-    assert followed.json["source"]["followed"] is True
-
-
-def test_a_followed_run_is_that_on_the_finished_recording(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    quick = ("--set", "learner.tau=20", "--max-iterations", "30", "--json")
-    folder = tmp_path / "rec"
+    """Also where it was stopped and went on."""
+    quick = ("--set", "learner.tau=20", "--json", "--max-iterations")
+    folder, out = tmp_path / "rec", ("-o", tmp_path / "run", "--no-rerun")
     with recorder(folder) as process:
-        followed = cdmisfa(
-            "learn", folder, "--follow", "-o", tmp_path / "run", "--no-rerun", *quick
-        )
+        assert cdmisfa("learn", folder, "--follow", *out, *quick, 3).code == 0
+        followed = cdmisfa("learn", folder, "--follow", *out, "--resume", *quick, 28)
         process.wait()
     assert followed.code == 0, followed.err
-    later = cdmisfa("learn", folder, *quick)
-    assert followed.json["signals_sha256"] == later.json["signals_sha256"]
+    assert followed.json["source"]["followed"] is True
+    later = cdmisfa("learn", folder, *quick, 28)
+    for alike in (later, cdmisfa("learn", "oscillatory", *quick, 28)):
+        assert followed.json["signals_sha256"] == alike.json["signals_sha256"]
     source = json.loads((tmp_path / "run" / "run.json").read_text())["source"]
     for view, whole in zip(source["views"], later.json["source"]["views"], strict=True):
         raw = (folder / whole["file"]).read_bytes()
@@ -179,13 +167,7 @@ def test_nothing_is_read_twice(
 def test_a_resumed_recorder_is_followed_on(tmp_path: Path) -> None:
     """Going on with a recording replaces its unfinished files by others."""
     live = OscillatorySource()
-
-    def stop(done: float) -> None:
-        if done >= 200:
-            raise RuntimeError("stop")
-
-    with pytest.raises(RuntimeError, match="stop"):
-        record_scene("oscillatory", tmp_path / "rec", frames=400, progress=stop)
+    half_recorded(tmp_path / "rec", 0)
     source = FollowedSource(tmp_path / "rec", timeout=30)
     same(source.take(0, 150), live.take(0, 150))
     record_scene("oscillatory", tmp_path / "rec", resume=True)
@@ -268,19 +250,6 @@ def test_a_resumed_run_goes_on_with_the_frames_that_it_had(tmp_path: Path) -> No
         learned(resume=True, max_iterations=9)
     record(Unseeded(1), tmp_path / "rec", frames=300, force=True)
     learned(resume=True, max_iterations=9)
-
-
-def test_a_stopped_run_goes_on_following(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    words = ("learn", tmp_path / "rec", "--follow", "-o", tmp_path / "run", "--no-rerun", "--json")
-    words += ("--set", "learner.tau=20")
-    with recorder(tmp_path / "rec"):
-        assert cdmisfa(*words, "--max-iterations", "3").code == 0
-        resumed = cdmisfa(*words, "--max-iterations", "20", "--resume")
-    assert resumed.code == 0, resumed.err
-    live = cdmisfa(
-        "learn", "oscillatory", "--set", "learner.tau=20", "--max-iterations", "20", "--json"
-    )
-    assert resumed.json["signals_sha256"] == live.json["signals_sha256"]
 
 
 def test_a_signal_ends_the_waiting(cdmisfa: Cdmisfa, tmp_path: Path, finished: Path) -> None:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import http.server
-import io
 import json
 import re
+import signal
 import socket
 import struct
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,12 @@ import av
 import foxglove
 import numpy as np
 import pytest
+from camera_files import HEIGHT, WIDTH, encoded, write_video
 from conftest import Cdmisfa
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage as FoxgloveRaw
-from PIL import Image
+from live_cameras import Robot
 from waiting import Clock, wait_for
 from websockets.sync.server import ServerConnection, serve
 
@@ -37,32 +39,18 @@ from recorder.cameras.options import LiveOptions
 from recorder.cameras.video import VideoCamera
 from recorder.cameras.words import is_live, live_names, open_live
 from replay.recordings.source import RecordedSource
-from replay.runs.log import read_header
 
 RAW = "foxglove.RawImage"
 TEST = "av:lavfi:testsrc=size=160x120:rate=30"
 
 
-@pytest.mark.parametrize(
-    ("word", "live"),
-    [
-        ("camera:/dev/video0", True),
-        ("rtsp://robot/left", True),
-        ("http://robot:8080/stream.mjpg", True),
-        ("https://robot/a.mjpeg?x=1", True),
-        ("tcp://robot:9000", True),
-        ("av:clip.mkv", True),
-        ("gym:Pendulum-v1", True),
-        ("foxglove://robot:8765/cam", True),
-        ("http://robot/log.mcap", False),
-        ("s3://bucket/log.mcap", False),
-        ("icub", False),
-        ("av", False),
-        ("folder/log.mcap", False),
-    ],
-)
-def test_which_words_name_live_streams(word: str, live: bool) -> None:
-    assert is_live(word) is live
+def test_which_words_name_live_streams() -> None:
+    live = (
+        "camera:/dev/video0 rtsp://robot/left http://robot:8080/stream.mjpg gym:Pendulum-v1 "
+        "https://robot/a.mjpeg?x=1 tcp://robot:9000 av:clip.mkv foxglove://robot:8765/cam"
+    )
+    others = "http://robot/log.mcap s3://bucket/log.mcap icub av folder/log.mcap"
+    assert [word for word in f"{live} {others}".split() if is_live(word)] == live.split()
 
 
 def test_streams_are_named_after_what_they_are() -> None:
@@ -144,19 +132,18 @@ def learned_twice(cdmisfa: Cdmisfa, place: Path, *words: str) -> dict[str, Any]:
     assert live.code == 0, live.err
     again = cdmisfa("learn", place / "rec", *options).json
     assert again["signals_sha256"] == live.json["signals_sha256"]
+    stated = json.loads((place / "run" / "run.json").read_text())["config"]["record"]
+    with contextlib.closing(RecordedSource(place / "rec")) as source:
+        assert (stated["fps"], stated["start_ns"]) == (source.spec.fps, source.spec.start_ns)
     return {**live.json, "said": live.err}
 
 
 def test_a_task_is_recorded_and_learned_from_alike(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     words = ["gym:CartPole-v1", "gym:Pendulum-v1", "--size", "32x24"]
     learned_twice(cdmisfa, tmp_path, *words)
-    views = cdmisfa("record", *words, "-o", tmp_path / "two", "--json", "--frames", 160).json[
-        "views"
-    ]
-    assert [(view["name"], view["frames"]) for view in views] == [
-        ("CartPole-v1", 160),
-        ("Pendulum-v1", 160),
-    ]
+    done = cdmisfa("record", *words, "-o", tmp_path / "two", "--json", "--frames", 160).json
+    shown = {view["name"]: view["frames"] for view in done["views"]}
+    assert shown == {"CartPole-v1": 160, "Pendulum-v1": 160}
     refused = cdmisfa("record", "gym:Nothing-v0", "-o", str(tmp_path / "x"))
     assert refused.code == 2
     assert "gym:Nothing-v0 cannot be made" in refused.err
@@ -173,13 +160,7 @@ def test_pictures_of_ffmpeg_are_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_
 
 def write_clip(clip: Path) -> Path:
     """Twenty pictures, 25 a second; the k-th has the grey k."""
-    with av.open(str(clip), "w") as container:
-        video = container.add_stream("ffv1", rate=25)
-        video.width, video.height, video.pix_fmt = 64, 48, "gray"
-        for k in range(20):
-            frame = av.VideoFrame.from_ndarray(np.full((48, 64), k, np.uint8), format="gray")
-            container.mux(video.encode(frame))
-        container.mux(video.encode(None))
+    write_video(clip, (np.full((HEIGHT, WIDTH), k, np.uint8) for k in range(20)))
     return clip
 
 
@@ -236,10 +217,9 @@ class Motion(http.server.BaseHTTPRequestHandler):
         self.end_headers()
         with contextlib.suppress(OSError):
             for k in range(20):
-                data = io.BytesIO()
-                Image.fromarray(np.full((48, 64), 5 * k, np.uint8)).save(data, "JPEG")
-                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {data.tell()}\r\n"
-                self.wfile.write(head.encode() + b"\r\n" + data.getvalue() + b"\r\n")
+                data = encoded(gray(5 * k), "JPEG")
+                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
+                self.wfile.write(head.encode() + b"\r\n" + data + b"\r\n")
                 time.sleep(0.1 if self.path == "/slow.mjpg" else 0.04)
 
     def log_message(self, *args: Any) -> None:
@@ -323,67 +303,29 @@ def test_a_stream_over_tcp_ends_where_that_is_asked_for(tmp_path: Path) -> None:
         thread.join()
 
 
-class Robot:
-    """foxglove-sdk's server on loopback, with two topics of images and one of something else."""
+def gray(k: int) -> np.ndarray[Any, Any]:
+    return np.full((48, 64), k % 256, np.uint8)
 
-    def __init__(self) -> None:
-        self.context = foxglove.Context()
-        self.server = foxglove.start_server(
-            name="robot", host="127.0.0.1", port=0, context=self.context
-        )
-        self.raw = RawImageChannel("/cam/left", context=self.context)
-        self.jpeg = CompressedImageChannel("/cam/right", context=self.context)
-        self.other = foxglove.Channel("/words", message_encoding="json", context=self.context)
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._show)
-        self._thread.start()
 
-    @property
-    def address(self) -> str:
-        return f"foxglove://127.0.0.1:{self.server.port}"
-
-    def _show(self) -> None:
-        k = 0
-        while not self._over.wait(0.02):
-            image = np.full((48, 64), k % 256, np.uint8)
-            data = io.BytesIO()
-            Image.fromarray(image).save(data, "PNG")
-            self.raw.log(
-                RawImage(width=64, height=48, encoding="mono8", step=64, data=image.tobytes())
-            )
-            self.jpeg.log(CompressedImage(format="png", data=data.getvalue()))
-            self.other.log({"k": k})
-            k += 1
-
-    @contextlib.contextmanager
-    def showing(self, topic: str, image: RawImage, after: Sized = "at once") -> Iterator[None]:
-        """Show an image on a further topic, again and again, once something is in `after`."""
-        over = threading.Event()
-
-        def show() -> None:
-            while not after:
-                time.sleep(0.02)
-            channel = RawImageChannel(topic, context=self.context)
-            while not over.wait(0.02):
-                channel.log(image)
-
-        thread = threading.Thread(target=show)
-        thread.start()
-        yield
-        over.set()
-        thread.join()
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-        self.server.stop()
+def raw_image(k: int) -> RawImage:
+    return RawImage(width=64, height=48, encoding="mono8", step=64, data=gray(k).tobytes())
 
 
 @pytest.fixture
 def robot() -> Iterator[Robot]:
-    robot = Robot()
-    yield robot
-    robot.close()
+    """It has two topics of images and one of something else."""
+    in_json = functools.partial(foxglove.Channel, message_encoding="json")
+    with (
+        contextlib.closing(Robot()) as robot,
+        robot.showing(RawImageChannel, "/cam/left", raw_image),
+        robot.showing(
+            CompressedImageChannel,
+            "/cam/right",
+            lambda k: CompressedImage(format="png", data=encoded(gray(k))),
+        ),
+        robot.showing(in_json, "/words", lambda k: {"k": k}),
+    ):
+        yield robot
 
 
 def test_images_of_a_running_robot_are_recorded_and_learned_from(
@@ -403,7 +345,7 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
     data = np.tile(np.array([0, 1, 2, 3, 9], "<f4"), (4, 1)).tobytes()
     image = RawImage(width=5, height=4, encoding="32FC1", step=20, data=data)
     words = [f"{robot.address}/depth"]
-    with robot.showing("/depth", image):
+    with robot.showing(RawImageChannel, "/depth", lambda _: image):
         with contextlib.closing(open_live(words, LiveOptions(depth=(1, 3)))) as source:
             assert source.take(0, 2).frames[1, 0].tolist() == [0, 0, 128, 255, 255]
             assert source.describe()["range_metres"] == [1, 3]
@@ -455,33 +397,26 @@ def test_a_topic_that_is_no_image_is_refused(
 
 def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
     said: list[str] = []
-    image = RawImage(width=5, height=4, encoding="mono8", step=5, data=bytes(20))
     words = [f"{robot.address}/cam/late"]
     with (
-        robot.showing("/cam/late", image, after=said),
+        robot.showing(RawImageChannel, "/cam/late", raw_image, after=said),
         contextlib.closing(open_live(words, LiveOptions(), say=said.append)) as source,
     ):
-        assert source.take(0, 2).frames.shape == (2, 4, 5)
+        assert source.take(0, 2).frames.shape == (2, 48, 64)
 
 
 def test_a_topic_that_the_server_does_not_know_yet_is_subscribed_to_again() -> None:
     told: list[dict[str, Any]] = []
     data = FoxgloveRaw(width=5, height=4, encoding="mono8", step=5, data=bytes(20))
+    channel = {"id": 1, "topic": "/cam", "encoding": "protobuf", "schema": "", "schemaName": RAW}
+    refused = {"op": "status", "level": 2, "message": "Unknown channel ID: 1"}
 
     def talk(connection: ServerConnection) -> None:
-        channel = {
-            "id": 1,
-            "topic": "/cam",
-            "encoding": "protobuf",
-            "schema": "",
-            "schemaName": RAW,
-        }
         connection.send(json.dumps({"op": "advertise", "channels": [channel]}))
         for message in connection:
             told.append(json.loads(message))
             if len(told) < 3:
-                refused = "Unknown channel ID: 1"
-                connection.send(json.dumps({"op": "status", "level": 2, "message": refused}))
+                connection.send(json.dumps(refused))
                 continue
             for k in range(20):
                 head = struct.pack("<BIQ", 1, 1, 10**18 + k * 10**7)
@@ -566,14 +501,21 @@ def test_what_cannot_be_is_refused_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(tmp_path / "rec")]
+def ended(rec: Path, number: int, least: int) -> tuple[int, str]:
+    """The exit code and words of a recording that is sent a signal once it has some bytes."""
+    command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(rec)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: list(tmp_path.glob("rec/*.partial")), 60, process)
-    time.sleep(0.5)
-    process.send_signal(2)
+    partial = rec / "lavfi_testsrc.mcap.partial"
+    wait_for(lambda: partial.exists() and partial.stat().st_size > least, 60, process)
+    time.sleep(0.3)
+    process.send_signal(number)
     _, said = process.communicate(timeout=60)
-    assert process.returncode == 0, said
+    return process.returncode, said
+
+
+def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
+    code, said = ended(tmp_path / "rec", signal.SIGINT, 0)
+    assert code == 0, said
     with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
         assert source.frames > 3
     assert (tmp_path / "rec" / "lavfi_testsrc.mcap").exists()
@@ -582,12 +524,7 @@ def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
 def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(tmp_path / "rec")]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    partial = tmp_path / "rec" / "lavfi_testsrc.mcap.partial"
-    wait_for(lambda: partial.exists() and partial.stat().st_size > 8000, 60, process)
-    process.kill()
-    process.wait()
+    ended(tmp_path / "rec", signal.SIGKILL, 8000)
     assert cdmisfa("info", str(tmp_path / "rec"), "--json").json["complete"] is False
     refused = cdmisfa("record", "-o", str(tmp_path / "rec"), "--resume")
     assert refused.code == 2
@@ -595,14 +532,3 @@ def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
     cdmisfa("recover", str(tmp_path / "rec"), "-o", str(tmp_path / "saved"))
     with contextlib.closing(RecordedSource(tmp_path / "saved")) as source:
         assert source.frames > 0
-
-
-def test_a_run_states_the_clock_of_what_it_learned_from(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
-    told = ("--max-iterations", 1, "--no-rerun", "--json")
-    live = ("learn", "gym:Pendulum-v1", "-o", tmp_path / "live", "--record", tmp_path / "rec")
-    assert cdmisfa(*live, *told).code == 0
-    assert cdmisfa("learn", tmp_path / "rec", "-o", tmp_path / "again", *told).code == 0
-    for run in ("live", "again"):
-        stated = json.loads((tmp_path / run / "run.json").read_text())["config"]["record"]
-        spec = read_header(tmp_path / run / "run.mcap").spec
-        assert (stated["fps"], stated["start_ns"]) == (30.0, spec.start_ns)

@@ -4,44 +4,44 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, packed, pictures, write_cameras, write_pictures
+from camera_files import (
+    HEIGHT,
+    PACKED,
+    WIDTH,
+    packed,
+    pictures,
+    write_cameras,
+    write_pictures,
+    write_video,
+)
 from conftest import Cdmisfa
-from message_files import STEP, every, write_mcap
+from message_files import STEP, every, write_mcap, write_table
 from PIL import Image
 from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
 from test_foreign import raw_json, ros1
+from video_packets import FOXGLOVE, foxglove, video
 from web_server import serving
 
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.testing.sources import SourceContract
 from recorder.images.decoding import MessageKind
+from replay.camera_logs.source import ForeignSource
 
 COUNT = 60
 STEP_MS = 20
+MESSAGES_OF = ("foxglove", "compressed", "json", "ros1")
+BAGS = ("ros2 mcap folder", "bag", "db3", "db3 folder")
 PICTURES = ("png folder", "jpeg folder")
 FORMATS = (
-    "recording",
-    "run",
-    "foxglove mcap",
-    "compressed mcap",
-    "json mcap",
-    "ros1 mcap",
-    "ros2 mcap folder",
-    "bag",
-    "db3",
-    "db3 folder",
-    "video",
-    *PICTURES,
-    "lerobot",
-    "table",
-    "url",
-    "several",
-    "glob",
+    *("recording", "run", *(f"{kind} mcap" for kind in MESSAGES_OF), *BAGS, "video", "video mcap"),
+    *(*PICTURES, "lerobot", "table", "url", "several", "glob"),
 )
-BAGS = ("ros2 mcap folder", "bag", "db3", "db3 folder")
 COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "play")
 REFUSED = {
     ("export", "run"): "name the recording",
@@ -54,24 +54,20 @@ REFUSED = {
 """Cells that make no sense, and words of the line that says so."""
 
 
-def write_images(path: Path, schema: str, encoding: str, messages: Iterator[bytes]) -> Path:
-    return write_mcap(path, MessageKind(schema, encoding), {"/cam": every(STEP, messages)})
+def fields(image: np.ndarray) -> dict[str, Any]:
+    size = {"height": HEIGHT, "width": WIDTH, "encoding": "mono8", "step": WIDTH}
+    return {**size, "big": 0, "data": image.tobytes()}
 
 
-def raw(image: np.ndarray) -> dict[str, object]:
-    fields = {"height": HEIGHT, "width": WIDTH, "encoding": "mono8", "step": WIDTH}
-    return {**fields, "big": 0, "data": image.tobytes()}
+MESSAGES: dict[str, tuple[MessageKind, Callable[[np.ndarray], bytes]]] = {
+    "compressed mcap": (PACKED, packed),
+    "json mcap": (MessageKind("foxglove.RawImage", "json"), lambda i: raw_json(**fields(i))),
+    "ros1 mcap": (MessageKind("sensor_msgs/Image", "ros1"), lambda i: ros1(**fields(i))),
+}
 
 
-def write_video(path: Path) -> Path:
-    av = pytest.importorskip("av")
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=50)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        for image in pictures(COUNT):
-            frame = av.VideoFrame.from_ndarray(np.stack([image] * 3, axis=2), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+def write_film(path: Path) -> Path:
+    write_video(path, pictures(COUNT), codec="libx264", pixels="yuv420p", fps=50)
     return path
 
 
@@ -81,6 +77,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
     from cdmisfa.cli import run
 
     pytest.importorskip("rosbags")
+    pytest.importorskip("av")
     base = tmp_path_factory.mktemp("logs")
     for name in ("ros1", "ros2", "db", "mcap", "jpeg"):
         (base / name).mkdir()
@@ -88,50 +85,35 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
     write_cameras(base / "part-1.mcap", {"/left": (COUNT, STEP_MS)})
     write_cameras(base / "part-2.mcap", {"/right": (COUNT, STEP_MS)})
     write_pictures(base / "png", COUNT)
-    rows = (f"{i},{i % 7}" for i in range(COUNT))
-    (base / "t.csv").write_text("\n".join(["a,b", *rows]))
-    for i, image in enumerate(pictures(COUNT)):
-        Image.fromarray(image).save(base / "jpeg" / f"{i}.jpg")
-    made = ("a.mcap", "rec", "run", "lerobot/")
-    for words in (
-        ["convert", "a.mcap", "-o", "rec"],
-        ["learn", "rec", "-o", "run", "--max-iterations", "1", "--no-rerun"],
-        ["export", "rec", "--to", "lerobot", "-o", "lerobot/"],
-    ):
-        assert run([str(base / word) if word in made else word for word in words]) == 0
+    write_table(base / "t.csv", {"a": np.arange(COUNT), "b": np.arange(COUNT) % 7})
     images = list(pictures(COUNT))
+    for i, image in enumerate(images):
+        Image.fromarray(image).save(base / "jpeg" / f"{i}.jpg")
+    for name, (kind, encode) in MESSAGES.items():
+        write_mcap(base / name, kind, {"/cam": every(STEP, map(encode, images))})
+    packets = (foxglove(packet, "h264") for packet in video("h264"))
+    write_mcap(base / "video mcap", FOXGLOVE, {"/cam": every(STEP, packets)})
+    rec = str(base / "rec")
+    for words in (
+        ["convert", str(base / "a.mcap"), "-o", rec],
+        ["learn", rec, "-o", str(base / "run"), "--max-iterations", "1", "--no-rerun"],
+        ["export", rec, "--to", "lerobot", "-o", str(base / "lerobot/")],
+    ):
+        assert run(words) == 0
     with serving() as web:
         web.files["/a.mcap"] = (base / "a.mcap").read_bytes()
         yield {
             "recording": [base / "rec"],
             "run": [base / "run"],
             "foxglove mcap": [base / "a.mcap"],
-            "compressed mcap": [
-                write_images(
-                    base / "c.mcap", "foxglove.CompressedImage", "protobuf", map(packed, images)
-                )
-            ],
-            "json mcap": [
-                write_images(
-                    base / "j.mcap",
-                    "foxglove.RawImage",
-                    "json",
-                    (raw_json(**raw(i)) for i in images),
-                )
-            ],
-            "ros1 mcap": [
-                write_images(
-                    base / "r.mcap", "sensor_msgs/Image", "ros1", (ros1(**raw(i)) for i in images)
-                )
-            ],
+            **{name: [base / name] for name in (*MESSAGES, "video mcap", "lerobot")},
             "ros2 mcap folder": [ros2_mcap(base / "mcap")],
             "bag": [ros1_bag(base / "ros1")],
             "db3": [ros2_database(base / "db")],
             "db3 folder": [ros2_bag(base / "ros2")],
-            "video": [write_video(base / "film.mp4")],
+            "video": [write_film(base / "film.mp4")],
             "png folder": [base / "png"],
             "jpeg folder": [base / "jpeg"],
-            "lerobot": [base / "lerobot"],
             "table": [base / "t.csv"],
             "url": [web.url("/a.mcap")],
             "several": [base / "part-1.mcap", base / "part-2.mcap"],
@@ -139,10 +121,28 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
         }
 
 
+class TestSources(SourceContract):
+    """Of every kind of log that is opened otherwise than the others."""
+
+    ends = True
+
+    @pytest.fixture(
+        autouse=True,
+        params=["foxglove mcap", "bag", "video", "video mcap", "png folder", "table", "several"],
+    )
+    def _log(self, request: pytest.FixtureRequest, logs: dict[str, list[Any]]) -> None:
+        self.kind, self.paths = request.param, logs[request.param]
+
+    def open(self) -> FrameSource:
+        topics = ["/cam_*"] if self.kind in BAGS else []
+        rate = 50.0 if self.kind in (*PICTURES, "table") else None
+        return ForeignSource(self.paths, topics, rate=rate)
+
+
 def write_numbers(table: Path, log: Path) -> None:
     """A table with the columns stamp, a and b, and a log of joints in JSON."""
-    rows = (f"{i / 50},{np.sin(i / 9)},{i % 7}" for i in range(200))
-    table.write_text("\n".join(["stamp,a,b", *rows]))
+    t = np.arange(200)
+    write_table(table, {"stamp": t / 50, "a": np.sin(t / 9), "b": t % 7})
     joints = ({"position": [i, i % 5, 1], "velocity": [0.5, i % 3]} for i in range(200))
     kind = MessageKind("joints", "json", b"{}", "jsonschema")
     write_mcap(log, kind, {"/joint_states": every(STEP, (json.dumps(j).encode() for j in joints))})
@@ -225,7 +225,7 @@ def test_the_commands_of_the_page_work(
     write_cameras(Path("part-1.mcap"), {"/left": (COUNT, STEP_MS)})
     write_cameras(Path("part-2.mcap"), {"/right": (COUNT, STEP_MS)})
     write_pictures(Path("pictures"), COUNT)
-    write_video(Path("film.mp4"))
+    write_film(Path("film.mp4"))
     write_numbers(Path("data.csv"), Path("joints.mcap"))
     page = (Path(__file__).parents[1] / "docs" / "logs.md").read_text("utf-8")
     lines = [

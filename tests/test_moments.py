@@ -305,32 +305,20 @@ def test_a_fork_that_changes_nothing_is_its_parent(place: Path, tmp_path: Path) 
         assert first_difference(parent, fork) is None
 
 
-def test_a_fork_at_the_beginning_is_one_too(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
-    parent, fork, straight = place / "2.0-live", tmp_path / "fork", tmp_path / "straight"
-    told = ("--set", "learner.nu=0.02", "--seed", 9, "--no-rerun", "--json")
-    begun = ("fork", parent, "--at", 0, *told)
-    assert cdmisfa(*begun, "-o", fork, "--max-iterations", 20).code == 0
-    assert cdmisfa(*begun, "-o", straight, "--max-iterations", 60).code == 0
-    resumed = cdmisfa("learn", "--resume", "-o", fork, "--max-iterations", 60, "--no-rerun")
-    assert resumed.code == 0, resumed.err
-    assert first_difference(fork, straight) is None
-    assert Session.check(fork).difference is None
-    compared = cdmisfa("compare", parent, fork, "--save", tmp_path / "both.rrd")
-    assert (compared.code, "learner.nu 0.05 against 0.02; seed 3 against 9" in compared.out) == (
-        4,
-        True,
-    )
-
-
 @pytest.mark.parametrize(
-    ("parent", "key"), [("2.0-loop", "learner.nu=0.03"), ("progress-live", "learner.settled=0.1")]
+    ("parent", "key", "at"),
+    [
+        ("2.0-loop", "learner.nu=0.03", 31),
+        ("progress-live", "learner.settled=0.1", 31),
+        ("2.0-live", "learner.nu=0.02", 0),
+    ],
 )
 def test_forks_of_forks_are_resumed_and_checked(
-    place: Path, tmp_path: Path, cdmisfa: Cdmisfa, parent: str, key: str
+    place: Path, tmp_path: Path, cdmisfa: Cdmisfa, parent: str, key: str, at: int
 ) -> None:
     one, two, straight = (tmp_path / n for n in ("one", "two", "straight"))
     told = ("--no-rerun", "--keyframes", 15)
-    fork = ("fork", place / parent, "--at", 31, "--set", key, *told, "-o", one)
+    fork = ("fork", place / parent, "--at", at, "--set", key, *told, "-o", one)
     assert cdmisfa(*fork, "--max-iterations", 60).code == 0
     again = ("fork", one, "--at", 52, "--seed", 9, *told)
     assert cdmisfa(*again, "-o", two, "--max-iterations", 70).code == 0
@@ -408,6 +396,7 @@ def test_compare_says_what_differs_and_shows_both(
     row = next(line for line in found.out.splitlines() if line.startswith("epsilon "))
     assert row.endswith("differs")
     document = cdmisfa("compare", parent, fork, "--json").json
+    assert (document["identical"], document["first_difference"]["iteration"]) == (False, 20)
     first, second = document["signals"]["epsilon"]
     assert (first > second, document["signals"]["t"]) == (True, [800, 800])
     keys = [told["key"] for told in document["runs"][1]["told_otherwise"]]

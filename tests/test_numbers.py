@@ -13,15 +13,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from message_files import START, STEP, every, write_mcap
+from message_files import START, STEP, every, write_mcap, write_table
 
-from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.testing.sources import SourceContract
 from recorder.images.decoding import MessageKind, message_decoder
 from recorder.images.fields import Field, numbers_of
 from recorder.log.messages import descriptor_set
@@ -230,17 +227,6 @@ def test_broken_messages_are_said_to_be(encoding: str) -> None:
     assert broken > 150
 
 
-def write_table(path: Path, columns: dict[str, Any]) -> Path:
-    table = pa.table(columns)
-    if path.suffix == ".csv":
-        from pyarrow import csv
-
-        csv.write_csv(table, path)
-    else:
-        pq.write_table(table, path)
-    return path
-
-
 @pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
 @pytest.mark.parametrize(
     ("unit", "times"),
@@ -371,17 +357,6 @@ def test_a_few_bytes_that_are_many_rows_are_refused(tmp_path: Path) -> None:
     assert path.stat().st_size < 100_000
     with pytest.raises(LogDamagedError, match="4194305 rows are too many for its few bytes"):
         ForeignSource(path, rate=5)
-
-
-class TestTable(SourceContract):
-    ends = True
-
-    @pytest.fixture(autouse=True)
-    def _table(self, tmp_path: Path) -> None:
-        self.path = write_table(tmp_path / "t.csv", {"a": angles(500)[:, 0]})
-
-    def open(self) -> SeekableSource:
-        return ForeignSource(self.path, rate=50)
 
 
 def test_a_slow_sine_hidden_in_fields_of_noise_is_learned(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

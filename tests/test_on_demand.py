@@ -89,15 +89,18 @@ def test_a_view_is_written_without_most_of_rerun(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "run.rrd").stat().st_size > 0
 
 
-def test_a_scene_is_learned_from_without_what_reads_logs_of_others() -> None:
+def test_a_scene_is_learned_from_without_views_and_what_reads_logs_of_others(
+    tmp_path: Path,
+) -> None:
+    words = ["learn", "oscillatory", "-o", str(tmp_path / "run"), "--max-iterations", "1"]
     program = (
         "import sys\n"
         "from cdmisfa.cli import run\n"
-        "run(['learn', 'oscillatory', '--max-iterations', '1'])\n"
-        "wanted = 'rerun', 'replay.camera_logs.source'\n"
-        "print(*(name in sys.modules for name in wanted), file=sys.stderr)\n"
+        f"assert run({[*words, '--no-rerun']}) == 0\n"
+        "wanted = {'rerun', 'matplotlib', 'pybullet', 'replay.camera_logs.source'}\n"
+        "print(wanted & sys.modules.keys(), file=sys.stderr)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
-    assert done.stderr.splitlines()[-1] == "False False"
+    assert done.stderr.splitlines()[-1] == "set()"

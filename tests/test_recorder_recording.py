@@ -115,29 +115,22 @@ def test_bytes_do_not_depend_on_jobs(kind, request, tmp_path):
 
 
 def test_one_view_alone_is_the_same_file(icub, tmp_path):
-    files = record_scene("icub", tmp_path / "b", IcubConfig(seed=3), frames=150, views=["right"])
-    assert [f.name for f in files] == ["right"]
-    assert files[0].sha256 == sha256(icub / "right.mcap")
-    assert files[0].bytes == (icub / "right.mcap").stat().st_size
-    assert os.listdir(tmp_path / "b") == ["right.mcap"]
+    (file,) = record_scene("icub", tmp_path, IcubConfig(seed=3), frames=150, views=["right"])
+    data = (icub / "right.mcap").read_bytes()
+    assert contents(tmp_path) == {"right.mcap": data}
+    assert (file.name, file.sha256, file.bytes) == ("right", sha256(icub / "right.mcap"), len(data))
 
 
 def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
     folder = tmp_path / "a"
-    folder.mkdir()
     record_scene("oscillatory", folder, frames=10)
+    (folder / "notes.txt").write_text("mine")
     before = contents(folder)
     with pytest.raises(UsageError, match=r"a exists.*--force"):
         record_scene("oscillatory", folder, frames=3000)
     assert contents(folder) == before
-    (folder / "notes.txt").write_text("mine")
     record_scene("oscillatory", folder, frames=3000, views=["x2"], force=True)
-    after = contents(folder)
-    assert sorted(after) == ["notes.txt", "x1.mcap", "x2.mcap", "x3.mcap"]
-    assert {name: after[name] for name in ("x1.mcap", "x3.mcap")} == {
-        name: before[name] for name in ("x1.mcap", "x3.mcap")
-    }
-    assert sha256(folder / "x2.mcap") == sha256(oscillatory / "x2.mcap")
+    assert contents(folder) == {**before, "x2.mcap": (oscillatory / "x2.mcap").read_bytes()}
 
 
 def test_a_folder_in_use_is_refused(tmp_path):
@@ -146,9 +139,6 @@ def test_a_folder_in_use_is_refused(tmp_path):
     with held(folder), pytest.raises(UsageError, match="in use by another process"):
         record_scene("oscillatory", folder, frames=20)
     assert contents(folder) == {}
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="file is a file: name a folder"):
-        record_scene("oscillatory", tmp_path / "file" / "a", frames=10)
 
 
 RECORD = """
@@ -242,13 +232,12 @@ def test_resume_goes_on_from_any_torn_byte(oscillatory, tmp_path, cut):
     assert contents(tmp_path) == contents(oscillatory)
 
 
-@pytest.mark.parametrize("zeros", [False, True])
-def test_resume_takes_what_stands_before_the_first_damage(oscillatory, tmp_path, zeros):
+@pytest.mark.parametrize("damage", [b"\xff" * 2000, bytes(10**6)])
+def test_resume_takes_what_stands_before_the_first_damage(oscillatory, tmp_path, damage):
     path = partial_path(tmp_path / "x1.mcap")
-    data = bytearray((oscillatory / "x1.mcap").read_bytes())
+    data = (oscillatory / "x1.mcap").read_bytes()
     middle = len(data) // 2
-    data[middle:] = bytes(len(data) - middle) if zeros else b"\xff" * 2000 + data[middle + 2000 :]
-    path.write_bytes(data)
+    path.write_bytes((data[:middle] + damage + data[middle + len(damage) :])[: len(data)])
     assert 1000 < whole_frames(path, "x1") < 2000
     record_scene("oscillatory", tmp_path, frames=3000, resume=True)
     assert contents(tmp_path) == contents(oscillatory)
@@ -325,8 +314,7 @@ def test_ctrl_c_reaches_the_writer_alone(tmp_path, wait_for_frames):
     if wait_for_frames:
         process.stdout.readline()
     else:
-        while process.poll() is None and not list(tmp_path.glob("a/*.partial")):
-            time.sleep(0.01)
+        wait_for(lambda: list(tmp_path.glob("a/*.partial")), 60, process)
     os.killpg(process.pid, signal.SIGINT)
     _, complaint = process.communicate(timeout=30)
     assert process.returncode in (1, 130, -signal.SIGINT)
@@ -379,16 +367,8 @@ def test_a_second_signal_does_not_wait_for_a_process_that_stands_still(recorder)
     assert not any(running(pid) for pid in workers)
 
 
-def test_rendering_processes_end_with_their_killed_parent(tmp_path):
-    code = RECORD.replace("frames=int", "jobs=2, frames=int")
-    script = tmp_path / "run.py"
-    script.write_text(code)
-    process = subprocess.Popen(
-        [sys.executable, str(script), str(tmp_path / "a"), "1000000"],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    process.stdout.readline()
+def test_rendering_processes_end_with_their_killed_parent(recorder):
+    process, _ = recorder
     rendering = children(process)
     assert len(rendering) >= 2
     process.kill()

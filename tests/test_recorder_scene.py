@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import foxglove.messages
@@ -46,28 +47,22 @@ def test_frames_and_truth_are_the_bytes_that_they_were_before_there_was_a_world(
 
 
 def test_objects_are_where_the_truth_says(recorded):
-    source = RecordedSource(recorded)
-    truth = source.take(0, FRAMES).truth
-    source.close()
-    things = [
-        scenery_of(section_table(IcubConfig())).table,
-        *scenery_of(section_table(IcubConfig())).objects,
-    ]
-    told = [*messages(recorded / "right.mcap", "/scene")]
+    with contextlib.closing(RecordedSource(recorded)) as source:
+        truth = source.take(0, FRAMES).truth
+    scenery = scenery_of(section_table(IcubConfig()))
+    told = messages(recorded / "right.mcap", "/scene")
     assert len(told) == FRAMES
     for t, (_, data) in enumerate(told):
         entities = SceneUpdate_pb2.SceneUpdate.FromString(data).entities
         assert [e.id for e in entities] == ["table", "box", "cylinder", "ball"]
-        assert {e.frame_id for e in entities} == {"root"}
+        things = [scenery.table, *scenery.objects]
         for i, (thing, entity) in enumerate(zip(things, entities, strict=True)):
             (shape,) = [*entity.cubes, *entity.cylinders, *entity.spheres]
             assert (shape.size.x, shape.size.y, shape.size.z) == thing.size
+            x, y = (truth[t, 2 * i - 2], -truth[t, 2 * i - 1]) if i else thing.place[:2]
             place = shape.pose.position
-            if i:
-                x, y = truth[t, 2 * i - 2 : 2 * i]
-                assert (place.x, place.y, place.z) == (x, -y, thing.place[2])
-            else:
-                assert (place.x, place.y, place.z) == thing.place
+            assert (place.x, place.y, place.z) == (x, y, thing.place[2])
+            assert entity.frame_id == "root"
 
 
 @pytest.mark.parametrize("view", ["left", "right"])

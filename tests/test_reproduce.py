@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from waiting import wait_for
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -114,30 +109,6 @@ def test_results_of_more_or_other_trials_are_replaced_only_with_force(
     assert {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()} == before
     assert cdmisfa(*command, "--trials", 1, "--force").code in (0, 4)
     assert json.loads((folder / "results.json").read_text())["trials"] == 2
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_a_killed_reproduction_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "cdmisfa", "reproduce", "oscillatory"]
-    folder = tmp_path / "oscillatory"
-    rows = folder / "rows.jsonl"
-
-    def kept() -> int:
-        return rows.read_bytes().count(b"\n") if rows.exists() else 0
-
-    process = subprocess.Popen(
-        [*command, "-o", str(tmp_path), "--trials", "400"], stderr=subprocess.DEVNULL
-    )
-    try:
-        wait_for(lambda: kept() >= 3, 120, process)
-    finally:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-    finished, done = kept(), list[int]()
-    request = Request(finished + 1, True, None, folder)
-    document = reproduce("oscillatory", request, progress=lambda n, _: done.append(n))
-    assert document["trials"] == finished + 1
-    assert done == [finished, finished + 1]
 
 
 @pytest.mark.usefixtures("undrawn")

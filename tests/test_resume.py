@@ -102,23 +102,6 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole: Path, tmp_path: Path, stopped:
     assert f"resumed at iteration {stopped}" in [e.text for e in parts_of(out, "events")]
 
 
-def test_the_first_algorithm_goes_on_too(tmp_path: Path) -> None:
-    config = LearnerConfig(algorithm="1.0", tau=40, eta_dot_window=5, warm_up=3)
-    go(OscillatorySource(), tmp_path / "run", 47, config)
-    resumed = go(OscillatorySource(), tmp_path / "run", LENGTH, config, resume=True)
-    assert resumed.signals_sha256 == go(OscillatorySource(), None, LENGTH, config).signals_sha256
-
-
-@pytest.mark.parametrize(("frames", "loop"), [(LENGTH * CONFIG.tau, False), (1500, True)])
-def test_a_recording_goes_on(tmp_path: Path, frames: int, loop: bool) -> None:
-    record_scene("oscillatory", tmp_path / "log", frames=frames)
-    for iterations, resume in ((43, False), (LENGTH, True)):
-        source = RecordedSource(tmp_path / "log", loop=loop)
-        result = go(source, tmp_path / "run", iterations, resume=resume)
-        source.close()
-    assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
-
-
 def test_a_recording_that_ended_goes_on_to_the_same_end(tmp_path: Path) -> None:
     record_scene("oscillatory", tmp_path / "log", frames=30 * CONFIG.tau)
     source = RecordedSource(tmp_path / "log")
@@ -304,13 +287,6 @@ def test_a_run_that_is_still_going_is_left_alone(tmp_path: Path) -> None:
     result = go(OscillatorySource(), out, 2, sinks=[Told(meddle)])
     assert len(refused) == 4
     assert result.signals_sha256 == go(OscillatorySource(), None, 2).signals_sha256
-
-
-def test_a_forced_run_keeps_nothing_of_the_one_before(tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    go(OscillatorySource(), out, 60)
-    go(OscillatorySource(), out, 20, seed=4, force=True)
-    assert keyframes(out) == [20]
 
 
 @pytest.mark.parametrize("removed", range(3))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -164,16 +162,6 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path, leftover: str)
     assert (tmp_path / leftover).read_text() == "mine"
 
 
-@pytest.mark.parametrize("force", [False, True])
-def test_a_file_in_the_place_of_the_folder_stays(tmp_path: Path, force: bool) -> None:
-    file = tmp_path / "run"
-    file.write_text("mine")
-    for out in (file, file / "inside"):
-        with pytest.raises(UsageError, match=str(file)):
-            run(out, force=force)
-    assert file.read_text() == "mine"
-
-
 def test_force_replaces_the_run_and_nothing_else(tmp_path: Path) -> None:
     run(tmp_path, max_iterations=3)
     for name in ("run.rrd", "notes.txt"):
@@ -232,16 +220,3 @@ def test_the_folder_is_held_until_the_view_is_built(
     monkeypatch.setattr("replay.view.build.build_view", build)
     run(tmp_path / "run", rerun=True)
     assert seen == [tmp_path / "run" / "run.rrd"]
-
-
-def test_without_a_view_rerun_is_not_imported(tmp_path):
-    words = ["learn", "oscillatory", "-o", str(tmp_path / "run"), "--max-iterations", "1"]
-    script = (
-        "import sys\nfrom cdmisfa.cli import run\n"
-        f"assert run({[*words, '--no-rerun']}) == 0\n"
-        "print([name for name in ('rerun', 'matplotlib', 'pybullet') if name in sys.modules])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.splitlines()[-1] == "[]"

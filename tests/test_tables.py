@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv as pa_csv
-import pyarrow.parquet as pq
 import pytest
 from conftest import Cdmisfa
+from message_files import write_table
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.csv_table import line_of
@@ -85,18 +84,13 @@ def test_a_row_of_units_and_a_time_that_is_none_are_left_out(tmp_path: Path) -> 
     )
 
 
-@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+@pytest.mark.parametrize(("name", "place"), [("t.csv", "line 5"), ("t.parquet", "row 3")])
 def test_what_is_not_finite_is_left_out_by_its_name_or_kept_in_a_range(
-    tmp_path: Path, name: str
+    tmp_path: Path, name: str, place: str
 ) -> None:
     values = np.arange(ROWS) - 4.0
     values[3] = np.inf
-    path = tmp_path / name
-    if path.suffix == ".csv":
-        path.write_text("t,a\n" + "".join(f"{i / 10},{a}\n" for i, a in enumerate(values)))
-    else:
-        pq.write_table(pa.table({"t": np.arange(ROWS) / 10, "a": values}), path)
-    place = "line 5" if path.suffix == ".csv" else "row 3"
+    path = write_table(tmp_path / name, {"t": np.arange(ROWS) / 10, "a": values})
     frames, said = taken(path)
     assert [a for (a,) in frames] == [*range(-4, -1), *range(8)]
     assert said[0].endswith(f"{place} is left out: a holds inf, which is not finite")
@@ -196,21 +190,14 @@ def test_an_empty_column_and_rows_out_of_order_are_said(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+@pytest.mark.parametrize(("name", "place"), [("t.csv", "line 5"), ("t.parquet", "row 3")])
 def test_what_is_missing_is_left_out_and_is_not_the_end_of_a_range(
-    tmp_path: Path, name: str
+    tmp_path: Path, name: str, place: str
 ) -> None:
-    values: list[Any] = [*range(ROWS)]
-    values[3], values[5] = None, float("inf")
-    path = tmp_path / name
-    if path.suffix == ".csv":
-        cells = ["" if v is None else v for v in values]
-        path.write_text("t,a\n" + "".join(f"{i / 10},{a}\n" for i, a in enumerate(cells)))
-    else:
-        pq.write_table(pa.table({"t": np.arange(ROWS) / 10, "a": values}), path)
+    values = [0, 1, 2, None, 4, np.inf, *range(6, ROWS)]
+    path = write_table(tmp_path / name, {"t": np.arange(ROWS) / 10, "a": values})
     kept, said = taken(path, depth=(1.0, 8.0), gaps="hold", align="index")
     assert [a for (a,) in kept] == [1, 1, 2, 4, 1, 6, 7, 8, 8, 8, 8]
-    place = "line 5" if path.suffix == ".csv" else "row 3"
     assert said[0].endswith(f"{place} is left out: a holds no number")
     with pytest.raises(UsageError, match=f"{place} lacks a number.*so that it can be left out$"):
         taken(path, time=None, rate=5, depth=(1.0, 8.0))
@@ -218,8 +205,7 @@ def test_what_is_missing_is_left_out_and_is_not_the_end_of_a_range(
 
 def test_distances_in_a_list_that_were_not_measured_are_the_end_of_a_range(tmp_path: Path) -> None:
     lists = [[1.0, None], [np.nan, 2.0], None, [3.0, np.inf]]
-    path = tmp_path / "t.parquet"
-    pq.write_table(pa.table({"t": np.arange(4) / 10, "r": lists}), path)
+    path = write_table(tmp_path / "t.parquet", {"t": np.arange(4) / 10, "r": lists})
     kept, said = taken(path, fields=["r"], depth=(0.5, 9.0), align="index")
     assert kept == [[1, 0.5], [0.5, 2], [3, 0.5]]
     assert said[0].endswith("row 2 is left out: r holds no number")
@@ -227,67 +213,60 @@ def test_distances_in_a_list_that_were_not_measured_are_the_end_of_a_range(tmp_p
 
 @pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
 def test_whole_numbers_that_float64_rounds_are_said(tmp_path: Path, name: str) -> None:
-    big = [2**53 + i for i in range(ROWS)]
-    table = pa.table({"t": np.arange(ROWS) / 10, "a": big, "b": range(ROWS)})
-    (pa_csv.write_csv if name == "t.csv" else pq.write_table)(table, tmp_path / name)
-    said = taken(tmp_path / name)[1]
-    assert [line.partition(": ")[2] for line in said] == [
+    times, big = np.arange(ROWS) / 10, [2**53 + i for i in range(ROWS)]
+    path = write_table(tmp_path / name, {"t": times, "a": big, "b": range(ROWS)})
+    assert [line.partition(": ")[2] for line in taken(path)[1]] == [
         "a holds whole numbers beyond 2^53, which are rounded to float64"
     ]
-    assert taken(tmp_path / name, fields=["b"])[1] == ()
-    assert taken(tmp_path / name, depth=(0, 9))[1] == ()
-    part = ForeignSource(tmp_path / name, time="t", start=0.2, salvage=True)
+    assert taken(path, fields=["b"])[1] == taken(path, depth=(0, 9))[1] == ()
+    part = ForeignSource(path, time="t", start=0.2, salvage=True)
     with contextlib.closing(part) as source:
         source.take(0, source.frames)
         assert source.changes == {}  # said once
     if name == "t.parquet":  # they were rounded before
-        floats = pa.table({"t": np.arange(ROWS) / 10, "a": [1e300] * ROWS})
-        pq.write_table(floats, tmp_path / name)
-        assert taken(tmp_path / name)[1] == ()
+        assert taken(write_table(path, {"t": times, "a": [1e300] * ROWS}))[1] == ()
 
 
 @pytest.mark.parametrize(
     ("field", "why"),
     [
-        ("state[3]", r"t.parquet: row 0: --field state\[3\]: there are 3 members only"),
-        (
-            "state[1:4]",
-            r"row 0: --field state\[1:4\]: there are 3 members only, all of them are \[",
-        ),
-        ("word", "t.parquet: row 0: --field word is no number but a text: name another"),
-        ("a.b", "t.parquet: row 0: --field a.b is no number but dict: name one of its fields: x"),
-        ("n[0]", r"t.parquet: row 0: --field n\[0\]: what the index is of is no list"),
+        ("state[3]", "there are 3 members only"),
+        ("state[1:4]", r"there are 3 members only, all of them are \["),
+        ("word", "is no number but a text: name another"),
+        ("a.b", "is no number but dict: name one of its fields: x"),
+        ("n[0]", "what the index is of is no list"),
     ],
 )
 def test_a_field_that_is_none_is_named_as_it_was_written(
     tmp_path: Path, field: str, why: str
 ) -> None:
     columns = {"state": [[1, 2, 3]] * 2, "word": ["x", "y"], "a.b": [{"x": 1}] * 2, "n": [1, 2]}
-    pq.write_table(pa.table(columns), tmp_path / "t.parquet")
-    with pytest.raises(UsageError, match=why):
-        ForeignSource(tmp_path / "t.parquet", rate=5, fields=[field])
+    path = write_table(tmp_path / "t.parquet", columns)
+    with pytest.raises(UsageError, match=rf"t.parquet: row 0: --field {re.escape(field)}:? {why}"):
+        ForeignSource(path, rate=5, fields=[field])
 
 
 def test_commands_take_tables_and_say_what_was_left_out(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    path = written(tmp_path, {7: "0.7,7,broken"})
-    left_out = f"warning: {path}: line 9 is left out: b holds 'broken'"
-    outs = {name: tmp_path / name for name in ("set", "rec", "v.rrd")}
-    every = [
-        ["learn", path, "--time", "t", "--range", "-3:3", "--dry-run"],
-        ["convert", path, "--time", "t", "-o", outs["rec"]],
-        ["export", path, "--time", "t", "--to", "lerobot", "-o", outs["set"]],
-        ["view", path, "--time", "t", "--range", "-3:3", "--save", outs["v.rrd"]],
-        ["play", path, "--time", "t", "--to", "foxglove", "--wait", 0, "--port", 0, "--rate", 99],
-    ]
-    for words in every:
-        done = cdmisfa(*words)
+    rows = [f"{i / 50},{'broken' if i == 7 else i}" for i in range(60) if i not in (20, 21)]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(["t,a", *rows]) + "\n")
+    for words in (
+        ["learn", path, "--dry-run"],
+        ["learn", path, "--range", "-3:3", "--dry-run"],
+        ["convert", path, "-o", tmp_path / "rec"],
+        ["export", path, "--to", "lerobot", "-o", tmp_path / "set"],
+        ["view", path, "--range", "-3:3", "--save", tmp_path / "v.rrd"],
+        ["play", path, "--to", "foxglove", "--wait", 0, "--port", 0, "--rate", 99],
+    ):
+        done = cdmisfa(*words, "--time", "t")
         assert done.code == 0, done.err
         if "--range" not in words:
-            assert left_out in done.err, words[0]
+            assert f"warning: {path}: line 9 is left out: a holds 'broken'" in done.err, words[0]
+            assert done.err.count("(3 missing): 1.2 s of it become 1.14 s of frames") == 1
         assert "H.264" not in done.err
     checked = cdmisfa("verify", path)
-    assert (checked.code, "b holds words" in checked.out) == (0, True)
-    assert "12 rows of 3 columns can be read; a table has no checksums" in checked.out
+    assert (checked.code, "a holds words" in checked.out) == (0, True)
+    assert "58 rows of 2 columns can be read; a table has no checksums" in checked.out
     refused = cdmisfa("export", path, "--time", "t", "--to", "npz", "-o", tmp_path / "a.npz")
     assert refused.code == 2
     assert f"{path} is no run, npz is for the signals of one: choose images or mp4" in refused.err

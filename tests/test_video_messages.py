@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import foxglove as foxglove_sdk
 import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH
 from foxglove.channels import CompressedVideoChannel
 from foxglove.messages import CompressedVideo
+from live_cameras import Robot
 from message_files import STEP, every, write_mcap
 from video_packets import COUNT, ENCODERS, FOXGLOVE, GROUP, KINDS, video
 
-from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.testing.sources import SourceContract
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import open_live
 from recorder.images.decoding import MessageKind
@@ -68,17 +65,6 @@ def test_messages_of_every_kind_hold_videos(tmp_path: Path, kind: MessageKind) -
         np.testing.assert_array_equal(images.image(30), decoded("h264")[30])
 
 
-class TestVideoMessages(SourceContract):
-    ends = True
-
-    @pytest.fixture(autouse=True)
-    def _logs(self, tmp_path: Path) -> None:
-        self.paths = [write(tmp_path / f"{s}.mcap", video("h264", s)) for s in (0, 1)]
-
-    def open(self) -> FrameSource:
-        return ForeignSource(self.paths, size=(HEIGHT, WIDTH), align="index")
-
-
 def test_a_video_is_taken_from_its_first_whole_picture(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", video("h264")[5:])
     with opened(path) as images:
@@ -108,28 +94,14 @@ def test_what_follows_a_broken_picture_is_not_made_up(tmp_path: Path) -> None:
 
 
 def test_a_running_robots_video_is_shown_from_its_first_whole_picture() -> None:
-    context = foxglove_sdk.Context()
-    server = foxglove_sdk.start_server(name="r", host="127.0.0.1", port=0, context=context)
-    channel = CompressedVideoChannel("/cam", context=context)
-    over = threading.Event()
+    def message(k: int) -> CompressedVideo:
+        return CompressedVideo(data=video("h264")[(k + 3) % COUNT], format="h264")
 
-    def show() -> None:
-        row = 3
-        while not over.wait(0.02):
-            data = video("h264")[row % COUNT]
-            channel.log(CompressedVideo(data=data, format="h264"))
-            row += 1
-
-    thread = threading.Thread(target=show)
-    thread.start()
-    try:
-        word, options = f"foxglove://127.0.0.1:{server.port}/cam", LiveOptions(rate=50)
+    robot = Robot()
+    with contextlib.closing(robot), robot.showing(CompressedVideoChannel, "/cam", message):
+        word, options = f"{robot.address}/cam", LiveOptions(rate=50)
         with contextlib.closing(open_live([word], options)) as source:
             frames = source.take(0, 30).frames
-    finally:
-        over.set()
-        thread.join()
-        server.stop()
     shown = decoded("h264")
     found = [next((k for k in range(COUNT) if (shown[k] == f).all()), None) for f in frames]
     assert None not in found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from cdmisfa.core.signals import SIGNALS
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view.build import build_view
-from replay.view.columns import images, named_tensors, tensors
+from replay.view.columns import named_tensors, tensors
 from replay.view.summary import summary_text
 
 REPLAY = Path(__file__).parents[1] / "replay"
@@ -173,12 +172,6 @@ def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
     assert "It ended: nothing was left." in text
 
 
-def test_the_file_has_a_layout_and_properties(shown):
-    *_, view = shown
-    assert len(view.blueprints) == 1
-    assert {"/__properties/learner", "/__properties/result"} <= view.names
-
-
 def test_many_streams_show_the_most_watched(tmp_path, monkeypatch):
     monkeypatch.setattr("replay.view.build.MOST_STREAMS", 5)
     spec = SourceSpec(tuple(f"s{i}" for i in range(70)), (2,), "float64", (), 50.0, 0)
@@ -221,21 +214,6 @@ def test_tensors_are_encoded_as_rerun_does():
         for values in (block.reshape(-1), tensors(block.reshape(1, -1)))
     ]
     assert bars[0] == bars[1]
-
-
-def test_images_are_encoded_as_rerun_does():
-    pixels = np.arange(24, dtype=np.uint8).reshape(4, 6)
-    (theirs,) = rr.Image.columns(buffer=pixels)
-    (found,) = images(pixels)
-    assert found.component_descriptor() == theirs.component_descriptor()
-    assert found.as_arrow_array().equals(theirs.as_arrow_array())
-
-
-def test_private_names_of_rerun_are_taken_in_one_place():
-    private = re.compile(r"\b(rerun_\w+|rerun\.experimental|rerun\._\w+|rrb?\.(\w+\.)*_\w+)\b")
-    files = [file for room in ("view", "viewer") for file in (REPLAY / room).glob("*.py")]
-    users = [file.name for file in files if private.search(file.read_text("utf-8"))]
-    assert users == ["bindings.py"]
 
 
 def test_an_existing_view_is_kept_and_nothing_half_done_is_left(tmp_path):

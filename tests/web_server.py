@@ -23,11 +23,13 @@ class WebServer:
     Attributes:
         files: path, with its slash, to content; may be changed at any time.
         sent: bytes of content that were sent.
+        asked: bytes of each part that was asked for.
     """
 
     def __init__(self) -> None:
         self.files: dict[str, bytes] = {}
         self.sent = 0
+        self.asked: list[int] = []
         self.server = _Server(("127.0.0.1", 0), _handler_of(self))
 
     def url(self, path: str) -> str:
@@ -37,6 +39,7 @@ class WebServer:
     def reset(self) -> None:
         """Begin to count anew."""
         self.sent = 0
+        self.asked = []
 
 
 @contextlib.contextmanager
@@ -67,6 +70,7 @@ def _handler_of(web: WebServer) -> type[BaseHTTPRequestHandler]:
             if body is None or found is None:
                 return self.answer(404 if body is None else 200, body or b"")
             start, stop = int(found[1]), int(found[2]) + 1
+            web.asked.append(stop - start)
             if start >= len(body):
                 return self.answer(416, **{"Content-Range": f"bytes */{len(body)}"})
             part = body[start:stop]

@@ -6,6 +6,7 @@ Nothing is taken on trust: every part must be of an object that is still the one
 from __future__ import annotations
 
 import bisect
+import itertools
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future
@@ -22,10 +23,8 @@ CACHE_BYTES: Final = 16 * 1024 * 1024
 _LEAST: Final = 16 * 1024
 _MOST: Final = 1024 * 1024
 """Bytes that are read ahead where reads go forward, at first and at most."""
-_BUNDLE: Final = 128 * 1024
-"""Bytes of expected spans that touch and are asked for together; a longer span is by itself."""
-_DEEPEST: Final = 16
-"""Bundles that are asked for ahead, at most; and no further one once `_MOST` bytes are."""
+_AT_ONCE: Final = 16
+"""Parts that are asked for ahead, at most; and no further one once `_stride` bytes are."""
 
 
 class RemoteStore(Store):
@@ -39,9 +38,10 @@ class RemoteStore(Store):
         self._server: Server = connect(url)
         self._parts: deque[tuple[int, bytes]] = deque()
         self._held = 0
-        self._bundles: list[tuple[int, int]] = []
-        self._ahead: dict[int, Future[Part]] = {}
-        self._depth, self._reach, self._follows = 1, _LEAST, -1
+        self._spans: list[tuple[int, int]] = []
+        self._ahead: dict[tuple[int, int], Future[Part]] = {}
+        self._next, self._stride = 0, EDGE_BYTES
+        self._reach, self._follows = _LEAST, -1
         first = self._server.wait(self._server.begin(0, EDGE_BYTES), EDGE_BYTES)
         self.size, self.tag = first.total, first.tag
         self._keep(0, self._checked(first, 0, EDGE_BYTES))
@@ -59,8 +59,8 @@ class RemoteStore(Store):
         for start, data in reversed(self._parts):
             if start <= offset and stop <= start + len(data):
                 return data[offset - start : stop - start]
-        number = bisect.bisect_right(self._bundles, (offset, self.size)) - 1
-        if number >= 0 and stop <= self._bundles[number][1]:
+        number = bisect.bisect_right(self._spans, (offset, self.size)) - 1
+        if number >= 0 and stop <= self._spans[number][1]:
             start, data = self._expected(number)
         else:
             start, data = self._unexpected(offset, stop)
@@ -70,13 +70,7 @@ class RemoteStore(Store):
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:
         """Read the spans ahead of what is read of them."""
         self._drop_ahead()
-        self._bundles = []
-        for start, stop in sorted(spans):
-            before = self._bundles[-1] if self._bundles else (0, -1)
-            if start == before[1] and stop - before[0] <= _BUNDLE:
-                self._bundles[-1] = before[0], stop
-            else:
-                self._bundles.append((start, stop))
+        self._spans = sorted(spans)
 
     def forget(self) -> None:
         super().forget()
@@ -97,27 +91,40 @@ class RemoteStore(Store):
         return start, self._fetched(self._server.begin(start, stop), start, stop)
 
     def _expected(self, number: int) -> tuple[int, bytes]:
-        """Fetch a bundle; more and more of those after it are asked for meanwhile."""
-        start, stop = self._bundles[number]
-        coming = self._ahead.pop(number, None)
-        if coming is None:
+        """Fetch a span that is expected, with more and more of those after it meanwhile."""
+        offset = self._spans[number][0]
+        part = next((p for p in self._ahead if p[0] <= offset < p[1]), None)
+        if part is None:
             self._drop_ahead()
-            coming = self._server.begin(start, stop)
+            self._next, self._stride = number, EDGE_BYTES
+            part = self._begin_next()
         else:
-            self._depth = min(2 * self._depth, _DEEPEST)
-        asked = sum(high - low for low, high in (self._bundles[n] for n in self._ahead))
-        for after in range(number + 1, min(number + 1 + self._depth, len(self._bundles))):
-            if after not in self._ahead and asked < _MOST:
-                begin, end = self._bundles[after]
-                self._ahead[after] = self._server.begin(begin, end)
-                asked += end - begin
-        return start, self._fetched(coming, start, stop)
+            self._stride = min(2 * self._stride, _MOST)
+        coming = self._ahead.pop(part)
+        while (
+            self._next < len(self._spans)
+            and len(self._ahead) < _AT_ONCE
+            and sum(stop - start for start, stop in self._ahead) < self._stride
+        ):
+            self._begin_next()
+        return part[0], self._fetched(coming, *part)
+
+    def _begin_next(self) -> tuple[int, int]:
+        """Ask for the next expected span, with those that touch until they are `_stride` bytes."""
+        start, stop = self._spans[self._next]
+        self._next += 1
+        for begin, end in itertools.islice(self._spans, self._next, None):
+            if begin != stop or stop - start >= self._stride:
+                break
+            stop = end
+            self._next += 1
+        self._ahead[start, stop] = self._server.begin(start, stop)
+        return start, stop
 
     def _drop_ahead(self) -> None:
         for coming in self._ahead.values():
             coming.cancel()
         self._ahead.clear()
-        self._depth = 1
 
     def _fetched(self, coming: Future[Part], start: int, stop: int) -> bytes:
         return self._checked(self._server.wait(coming, stop - start), start, stop)

@@ -21,8 +21,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.files import atomic_write, refuse_taken
 from replay.camera_logs.options import CameraOptions
 from replay.inputs import Logged, holds_run, open_to_look
-from replay.recordings.poses import head_poses
-from replay.recordings.source import RecordedSource
+from replay.recordings.source import RecordedSource, head_poses
 from replay.runs.columns import Blocks
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import Frames, read_batches, read_header

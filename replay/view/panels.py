@@ -33,7 +33,7 @@ from replay.view.layouts import (
 )
 from replay.view.run import HARDLY_WATCHED
 from replay.view.scene import gaze_view, scene_view
-from replay.view.wall import WALL
+from replay.view.world import WALL
 
 MOST_MODULES = 6
 """Modules that stand on one page."""

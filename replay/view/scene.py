@@ -24,7 +24,7 @@ from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import CdmisfaError
 from recorder.log.scenery import Eye, Gaze, Scenery, Thing
 from replay.palette import Rgb, colour, packed_all, pale
-from replay.recordings.poses import yaw_of
+from replay.recordings.source import yaw_of
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
 from replay.runs.run import Outline

@@ -257,7 +257,7 @@ def _database(folder: Path) -> None:
 
 def _video(suffix: str) -> Callable[[Path], None]:
     def write(folder: Path) -> None:
-        from test_video import write_video
+        from camera_files import write_video
 
         codec = {"codec": "libx264", "pixels": "yuv420p"} if suffix == ".mp4" else {}
         write_video(folder / f"a{suffix}", pictures(5), **codec)

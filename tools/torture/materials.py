@@ -120,7 +120,7 @@ def ros2(folder: Path) -> None:
 
 def video(folder: Path, suffix: str = "mp4") -> None:
     """Two videos."""
-    from test_video import write_video
+    from camera_files import write_video
 
     folder.mkdir()
     how = {"codec": "libx264", "pixels": "yuv420p"} if suffix == "mp4" else {}
