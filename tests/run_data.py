@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
-from cdmisfa.core.signals import BlockSignals
+from cdmisfa.core.signals import SIGNALS, BlockSignals
 from replay.runs.log import read_batches, read_columns
 from replay.runs.writer import RunWriter
 
@@ -22,6 +22,14 @@ IMAGE = SourceSpec(
     ("left", "center", "right"), (12, 16), "uint8", ("box_y", "ball_y"), 50.0, START_NS
 )
 VECTOR = SourceSpec(("x1", "x2", "x3"), (2,), "float64", ("theta",), 50.0, START_NS)
+
+
+PROGRESS = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25, "delta": None}
+"""Settings of a progress learner."""
+
+LEARNING, LEARNED, KNOWN, GIVEN_UP = range(4)
+UNTOLD = ("share", "eta_dot", "gate_mean", "gate_sd", "band_sd", "xi", "xi_dot", "expert", "Q")
+UNTOLD += ("roc_error", "roc_error_inst", "roc_error_frozen")
 
 
 def read_signals(path: Path) -> Iterator[BlockSignals]:
@@ -165,3 +173,28 @@ def parts_of(run: Path, kind: str) -> list[Any]:
 def rows_of(run: Path, kind: str) -> NDArray[Any]:
     """Everything of one kind that belongs to frames, (frames, ...)."""
     return np.concatenate([values for _, values in parts_of(run, kind)])
+
+
+def by_progress(signals: BlockSignals) -> BlockSignals:
+    """The record as a progress learner would have it.
+
+    From the tenth iteration on the first stream is learned; from then on, module 1 knows the
+    second, module 2 from the twentieth on. The third is given up and looked at again.
+    """
+    k = signals.iteration
+    states = [LEARNED, KNOWN, GIVEN_UP if k < 25 else LEARNING] if k >= 10 else [LEARNING] * 3
+    blank: dict[str, Any] = {
+        name: np.full(np.shape(getattr(signals, name)), np.nan) if SIGNALS[name].dims else np.nan
+        for name in UNTOLD
+    }
+    known_by = (1, 1 + k // 20, 0)[k % 3] if k >= 10 else 0
+    untested: dict[str, Any] = dict.fromkeys(("tested", "change"), np.nan) if k % 11 == 0 else {}
+    return dataclasses.replace(
+        signals,
+        **blank,
+        **untested,
+        R=np.empty((0, 2, 0)),
+        known_by=known_by,
+        stream=k % 3,
+        state=np.array(states),
+    )

@@ -6,8 +6,6 @@ import json
 import re
 import shutil
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from PIL import Image
 from rerun.chunk import Chunk, ChunkStore, RrdReader
 from rerun_bindings import CatalogClientInternal
 from run_data import VECTOR, write_run
-from waiting import wait_for
+from waiting import started, wait_for
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import runs_in
@@ -115,10 +113,7 @@ def test_a_folder_without_runs_is_refused(tmp_path):
 
 
 def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "cdmisfa", "view", str(sweep)], stderr=subprocess.PIPE, text=True
-    )
-    try:
+    with started("view", sweep) as process:
         found = None
         while found is None:
             line = process.stderr.readline()
@@ -134,9 +129,6 @@ def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
         }
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20) == 130
-    finally:
-        process.kill()
-        process.communicate()
 
 
 @pytest.mark.skipif(bool(missing_driver()), reason=missing_driver())

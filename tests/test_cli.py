@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import Cdmisfa, Outcome
 from run_data import VECTOR, write_run
-from waiting import wait_for
+from waiting import started, wait_for
 
 SHORT = ("--max-iterations", "5", "--json")
 
@@ -24,16 +24,6 @@ def assert_one_line(outcome: Outcome, code: int, *words: str) -> None:
     assert outcome.err.count("\n") == 1
     for word in words:
         assert word in outcome.err
-
-
-def start(*args: str, **environment: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "cdmisfa", *args],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **environment},
-    )
 
 
 class TestJson:
@@ -231,10 +221,10 @@ class TestErrors:
         (tmp_path / "icub_models.py").write_text(stub)
         path = os.pathsep.join([str(tmp_path), *sys.path])
         for words in (["learn", "icub"], ["record", "icub", "-o", str(tmp_path / "r")]):
-            with start(*words, PYTHONPATH=path) as process:
+            with started(*words, PYTHONPATH=path) as process:
                 out, err = process.communicate(timeout=60)
             assert_one_line(Outcome(process.returncode, out, err), 1, "pip install")
-        with start("learn", "oscillatory", *SHORT, PYTHONPATH=path) as process:
+        with started("learn", "oscillatory", *SHORT, PYTHONPATH=path) as process:
             process.communicate(timeout=60)
         assert process.returncode == 0
 
@@ -246,7 +236,7 @@ class TestInterrupts:
     ) -> None:
         run = tmp_path / "run"
         words = ["learn", "oscillatory", "-o", str(run), "--no-rerun", "--json"]
-        with start(*words, "--set", "learner.delta=1e-12") as process:
+        with started(*words, "--set", "learner.delta=1e-12") as process:
             wait_for_bytes(run / "run.mcap.partial", process)
             process.send_signal(number)
             out, err = process.communicate(timeout=60)
@@ -258,13 +248,13 @@ class TestInterrupts:
         assert (run / "run.json").exists()
 
     def test_terminal_without_greek_letters(self) -> None:
-        with start("signals", PYTHONIOENCODING="ascii", PYTHONUTF8="0") as process:
+        with started("signals", PYTHONIOENCODING="ascii", PYTHONUTF8="0") as process:
             out, err = process.communicate(timeout=60)
         assert (process.returncode, err) == (0, "")
         assert "eta_dot" in out
 
     def test_closed_pipe_is_quiet(self) -> None:
-        with start("signals") as process:
+        with started("signals") as process:
             assert process.stdout is not None
             process.stdout.close()
             assert process.stderr is not None

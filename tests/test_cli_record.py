@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pty
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 from camera_files import write_cameras
 from conftest import Cdmisfa
 from folders import contents
-from waiting import wait_for
+from waiting import started, wait_for
 
 from cdmisfa.experiments.sources import convert
 from recorder.config import Split
@@ -33,17 +32,12 @@ def test_a_signal_says_how_to_go_on(
     cdmisfa: Cdmisfa, tmp_path: Path, number: int, code: int
 ) -> None:
     folder = tmp_path / "rec"
-    words = ["record", "oscillatory", "-o", str(folder), "--frames", "100000000"]
-    recorder = subprocess.Popen(
-        [sys.executable, "-m", "cdmisfa", *words], stderr=subprocess.PIPE, text=True
-    )
-    try:
+    words = ("record", "oscillatory", "-o", folder, "--frames", 100000000)
+    with started(*words) as recorder:
         wait_for((folder / "x3.mcap.partial").exists, 60, recorder)
         time.sleep(0.2)
         recorder.send_signal(number)
         error = recorder.communicate(timeout=60)[1]
-    finally:
-        recorder.kill()
     assert recorder.returncode == code
     line = f"cdmisfa: interrupted: {folder} is not finished: go on with --resume\n"
     assert error.lstrip("\n") == line  # behind the terminal's ^C

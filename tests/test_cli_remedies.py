@@ -123,3 +123,24 @@ def test_what_is_too_slow_to_convert_is_converted_as_is_said(
     assert "0.001 to 1000000 frames a second, not 0.000555556" in refused.err
     assert "logs are read at another rate with --align time --rate" in refused.err
     assert cdmisfa(*convert, "--align", "time", "--rate", 0.001).code == 0
+
+
+HAS_SIMULATOR = importlib.util.find_spec("pybullet") is not None
+
+
+@pytest.mark.skipif(not HAS_SIMULATOR, reason="PyBullet is missing: pip install pybullet")
+def test_demo_replaces_an_earlier_one(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    recording, run = tmp_path / "recordings" / "demo-icub", tmp_path / "runs" / "demo-icub"
+    assert cdmisfa("record", "icub", "-o", recording, "--frames", 80).code == 0
+    assert cdmisfa("learn", recording, "-o", run, "--max-iterations", 2, "--no-rerun").code == 0
+    words = ("demo", "-o", tmp_path, "--frames", 800, "--seed", 2, "--json")
+    report = cdmisfa(*words).json
+    assert report["live_equals_recorded"] is True
+    first, second = report["modules"]
+    assert (first["view"], first["follows"]) == ("left", "object1_y")
+    assert (second["view"], second["follows"]) == ("right", "object3_y")
+    assert first["policy"] == ["stay", "switch", "switch"]
+    assert second["policy"] == ["switch", "switch", "stay"]
+    assert min(first["correlation"], second["correlation"]) > 0.9
+    for file in (*report["figures"], Path(report["run"]) / "run.rrd"):
+        assert Path(file).stat().st_size > 0

@@ -22,54 +22,52 @@ def run(tmp_path, monkeypatch):
     return tmp_path, write_run(tmp_path / "run.mcap", VECTOR, 20)
 
 
-def table_of(path):
+def of_table(path):
+    """Values of each signal, what is said of it, and of the run."""
     if path.suffix == ".parquet":
-        return pq.read_table(path)
-    with pa.OSFile(str(path)) as file:
-        return pa.ipc.open_file(file).read_all()
+        table = pq.read_table(path)
+    else:
+        with pa.OSFile(str(path)) as file:
+            table = pa.ipc.open_file(file).read_all()
+    values = {name: table.column(name).to_pylist() for name in table.column_names}
+    said = {name: table.schema.field(name).metadata for name in values}
+    about = {name: {k.decode(): v.decode() for k, v in said[name].items()} for name in values}
+    return values, about, table.schema.metadata[b"cdmisfa.manifest"]
 
 
-@pytest.mark.parametrize("form", ["parquet", "arrow"])
-def test_tables_hold_every_number_and_what_it_is(form, run):
-    folder, records = run
-    out = folder / f"run.{form}"
-    assert export(folder, out, form) == 20
-    table = table_of(out)
-    assert table.column_names == list(SIGNALS)
-    for name, signal in SIGNALS.items():
-        for found, signals in zip(table.column(name).to_pylist(), records, strict=True):
-            expected = np.asarray(getattr(signals, name))
-            np.testing.assert_array_equal(np.reshape(found, expected.shape), expected)
-        about = table.schema.field(name).metadata
-        assert about[b"unit"].decode() == signal.unit
-        assert about[b"symbol"].decode() == signal.symbol
-        assert about[b"dims"].decode() == signal.dims
-    manifest = json.loads(table.schema.metadata[b"cdmisfa.manifest"])
-    assert manifest["config"]["learner"]["tau"] == 40
-
-
-def test_npz_holds_every_number(run):
-    folder, records = run
-    export(folder, folder / "run.npz", "npz")
-    with np.load(folder / "run.npz") as arrays:
-        assert set(arrays.files) == {*SIGNALS, "_signals", "_run"}
-        about = json.loads(str(arrays["_signals"]))
-        assert {name: found["unit"] for name, found in about.items()} == {
-            name: signal.unit for name, signal in SIGNALS.items()
-        }
-        assert about["eta"]["symbol"] == SIGNALS["eta"].symbol
-        manifest = json.loads(json.loads(str(arrays["_run"]))["manifest"])
-        assert manifest["config"]["learner"]["tau"] == 40
-        for name in SIGNALS:
-            for k, signals in enumerate(records):
-                expected = np.asarray(getattr(signals, name))
-                stored = arrays[name][k]
-                inner = tuple(slice(size) for size in expected.shape)
-                np.testing.assert_array_equal(stored[inner], expected)
+def of_arrays(path):
+    """The same of NumPy's arrays, which are filled up with NaN."""
+    with np.load(path) as arrays:
         assert np.isnan(arrays["band_mean"][0]).all()
+        values = {name: arrays[name] for name in arrays.files if not name.startswith("_")}
+        return (
+            values,
+            json.loads(str(arrays["_signals"])),
+            json.loads(str(arrays["_run"]))["manifest"],
+        )
 
 
-def test_csv_reads_back_exactly(run):
+@pytest.mark.parametrize(
+    ("form", "read"), [("parquet", of_table), ("arrow", of_table), ("npz", of_arrays)]
+)
+def test_every_number_is_there_and_what_it_is(form, read, run):
+    folder, records = run
+    assert export(folder, folder / f"run.{form}", form) == 20
+    values, about, manifest = read(folder / f"run.{form}")
+    assert list(values) == list(SIGNALS)
+    for name, signal in SIGNALS.items():
+        for found, signals in zip(values[name], records, strict=True):
+            expected = np.asarray(getattr(signals, name))
+            if form == "npz":
+                found = found[tuple(slice(size) for size in expected.shape)]
+            np.testing.assert_array_equal(np.reshape(found, expected.shape), expected)
+        assert (about[name]["unit"], about[name]["symbol"]) == (signal.unit, signal.symbol)
+    if form != "npz":
+        assert about["eta"]["dims"] == SIGNALS["eta"].dims
+    assert json.loads(manifest)["config"]["learner"]["tau"] == 40
+
+
+def test_csv_reads_back_exactly_and_comes_with_what_its_columns_are(run):
     folder, records = run
     export(folder, folder / "run.csv", "csv")
     with open(folder / "run.csv", newline="") as file:
@@ -82,19 +80,11 @@ def test_csv_reads_back_exactly(run):
         assert row["novel"] == str(signals.novel)
     assert float(rows[-1]["band_mean[1,0]"]) == 0.01
     assert rows[0]["band_mean[1,0]"] == "nan"
-
-
-def test_a_csv_file_comes_with_what_its_columns_are(run):
-    folder, _ = run
-    export(folder, folder / "run.csv", "csv")
     notes = json.loads((folder / "run.csv-metadata.json").read_text("utf-8"))
     assert notes["url"] == "run.csv"
-    with open(folder / "run.csv", newline="") as file:
-        titles = next(csv.reader(file))
-    columns = notes["tableSchema"]["columns"]
-    assert [column["titles"] for column in columns] == titles
-    for title, column in zip(titles, columns, strict=True):
+    for title, column in zip(rows[0], notes["tableSchema"]["columns"], strict=True):
         signal = SIGNALS[title.partition("[")[0]]
+        assert column["titles"] == title
         assert column["schema:unitText"] == signal.unit
         assert column["schema:alternateName"] == signal.symbol
     signals, run_notes = notes["notes"]

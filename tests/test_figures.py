@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from PIL import Image
-from run_data import IMAGE, VECTOR, write_run
+from run_data import IMAGE, PROGRESS, VECTOR, by_progress, write_run
 
 from cdmisfa.core.errors import UsageError
 from replay.export import figures
@@ -127,25 +127,9 @@ def test_no_phase_is_seen_in_what_does_not_go_round():
     np.testing.assert_allclose(found(np.array([0.4, 0.6])), [1.0, 3.0])
 
 
-def by_progress(signals):
-    """The record as a progress learner would have it: the streams end learned, known, given up."""
-    states = [1, 2, 3] if signals.iteration >= 20 else [0, 0, 0]
-    none = np.full(np.shape(signals.eta_dot), np.nan)
-    known_by = {0: 1, 1: 2}.get(signals.stream, 0) if signals.iteration >= 20 else 0
-    return dataclasses.replace(
-        signals,
-        R=np.empty((0, 2, 0)),
-        eta_dot=none,
-        tested=np.nan if signals.iteration == 0 else signals.tested,
-        known_by=known_by,
-        state=np.array(states),
-    )
-
-
 def test_the_progress_learner_has_one_figure_of_its_streams(tmp_path):
-    learner = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
     records = write_run(
-        tmp_path / "run.mcap", VECTOR, 30, saves=True, learner=learner, edit=by_progress
+        tmp_path / "run.mcap", VECTOR, 30, saves=True, learner=PROGRESS, edit=by_progress
     )
     assert drawn(tmp_path) == {"streams", "modules"}
     history = read_history(tmp_path)
@@ -153,8 +137,8 @@ def test_the_progress_learner_has_one_figure_of_its_streams(tmp_path):
     lanes, error, slowness, watched = figure.axes
     (became,) = lanes.child_axes
     labels = [text.get_text() for text in became.get_yticklabels()]
-    assert labels == ["learned by 1", "known by 2", "given up"]
-    assert len(lanes.patches) == 2 * 3
+    assert labels == ["learned by 1", "known by 2", "learning"]
+    assert len(lanes.patches) == 2 + 2 + 3
     for s, line in enumerate(error.lines[:3]):
         own = [r for r in records if r.stream == s]
         np.testing.assert_array_equal(line.get_xdata(), [r.iteration for r in own])

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -22,7 +19,7 @@ import pytest
 from camera_files import pictures, write_cameras
 from conftest import Cdmisfa
 from view_data import View
-from waiting import Clock
+from waiting import Clock, started
 
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.foxglove import FoxgloveCamera
@@ -295,18 +292,12 @@ def test_a_port_that_is_taken_is_said(cdmisfa: Cdmisfa, recording: Path) -> None
 @pytest.mark.parametrize(("loop", "code"), [(["--loop"], 0), ([], 130)])
 def test_ctrl_c_ends_it_cleanly(recording: Path, loop: list[str], code: int) -> None:
     pytest.importorskip("foxglove")
-    words = ["play", str(recording), "--to", "foxglove", "--wait", "0", "--port", "0", *loop]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "cdmisfa", *words, "--rate", "0.5"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )
-    assert process.stderr is not None
-    assert "playing at" in process.stderr.readline()
-    time.sleep(0.3)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    words = ("play", recording, "--to", "foxglove", "--wait", 0, "--port", 0, *loop)
+    with started(*words, "--rate", 0.5) as process:
+        assert process.stderr is not None
+        assert "playing at" in process.stderr.readline()
+        time.sleep(0.3)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
     assert (process.returncode, err) == (code, "")
     assert out.startswith("played ")

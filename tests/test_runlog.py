@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from run_data import IMAGE, VECTOR, parts_of, read_signals, rows_of, run_of, signals_of, write_run
 
+import replay
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
@@ -220,3 +222,49 @@ def test_a_message_does_not_depend_on_how_arrays_lie_in_memory():
         t, back = decode_matrix(encode_matrix(7, matrix))
         assert t == 7
         np.testing.assert_array_equal(back, matrix)
+
+
+ITERATIONS = 20
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path, write_run(tmp_path / "run.mcap", VECTOR, ITERATIONS, saves=True)
+
+
+def test_signals_are_columns_over_all_iterations(folder):
+    path, records = folder
+    run = replay.Run(path)
+    assert run.streams == VECTOR.streams
+    assert set(run.signals) == set(SIGNALS)
+    assert "etta" not in run.signals
+    for name, about in SIGNALS.items():
+        column = run.signals[name]
+        assert (column.dtype, len(column)) == (np.dtype(about.dtype), ITERATIONS)
+        for k, record in enumerate(records):
+            expected = np.asarray(getattr(record, name))
+            inner = tuple(slice(size) for size in expected.shape)
+            np.testing.assert_array_equal(column[k][inner], expected)
+            if about.dims.startswith("M"):
+                assert np.isnan(column[k][len(expected) :]).all()
+
+
+def test_a_run_without_iterations_has_empty_columns(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 0)
+    assert replay.Run(tmp_path).signals["y_frozen"].shape == (0, 0, 0, 0)
+
+
+def test_the_result_is_there_once_the_run_has_ended(folder):
+    path, _ = folder
+    assert replay.Run(path).result is None
+    (path / "run.json").write_text(json.dumps({"result": {"iterations": ITERATIONS}}))
+    assert replay.Run(path / "run.mcap").result == {"iterations": ITERATIONS}
+    (path / "run.json").write_text("{")
+    assert replay.Run(path).result is None
+
+
+def test_the_packages_hand_it_on():
+    import cdmisfa
+
+    assert issubclass(cdmisfa.Run, replay.Run)
+    assert {"Run", "RecordedSource"} <= set(dir(replay))

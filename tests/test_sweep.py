@@ -27,7 +27,7 @@ from camera_files import write_cameras
 from click.testing import CliRunner
 from conftest import Cdmisfa
 from engine_tasks import trace
-from waiting import wait_for
+from waiting import started, wait_for
 
 from cdmisfa.cli.commands.trials import parse_grid, parse_seeds, results_command, sweep_command
 from cdmisfa.core import processes
@@ -39,7 +39,7 @@ from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import open_source
 from cdmisfa.experiments.store import ROWS, read_rows
-from cdmisfa.experiments.sweep import REQUEST, UNKEPT, plan, sweep
+from cdmisfa.experiments.sweep import UNKEPT, plan, sweep
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 
@@ -243,12 +243,8 @@ def test_a_folder_takes_one_sweep_at_a_time(tmp_path: Path) -> None:
 
 
 def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:40", "-o"]
-    with subprocess.Popen([*words, str(tmp_path)]) as process:
-        try:
-            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
-        finally:
-            process.kill()
+    with started("sweep", "oscillatory", "--seeds", "0:40", "-o", tmp_path) as process:
+        wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
     assert process.returncode == -signal.SIGKILL
     before = rows_of(tmp_path)
     report = sweep("oscillatory", tmp_path, seeds=range(40))
@@ -257,42 +253,13 @@ def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
     assert rows_of(tmp_path).items() >= before.items()
 
 
-def test_the_processes_of_a_killed_sweep_end_with_it(tmp_path: Path) -> None:
-    """In the midst of trials that take hours: who has a result to hand over notices by itself."""
-    words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:2"]
-    words += ["--set", "learner.delta=1e-300", "--set", "learner.patience=1000000000"]
-    words += ["--max-iterations", "1000000000"]
-    workers: list[psutil.Process] = []
-
-    def busy() -> bool:
-        here = psutil.Process(process.pid).children()
-        workers[:] = [p for p in here if "spawn_main" in " ".join(p.cmdline())]
-        return len(workers) == 2 and (tmp_path / REQUEST).exists()
-
-    with subprocess.Popen([*words, "--jobs", "2", "-o", str(tmp_path)]) as process:
-        try:
-            wait_for(busy, seconds=200)
-            wait_for(lambda: all(sum(w.cpu_times()[:2]) > 2 for w in workers), 200)
-        finally:
-            process.kill()
-    left = psutil.wait_procs(workers, timeout=10)[1]
-    for worker in left:
-        worker.kill()
-    assert left == []
-    assert list(read_rows(tmp_path)) == []
-
-
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, jobs: str) -> None:
-    words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:4000"]
-    words += ["--jobs", jobs, "-o", str(tmp_path)]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
-            process.terminate()
-            complaint = process.communicate(timeout=30)[1]
-        finally:
-            process.kill()
+    words = ("sweep", "oscillatory", "--seeds", "0:4000", "--jobs", jobs, "-o", tmp_path)
+    with started(*words) as process:
+        wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
+        process.terminate()
+        complaint = process.communicate(timeout=30)[1]
     assert process.returncode == 143
     assert complaint.splitlines()[-1] == (
         f"cdmisfa: interrupted: {tmp_path} keeps the trials that are finished: "

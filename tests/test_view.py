@@ -172,12 +172,6 @@ def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
     assert "It ended: nothing was left." in text
 
 
-def test_the_file_has_a_layout_and_properties(shown):
-    *_, view = shown
-    assert len(view.blueprints) == 1
-    assert {"/__properties/learner", "/__properties/result"} <= view.names
-
-
 def test_many_streams_show_the_most_watched(tmp_path, monkeypatch):
     monkeypatch.setattr("replay.view.build.MOST_STREAMS", 5)
     spec = SourceSpec(tuple(f"s{i}" for i in range(70)), (2,), "float64", (), 50.0, 0)

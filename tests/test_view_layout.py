@@ -9,7 +9,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 import rerun as rr
-from run_data import IMAGE, VECTOR, write_run
+from run_data import IMAGE, PROGRESS, VECTOR, write_run
 from view_data import View
 
 from cdmisfa.core.errors import UsageError
@@ -25,10 +25,7 @@ from replay.view.panels import run_layout
 ITERATIONS, TAU = 420, 40
 MIN_MAX = rr.components.AggregationPolicy.MinMax.value
 
-LEARNERS = {
-    "2.0": {"algorithm": "2.0"},
-    "progress": {"algorithm": "progress", "settled": 0.05, "agreement": 0.25},
-}
+LEARNERS = {"2.0": {"algorithm": "2.0"}, "progress": PROGRESS}
 
 
 @pytest.fixture(scope="module", params=LEARNERS)

@@ -9,53 +9,22 @@ import numpy as np
 import pytest
 import rerun.blueprint as rrb
 from conftest import Cdmisfa
-from run_data import IMAGE, VECTOR, parts_of, write_run
+from run_data import IMAGE, PROGRESS, UNTOLD, VECTOR, by_progress, parts_of, write_run
 from view_data import View, scalars, tabs_of, views_of
 
-from cdmisfa.core.signals import NO_STATE, SIGNALS
+from cdmisfa.core.signals import NO_STATE
 from replay.runs.run import read_outline
 from replay.view.build import build_view
 from replay.view.summary import summary_text
 
 ITERATIONS = 30
 TAU = 40
-LEARNER = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25, "delta": None}
-LEARNING, LEARNED, KNOWN, GIVEN_UP = range(4)
-UNTOLD = ("share", "eta_dot", "gate_mean", "gate_sd", "band_sd", "xi", "xi_dot", "expert", "Q")
-UNTOLD += ("roc_error", "roc_error_inst", "roc_error_frozen")
 
 
 @pytest.fixture(autouse=True)
 def _strict(monkeypatch):
     """Rerun drops data that it does not understand, with a warning only, unless told so."""
     monkeypatch.setenv("RERUN_STRICT", "1")
-
-
-def by_progress(signals):
-    """The record as a progress learner would have it.
-
-    From the tenth iteration on the first stream is learned; from then on, module 1 knows the
-    second, module 2 from the twentieth on. The third is given up and looked at again.
-    """
-    k = signals.iteration
-    states = [LEARNED, KNOWN, GIVEN_UP if k < 25 else LEARNING] if k >= 10 else [LEARNING] * 3
-    blank = {
-        name: np.full(np.shape(getattr(signals, name)), np.nan)
-        if SIGNALS[name].dims
-        else float("nan")
-        for name in UNTOLD
-    }
-    known_by = (1 + k // 20 if k >= 10 else 0) if k % 3 == 1 else 0
-    untested = {"tested": float("nan"), "change": float("nan")} if k % 11 == 0 else {}
-    return dataclasses.replace(
-        signals,
-        **blank,
-        **untested,
-        R=np.empty((0, 2, 0)),
-        known_by=known_by,
-        stream=k % 3,
-        state=np.array(states),
-    )
 
 
 @pytest.fixture(scope="module", params=[IMAGE, VECTOR], ids=["images", "vectors"])
@@ -70,7 +39,7 @@ def shown(request, tmp_path_factory):
             request.param,
             ITERATIONS,
             saves=True,
-            learner=LEARNER,
+            learner=PROGRESS,
             edit=by_progress,
         )
         build_view(folder, folder / "run.rrd")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_data import IMAGE, VECTOR, write_run
+from run_data import IMAGE, PROGRESS, VECTOR, write_run
 from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
@@ -176,7 +176,7 @@ def test_a_module_that_said_nothing_later_is_asked_itself(tmp_path):
 
 @pytest.mark.parametrize("algorithm", ["2.0", "progress"])
 def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
-    learner = {"algorithm": algorithm, "settled": 0.05, "agreement": 0.25}
+    learner = {**PROGRESS, "algorithm": algorithm}
     records = write_run(tmp_path / "run.mcap", IMAGE, 15, saves=True, learner=learner)
     build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
     rows = View(tmp_path / "run.rrd").rows

@@ -15,7 +15,7 @@ import pytest
 import rerun.blueprint as rrb
 from conftest import Cdmisfa
 from PIL import Image
-from run_data import IMAGE, VECTOR, read_signals, run_of, write_run
+from run_data import IMAGE, PROGRESS, VECTOR, read_signals, run_of, write_run
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.view import panels
@@ -61,7 +61,6 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
             opened.ask(lambda client, v=view, g=grey: shows(client, v, g))
 
 
-BY_PROGRESS = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
 NAMED = {
     "2.0": (7, 30, ("R and Q, every 10 iterations", "What was done: the last 50 blocks", "Events")),
     "progress": (5, 23, ("φ 3: right", "Output y on new frames, from least to most", "Events")),
@@ -75,7 +74,7 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(
 ):
     """All tabs at once; a name in letters that the viewer's font lacks would end it."""
     n_tabs, n_views, some = NAMED[algorithm]
-    learner = BY_PROGRESS if algorithm == "progress" else None
+    learner = PROGRESS if algorithm == "progress" else None
     spec = dataclasses.replace(IMAGE, streams=("左", "⟨b⟩/ c", "right"), truth=("x→", "y"))
     write_run(
         *(tmp_path / "run.mcap", spec, ITERATIONS),

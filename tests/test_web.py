@@ -10,7 +10,6 @@ import json
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -22,6 +21,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from run_data import VECTOR, write_run
+from waiting import started
 
 from replay.viewer import web
 from replay.viewer.web import POLICY, page_of, served
@@ -74,16 +74,10 @@ def command(tmp_path):
     """`cdmisfa view RUN --web`; interrupted at the end."""
     (tmp_path / "run").mkdir()
     write_run(tmp_path / "run" / "run.mcap", VECTOR, 24)
-    words = [sys.executable, "-m", "cdmisfa", "view", str(tmp_path / "run"), "--web"]
-    words += ["--tab", "Overview"]
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
-    try:
+    with started("view", tmp_path / "run", "--web", "--tab", "Overview") as process:
         yield process
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 130
-    finally:
-        process.kill()
-        process.communicate()
 
 
 @pytest.fixture

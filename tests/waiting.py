@@ -1,10 +1,13 @@
-"""Waiting for what another process or thread does."""
+"""Commands in processes of their own, and waiting for what another process or thread does."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 
@@ -21,6 +24,22 @@ class Clock:
     def sleep(self, seconds: float) -> None:
         """Let seconds pass."""
         self.now += seconds + self.over
+
+
+@contextlib.contextmanager
+def started(*words: object, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    """The command line in a process of its own, which is killed where it goes on at the end."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "cdmisfa", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment},
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def wait_for(
