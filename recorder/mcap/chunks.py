@@ -117,12 +117,12 @@ class Chunks:
         """
         if not segment.indexes:
             return []
-        first = segment.indexes[0].offset
-        if segment.stop - first > MAX_CHUNK:
+        first, stop = segment.indexes[0].offset, segment.stop
+        if stop - first > MAX_CHUNK:
             raise MalformedRecord("its message index is larger than any chunk")
-        data, found = self._file.read(first, segment.stop - first), []
+        data, found = self._file.read(first, stop - first), []
         for part in segment.indexes:
-            pairs = np.frombuffer(data, "<u8", 2 * part.count, part.offset - first)
+            pairs = np.frombuffer(data, np.uint64, 2 * part.count, part.offset - first)
             found.append((part.channel, pairs.reshape(-1, 2)))
         return found
 

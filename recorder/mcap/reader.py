@@ -373,7 +373,8 @@ class LogReader:
         known, counted = definitions.channels, set[int]()
         if self._defined == len(segments):
             return
-        for segment in segments[self._defined :]:
+        # A summary that is believed defines every channel of which it counts messages.
+        for segment in () if self.by_index else segments[self._defined :]:
             counts = segment.channel_counts()
             if counts is None or not counts.keys() <= known.keys():
                 self.table(segment)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import itertools
+import operator
 import struct
 from dataclasses import dataclass, field
 from typing import Final
@@ -59,7 +59,7 @@ class Summary:
     broken: bool = False
     statistics: Statistics | None = None
     named: list[int] = field(default_factory=list)
-    indexes: dict[int, list[memoryview]] = field(default_factory=lambda: {o: [] for o in _INDEXES})
+    indexes: dict[int, list[bytes]] = field(default_factory=lambda: {o: [] for o in _INDEXES})
 
     def sound_chunks(self) -> list[Segment]:
         """The chunks of which it says everything but their CRC, in file order."""
@@ -83,9 +83,9 @@ class Summary:
             return None
         all_of = [_segment(content) for content in self.indexes[Opcode.CHUNK_INDEX]]
         found = sorted(filter(None, all_of), key=lambda segment: segment.offset)
-        begin = self.begin
-        edges = [(len(MAGIC), len(MAGIC)), *((s.offset, s.stop) for s in found), (begin, begin)]
-        if any(stop > start for (_, stop), (start, _) in itertools.pairwise(edges)):
+        starts = [*(segment.offset for segment in found), self.begin]
+        stops = [len(MAGIC), *(segment.stop for segment in found)]
+        if any(map(operator.gt, stops, starts)):
             raise MalformedRecord("its chunk index names chunks that overlap")
         counts = [segment.channel_counts() or {} for segment in found]
         accounted = (
@@ -134,7 +134,7 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
     summary = Summary(begin)
     if footer_at - begin > MAX_DEFINITION:
         return summary
-    data = memoryview(file.read(begin, footer_at - begin))
+    data = file.read(begin, footer_at - begin)
     if crc and crc32(footer[:-4], crc32(data)) != crc:
         summary.broken = True
         refuse("summary", "its CRC does not match: damaged")
@@ -149,7 +149,7 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
     return summary
 
 
-def _take_records(data: memoryview, summary: Summary, definitions: Definitions) -> None:
+def _take_records(data: bytes, summary: Summary, definitions: Definitions) -> None:
     at = 0
     while at < len(data):
         if len(data) - at < RECORD_HEADER.size:
@@ -163,7 +163,7 @@ def _take_records(data: memoryview, summary: Summary, definitions: Definitions) 
             if opcode == Opcode.CHUNK_INDEX and length >= 24:
                 summary.named += struct.unpack_from("<Q", content, 16)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            definitions.add(opcode, bytes(content), "summary")
+            definitions.add(opcode, content, "summary")
         elif opcode == Opcode.STATISTICS:
             summary.statistics = statistics(content)
         elif opcode <= Opcode.DATA_END and opcode != Opcode.SUMMARY_OFFSET:
@@ -171,7 +171,7 @@ def _take_records(data: memoryview, summary: Summary, definitions: Definitions) 
         at += RECORD_HEADER.size + length
 
 
-def _segment(content: memoryview) -> Segment | None:
+def _segment(content: bytes) -> Segment | None:
     """The chunk of a chunk index, or None where only the chunk tells what it holds."""
     try:
         (mapped,) = _LENGTH.unpack_from(content, _BEFORE_PLACES - 4)
@@ -190,13 +190,16 @@ def _segment(content: memoryview) -> Segment | None:
         raise MalformedRecord("a chunk index lies about its chunk's length")
     if not places:
         return None
-    parts = sorted(zip(places[1::2], places[::2], strict=True), reverse=True)
-    if parts[-1][0] != after:
+    # Not `strict`, and not sorted if not needed: of a long log this is most of what opening takes.
+    parts = list(zip(places[1::2], places[::2]))  # noqa: B905
+    if len(parts) > 1:
+        parts.sort()
+    if parts[0][0] != after:
         raise MalformedRecord("a chunk index lies about its message indexes")
     indexes: list[IndexPart] = []
     counts: dict[int, int] = {}
     after += index_size
-    for place, channel in parts:
+    for place, channel in reversed(parts):
         first = place + INDEX_HEADER.size
         count, rest = divmod(after - first, 16)
         if rest or count < 0:

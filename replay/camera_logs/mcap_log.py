@@ -100,17 +100,18 @@ class McapImages(MessageImages):
 
     def _by_index(self) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
         """As `_by_pass`, by the message indexes: a chunk is checked when its images are read."""
+        channels = set(self._channels)
         segments = [
             segment
             for segment in self.reader.segments
-            if any((segment.channel_counts() or {}).get(channel) for channel in self._channels)
+            if not channels.isdisjoint(segment.channel_counts() or ())
         ]
         self.reader.expect(segments, indexes=True)
         for segment in segments:
             index = self.reader.index(segment)
-            own = (pairs for channel, pairs in index if channel in self._channels)
-            pairs = np.concatenate([np.empty((0, 2), np.uint64), *own])
-            yield segment, pairs[np.argsort(pairs[:, 1], kind="stable"), 0]
+            own = [pairs for channel, pairs in index if channel in channels]
+            pairs = own[0] if len(own) == 1 else np.concatenate(own)
+            yield segment, pairs[pairs[:, 1].argsort(kind="stable"), 0]
 
 
 def mcap_topics(path: Location, reading: Reading = IMAGES) -> list[str]:

@@ -104,9 +104,10 @@ class ChannelRows:
         new = segments[len(seen) :]
         if self._reader.by_index and not self._may_lack:
             # The log times of each chunk are compared with the summary's count when it is read.
+            known = len(self._segments)
             for segment in new:
-                if self._take(segment):
-                    self._unconfirmed.add(len(self._segments) - 1)
+                self._take(segment)
+            self._unconfirmed.update(range(known, len(self._segments)))
             first, count = self._facts.first_frame, self._starts[-1]
             self.row_ranges = [RowRange(first, first + count, 0)] if count else []
             return
@@ -130,7 +131,7 @@ class ChannelRows:
         if self._segments and self._segments[-1] is segment:
             number = len(self._segments) - 1
             if self._reader.table(segment) is not None:
-                self._read(number, 0, self._starts[-1] - self._starts[-2], None)
+                self.read(number, 0, self._starts[-1] - self._starts[-2], None)
 
     @property
     def ranges(self) -> list[tuple[int, int]]:
@@ -162,28 +163,24 @@ class ChannelRows:
         """Where a chunk begins in the file."""
         return self._segments[number].offset
 
-    def read(self, number: int, low: int, out: ByteArray) -> None:
-        """Copy the values of messages of a chunk from the `low`th on.
+    def read(self, number: int, low: int, n: int, out: ByteArray | None) -> None:
+        """Check how messages of a chunk are laid out, and copy their values.
 
         Args:
             number: of the chunk among those of the channel.
             low: the first message.
-            out: (n, bytes of a message's values), written.
+            n: how many.
+            out: (n, bytes of a message's values), written; None to check only.
 
         Raises:
             LogDamagedError: the chunk is damaged, or one is laid out otherwise than others.
         """
-        if number in self._unconfirmed:
-            self._own(number)
-        self._read(number, low, low + len(out), out)
-
-    def _read(self, number: int, low: int, high: int, out: ByteArray | None) -> None:
         if self.layout is None:
             self._own(number)
             return
         table = self._table(number)
         try:
-            found = self.layout.read(table, self.channel.id, (low, high), out)
+            found = self.layout.read(table, self.channel.id, (low, low + n), out)
         except MalformedRecord as error:
             where = f"{self._reader.path}: {self._segments[number].name}"
             raise LogDamagedError(f"{where}: {error}") from None
@@ -252,10 +249,18 @@ class ChannelRows:
         return np.concatenate(own)
 
     def _table(self, number: int) -> MessageTable:
-        """A chunk's messages; a LogDamagedError where it is damaged."""
+        """A chunk's messages; raises as `_own`."""
         table = self._reader.table(self._segments[number])
         if table is None:
             raise LogDamagedError(f"{self._reader.path}: {self._segments[number].name} is damaged")
+        if number in self._unconfirmed:
+            times = table.log_time[table.channel == self.channel.id]
+            self._count(number, len(times))
+            (row, stop), first = self._starts[number : number + 2], self._facts.first_frame
+            if (times != self._facts.times(np.arange(first + row, first + stop))).any():
+                # This says what is wrong.
+                self._number(times, row, [RowRange(first, first + row, 0)] if row else [])
+            self._unconfirmed.remove(number)
         return table
 
     def _own(self, number: int) -> MessageTable:
@@ -267,10 +272,6 @@ class ChannelRows:
         table = self._table(number)
         own = table.select(table.channel == self.channel.id)
         self._count(number, len(own))
-        if number in self._unconfirmed:
-            row, first = self._starts[number], self._facts.first_frame
-            self._number(own.log_time, row, [RowRange(first, first + row, 0)] if row else [])
-            self._unconfirmed.remove(number)
         return own
 
     def _count(self, number: int, found: int) -> None:

@@ -134,7 +134,7 @@ class ViewFile:
                 pieces.append((rows.place(number), which, number, low, at, at + n))
                 at += n
         for _, which, number, low, at, stop in sorted(pieces):  # each chunk is decoded once
-            self._channels[which].read(number, low, outs[which][at:stop])
+            self._channels[which].read(number, low, stop - at, outs[which][at:stop])
 
     def check_chunk(self, segment: Segment) -> None:
         """Check every frame of the next chunk of the file, without copying any.

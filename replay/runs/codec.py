@@ -64,7 +64,8 @@ _BY_AGE = sorted(SIGNALS.values(), key=lambda s: s.since)
 _FIRST = [s.name for s in _BY_AGE if s.since == 1]
 _LATER = [s.name for s in _BY_AGE if s.since > 1]
 _NUMBERS = {name: number for number, name in enumerate((*_FIRST, SHAPES, *_LATER), start=1)}
-_STORED = sorted(_BY_AGE, key=lambda s: bool(s.dims))
+_SCALARS = [s for s in _BY_AGE if not s.dims]
+_ARRAYS = [s for s in _BY_AGE if s.dims]
 """The signals in the order in which messages hold them: scalars, then arrays."""
 
 _MATRIX_HEAD = struct.Struct("<BqBIB5s")
@@ -118,54 +119,62 @@ class Layout:
 
 
 @lru_cache
-def _layout(shapes: tuple[tuple[int, ...], ...], version: int) -> tuple[Layout, struct.Struct, Any]:
-    """Layout of records whose arrays have these shapes, for reading and for writing.
+def _around(shapes: tuple[tuple[int, ...], ...], version: int) -> tuple[bytes, ...]:
+    """The parts of a message: its scalars, each array after what stands before it, its end.
 
     Args:
-        shapes: of the arrays, in the order of `_STORED`.
+        shapes: of all arrays.
         version: of the record.
 
     Returns:
-        The third one is the constant parts of `struct`, with a place for each value.
+        Places for the scalars (0) and for the arrays (2, 4, ...) are empty.
     """
-    fields, parts, codes = [], list[Any](), ["<"]
-    remaining = iter(shapes)
-    for signal in _STORED:
-        shape = next(remaining) if signal.dims else ()
-        kind = _TYPES[signal.dtype]
-        size = kind.stored.itemsize * math.prod(shape)
-        if signal.since > version:
-            continue
-        before = _tag(signal, kind.wire)
-        if signal.dims:
-            before = _tag(signal, _LENGTH_DELIMITED) + varint(size) if size else b""
-        if size:
-            fields.append((signal.name, kind.stored, shape, before))
-        codes += [f"{len(before)}s", f"{size}s" if signal.dims else kind.code]
-        parts += [before, None]
-    known = zip(shapes, (s for s in _STORED if s.dims), strict=True)
-    sizes = b"".join(varint(n) for shape, s in known if s.since <= version for n in shape)
+    parts, sizes = [b""], b""
+    for signal, shape in zip(_ARRAYS, shapes, strict=True):
+        known = signal.since <= version
+        size = _TYPES[signal.dtype].stored.itemsize * math.prod(shape)
+        before = _tag(signal) + varint(size) if known and size else b""
+        parts += [before, b""]
+        sizes += b"".join(varint(n) for n in shape if known)
     end = varint(_NUMBERS[SHAPES] << 3 | _LENGTH_DELIMITED) + varint(len(sizes)) + sizes
-    codes.append(f"{len(end)}s")
-    return Layout(fields, end), struct.Struct("".join(codes)), (*parts, end)
+    return *parts, end
 
 
-def _tag(signal: Signal, wire_type: int) -> bytes:
-    return varint(_NUMBERS[signal.name] << 3 | wire_type)
+@lru_cache
+def _layout(shapes: tuple[tuple[int, ...], ...], version: int) -> Layout:
+    """Layout of records of a version whose arrays have these shapes."""
+    *before, end = _around(shapes, version)[1::2]
+    scalars = [(s, (), _tag(s)) for s in _SCALARS if s.since <= version]
+    arrays = [item for item in zip(_ARRAYS, shapes, before, strict=True) if item[2]]
+    fields = [(s.name, _TYPES[s.dtype].stored, shape, tag) for s, shape, tag in scalars + arrays]
+    return Layout(fields, end)
 
 
-_SCALARS_OF = attrgetter(*(s.name for s in _STORED if not s.dims))
-_ARRAYS_OF = attrgetter(*(s.name for s in _STORED if s.dims))
-_ARRAY_TYPES = [_TYPES[s.dtype].stored for s in _STORED if s.dims]
+def _tag(signal: Signal) -> bytes:
+    wire = _LENGTH_DELIMITED if signal.dims else _TYPES[signal.dtype].wire
+    return varint(_NUMBERS[signal.name] << 3 | wire)
+
+
+_SCALARS_OF = attrgetter(*(s.name for s in _SCALARS))
+_ARRAYS_OF = attrgetter(*(s.name for s in _ARRAYS))
+_SHAPE_OF = attrgetter("shape")
+_ARRAY_TYPES = [_TYPES[s.dtype].stored for s in _ARRAYS]
+_TAGGED: list[Any] = [x for s in _SCALARS for x in (_tag(s), None)]
+"""The tag of each scalar, and a place for its value."""
+_SCALARS_STRUCT = struct.Struct(
+    "<" + "".join(f"{len(_tag(s))}s{_TYPES[s.dtype].code}" for s in _SCALARS)
+)
 
 
 def encode_signals(signals: BlockSignals) -> bytes:
     """A record as the bytes of its message."""
-    arrays = list(map(np.asarray, _ARRAYS_OF(signals), _ARRAY_TYPES))
-    _, layout, constant = _layout(tuple([array.shape for array in arrays]), SCHEMA_VERSION)
-    parts = list(constant)
-    parts[1::2] = [*_SCALARS_OF(signals), *[array.tobytes() for array in arrays]]
-    return layout.pack(*parts)
+    scalars = _TAGGED.copy()
+    scalars[1::2] = _SCALARS_OF(signals)
+    arrays = list(map(np.ascontiguousarray, _ARRAYS_OF(signals), _ARRAY_TYPES))
+    parts: list[Any] = list(_around(tuple(map(_SHAPE_OF, arrays)), SCHEMA_VERSION))
+    parts[0] = _SCALARS_STRUCT.pack(*scalars)
+    parts[2::2] = arrays
+    return b"".join(parts)
 
 
 def decode_signals(
@@ -180,7 +189,7 @@ def decode_signals(
     sizes = iter(getattr(decoded, SHAPES))
     fields: dict[str, Any] = {}
     known: dict[str, int] = {}
-    for signal in _STORED:
+    for signal in (*_SCALARS, *_ARRAYS):
         name, stored = signal.name, signal.since <= version
         if not signal.dims:
             fields[name] = getattr(decoded, name) if stored else math.nan
@@ -203,7 +212,7 @@ def decode_columns(
     for _, group in groupby(messages, key=len):
         same_size = list(group)
         first = decode_signals(same_size[0], where, version)
-        layout, *_ = _layout(tuple([array.shape for array in _ARRAYS_OF(first)]), version)
+        layout = _layout(tuple([array.shape for array in _ARRAYS_OF(first)]), version)
         found = layout.read(same_size)
         if found is None or any(v.dtype == np.uint8 and v.max() > 1 for v in found.values()):
             records = [decode_signals(data, where, version) for data in same_size]
@@ -316,7 +325,7 @@ def _sentence(signal: Signal) -> str:
     return "; ".join([signal.about.rstrip("."), *said, f"unit {signal.unit}"]) + "."
 
 
-_SIZES = ", ".join(f"{s.name} [{s.dims}]" for s in _STORED if s.dims)
+_SIZES = ", ".join(f"{s.name} [{s.dims}]" for s in _ARRAYS)
 _SIGNAL_FIELDS = [
     (s.name, _NUMBERS[s.name], _TYPES[s.dtype].field, bool(s.dims), _sentence(s)) for s in _BY_AGE
 ]
