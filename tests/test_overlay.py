@@ -17,9 +17,8 @@ from replay.view.overlay import build_overlay
 
 
 @pytest.fixture
-def three(tmp_path, monkeypatch):
+def three(tmp_path):
     """Two equal runs of the same name in other places, and another one."""
-    monkeypatch.setenv("RERUN_STRICT", "1")
     runs = [tmp_path / "a" / "run", tmp_path / "b" / "run", tmp_path / "c"]
     records = []
     for run, seed in zip(runs, (3, 3, 4), strict=True):
