@@ -21,6 +21,9 @@ if "TMPDIR" not in os.environ and MEMORY.is_dir() and shutil.disk_usage(MEMORY).
     # What tests write is synced some thousand times, which a disk takes milliseconds for.
     os.environ["TMPDIR"] = tempfile.tempdir = str(MEMORY)
 
+# Rerun drops data that it does not understand, with a warning only, unless told so.
+os.environ.setdefault("RERUN_STRICT", "1")
+
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Other cores have processes of their own: threads for one product would wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,3 +49,16 @@ def write_table(path: Path, columns: dict[str, Any]) -> Path:
     else:
         parquet.write_table(table, path)
     return path
+
+
+def learned_alike(cdmisfa: Callable[..., Any], folder: Path, *words: object) -> Any:
+    """What a run says of itself; one on the conversion, by the same words, is the same."""
+    quick = ("--set", "learner.tau=10", "--max-iterations", "3", "--json")
+    run = cdmisfa("learn", *words, *quick, "-o", folder / "run", "--no-rerun")
+    assert run.code == 0, run.err
+    assert cdmisfa("check", folder / "run").code == 0
+    converted = cdmisfa("convert", *words, "-o", folder / "rec")
+    assert converted.code == 0, converted.err
+    again = cdmisfa("learn", folder / "rec", "--algorithm", "progress", *quick).json
+    assert again["signals_sha256"] == run.json["signals_sha256"]
+    return {**run.json, "said": (run.err, converted.err)}

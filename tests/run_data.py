@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
+from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS, BlockSignals
 from replay.runs.log import read_batches, read_columns
 from replay.runs.writer import RunWriter
@@ -125,6 +126,17 @@ def run_of(
         saved = saves and 3 * (k + 1) // iterations > modules
         signals = dataclasses.replace(signals, saved=saved)
         yield signals, block_of(spec, signals.stream, signals.t, tau, rng)
+
+
+def module_of(
+    index: int, iteration: int, phi: NDArray[Any], stream: int = 0, name: str = "a"
+) -> Module:
+    """A module of one output with these weights, (1, I)."""
+    one = np.ones(1)
+    about = {"index": index, "stream": name, "stream_index": stream, "iteration": iteration}
+    bands = {"band_mean": 0 * one, "band_sd": one, "eta": one}
+    policy = np.zeros(3, dtype=int)
+    return Module(**about, phi=phi, mean=np.zeros(phi.shape[1]), **bands, policy=policy)
 
 
 def having(phi: NDArray[Any]) -> Any:

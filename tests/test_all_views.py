@@ -30,8 +30,7 @@ def made(tmp_path_factory):
     return place
 
 
-def test_every_view_is_there_at_every_frame(made, tmp_path, monkeypatch):
-    monkeypatch.setenv("RERUN_STRICT", "1")
+def test_every_view_is_there_at_every_frame(made, tmp_path):
     build_view(made / "run", tmp_path / "v.rrd", all_views=made / "rec")
     source = RecordedSource(made / "rec")
     expected = source.take(1, 500).frames

@@ -85,19 +85,6 @@ def test_what_cannot_be_taken_is_refused_in_one_line(
     assert refused.err.count("\n") == 1
 
 
-def test_learning_from_a_log_notes_how_images_became_frames(cdmisfa: Cdmisfa, logs: Path) -> None:
-    run = logs / "run"
-    done = cdmisfa("learn", logs / "a.mcap", *BOTH, *SMALL, *QUICK, "-o", run)
-    assert done.code == 0, done.err
-    assert "/cam_left: 60 images, 0 frames repeated, 0 images dropped" in done.err
-    source = json.loads((run / "run.json").read_text())["source"]
-    assert source["kind"] == "foreign"
-    assert source["topics"] == ["/cam_left", "/cam_right"]
-    assert source["size"] == [12, 16]
-    assert "area average" in source["recipe"]
-    assert [len(file["sha256"]) for file in source["files"]] == [64]
-
-
 def test_the_refusal_prints_a_command_that_works(cdmisfa: Cdmisfa, logs: Path) -> None:
     uneven = logs / "uneven.mcap"
     refused = cdmisfa("learn", uneven, *BOTH, *SMALL, *QUICK)
@@ -131,19 +118,24 @@ def test_topics_become_names_of_files() -> None:
 
 
 def test_a_run_on_cameras_says_of_what_its_streams_are(cdmisfa: Cdmisfa, logs: Path) -> None:
-    words = (logs / "a.mcap", *BOTH, "--seed", "3")
-    assert cdmisfa("learn", *words, *QUICK, "-o", logs / "run").code == 0
-    assert cdmisfa("convert", logs / "a.mcap", *BOTH, "-o", logs / "rec").code == 0
-    assert cdmisfa("learn", logs / "rec", *QUICK, "-o", logs / "again").code == 0
-    for run in ("run", "again"):
-        config = json.loads((logs / run / "run.json").read_text())["config"]
-        assert config["scene"] == {"kind": "foreign"}
+    log, rec, out = logs / "a.mcap", logs / "rec", logs / "sweep"
+    done = cdmisfa("learn", log, *BOTH, *SMALL, "--seed", "3", *QUICK, "-o", logs / "run")
+    assert done.code == 0, done.err
+    assert "/cam_left: 60 images, 0 frames repeated, 0 images dropped" in done.err
+    source = json.loads((logs / "run" / "run.json").read_text())["source"]
+    assert (source["kind"], source["topics"]) == ("foreign", ["/cam_left", "/cam_right"])
+    assert source["size"] == [12, 16]
+    assert "area average" in source["recipe"]
+    assert [len(file["sha256"]) for file in source["files"]] == [64]
+    assert cdmisfa("convert", log, *BOTH, "-o", rec).code == 0
+    assert cdmisfa("learn", rec, *QUICK, "-o", logs / "again").code == 0
     sweep = ("--seeds", "0:1", "--set", "learner.algorithm=progress", "--keep-logs")
     quick = (*QUICK[:2], "--set", "learner.tau=10")
-    done = cdmisfa("sweep", logs / "rec", *sweep, *quick, "-o", logs / "sweep")
+    done = cdmisfa("sweep", rec, *sweep, *quick, "-o", out)
     assert done.code == 0, done.err
-    found = next((logs / "sweep").rglob("run.json")).read_text()
-    assert json.loads(found)["config"]["scene"] == {"kind": "foreign"}
+    for run in (logs / "run", logs / "again", next(out.rglob("run.json")).parent):
+        config = json.loads((run / "run.json").read_text())["config"]
+        assert config["scene"] == {"kind": "foreign"}
 
 
 def test_a_run_that_called_its_cameras_a_scene_is_resumed(
@@ -161,10 +153,11 @@ def test_a_run_that_called_its_cameras_a_scene_is_resumed(
 def test_recordings_named_together_are_refused_with_what_would_work(
     cdmisfa: Cdmisfa, logs: Path
 ) -> None:
-    for name in ("one", "two"):
-        write_cameras(logs / f"{name}.mcap", {"/image": (60 if name == "one" else 50, 20)})
-        assert cdmisfa("convert", logs / f"{name}.mcap", "-o", logs / name).code == 0
     both = (logs / "one", logs / "two")
+    for folder, count in zip(both, (60, 50), strict=True):
+        log = folder.with_suffix(".mcap")
+        write_cameras(log, {"/image": (count, 20)})
+        assert cdmisfa("convert", log, "-o", folder).code == 0
     refused = cdmisfa("learn", *both)
     assert (refused.code, refused.err.count("\n")) == (2, 1)
     assert f"{both[0]} and {both[1]} are recordings of their own" in refused.err
@@ -175,8 +168,7 @@ def test_recordings_named_together_are_refused_with_what_would_work(
     twice = cdmisfa("learn", both[0], both[0])
     assert (twice.code, "is named twice" in twice.err) == (2, True)
     assert cdmisfa("view", *both, "--save", logs / "both.rrd").code == 0
-    info = cdmisfa("info", *both, "--json").json
-    assert len(info["metadata"]) == 2
+    assert len(cdmisfa("info", *both, "--json").json["metadata"]) == 2
 
 
 def test_streams_with_gaps_are_not_put_together_by_number(cdmisfa: Cdmisfa, logs: Path) -> None:

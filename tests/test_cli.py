@@ -195,14 +195,6 @@ class TestErrors:
         assert "Traceback" not in done.err
         assert not (tmp_path / "out.mcap").exists()
 
-    def test_what_is_no_recording_is_refused_as_a_wrong_word(
-        self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
-    ) -> None:
-        (tmp_path / "README.md").write_text("# Read me")
-        assert_one_line(cdmisfa("learn", tmp_path / "README.md"), 2, "README.md", "no MCAP file")
-        for run in (oscillatory_run, oscillatory_run / "run.mcap"):
-            assert_one_line(cdmisfa("learn", run), 2, "is a run", f"cdmisfa view {run}")
-
     def test_a_damaged_recording(
         self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
     ) -> None:

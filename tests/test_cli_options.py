@@ -94,15 +94,6 @@ def test_the_words_of_settings_are_read_as_these_settings() -> None:
     assert told == [chosen, CameraOptions()]
 
 
-@pytest.mark.parametrize(
-    ("option", "wrong"),
-    [("--size", "0x48"), ("--from", "1:2:3:4"), ("--range", "3:1"), ("--hold", "-1")],
-)
-def test_what_is_written_otherwise_is_refused(cdmisfa: Cdmisfa, option: str, wrong: str) -> None:
-    done = cdmisfa("learn", "nothing.mcap", option, wrong)
-    assert (done.code, option in done.err) == (2, True)
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_lists_each_option_once_the_common_six_first(cdmisfa: Cdmisfa, name: str) -> None:
     command = cli.get_command(click.Context(cli), name)

@@ -12,6 +12,7 @@ from test_cli import assert_one_line
 
 LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
 
+A_RUN = "is a run, not a recording: look at it with cdmisfa view"
 NO_MCAP = "numbers.npz is no MCAP file: name a recording"
 URLS = ("gs://bucket/there", "https://there.org/x")
 ONE = "is a scene, of which only one can be named"
@@ -105,6 +106,38 @@ CASES: dict[str, tuple[str, ...]] = {
             )
         )
     },
+    **{
+        f"{words} s3://lab/x": ("s3://lab/x is a URL: name a path on this machine",)
+        for words in ("plot RUN -o", "record icub --scene-picture", "reproduce stability -o")
+    },
+    "record oscillatory -o x --local y": ("--local goes with -o s3://",),
+    # a run is no recording
+    **{f"learn {run}": (A_RUN,) for run in ("RUN", "RUN/run.mcap")},
+    "play RUN": (A_RUN,),
+    "play REC --wait 1": ("--wait is for --to foxglove",),
+    "play no/such": ("no such file or folder",),
+    # options that are written otherwise
+    "learn nothing.mcap --size 0x48": ("--size",),
+    "learn nothing.mcap --from 1:2:3:4": ("--from",),
+    "learn nothing.mcap --range 3:1": ("--range",),
+    "learn nothing.mcap --hold -1": ("--hold",),
+    # a grid is checked before anything runs, and live streams are recorded first
+    "sweep oscillatory --seeds 0 -o s --grid learner.sigm=1": ("did you mean learner.sigma",),
+    "sweep oscillatory --seeds 0 -o s --grid learner.tau=40,many": ("learner.tau",),
+    "sweep gym:Pendulum-v1 --seeds 0 -o s": (
+        "record it first, with cdmisfa record gym:Pendulum-v1 -o REC",
+    ),
+    # a fork that cannot be
+    "fork RUN --at 3 -o x --set learner.tau=20": ("learner.tau is 100 and stays",),
+    "fork RUN --at 3 -o x --set learner.expansion=none": ("expansion is quadratic and stays",),
+    "fork RUN --at 3 -o x --set learner.components=3": ("does not fit",),
+    "fork RUN --at 3 -o x --set scene.seed=3": ("changes learner.* alone",),
+    "fork RUN --at 3 -o x --set learner.nuu=3": ("unknown key learner.nuu",),
+    "fork RUN --at 16 -o x": ("holds 15 iterations",),
+    # experiments that there are not, or not so
+    "reproduce stabillity -o x": ("no experiment 'stabillity': did you mean stability?",),
+    "reproduce -o x": ("say which experiment",),
+    "reproduce difficulty -o x --recording LOGS": ("takes more than 4000: record them",),
     # what is read from no URL, and what is the URL of no log
     "results https://host/a/b": ("https://host/a/b is a URL: name a path on this machine",),
     "view RUN --save a.rrd --all-views https://host/a/b": ("https://host/a/b is a URL: name a",),

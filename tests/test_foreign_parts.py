@@ -113,41 +113,29 @@ def test_a_log_that_was_cut_before_its_first_message_is_damaged(
     assert not out.exists()
 
 
-def test_a_killed_conversion_goes_on(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_conversion_that_was_stopped_goes_on(
+    cdmisfa: Cdmisfa, tmp_path: Path, number: signal.Signals
+) -> None:
     write_cameras(tmp_path / "a.mcap", {"/left": (6000, 20), "/right": (6000, 20)})
     words = ("convert", tmp_path / "a.mcap", *BOTH, "-o")
     assert cdmisfa(*words, tmp_path / "whole").code == 0
     folder = tmp_path / "rec"
     command = [sys.executable, "-m", "cdmisfa", *map(str, words), str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    try:
-        _wait_for_bytes(folder / "left.mcap.partial", 20_000, process)
-    finally:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    partial = folder / "left.mcap.partial"
+    wait_for(lambda: partial.exists() and partial.stat().st_size >= 20_000, 60, process)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    if number == signal.SIGTERM:
+        assert process.returncode == 143, said
+        assert said.rstrip().endswith("rec is not finished: go on with --resume")
     assert not (folder / "left.mcap").exists()
     refused = cdmisfa(*words, folder)
     assert (refused.code, "--resume" in refused.err) == (2, True)
     other = cdmisfa(*words, folder, "--resume", "--rate", "25", "--align", "time")
     assert (other.code, "cannot be continued" in other.err) == (2, True), other.err
-    done = cdmisfa(*words, folder, "--resume")
-    assert done.code == 0, done.err
-    assert contents(folder) == contents(tmp_path / "whole")
-    assert cdmisfa(*words, folder, "--resume").code == 0
-    assert contents(folder) == contents(tmp_path / "whole")
-
-
-def test_a_stopped_conversion_says_how_to_go_on(tmp_path: Path) -> None:
-    write_cameras(tmp_path / "a.mcap", {"/left": (8000, 20), "/right": (8000, 20)})
-    words = ["convert", tmp_path / "a.mcap", *BOTH, "-o", tmp_path / "rec"]
-    command = [sys.executable, "-m", "cdmisfa", *map(str, words)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    _wait_for_bytes(tmp_path / "rec" / "left.mcap.partial", 20_000, process)
-    process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 143, said
-    assert said.rstrip().endswith("rec is not finished: go on with --resume")
-
-
-def _wait_for_bytes(path: Path, size: int, process: subprocess.Popen[Any]) -> None:
-    wait_for(lambda: path.exists() and path.stat().st_size >= size, 60, process)
+    for _ in range(2):
+        done = cdmisfa(*words, folder, "--resume")
+        assert done.code == 0, done.err
+        assert contents(folder) == contents(tmp_path / "whole")

@@ -39,11 +39,6 @@ from replay.viewer.program import open_privately
 MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
 
 
-@pytest.fixture(autouse=True)
-def _strict(monkeypatch):
-    monkeypatch.setenv("RERUN_STRICT", "1")
-
-
 def feed(view, spec, iterations=30, tau=40):
     for signals, block in run_of(spec, iterations, saves=True):
         view.block(block, signals, having(np.ones((1, int(np.prod(spec.frame_shape))))))

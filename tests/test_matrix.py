@@ -21,7 +21,7 @@ from camera_files import (
     write_video,
 )
 from conftest import Cdmisfa
-from message_files import STEP, every, write_mcap, write_table
+from message_files import STEP, every, learned_alike, write_mcap, write_table
 from PIL import Image
 from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
 from test_foreign import raw_json, ros1
@@ -148,17 +148,22 @@ def write_numbers(table: Path, log: Path) -> None:
     write_mcap(log, kind, {"/joint_states": every(STEP, (json.dumps(j).encode() for j in joints))})
 
 
+def needed(kind: str) -> list[str]:
+    """What learning and converting ask for."""
+    rate = ["--rate", "50"] if kind in (*PICTURES, "table") else []
+    return [*rate, *(["--topic", "/cam_*"] if kind in BAGS else [])]
+
+
 def command_line(command: str, kind: str, words: list[object], out: Path) -> list[object]:
     """The command, with what every kind of log needs."""
-    rate = ["--rate", "50"] if kind in (*PICTURES, "table") else []
-    topics = ["--topic", "/cam_*"] if kind in BAGS else []
+    rate = [] if kind in BAGS else needed(kind)
     return {
         "info": ["info", *words, "--json"],
         "verify": ["verify", *words, "--json"],
         "view": ["view", *words, "--save", out / "view.rrd", *rate],
         "export": ["export", *words, "--to", "images", "-o", out / "images", *rate],
-        "learn": ["learn", *words, "--max-iterations", "1", "--json", *topics, *rate],
-        "convert": ["convert", *words, "-o", out / "rec", "--json", *topics, *rate],
+        "learn": ["learn", *words, "--max-iterations", "1", "--json", *needed(kind)],
+        "convert": ["convert", *words, "-o", out / "rec", "--json", *needed(kind)],
         "play": [
             *("play", *words, "--to", "foxglove", "--port", 0, "--wait", 0),
             *("--rate", 100, "--json", *(["--fps", 50] if rate else [])),
@@ -205,16 +210,8 @@ def test_a_command_takes_a_log_or_says_why_not(
 def test_a_log_and_its_conversion_are_learned_alike(
     kind: str, logs: dict[str, list[object]], cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
-    words = command_line("convert", kind, logs[kind], tmp_path)
-    assert cdmisfa(*words).code == 0
-    quick = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
-    learned = cdmisfa(
-        "learn", *words[1 : words.index("-o")], *words[words.index("--json") :], *quick
-    )
-    assert learned.code == 0, learned.err
-    assert {len(file.get("sha256", "x" * 64)) for file in learned.json["source"]["files"]} == {64}
-    again = cdmisfa("learn", tmp_path / "rec", "--algorithm", "progress", *quick)
-    assert again.json["signals_sha256"] == learned.json["signals_sha256"]
+    run = learned_alike(cdmisfa, tmp_path, *logs[kind], *needed(kind))
+    assert {len(file.get("sha256", "x" * 64)) for file in run["source"]["files"]} == {64}
 
 
 def test_the_commands_of_the_page_work(

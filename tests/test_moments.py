@@ -334,26 +334,6 @@ def test_forks_of_forks_are_resumed_and_checked(
     assert (keyframe.iteration, found.iteration >= 52) == (52, True)
 
 
-@pytest.mark.parametrize(
-    ("told", "why"),
-    [
-        (("--set", "learner.tau=20"), "learner.tau is 40 and stays"),
-        (("--set", "learner.expansion=none"), "learner.expansion is quadratic and stays"),
-        (("--set", "learner.components=3"), "does not fit"),
-        (("--set", "scene.seed=3"), "changes learner.* alone"),
-        (("--set", "learner.nuu=3"), "unknown key learner.nuu"),
-        (("--at", 131), "holds 130 iterations"),
-    ],
-)
-def test_a_fork_that_cannot_be_is_refused(
-    place: Path, tmp_path: Path, cdmisfa: Cdmisfa, told: tuple[object, ...], why: str
-) -> None:
-    refused = cdmisfa("fork", place / "2.0-live", "--at", 40, *told, "-o", tmp_path / "fork")
-    assert (refused.code, len(refused.err.splitlines())) == (2, 1)
-    assert why in refused.err
-    assert not (tmp_path / "fork").exists()
-
-
 def test_a_fork_that_was_cut_before_it_began_is_refused(
     place: Path, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:

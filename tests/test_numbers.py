@@ -16,7 +16,7 @@ import pyarrow as pa
 import pytest
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from message_files import START, STEP, every, write_mcap, write_table
+from message_files import START, STEP, every, learned_alike, write_mcap, write_table
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.images.decoding import MessageKind, message_decoder
@@ -383,19 +383,17 @@ def test_a_slow_sine_hidden_in_fields_of_noise_is_learned(cdmisfa: Cdmisfa, tmp_
 
 
 def test_commands_take_numbers_of_a_log(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    log, rec = json_mcap(tmp_path), tmp_path / "rec"
-    words = [log, "--topic", "/joint_states", "--field", "position"]
-    plan = cdmisfa("learn", *words, "--dry-run", "--json").json
+    log = json_mcap(tmp_path)
+    how = ("--topic", "/joint_states", "--field", "position")
+    plan = cdmisfa("learn", log, *how, "--dry-run", "--json").json
     assert (plan["size"], plan["streams"][0]["shape"]) == ([3], "3 numbers")
-    assert "90 messages, 0 frames repeated" in cdmisfa("convert", *words, "-o", rec).err
-    with contextlib.closing(RecordedSource(rec)) as source:
+    _, converted = learned_alike(cdmisfa, tmp_path, log, *how)["said"]
+    assert "90 messages, 0 frames repeated" in converted
+    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
         assert (source.take(0, COUNT).frames == angles()).all()
-    options = ["--max-iterations", "2", "--json"]
-    live = cdmisfa("learn", *words, *options, "-o", tmp_path / "run", "--no-rerun").json
-    assert cdmisfa("learn", rec, *options).json["signals_sha256"] == live["signals_sha256"]
-    assert cdmisfa("check", tmp_path / "run").code == 0
-    assert cdmisfa("view", *words, "--save", tmp_path / "v.rrd").code == 0
-    assert cdmisfa("export", *words, "--to", "lerobot", "-o", tmp_path / "set").code == 0
-    refused = cdmisfa("export", *words, "--to", "images", "-o", tmp_path / "pngs")
+    assert cdmisfa("view", log, *how, "--save", tmp_path / "v.rrd").code == 0
+    assert cdmisfa("export", log, *how, "--to", "lerobot", "-o", tmp_path / "set").code == 0
+    refused = cdmisfa("export", log, *how, "--to", "images", "-o", tmp_path / "pngs")
     assert (refused.code, "holds no images" in refused.err) == (2, True)
-    assert cdmisfa("info", rec).code == cdmisfa("verify", rec).code == 0
+    for command in ("info", "verify"):
+        assert cdmisfa(command, tmp_path / "rec").code == 0

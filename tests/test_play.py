@@ -224,10 +224,7 @@ def test_topics_are_played_as_they_are_and_fields_as_numbers(tmp_path: Path) -> 
     assert ["line 4 is left out: a holds no number" in line for line in said] == [True]
 
 
-def test_the_viewer_is_handed_every_frame(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("RERUN_STRICT", "1")
+def test_the_viewer_is_handed_every_frame(recording: Path, tmp_path: Path) -> None:
     from replay.playing.in_rerun import play_in_rerun
 
     taken: list[bytes] = []
@@ -259,7 +256,7 @@ def test_the_viewer_is_handed_every_frame(
         assert shown[entity] == [(t, image.tobytes()) for t, image in enumerate(images)]
 
 
-def test_play_in_the_command_line(cdmisfa: Cdmisfa, recording: Path, oscillatory_run: Path) -> None:
+def test_play_in_the_command_line(cdmisfa: Cdmisfa, recording: Path) -> None:
     done = cdmisfa("play", recording, "--rate", 20)
     assert (done.code, done.out) == (0, f"played {FRAMES} frames, 2.50 s of the recording\n")
     assert "live view http://127.0.0.1:" in done.err
@@ -269,14 +266,6 @@ def test_play_in_the_command_line(cdmisfa: Cdmisfa, recording: Path, oscillatory
         f"played {2 * FRAMES} messages, 2.50 s of the recording\n",
     )
     assert robot.err.startswith("playing at ws://127.0.0.1:")
-    for words, why in (
-        (("play", recording, "--wait", 1), "--wait is for --to foxglove"),
-        (("play", oscillatory_run), "is a run, not a recording"),
-        (("play", recording / "nothing"), "no such file or folder"),
-    ):
-        refused = cdmisfa(*words)
-        assert (refused.code, refused.err.count("\n")) == (2, 1)
-        assert why in refused.err
 
 
 def test_a_port_that_is_taken_is_said(cdmisfa: Cdmisfa, recording: Path) -> None:

@@ -161,22 +161,6 @@ def test_a_key_that_is_not_counted_for_an_algorithm_changes_nothing(algorithm: s
     assert learned(*set(other) & set(oscillatory.used_keys(algorithm))) != unchanged
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["stabillity"], "no experiment 'stabillity': did you mean stability?"),
-        ([], "say which experiment"),
-        (["difficulty", "--recording", str(SAMPLE)], "takes more than 4000: record them"),
-    ],
-)
-def test_what_cannot_be_run_is_refused(
-    words: list[str], said: str, tmp_path: Path, cdmisfa: Cdmisfa
-) -> None:
-    done = cdmisfa("reproduce", *words, "-o", tmp_path)
-    assert done.code == 2
-    assert said in done.err
-
-
 def trials_with(midpoints: dict[float, float], rewarded: int = 100) -> list[Trial]:
     """Ten trials a sigma and epsilon^c, with blocks rewarded before a change at .86 and later."""
     return [

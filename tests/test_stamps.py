@@ -12,7 +12,7 @@ import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_cameras
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from message_files import START, STEP, every, write_mcap
+from message_files import START, STEP, every, learned_alike, write_mcap
 from test_foreign import raw_json
 from test_numbers import bag, joint_state
 from web_server import serving
@@ -128,9 +128,4 @@ def test_learning_by_headers_is_the_same_from_the_conversion(
 ) -> None:
     what, messages = LOGS["protobuf"]
     path = write_mcap(tmp_path / "a.mcap", what, {"/cam": every(STEP, messages())})
-    options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
-    run = cdmisfa("learn", path, "--stamp", "header", *options, "-o", tmp_path / "run").json
-    assert cdmisfa("convert", path, "--stamp", "header", "-o", tmp_path / "rec").code == 0
-    again = cdmisfa("learn", tmp_path / "rec", *options).json
-    assert again["signals_sha256"] == run["signals_sha256"]
-    assert cdmisfa("check", tmp_path / "run").code == 0
+    learned_alike(cdmisfa, tmp_path, path, "--stamp", "header")

@@ -111,14 +111,6 @@ def test_a_recording_is_named_by_its_bytes_and_swept_as_its_scene_is(tmp_path: P
     assert found[0] == found[1]
 
 
-def test_the_grid_is_checked_before_anything_runs(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"did you mean learner\.sigma"):
-        sweep("oscillatory", tmp_path / "s", grid={"learner.sigm": [1]})
-    with pytest.raises(UsageError, match=r"learner\.tau"):
-        sweep("oscillatory", tmp_path / "s", grid={"learner.tau": [40, "many"]})
-    assert not (tmp_path / "s").exists()
-
-
 def test_a_trial_is_a_run_and_its_log_is_made_up_for(tmp_path: Path) -> None:
     sweep("oscillatory", tmp_path, seeds=[5], max_iterations=600)
     bare = rows_of(tmp_path)
@@ -166,12 +158,6 @@ def test_logs_are_swept_as_the_options_say(tmp_path: Path, cdmisfa: Cdmisfa) -> 
     assert (again["skipped"], again["computed"]) == (1, 0)
     later = cdmisfa(*swept, "--topic", "/left", "--from", 0.2, "--json").json
     assert (later["skipped"], later["computed"]) == (0, 1)
-
-
-def test_live_streams_are_to_be_recorded_before_a_sweep(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
-    done = cdmisfa("sweep", "gym:Pendulum-v1", "-o", tmp_path / "sweep", "--seeds", 0)
-    assert (done.code, list(tmp_path.iterdir())) == (2, [])
-    assert "record it first, with cdmisfa record gym:Pendulum-v1 -o REC" in done.err
 
 
 # Going on

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import struct
 import sys
 from pathlib import Path
@@ -59,20 +58,13 @@ def test_other_codecs_come_close_in_any_order(
 ) -> None:
     path = tmp_path / f"a.{ending}"
     images = np.array(write_video(path, pictures(60), codec=codec, pixels=pixels), float)
-    video = VideoImages(path, None)
-    once = [video.image(row) for row in range(60)]
+    with contextlib.closing(VideoImages(path, None)) as video:
+        once = [video.image(row) for row in range(60)]
     small = np.array([shrink(image, *SIZE) for image in once], float)
     assert abs(small - images).mean() < 8
-    other = VideoImages(path, None)
-    for row in (59, 0, 31, 30, 7, 8):
-        np.testing.assert_array_equal(other.image(row), once[row])
-    again = VideoImages(path, None)
-    digest = [
-        hashlib.sha256(b"".join(v.image(r) for r in range(60))).hexdigest() for v in (video, again)
-    ]
-    assert digest[0] == digest[1]
-    for each in (video, other, again):
-        each.close()
+    with contextlib.closing(VideoImages(path, None)) as video:
+        for row in (59, 0, 31, 30, 7, 8, *range(60)):
+            np.testing.assert_array_equal(video.image(row), once[row])
 
 
 def test_limited_luma_becomes_the_full_range(tmp_path: Path) -> None:

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from run_data import DELTA, IMAGE, VECTOR, run_of, write_run
+from run_data import DELTA, IMAGE, VECTOR, module_of, run_of, write_run
 from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
@@ -26,31 +25,13 @@ ITERATIONS = 24
 TAU = 40
 
 
-@pytest.fixture(autouse=True)
-def _strict(monkeypatch):
-    """Rerun drops data that it does not understand, with a warning only, unless told so."""
-    monkeypatch.setenv("RERUN_STRICT", "1")
-
-
 @pytest.fixture(scope="module", params=[IMAGE, VECTOR], ids=["images", "vectors"])
 def shown(request, tmp_path_factory):
     """A run, its records, and the rows of its view."""
     folder = tmp_path_factory.mktemp("run")
     records = write_run(folder / "run.mcap", request.param, ITERATIONS, phi_every=10)
     size = int(np.prod(request.param.frame_shape))
-    module = Module(
-        index=1,
-        stream="a",
-        stream_index=0,
-        iteration=8,
-        phi=np.ones((1, size)),
-        mean=np.zeros(size),
-        band_mean=np.zeros(1),
-        band_sd=np.ones(1),
-        eta=np.ones(1),
-        policy=np.array([0, 1, 1]),
-    )
-    save_modules(folder / "modules.npz", [module])
+    save_modules(folder / "modules.npz", [module_of(1, 8, np.ones((1, size)))])
     build_view(folder, folder / "run.rrd", every=20)
     view = View(folder / "run.rrd")
     return request.param, records, view.rows, view

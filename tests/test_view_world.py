@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_data import IMAGE, PROGRESS, VECTOR, write_run
+from run_data import IMAGE, PROGRESS, VECTOR, module_of, write_run
 from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.config import section_table
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import STATES
 from recorder.log.scenery import NECK, scenery_of, turned
 from recorder.mcap.reader import LogReader
@@ -32,11 +31,6 @@ CONFIG = section_table(IcubConfig())
 SCENE = SourceSpec(("left", "center", "right"), (12, 32), "uint8", TRUTH, 50.0, IMAGE.start_ns)
 LIVE = {"kind": "icub", "seed": 0, "scene": CONFIG}
 ITERATIONS, TAU, EVERY = 12, 40, 20
-
-
-@pytest.fixture(autouse=True)
-def _strict(monkeypatch):
-    monkeypatch.setenv("RERUN_STRICT", "1")
 
 
 def without_models(monkeypatch):
@@ -152,20 +146,8 @@ def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
 def test_a_module_that_said_nothing_later_is_asked_itself(tmp_path):
     records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
     last = records[-1]
-    module = Module(
-        index=last.module,
-        stream=VECTOR.streams[last.stream],
-        stream_index=last.stream,
-        iteration=last.iteration,
-        phi=np.array([[2.0, 0.0]]),
-        mean=np.zeros(2),
-        band_mean=np.zeros(1),
-        band_sd=np.ones(1),
-        eta=np.ones(1),
-        policy=np.zeros(3, dtype=int),
-    )
-    modules = [dataclasses.replace(module, index=i) for i in (1, 2, 3)]
-    save_modules(tmp_path / "modules.npz", modules)
+    told = (last.iteration, np.array([[2.0, 0.0]]), last.stream, VECTOR.streams[last.stream])
+    save_modules(tmp_path / "modules.npz", [module_of(i, *told) for i in (1, 2, 3)])
     build_view(tmp_path, tmp_path / "run.rrd")
     watched = View(tmp_path / "run.rrd").rows["/world/watched"]
     shown = dict(zip(watched["frame"], (v[0] for v in watched["Scalars:scalars"]), strict=True))

@@ -34,12 +34,6 @@ from replay.viewer.program import (
 ITERATIONS = 24
 
 
-@pytest.fixture(autouse=True)
-def _strict(monkeypatch):
-    """Rerun drops data that it does not understand, with a warning only, unless told so."""
-    monkeypatch.setenv("RERUN_STRICT", "1")
-
-
 needs_driver = pytest.mark.skipif(bool(program.missing_driver()), reason=program.missing_driver())
 
 
