@@ -106,6 +106,11 @@ CASES: dict[str, tuple[str, ...]] = {
             )
         )
     },
+    **{
+        f"{words} s3://lab/x": ("s3://lab/x is a URL: name a path on this machine",)
+        for words in ("plot RUN -o", "record icub --scene-picture", "reproduce stability -o")
+    },
+    "record oscillatory -o x --local y": ("--local goes with -o s3://",),
     # a run is no recording
     **{f"learn {run}": (A_RUN,) for run in ("RUN", "RUN/run.mcap")},
     "play RUN": (A_RUN,),

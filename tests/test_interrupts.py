@@ -1,7 +1,8 @@
-"""Signals: they end what a command does, once, wherever they come."""
+"""Signals end what a command does, once, wherever they come; closed streams end nothing."""
 
 from __future__ import annotations
 
+import os
 import pkgutil
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import click
 import pytest
 from conftest import Cdmisfa, Outcome
+from folders import contents
 
 from cdmisfa.cli.app import run
 from cdmisfa.cli.interrupts import SIGNALS, interruptible, stoppable
@@ -175,3 +177,61 @@ def test_what_was_played_to_its_end_was_not_stopped() -> None:
         for i, _ in paced(feed, how, played):
             signals += [i] if i == last else []
         assert played.stopped is stopped
+
+
+CLOSED = ("<&-", ">&-", "2>&-", "<&- >&- 2>&-")
+SCENE = ("record", "oscillatory", "--frames", 256)
+
+
+def closed_streams(closed: str, *words: object) -> subprocess.CompletedProcess[str]:
+    line = f'exec "$0" -m cdmisfa "$@" {closed}'
+    return subprocess.run(
+        ["sh", "-c", line, sys.executable, *map(str, words)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What a recording holds that a command with open streams made."""
+    folder = tmp_path_factory.mktemp("open") / "rec"
+    assert closed_streams("", *SCENE, "-o", folder).returncode == 0
+    return contents(folder)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("closed", CLOSED)
+def test_a_command_and_its_processes_do_their_work_and_say_so(
+    tmp_path: Path, recorded: dict[str, bytes], closed: str, jobs: int
+) -> None:
+    ended = closed_streams(closed, *SCENE, "--jobs", jobs, "-o", tmp_path / "rec")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert bool(ended.stdout) == (">&-" not in closed.split())
+    assert contents(tmp_path / "rec") == recorded
+
+
+@pytest.mark.parametrize("closed", CLOSED)
+def test_an_error_keeps_its_exit_code(tmp_path: Path, closed: str) -> None:
+    assert closed_streams(closed, "info", tmp_path / "nothing").returncode == 2
+
+
+def test_a_stop_inside_of_an_exec_ends_with_its_code_too(tmp_path: Path) -> None:
+    (tmp_path / "stopped.py").write_text(
+        "from cdmisfa.cli import app\n"
+        "kill = 'import os, signal; os.kill(os.getpid(), signal.SIGTERM)'\n"
+        "app.cli.main = lambda **words: exec(kill)\n"
+        "app.main()\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-m", "stopped"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (143, "cdmisfa: interrupted\n")

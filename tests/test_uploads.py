@@ -247,11 +247,6 @@ def test_other_bytes_than_were_sent_are_found(
     [
         (["record", "oscillatory", "-o", "s3://lab"], "s3://lab names no place in a bucket"),
         (["record", "oscillatory", "-o", "s3://nobucket/x"], "s3://nobucket/x: there is no such"),
-        (["record", "oscillatory", "-o", "https://host/x"], "is a URL: name a path"),
-        (["record", "oscillatory", "-o", "x", "--local", "y"], "--local goes with -o s3://"),
-        (["plot", ".", "-o", "s3://lab/x"], "s3://lab/x is a URL: name a path"),
-        (["record", "icub", "--scene-picture", "s3://lab/x"], "is a URL: name a path"),
-        (["reproduce", "stability", "-o", "s3://lab/x"], "s3://lab/x is a URL: name a path"),
         (["upload", "nothing", "s3://lab/x"], "nothing: no such file or folder"),
         (["upload", ".", "there"], "there is no s3:// address"),
     ],
