@@ -31,42 +31,38 @@ def logs(tmp_path: Path) -> Path:
 BOTH = ("--topic", "/cam_left", "--topic", "/cam_right")
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        ("learn oscillatory --topic /left", "is a scene: --topic is for cameras"),
-        (
-            "learn oscillatory --range 0.3:5 --from 1 --stamp header --color",
-            "a scene: --color, --range, --stamp and --from are for cameras",
-        ),
-        ("learn oscillatory --size 12", "128x48"),
-        ("learn pictures", "--rate"),
-        ("learn a.mcap --topic /cam_* --rate 25", "50 images a second, not 25"),
-        ("learn a.mcap --topic /cam_* --from 12 --to 5", "--from 12 is no earlier than --to 5"),
-        (
-            "learn a.mcap --topic /cam_* --range 0.3:5",
-            "a.mcap: it holds no distances (16UC1, 32FC1): --range is for these",
-        ),
-        (
-            "learn uneven.mcap --topic /cam_* --gaps hold --from 0.2 --to 1",
-            "--from 0.2 --to 1 --gaps hold --align time --rate 50",
-        ),
-        ("view t.csv uneven.mcap --time s --save v", "these show a number and images"),
-        (
-            "learn t.csv b.mcap --time s --field a",
-            "there is no a, it has data; --field is of every stream, images are no numbers",
-        ),
-        (
-            "view apart.mcap --save v.rrd",
-            "apart.mcap: /early ends before /late begins, they have no time in common: "
-            "take each by itself, with --topic",
-        ),
-        ("learn joints.mcap", "holds no images; numbers are taken with --field"),
-        ("convert joints.mcap -o rec", "holds no images; numbers are taken with --field"),
-        ("learn joints.mcap --topic /j*", "holds no images; numbers are taken with --field"),
-        ("view joints.mcap --save v.rrd", "it holds no images"),
-    ],
-)
+NO_IMAGES = "holds no images; numbers are taken with --field"
+REFUSED = {
+    "learn oscillatory --topic /left": "is a scene: --topic is for cameras",
+    "learn oscillatory --range 0.3:5 --from 1 --stamp header --color": (
+        "a scene: --color, --range, --stamp and --from are for cameras"
+    ),
+    "learn oscillatory --size 12": "128x48",
+    "learn pictures": "--rate",
+    "learn a.mcap --topic /cam_* --rate 25": "50 images a second, not 25",
+    "learn a.mcap --topic /cam_* --from 12 --to 5": "--from 12 is no earlier than --to 5",
+    "learn a.mcap --topic /cam_* --range 0.3:5": (
+        "a.mcap: it holds no distances (16UC1, 32FC1): --range is for these"
+    ),
+    "learn uneven.mcap --topic /cam_* --gaps hold --from 0.2 --to 1": (
+        "--from 0.2 --to 1 --gaps hold --align time --rate 50"
+    ),
+    "view t.csv uneven.mcap --time s --save v": "these show a number and images",
+    "learn t.csv b.mcap --time s --field a": (
+        "there is no a, it has data; --field is of every stream, images are no numbers"
+    ),
+    "view apart.mcap --save v.rrd": (
+        "apart.mcap: /early ends before /late begins, they have no time in common: "
+        "take each by itself, with --topic"
+    ),
+    "learn joints.mcap": NO_IMAGES,
+    "convert joints.mcap -o rec": NO_IMAGES,
+    "learn joints.mcap --topic /j*": NO_IMAGES,
+    "view joints.mcap --save v.rrd": "it holds no images",
+}
+
+
+@pytest.mark.parametrize(("words", "why"), REFUSED.items())
 def test_what_cannot_be_taken_is_refused_in_one_line(
     words: str, why: str, cdmisfa: Cdmisfa, logs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -190,7 +190,7 @@ def _segment(content: bytes) -> Segment | None:
         raise MalformedRecord("a chunk index lies about its chunk's length")
     if not places:
         return None
-    # Not `strict`, and not sorted if not needed: of a long log this is most of what opening takes.
+    # Neither `strict` nor a sort of one: opening a log of many chunks is mostly this function.
     parts = list(zip(places[1::2], places[::2]))  # noqa: B905
     if len(parts) > 1:
         parts.sort()
