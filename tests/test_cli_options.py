@@ -11,6 +11,7 @@ from conftest import Cdmisfa
 
 from cdmisfa.cli.app import COMMANDS, cli
 from cdmisfa.cli.making import GROUPS, GroupedCommand, Option
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.options import given, option_name, option_words
 from recorder.cameras.options import LiveOptions
 from recorder.images.options import ImageOptions
@@ -109,3 +110,38 @@ def test_help_lists_each_option_once_the_common_six_first(cdmisfa: Cdmisfa, name
     else:
         assert headings == ["Options"]
     assert isinstance(command, GroupedCommand) or name not in ("learn", "record", "view")
+
+
+@pytest.mark.parametrize(
+    ("chosen", "why"),
+    [
+        ({"rate": float("nan")}, r"--rate is nan: it must be in \[0.001, 1000000\]"),
+        ({"rate": -5.0}, "--rate is -5.0"),
+        ({"rate": 1e12}, "--rate is 1e12|--rate is 1000000000000.0"),
+        ({"rate": "25"}, "--rate is 25"),
+        ({"size": (0, 4)}, r"--size is \(0, 4\): give height and width above 0"),
+        ({"size": "x"}, "--size is x"),
+        ({"start": float("nan")}, "--from is nan: give seconds from 0 on"),
+        ({"stop": "late"}, "--to is late"),
+    ],
+)
+def test_settings_of_a_log_or_a_caller_are_checked_like_typed_ones(
+    chosen: dict[str, Any], why: str
+) -> None:
+    with pytest.raises(UsageError, match=f"^({why})"):
+        CameraOptions(**chosen)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("convert", "a.mcap", "--rate", "nan"),
+        ("record", "oscillatory", "--fsync-every", "nan"),
+        ("play", "a.mcap", "--rate", "nan"),
+        ("learn", "oscillatory", "--timeout", "nan"),
+    ],
+)
+def test_no_number_is_no_number(cdmisfa: Cdmisfa, words: tuple[str, ...]) -> None:
+    done = cdmisfa(*words)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert f"{words[-2]}': nan is no finite number" in done.err

@@ -6,8 +6,12 @@ The command line makes its options of them; see `cdmisfa.cli.options.options_of`
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
+from numbers import Real
 from typing import Any, Final
+
+from cdmisfa.core.errors import UsageError
 
 SIZE, TIME, RANGE = "WxH", "TIME", "LOW:HIGH"
 """Units that are written in a way of their own: (height, width), seconds, two numbers."""
@@ -66,3 +70,32 @@ def option_words(settings: Any) -> list[str]:
             elif not isinstance(each, bool):
                 words.append(_WRITTEN.get(field.metadata["unit"], str)(each))
     return words
+
+
+def check_settings(settings: Any) -> None:
+    """Refuse numbers that their settings do not take: a log's or a caller's, not typed by hand.
+
+    Raises:
+        UsageError: it names the option.
+    """
+    for field in given(settings):
+        value, told = getattr(settings, field.name), field.metadata
+        if told["unit"] == SIZE and not _all_numbers(value, 2, 1):
+            raise UsageError(f"{option_name(field)} is {value}: give height and width above 0")
+        if told["unit"] == TIME and not _all_numbers([value], 1, 0):
+            raise UsageError(f"{option_name(field)} is {value}: give seconds from 0 on")
+        least, most = told["least"], told["most"]
+        if least is not None and not _all_numbers([value], 1, least, most):
+            raise UsageError(
+                f"{option_name(field)} is {value}: it must be in [{least:g}, {most:.0f}]"
+            )
+
+
+def _all_numbers(values: Any, count: int, least: float, most: float = math.inf) -> bool:
+    """Whether these are so many finite numbers within bounds."""
+    return (
+        isinstance(values, list | tuple)
+        and len(values) == count
+        and all(isinstance(value, Real) for value in values)
+        and all(math.isfinite(value) and least <= value <= most for value in values)
+    )

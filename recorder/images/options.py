@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from cdmisfa.core.options import RANGE, SIZE, given, option_name, setting
+from cdmisfa.core.options import RANGE, SIZE, check_settings, given, option_name, setting
 
 Size = tuple[int, int]
 """(height, width) in pixels."""
@@ -66,6 +66,9 @@ class ImageOptions:
         name="range",
         group="Images",
     )
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
     def given(self) -> tuple[str, ...]:
         """The options of the command line that say other than the defaults."""
