@@ -26,6 +26,10 @@ def scalars(entity: dict[str, list[Any]]) -> NDArray[np.float64]:
 class View:
     """A view as it stands in its file.
 
+    Args:
+        path: of the file.
+        only: the one entity that is looked at.
+
     Attributes:
         rows: of each entity its columns over all chunks, in the order of frames.
         static: of each entity what is said of it once.
@@ -33,12 +37,14 @@ class View:
         layout: the components of each part of the layout.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, only: str = "") -> None:
         reader = RrdReader(str(path))
         self.rows: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
         self.static: dict[str, dict[str, Any]] = defaultdict(dict)
         self.layout: dict[str, dict[str, Any]] = defaultdict(dict)
         for chunk in reader.stream():
+            if only and chunk.entity_path != only:
+                continue  # to read numbers one by one takes long
             batch = chunk.to_record_batch()
             for name in batch.schema.names:
                 times = batch.column(name).type == pa.timestamp("ns")
