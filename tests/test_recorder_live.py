@@ -98,16 +98,18 @@ def test_the_truth_is_where_the_objects_are(seen):
     assert columns[y == 0.6].max() < columns[y == 0.4].min()
 
 
-def test_views_are_as_if_all_were_drawn_each_frame_but_for_the_robot(seen):
+@pytest.mark.parametrize(("robot_seen", "frames"), [(False, 30), (True, 1)])
+def test_views_are_as_if_all_were_drawn_each_frame_but_for_the_robot(seen, robot_seen, frames):
     """The table drawn once and the objects over it, against everything drawn, the robot, too."""
     eyes, motions = SCENE.eyes, Motions(SCENE, 1)
     lens = perspective(eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far)
     differing = 0
-    with contextlib.closing(World(SCENE, robot_seen=True)) as world:
-        for t, places in enumerate(motions.positions(0, 30)):
+    with contextlib.closing(World(SCENE, robot_seen=robot_seen)) as world:
+        for t, places in enumerate(motions.positions(0, frames)):
             world.place(places)
             for view, yaw in enumerate(eyes.yaw):
-                world.turn_head(yaw)
+                if robot_seen:
+                    world.turn_head(yaw)
                 pair = [
                     grey(world.render(m, lens, eyes.width, eyes.height, eyes.light)[0])
                     for m in (eye_matrix(eyes, world.neck, yaw, side) for side in (1, -1))
