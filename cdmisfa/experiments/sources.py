@@ -17,11 +17,11 @@ from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, open_live
 from recorder.config import RecordConfig, SceneConfig, view_names
 from recorder.images.options import ImageOptions
-from recorder.recording import ViewRecording, record
 from recorder.world.scenes import SCENES, open_scene
 from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
+    from recorder.recording import ViewRecording
     from replay.camera_logs.source import ForeignSource
 
 OF_CAMERAS = "progress"
@@ -391,6 +391,8 @@ def convert(source: ForeignSource, folder: Path, **options: Any) -> list[ViewRec
         LogDamagedError: an image cannot be read.
         LogWriteError: the disk does not take it.
     """
+    from recorder.recording import record
+
     if source.spec.length is None:
         raise UsageError("a source that loops has no end: convert it without looping")
     return record(source, folder, names=view_names(source.spec.streams), **options)

@@ -20,9 +20,7 @@ from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, as_array, chec
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from recorder.images.framing import framings
-from recorder.images.options import Fit, Size
-from recorder.images.pixels import RECIPE
-from recorder.images.videos import COLOR_RECIPE
+from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
 
 LARGEST_SEED: Final = 2**31 - 1
 

@@ -5,20 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
-from recorder.cameras.live import LiveSource
 from recorder.cameras.options import LiveOptions
-from recorder.cameras.readers import Camera, CameraFrames, Readers
 from recorder.config import view_names
-from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.options import Reading
-from recorder.images.pixels import RECIPE
-from recorder.images.videos import COLOR_RECIPE, VIDEO_RECIPE
+from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, Reading
+
+if TYPE_CHECKING:
+    from recorder.cameras.readers import Camera
 
 PACKAGES: Final = "packages"
 """Key of what cameras of plugins say of themselves: the versions of their packages."""
@@ -100,6 +98,9 @@ def open_live(
     Raises:
         UsageError: a word names nothing, a package is missing, or a camera cannot be opened.
     """
+    from recorder.cameras.live import LiveSource
+    from recorder.cameras.readers import CameraFrames, Readers
+
     names = live_names(words)
     schemes = [word.partition(":")[0].lower() for word in words]
     if "gym" in schemes:

@@ -13,9 +13,6 @@ from cdmisfa.core.errors import UsageError
 from recorder.images.options import Depth
 from recorder.images.pixels import MalformedImage
 
-NUMBERS_RECIPE: Final = "numbers as they are, float64"
-"""How numbers become a frame, for the record."""
-
 MOST: Final = 100_000
 """Most numbers that a message may give."""
 

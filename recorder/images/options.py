@@ -3,9 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from cdmisfa.core.options import RANGE, SIZE, check_settings, given, option_name, setting
+
+RECIPE: Final = (
+    "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
+    "size: area average (Pillow BOX); turned as the EXIF of a JPEG or PNG says"
+)
+"""How any image becomes a frame, for the record."""
+
+VIDEO_RECIPE: Final = (
+    f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
+    "((Y - 16) * 510 + 219) // 438 where its range is limited, by the nearest quarter turns of its "
+    "display matrix"
+)
+"""How a picture of a video becomes a frame, for the record."""
+
+COLOR_RECIPE: Final = (
+    "red, green and blue beside one another, each as gray is; of a Bayer pattern green is the mean "
+    "of two; of a video by BT.709 or, where it states another or none, BT.601, in 16 bit whole "
+    "numbers, with each chroma pixel repeated"
+)
+"""How any image becomes a frame in colours, for the record."""
+
+NUMBERS_RECIPE: Final = "numbers as they are, float64"
+"""How numbers become a frame, for the record."""
 
 Size = tuple[int, int]
 """(height, width) in pixels."""

@@ -24,12 +24,6 @@ Shown = NDArray[Any]
 MAX_PIXELS: Final = 36_000_000
 """Largest image that is decoded, more than one of 7680x4320."""
 
-RECIPE: Final = (
-    "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
-    "size: area average (Pillow BOX); turned as the EXIF of a JPEG or PNG says"
-)
-"""How any image becomes a frame, for the record."""
-
 ENCODINGS: Final[Mapping[str, str]] = {
     "mono8": "g",
     "8UC1": "g",

@@ -15,21 +15,7 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import BUDGET
-from recorder.images.pixels import MAX_PIXELS, RECIPE, MalformedImage, raw_image
-
-VIDEO_RECIPE: Final = (
-    f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
-    "((Y - 16) * 510 + 219) // 438 where its range is limited, by the nearest quarter turns of its "
-    "display matrix"
-)
-"""How a picture of a video becomes a frame, for the record."""
-
-COLOR_RECIPE: Final = (
-    "red, green and blue beside one another, each as gray is; of a Bayer pattern green is the mean "
-    "of two; of a video by BT.709 or, where it states another or none, BT.601, in 16 bit whole "
-    "numbers, with each chroma pixel repeated"
-)
-"""How any image becomes a frame in colours, for the record."""
+from recorder.images.pixels import MAX_PIXELS, MalformedImage, raw_image
 
 HELD: Final = 17
 """Pictures that a decoder holds at most, where they are made from one another: 16 and its own."""

@@ -23,8 +23,7 @@ import zstandard
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
 from recorder.images.decoding import MessageKind, decoder_of
-from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.options import IMAGES, Reading
+from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
 from recorder.mcap.records import MAX_CHUNK
 from replay.camera_logs.stream import (
     ChannelFacts,

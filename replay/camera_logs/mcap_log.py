@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from recorder.images.decoding import MessageKind, decoder_of
-from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.options import IMAGES, Reading
+from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Channel, MalformedRecord, Segment
 from recorder.mcap.tables import MessageTable

@@ -19,9 +19,9 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, data_bytes, opened_regular, read_regular
-from recorder.images.options import Size
+from recorder.images.options import VIDEO_RECIPE, Size
 from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
-from recorder.images.videos import VIDEO_RECIPE, frame_colors, frame_gray, pyav
+from recorder.images.videos import frame_colors, frame_gray, pyav
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.options import Size
+from recorder.images.options import VIDEO_RECIPE, Size
 from recorder.images.pixels import MalformedImage, Shown
-from recorder.images.videos import VIDEO_RECIPE, VideoPackets
+from recorder.images.videos import VideoPackets
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, UnreadableError, sorted_times
 from replay.storage.location import Location, Url

@@ -15,8 +15,8 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.options import option_words
 from recorder.images.fields import rounded
 from recorder.images.framing import framings
+from recorder.images.options import COLOR_RECIPE
 from recorder.images.pixels import Shown, UnknownPixels
-from recorder.images.videos import COLOR_RECIPE
 from replay.camera_logs.alignment import (
     Rows,
     by_index,

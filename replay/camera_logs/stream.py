@@ -16,8 +16,8 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
 from recorder.images.messages import SCHEMAS, Decoder, holds_distances
-from recorder.images.options import Reading, Size
-from recorder.images.pixels import RECIPE, Shown
+from recorder.images.options import RECIPE, Reading, Size
+from recorder.images.pixels import Shown
 from recorder.log.messages import VECTOR_SCHEMA
 from replay.storage.location import Location
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.fields import EXACT, NUMBERS_RECIPE, Field, bounded
-from recorder.images.options import IMAGES, Reading
+from recorder.images.fields import EXACT, Field, bounded
+from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
 from recorder.images.pixels import Shown
 from replay.camera_logs.csv_table import LoadedTable, called, read_table
 from replay.camera_logs.stream import (
