@@ -1,6 +1,6 @@
 """Settings that are options of commands, too: fields of dataclasses, each stated once.
 
-The command line makes its options of them; see `cdmisfa.cli.options.options_of`.
+The command line makes its options of them; see `cdmisfa.cli.making.options_of`.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cdmisfa.agents.learners import LEARNERS, open_learner
 from cdmisfa.core.blocks import SeekableSource, SourceSpec
@@ -23,16 +23,11 @@ from recorder.cameras.words import is_live
 from recorder.log.files import found_path, partial_path, relative_path
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
-from replay.recordings.source import RecordedSource
-from replay.recordings.view_file import NoRecordingError
 from replay.runs.folders import RUN_FILE
 from replay.runs.keyframes import read_keyframe
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.run import known_to_both, stated_source
 from replay.storage.location import location
-
-if TYPE_CHECKING:
-    from cdmisfa.experiments.recompute import Recomputation
 
 COMMAND = "command"
 """Key of a manifest: the command that began the run, which may differ when it is resumed."""
@@ -168,6 +163,9 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
 
 
 def _is_recording(words: Sequence[str]) -> bool:
+    from replay.recordings.source import RecordedSource  # what begins a run needs no reader
+    from replay.recordings.view_file import NoRecordingError
+
     try:
         RecordedSource([location(word) for word in words]).close()
     except NoRecordingError:
@@ -335,20 +333,26 @@ def reconfigured(learner: Learner, span: ConfigSpan, spec: SourceSpec) -> Learne
 
 
 def continued(
-    parent: Recomputation, settings: Sequence[str], seed: int | None
+    parent: RunHeader, learner: Learner, settings: Sequence[str], seed: int | None
 ) -> tuple[ConfigSpan, LearnerState]:
-    """The configuration of a fork, and its learner's state, where its parent was computed again.
+    """The configuration of a fork, and its learner's state where it begins.
+
+    Args:
+        parent: the header of the run that it goes on from.
+        learner: that run's, where it goes on.
+        settings: what is set anew, as of --set.
+        seed: of the random choices from there on; None the parent's.
 
     Raises:
         UsageError: a setting cannot change.
     """
-    manifest = parent.header.manifest
+    manifest = parent.manifest
     before = int(manifest["seed"])
     config = _config_of_fork(manifest["config"]["learner"], settings)
     seed = before if seed is None else seed
-    span = ConfigSpan(parent.learner.iteration, config, seed, reseeded=seed != before)
+    span = ConfigSpan(learner.iteration, config, seed, reseeded=seed != before)
     try:
-        return span, reconfigured(parent.learner, span, parent.header.spec).state
+        return span, reconfigured(learner, span, parent.spec).state
     except (ValueError, UsageError) as error:
         raise UsageError(
             f"{' '.join(settings)}: what was learned does not fit it ({error}): fork with keys "

@@ -205,7 +205,7 @@ class Session:
             )
         with cls.at(log, at, source) as stopped:
             manifest = stopped.header.manifest
-            span, state = continued(stopped, settings, seed)
+            span, state = continued(stopped.header, stopped.learner, settings, seed)
             sections = {k: part for k, part in manifest["config"].items() if k != "learner"}
             words, options = command_of_fork(log.parent, source, sections, settings)
             options |= {"seed": span.seed, **(limits or {})}

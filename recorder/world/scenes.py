@@ -8,8 +8,6 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, MutableMapping
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -18,7 +16,6 @@ from weakref import WeakKeyDictionary
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.processes import Workers
 from cdmisfa.core.registry import Registry
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.icub.config import IcubConfig
@@ -26,6 +23,8 @@ from recorder.world.icub.source import IcubSource, scene_picture
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from PIL.Image import Image
 
 
@@ -200,6 +199,10 @@ def render_in_processes(
     Raises:
         CdmisfaError: a process died, or could not open the scene.
     """
+    from concurrent.futures.process import BrokenProcessPool  # 20 ms, of no use to one process
+
+    from cdmisfa.core.processes import Workers
+
     pending: deque[Future[list[Block]]] = deque()
     workers = Workers(jobs)
     opened = SCENES[scene.name].open, scene.config, scene.record
