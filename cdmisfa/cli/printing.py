@@ -157,7 +157,7 @@ def announce(address: str) -> None:
 
 def outcome_line(outcome: Mapping[str, Any]) -> str:
     """What became of a stream, in words."""
-    came = outcome["state"].replace("_", " ")
+    came = "not decided" if outcome["state"] == "learning" else outcome["state"].replace("_", " ")
     if outcome["module"] is not None:
         came += f" by module {outcome['module']}"
     if outcome["slowness"] is not None:
@@ -191,8 +191,11 @@ def print_result(result: RunResult, *, as_json: bool) -> None:
         print_table(("module", "stream", "iteration", "eta"), without)
     else:
         click.echo("no module was learned")
-    for outcome in result.summary.get("streams", ()):
-        click.echo(outcome_line(outcome))
+    if "streams" in result.summary:
+        for outcome in result.summary["streams"]:
+            click.echo(outcome_line(outcome))
+    elif result.undecided:
+        click.echo(f"not decided: {', '.join(result.undecided)}")
     click.echo(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
     click.echo(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
@@ -297,6 +300,11 @@ class Reporter(Sink):
             note = f"{modules} saved, {left}"
             self._shown.update(learner.iteration, self._max_iterations, note)
 
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """See `Sink`."""
+        if level == "WARNING":
+            self._shown.say(text)
+
     def hashing(self, done: int, size: int) -> None:
         """Show how far the source's files are hashed, once that is waited for."""
         if not self._hashing:
@@ -308,13 +316,7 @@ class Reporter(Sink):
 
 
 @contextlib.contextmanager
-def learning(max_iterations: int | None, *, as_json: bool) -> Iterator[tuple[Stop, Reporter]]:
-    """Show the progress of a run, end it at a signal, and print its result if its source ended."""
-    from cdmisfa.experiments.run_folder import RunExhaustedError
-
-    try:
-        with bar("learning", "blocks") as shown, stoppable() as stop:
-            yield stop, Reporter(shown, max_iterations)
-    except RunExhaustedError as error:
-        print_result(error.result, as_json=as_json)
-        raise
+def learning(max_iterations: int | None) -> Iterator[tuple[Stop, Reporter]]:
+    """Show the progress of a run, and end it at a signal."""
+    with bar("learning", "blocks") as shown, stoppable() as stop:
+        yield stop, Reporter(shown, max_iterations)
