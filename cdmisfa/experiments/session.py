@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
-from cdmisfa.core.errors import LogExhaustedError, LogWriteError, UsageError
+from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.experiments.loop import Digest, Keyframes, learn
 from cdmisfa.experiments.recompute import Recomputation, check_run
@@ -34,7 +34,6 @@ from cdmisfa.experiments.resume import (
 )
 from cdmisfa.experiments.run_folder import (
     OpenLog,
-    RunExhaustedError,
     RunResult,
     opened_log,
     versions_used,
@@ -265,7 +264,7 @@ class Session:
 
         Raises:
             UsageError: the folder is not empty and is not to be replaced, or is in use.
-            RunExhaustedError: a recording ended first; what was learned is saved.
+            LogExhaustedError: the source has not enough for a single block.
         """
         digest, log = Digest(), None
         told: list[Sink] = [digest]
@@ -296,22 +295,17 @@ class Session:
                 self._copy_log(log, digest)
                 if live:
                     view.earlier(log.path.parent)
-            ended, exhausted = "log_exhausted", None
-            try:
-                ended = learn(self.source, self.learner, (*told, *sinks), stop=stop, **self._limits)
-            except LogExhaustedError as error:
-                exhausted = error
+            ended = learn(self.source, self.learner, (*told, *sinks), stop=stop, **self._limits)
             described = description(self.source, told=hashing)
             result = self._result(described, digest.hexdigest(), ended)
             if log is not None:
                 stated = {**self.manifest, "versions": self._versions}
                 write_results(log, result, stated, view=rerun)
-        if exhausted is not None:
-            raise RunExhaustedError(exhausted, result) from exhausted
         return result
 
     def _result(self, described: Mapping[str, Any], signals_sha256: str, ended: str) -> RunResult:
         learner = self.learner
+        summary = learner.summary()
         return RunResult(
             run=str(self.folder) if self.folder is not None else None,
             source=described,
@@ -321,8 +315,9 @@ class Session:
             frames=learner.iteration * learner.tau,
             signals_sha256=signals_sha256,
             modules=tuple(learner.modules),
-            summary=learner.summary(),
+            summary=summary,
             ended=ended,
+            undecided=() if learner.over else _undecided(learner, self.source, summary),
         )
 
     def _copy_log(self, log: RunWriter, digest: Digest) -> None:
@@ -350,6 +345,16 @@ class Session:
                 before.unlink()
             except OSError as error:
                 raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
+
+
+def _undecided(
+    learner: Learner, source: FrameSource, summary: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """The streams that are still being learned, or, where a learner says none, without a module."""
+    if "streams" in summary:
+        return tuple(one["stream"] for one in summary["streams"] if one["state"] == "learning")
+    learned = {module.stream_index for module in learner.modules}
+    return tuple(name for s, name in enumerate(source.spec.streams) if s not in learned)
 
 
 def _changes(changed: Mapping[str, Sequence[Any]]) -> list[str]:

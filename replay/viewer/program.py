@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.untrusted import printable
 from replay.view.bindings import viewer_client, viewer_program
 
 SIZE = re.compile(r"[1-9]\d{2,3}x[1-9]\d{2,3}")
@@ -40,6 +41,11 @@ TOLD_SECONDS = 30.0
 def environment() -> dict[str, str]:
     """Environment for the viewer: CI=1 switches its telemetry off."""
     return {**os.environ, "CI": "1"}
+
+
+def tell(line: str) -> None:
+    """A line on stderr, at once."""
+    print(printable(line), file=sys.stderr, flush=True)
 
 
 def check_limit(limit: str) -> str:

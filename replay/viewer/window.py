@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -18,6 +17,7 @@ from replay.viewer.program import (
     has_display,
     private_host,
     run_program,
+    tell,
 )
 from replay.viewer.web import page_of, page_server, pieces_of, served, shown_at
 
@@ -74,7 +74,7 @@ def serve(
         view = file or opened.enter_context(open(name, "rb"))
         page = page_of(viewer_port, lambda: pieces_of(view))
         address = opened.enter_context(served(page, port))
-        print(shown_at(address), file=sys.stderr, flush=True)
+        tell(shown_at(address))
         run_program(page_server(viewer_port))
 
 
