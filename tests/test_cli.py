@@ -65,7 +65,7 @@ class TestJson:
     ) -> None:
         done = cdmisfa("info", oscillatory_run)
         assert done.code == 0
-        assert "run, complete, checksums ok, seed 0, ended: the asked number of iter" in done.out
+        assert "run, whole, checksums ok, seed 0, ended: the asked number of iter" in done.out
         assert "2016-01-01 00:00:00.000Z" in done.out
         torn = tmp_path / "x1.mcap"
         data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())

@@ -161,6 +161,7 @@ class LogStructure:
             where = f"byte {self._at}"
             try:
                 if not self._step(limit) and not self._resume_after_cut():
+                    self.missing = f"cut short: {self.missing}"
                     break
             except MalformedRecord as error:
                 self._refuse(where, str(error))
@@ -169,7 +170,7 @@ class LogStructure:
                     break
         self._close_loose()
         if self.data_crc is not None and self._limit is None and not self.missing:
-            self.missing = "the summary at its end is cut, every message is there"
+            self.missing = "cut short: its summary is not all there, every message is"
         self.complete = self._limit is not None and self.data_crc is not None
         if self.complete:
             self._compare_with_summary()
