@@ -39,6 +39,18 @@ _threads = 0
 _before = (0, 0)
 
 
+def printable(text: str) -> str:
+    """A text of which a terminal shows every character and obeys none.
+
+    What does not print by itself, as controls, line breaks and marks that turn text around, is
+    written as in a Python string.
+    """
+    if text.isprintable():
+        return text
+    letters = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return "".join(letters)
+
+
 @contextlib.contextmanager
 def budget(size: int = BUDGET) -> Iterator[None]:
     """Limit this process to so much more memory than it has while the body runs.
