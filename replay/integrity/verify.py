@@ -234,7 +234,10 @@ def _check_images(path: Path) -> LogCheck:
     """Decode every image of a camera log that has no checksums."""
     files = (FileCheck(str(path), "absent"),)
     try:
-        notes = table_notes(path) if log_format(path) == "table" else []
+        kind = log_format(path)
+        notes = table_notes(path) if kind == "table" else []
+        if kind == "bag":
+            notes = [f"{path}: a ROS bag has no checksums, changed bytes may go unnoticed"]
         channels = channels_of(path, whole=True)
     except LogDamagedError as error:
         return LogCheck((as_problem(path, error),), files)
