@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
-from recorder.log.files import atomic_write, refuse_special
+from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
 from replay.camera_logs.options import CameraOptions
 from replay.export.frames import write_film, write_films, write_images
 from replay.export.lerobot import write_lerobot
@@ -101,6 +101,10 @@ def export(
     for named in paths:
         if not named.exists():
             raise UsageError(f"{named}: no such file or folder")
+    if form in TABLES:
+        refuse_unless(out, f"{form} is written", f".{form}", "")
+    elif form in ("images", "lerobot") or (form == "mp4" and out.suffix != ".mp4"):
+        refuse_named_as_file(out)
     if described.of == "recording":
         return _export_recording(paths, out, form, lossless, cameras, about)
     if out.is_dir():

@@ -6,16 +6,22 @@ import contextlib
 import itertools
 import json
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
-from replay.camera_logs.opening import channels_of, log_format, only_foreign, open_images
+from replay.camera_logs.opening import (
+    channels_of,
+    image_topics,
+    log_format,
+    only_foreign,
+    open_images,
+)
 from replay.camera_logs.stream import ImageStream
 from replay.camera_logs.table import table_notes
 from replay.inputs import locations
@@ -190,7 +196,7 @@ def check_log(path: str | Location) -> LogCheck:
     final record states. Of a recording also: each view has every frame once; of a folder, that
     the views have the same frames and none is missing.
 
-    Of a camera log that is not in MCAP files every image is decoded.
+    Of a camera log every image is decoded.
 
     Raises:
         UsageError: no such log.
@@ -214,6 +220,10 @@ def check_log(path: str | Location) -> LogCheck:
             elif passed is not None and not found:
                 problems += passed.problems()
                 notes += passed.notes()
+            elif not found:
+                told = _check_topics(file, image_topics(file))
+                problems += told.problems
+                notes += told.notes
         if views:
             problems += _check_views(views, alone=copy.is_file())
     unique = dict.fromkeys(moved(problem, copy, place) for problem in problems)
@@ -222,19 +232,34 @@ def check_log(path: str | Location) -> LogCheck:
 
 def _check_images(path: Path) -> LogCheck:
     """Decode every image of a camera log that has no checksums."""
+    files = (FileCheck(str(path), "absent"),)
+    try:
+        kind = log_format(path)
+        notes = table_notes(path) if kind == "table" else []
+        if kind == "bag":
+            notes = [f"{path}: a ROS bag has no checksums, changed bytes may go unnoticed"]
+        channels = channels_of(path, whole=True)
+    except LogDamagedError as error:
+        return LogCheck((as_problem(path, error),), files)
+    found = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
+    return LogCheck(found.problems, files, (*notes, *found.notes))
+
+
+def _check_topics(path: Location, topics: Iterable[str]) -> LogCheck:
+    """Decode every image on some topics of a camera log."""
     problems: list[Problem] = []
     notes: dict[str, None] = {}
-    try:
-        if log_format(path) == "table":
-            notes |= dict.fromkeys(table_notes(path))
-        for channel in channels_of(path, whole=True):
-            if channel.images and channel.messages:
-                with contextlib.closing(open_images(path, channel.topic)) as images:
-                    problems += _broken(images)
-                    notes |= dict.fromkeys(images.warnings)
-    except LogDamagedError as error:
-        problems.append(as_problem(path, error))
-    return LogCheck(tuple(problems), (FileCheck(str(path), "absent"),), tuple(notes))
+    for topic in topics:
+        try:
+            with contextlib.closing(open_images(path, topic)) as images:
+                problems += _broken(images)
+                notes |= dict.fromkeys(images.warnings)
+        except LogDamagedError as error:
+            problems.append(as_problem(path, error))
+        except UsageError as error:  # it needs an option, or what is not installed
+            said = str(error).removeprefix(f"{path}: ")
+            notes[f"{path}: {topic} is not decoded: {said}"] = None
+    return LogCheck(tuple(problems), (), tuple(notes))
 
 
 def _broken(images: ImageStream) -> Iterator[Problem]:

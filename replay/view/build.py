@@ -18,7 +18,7 @@ from rerun.chunk import Chunk
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.files import atomic_write, refuse_taken
+from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.camera_logs.options import CameraOptions
 from replay.inputs import Logged, holds_run, open_to_look
 from replay.recordings.source import RecordedSource, head_poses
@@ -129,6 +129,7 @@ def recording_to(
         UsageError: it exists and `force` is not set, or its folder is not there.
         CdmisfaError: the file cannot be written.
     """
+    refuse_unless(out, "the view is a file of Rerun", ".rrd", "")
     refuse_taken(out, force=force)
     if not out.parent.is_dir():
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.files import atomic_write, refuse_taken, refuse_unless_png
+from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.camera_logs.source import ForeignSource
 from replay.inputs import holds_run, open_to_look
 from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
@@ -106,7 +106,7 @@ def draw_table(folder: Path, out: Path, *, force: bool = False, window: str = WI
 
 
 def _refuse(out: Path, window: str, *, force: bool) -> None:
-    refuse_unless_png(out)
+    refuse_unless(out, "the picture is a PNG", ".png")
     refuse_taken(out, force=force)
     check_window(window)
     if missing_driver():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -18,8 +17,9 @@ from replay.viewer.program import (
     has_display,
     private_host,
     run_program,
+    tell,
 )
-from replay.viewer.web import page_of, page_server, served, shown_at
+from replay.viewer.web import page_of, page_server, pieces_of, served, shown_at
 
 
 def open_window(
@@ -72,8 +72,9 @@ def serve(
     with contextlib.ExitStack() as opened:
         name, file = opened.enter_context(_opened(path, every, all_views, tab))
         view = file or opened.enter_context(open(name, "rb"))
-        address = opened.enter_context(served(page_of(viewer_port, view), port))
-        print(shown_at(address), file=sys.stderr, flush=True)
+        page = page_of(viewer_port, lambda: pieces_of(view))
+        address = opened.enter_context(served(page, port))
+        tell(shown_at(address))
         run_program(page_server(viewer_port))
 
 

@@ -131,7 +131,7 @@ def learn_command(
         if dry_run:
             print_plan(frames, as_json=as_json)
             return
-        with learning(told["max_iterations"], as_json=as_json) as (stop, reporter):
+        with learning(told["max_iterations"]) as (stop, reporter):
             if hasattr(frames, "stop"):
                 frames.stop = stop  # waiting for frames ends with a signal, too
             result = run(

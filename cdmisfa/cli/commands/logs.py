@@ -14,7 +14,9 @@ from cdmisfa.cli.making import flag, option
 from cdmisfa.cli.printing import (
     print_document,
     print_json,
+    print_line,
     print_table,
+    print_text,
     quoted,
     say_about,
     tell,
@@ -57,10 +59,10 @@ def _print_info(found: LogInfo) -> None:
         from cdmisfa.experiments.loop import ENDINGS
 
         words.append(f"ended: {ENDINGS.get(found.ended, found.ended)}")
-    click.echo(f"{found.path}: {', '.join(words)}")
+    print_line(f"{found.path}: {', '.join(words)}")
     if found.signals is not None and found.signals.missing:
         version, lacks = found.signals.version, ", ".join(found.signals.missing)
-        click.echo(f"signals of version {version}: {lacks} are not in it, read as NaN")
+        print_line(f"signals of version {version}: {lacks} are not in it, read as NaN")
     head: tuple[str, ...] = ("topic", "messages", "encoding", "schema", "from", "to")
     rows: list[tuple[object, ...]] = [
         (c.topic, c.messages, c.encoding, c.schema, _clock(c.start_ns), _clock(c.end_ns))
@@ -98,9 +100,9 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
     if as_json:
         print_json(found.as_json())
     elif found.ok:
-        click.echo(f"{' '.join(path)}: whole")
+        print_line(f"{' '.join(path)}: whole")
         for note in found.notes:
-            click.echo(note)
+            print_line(note)
     else:
         print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
     if not found.ok:
@@ -134,7 +136,7 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
             print_table(("lost", "what"), [(p.where, p.what) for p in found.lost])
         for mended in found.mended:
             tell(f"{mended.where}: {mended.what}")
-        click.echo(f"written {out}")
+        print_line(f"written {out}")
     if not found.complete:
         ctx.exit(LogDamagedError.exit_code)
 
@@ -198,14 +200,14 @@ def compare_command(
             view=save,
         )
     elif len(runs) == 2:
-        click.echo(str(different[0]) if different else "identical, bit for bit")
+        print_line(str(different[0]) if different else "identical, bit for bit")
     else:
         print_table(HEAD, [row.cells() for row in rows])
     for explanation in filter(None, (row.explanation() for row in rows)):
         if not as_json:
-            click.echo(explanation)
+            print_line(explanation)
     if first and second and not as_json:
-        click.echo(f"signals of iteration {at}:")
+        print_line(f"signals of iteration {at}:")
         print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
     if save is not None and not as_json:
         tell(f"view {save}    look at it: cdmisfa view {quoted(save)}")
@@ -233,7 +235,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
         print_document(run=str(run), figures=[str(file) for file in files])
         return
     for file in files:
-        click.echo(file)
+        print_line(file)
     if not files:
         tell(f"nothing is drawn of {run}: it has no iterations")
 
@@ -284,7 +286,7 @@ def export_command(
     if as_json:
         print_document(path=" ".join(map(str, path)), file=str(out), rows=rows)
         return
-    click.echo(f"{rows} {FORMS[form].unit} written to {out}")
+    print_line(f"{rows} {FORMS[form].unit} written to {out}")
 
 
 def _is_film(out: Path) -> bool:
@@ -306,7 +308,7 @@ def signals_command(markdown: bool, as_json: bool) -> None:
     columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "show", "since", "about")
     rows = [[signal[column] for column in columns] for signal in signals]
     if markdown:
-        click.echo(_page(SCHEMA_VERSION, columns, rows))
+        print_text(_page(SCHEMA_VERSION, columns, rows))
     else:
         print_table(columns, rows)
 

@@ -18,7 +18,9 @@ from cdmisfa.cli.printing import (
     bar,
     print_document,
     print_json,
+    print_line,
     print_table,
+    print_text,
     quoted,
     say_failed,
     tell,
@@ -100,12 +102,12 @@ def sweep_command(
         each = {name: getattr(report, name) for name in counts}
         print_document(sweep=report.folder, **each, failed=failed)
     else:
-        click.echo(
+        print_line(
             f"{report.trials} trials: {report.computed} computed, {report.skipped} finished "
             f"before, {len(failed)} failed"
         )
         say_failed(failed)
-        click.echo(f"look at it: cdmisfa results {quoted(out)}")
+        print_line(f"look at it: cdmisfa results {quoted(out)}")
     if failed:
         ctx.exit(1)
 
@@ -157,9 +159,9 @@ def results_command(folder: Path, csv: bool, latex: bool, as_json: bool) -> None
     if as_json:
         print_json(results.as_json(points))
     elif csv:
-        click.echo(results.as_csv(points), nl=False)
+        print_text(results.as_csv(points))
     elif latex:
-        click.echo(results.as_latex(points), nl=False)
+        print_text(results.as_latex(points))
     else:
         print_table(*results.as_table(points))
 
@@ -225,7 +227,7 @@ def reproduce_command(
             lines.append(f"{holds}  {claim['claim']}: {claim['detail']}")
         lines.append("")
     if not as_json:
-        click.echo("\n".join(lines), nl=False)
+        print_text("\n".join(lines))
     for document in documents:
         check_claims(document)
 
@@ -348,11 +350,11 @@ def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
     told = {"policy": " ".join, "correlation": "{:.3f}".format}
     rows = [[told.get(key, str)(module[key]) for key in head] for module in report["modules"]]
     print_table(head, rows)
-    click.echo()
+    print_line()
     for figure in report["figures"]:
         if figure.suffix == ".png":
-            click.echo(f"figure     {figure}")
-    click.echo(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
+            print_line(f"figure     {figure}")
+    print_line(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
 
 
 @contextmanager

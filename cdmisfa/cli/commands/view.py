@@ -12,7 +12,7 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, options_of, word
-from cdmisfa.cli.printing import announce, bar, print_document, say_about, tell
+from cdmisfa.cli.printing import announce, bar, print_document, print_line, say_about, tell
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.options import CameraOptions
 
@@ -209,6 +209,6 @@ def play_command(
     if as_json:
         print_document(**{what: played.count, "seconds": played.seconds})
     else:
-        click.echo(f"played {played.count} {what}, {played.seconds:.2f} s of the recording")
+        print_line(f"played {played.count} {what}, {played.seconds:.2f} s of the recording")
     if played.stopped and not loop:
         ctx.exit(stop.exit_code)
