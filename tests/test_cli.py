@@ -198,7 +198,7 @@ class TestRuns:
         forked = cdmisfa("fork", run, "--at", 5, "-o", fork, "--no-rerun", "--json")
         assert (forked.code, forked.json["ended"]) == (0, "log_exhausted")
         info = cdmisfa("info", run)
-        assert "complete" in info.out
+        assert "whole" in info.out
         assert "ended: there were no more frames" in info.out
         looped = cdmisfa(*words, "--loop", "--max-iterations", blocks + 5, "--json").json
         assert looped["iterations"] == blocks + 5

@@ -32,7 +32,6 @@ from recorder.mcap.walk import LogStructure
 Check = Literal["chunks", "data", "pass"]
 
 NO_CHECKSUMS = "it has no checksums, nothing vouches for its bytes"
-"""What is said of a log in which no CRC protects messages."""
 
 _SENT_LESS = (
     "the server sends less than the log, or the log was cut (cdmisfa recover saves what is there)"
@@ -130,7 +129,7 @@ class LogReader:
     def warnings(self) -> list[str]:
         """What is missing, was left out or is unproven, a line each that names the file."""
         problems = [f"{p.where}: {p.what}" for p in self.problems]
-        said = [f"{self.path}: {text}" for text in (self.missing, *problems) if text]
+        said = (f"{self.path}: {text}" for text in (self.missing, *problems) if text)
         return [*said, *self.unproven()]
 
     def unproven(self) -> list[str]:

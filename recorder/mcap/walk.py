@@ -161,7 +161,6 @@ class LogStructure:
             where = f"byte {self._at}"
             try:
                 if not self._step(limit) and not self._resume_after_cut():
-                    self.missing = f"cut short: {self.missing}"
                     break
             except MalformedRecord as error:
                 self._refuse(where, str(error))
@@ -343,7 +342,7 @@ class LogStructure:
                 if self._at < limit
                 else "the data section has no end record"
             )
-        self.missing = what
+        self.missing = f"cut short: {what}"
         return False
 
     def _resume_after(self) -> bool:
@@ -365,7 +364,7 @@ class LogStructure:
 
     def _resume_after_cut(self) -> bool:
         """Continue where it was a length that made the file look cut."""
-        what = self.missing
+        what = self.missing.removeprefix("cut short: ")
         torn = self.tail is None and self._at < self._file.size
         if not (self._resync and torn and self._resume_after()):
             return False
