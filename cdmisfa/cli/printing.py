@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
     from cdmisfa.experiments.run_folder import RunResult
+    from replay.viewer.broadcast import Broadcast
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
@@ -158,13 +159,13 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
         warn(warning)
 
 
-def announce(address: str) -> None:
+def announce(broadcast: Broadcast) -> None:
     """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.program import has_display, open_privately
+    from replay.viewer.program import has_display
 
-    tell(f"live view {address}    look at it: rerun {address}")
+    tell(f"live view {broadcast.address}    look at it in a browser of this machine")
     if has_display():
-        open_privately(address)
+        broadcast.open_window()
 
 
 def outcome_line(outcome: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, description
@@ -44,6 +44,9 @@ from recorder.log.files import folder_here
 from replay.runs.folders import run_log
 from replay.runs.run import stated_source, states_whole
 from replay.runs.writer import RunWriter
+
+if TYPE_CHECKING:
+    from replay.viewer.broadcast import Broadcast
 
 Hashing = Callable[[int, int], None]
 """Told of bytes of the source that were hashed and of how many, while that is waited for."""
@@ -244,7 +247,7 @@ class Session:
         fsync_every: float | None = None,
         rerun: bool = True,
         live: bool = False,
-        announce: Callable[[str], None] = lambda address: None,
+        announce: Callable[[Broadcast], None] = lambda broadcast: None,
         hashing: Hashing = _not_told,
     ) -> RunResult:
         """Learn until nothing is left to learn, and log every signal.
@@ -257,7 +260,7 @@ class Session:
                 more; None leaves it to the operating system until the run is finished.
             rerun: also build the Rerun view.
             live: also show the run in Rerun while it learns, to viewers on this machine.
-            announce: called with the address of the live view.
+            announce: called with what viewers of the live view are served.
             hashing: told of bytes of the source that were hashed, and of how many, while the run
                 waits for what it states of its source at its end.
 
@@ -289,7 +292,7 @@ class Session:
                 tau, outputs = self.learner.tau, len(self.learner.phi)
                 view = LiveView(self.source.spec, self.manifest, tau, outputs, run=self.folder)
                 told.append(opened.enter_context(view))
-                announce(view.address)
+                announce(view.broadcast)
             if log is not None and self.before is not None:
                 self._copy_log(log, digest)
                 if live:

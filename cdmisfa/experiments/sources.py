@@ -337,7 +337,6 @@ def open_cameras_now(
     preset: str | None = None,
     settings: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
-    stop: Callable[[], bool] = lambda: False,
 ) -> tuple[FrameSource, Configuration]:
     """Open live streams, as `is_live` finds them, on one clock; see `open_live`.
 
@@ -348,7 +347,6 @@ def open_cameras_now(
         preset: instead of that of cameras.
         settings: `section.key=value` words.
         say: told in a line when a camera's state changes.
-        stop: asked while waiting for the first pictures.
 
     Raises:
         UsageError: a word names no live stream or one that cannot be opened, or a wrong
@@ -366,7 +364,7 @@ def open_cameras_now(
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
     live = replace(live, **framing)
     told = log_settings(settings, words[0])
-    source = open_live([str(word) for word in words], live, say=say, stop=stop)
+    source = open_live([str(word) for word in words], live, say=say)
     try:
         configuration = configure_for(source.spec, source.describe(), preset, told, live.seed)
     except BaseException:

@@ -84,7 +84,6 @@ def open_live(
     options: LiveOptions,
     *,
     say: Callable[[str], None] = lambda line: None,
-    stop: Callable[[], bool] = lambda: False,
 ) -> FrameSource:
     """Open live streams on one clock.
 
@@ -92,7 +91,6 @@ def open_live(
         words: a stream each.
         options: see there.
         say: told in a line when a camera's state changes.
-        stop: asked while waiting for the first pictures.
 
     Raises:
         UsageError: a word names nothing, a package is missing, or a camera cannot be opened.
@@ -126,7 +124,7 @@ def open_live(
         about["range_metres"] = list(options.depth)
     frames = CameraFrames(names, options.size, options.fit, color=options.color, say=say)
     readers = Readers(cameras, frames.frame, on_loss=options.on_loss, stall=options.stall, say=say)
-    source = LiveSource(readers, names, about, rate=options.rate, hold=options.hold, stop=stop)
+    source = LiveSource(readers, names, about, rate=options.rate, hold=options.hold)
     may_show = [
         "depth" in kind.takes and getattr(camera, "distances", None) is not False
         for kind, camera in zip(kinds, cameras, strict=True)

@@ -16,8 +16,9 @@ from cdmisfa.core.blocks import stream_name, stream_names
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import VIDEO_RECIPE, Size
-from recorder.images.pixels import MalformedImage, Shown
+from recorder.images.pixels import Shown
 from recorder.images.videos import VideoPackets
+from recorder.images.whole import MalformedImage
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, UnreadableError, sorted_times
 from replay.storage.location import Location, Url
