@@ -6,7 +6,7 @@ import contextlib
 import fnmatch
 import glob
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,9 @@ from replay.storage.opening import log_files, open_store, starts_as_log
 
 Logged = RecordedSource | ForeignSource
 """Frames from logs."""
+
+About = Callable[[Logged], None]
+"""Given logs that were opened to be looked at, to say what they are."""
 
 
 def open_log(
@@ -64,7 +67,8 @@ def open_to_look(
 ) -> Logged:
     """Open logs to view, export or play: every topic of images, aligned by time if need be.
 
-    What `cameras` choose is opened as they say.
+    What `cameras` choose is opened as they say. Of up to `AT_ONCE` bytes all are checked, of more
+    what is read.
 
     Raises:
         UsageError: as for `open_log`.
@@ -76,14 +80,25 @@ def open_to_look(
     chosen = bool(cameras.topics or cameras.fields)
     if not chosen and not any(map(only_foreign, paths)):
         with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
-            return RecordedSource(paths, salvage=salvage)
+            return _checked(RecordedSource(paths, salvage=salvage))
     goal = ("convert", "REC")
     if not chosen:
         cameras = replace(cameras, topics=ALL)
     try:
-        return open_cameras(paths, cameras, salvage=salvage, goal=goal)
+        return _checked(open_cameras(paths, cameras, salvage=salvage, goal=goal))
     except UnequalError:
-        return open_cameras(paths, replace(cameras, align="time"), salvage=salvage, goal=goal)
+        cameras = replace(cameras, align="time")
+        return _checked(open_cameras(paths, cameras, salvage=salvage, goal=goal))
+
+
+def _checked(source: Logged) -> Logged:
+    """Logs, with the checksum over all their data checked where that takes no time."""
+    try:
+        source.describe_at_once()
+    except BaseException:
+        source.close()
+        raise
+    return source
 
 
 def open_cameras(

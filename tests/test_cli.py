@@ -66,7 +66,7 @@ class TestJson:
     ) -> None:
         done = cdmisfa("info", oscillatory_run)
         assert done.code == 0
-        assert "run, complete, checksums ok, seed 0, ended: the asked number of iter" in done.out
+        assert "run, whole, checksums ok, seed 0, ended: the asked number of iter" in done.out
         assert "2016-01-01 00:00:00.000Z" in done.out
         torn = tmp_path / "x1.mcap"
         data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())
@@ -198,7 +198,7 @@ class TestRuns:
         forked = cdmisfa("fork", run, "--at", 5, "-o", fork, "--no-rerun", "--json")
         assert (forked.code, forked.json["ended"]) == (0, "log_exhausted")
         info = cdmisfa("info", run)
-        assert "complete" in info.out
+        assert "whole" in info.out
         assert "ended: there were no more frames" in info.out
         looped = cdmisfa(*words, "--loop", "--max-iterations", blocks + 5, "--json").json
         assert looped["iterations"] == blocks + 5

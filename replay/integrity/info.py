@@ -20,6 +20,7 @@ from recorder.mcap.records import Channel, MalformedRecord, Problem, Segment
 from recorder.mcap.tables import MessageTable
 from replay.camera_logs.opening import channels_of, only_foreign
 from replay.inputs import locations
+from replay.integrity.state import Crc, State, crc_of, state_of, worst
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
@@ -32,7 +33,6 @@ CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""
 
 Kind = Literal["recording", "run", "foreign"]
-Crc = Literal["ok", "absent", "bad", "unchecked"]
 Times = NDArray[np.uint64]
 
 
@@ -92,6 +92,8 @@ class LogInfo:
         seed: the one that all files name, if they do.
         ended: why a run ended, where its folder says so.
         signals: of a run.
+        state: the worst of the files.
+        notes: what is no problem, and what nothing proves.
     """
 
     path: str
@@ -105,6 +107,8 @@ class LogInfo:
     seed: int | None = None
     ended: str | None = None
     signals: RecordInfo | None = None
+    state: State = "whole"
+    notes: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The description as JSON values."""
@@ -124,7 +128,7 @@ def describe(*words: str | Location) -> LogInfo:
     named = locations(words)
     files = [found for place in named for found in _describe_place(place)]
     kinds, states = {f.kind for f in files}, {f.crc for f in files}
-    worst: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
+    by_weight: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
     named_alike = Counter(name for f in files for name in f.metadata)
     metadata = {
         name if named_alike[name] == 1 else f.path: records
@@ -138,12 +142,14 @@ def describe(*words: str | Location) -> LogInfo:
         channels=tuple(c for f in files for c in f.channels),
         chunks=sum(f.chunks for f in files),
         complete=all(f.complete for f in files),
-        crc=next(state for state in worst if state in states),
+        crc=next(state for state in by_weight if state in states),
         problems=tuple(p for f in files for p in f.problems),
         metadata=metadata,
         seed=_seed(records),
         ended=_ended(named[0]) if len(named) == 1 and isinstance(named[0], Path) else None,
         signals=next((f.signals for f in files if f.signals is not None), None),
+        state=worst(f.state for f in files),
+        notes=tuple(note for f in files for note in f.notes),
     )
 
 
@@ -183,6 +189,8 @@ def _describe_file(path: Location) -> LogInfo:
             problems=problems_of(reader),
             metadata={path.name: metadata},
             signals=RecordInfo(version, missing_signals(version)) if version else None,
+            state=state_of(reader),
+            notes=tuple(reader.unproven()),
         )
 
 
@@ -192,13 +200,6 @@ def kind_of(reader: LogReader) -> Kind:
     if RECORDING_METADATA in names:
         return "recording"
     return "run" if RUN_METADATA in names else "foreign"
-
-
-def crc_of(reader: LogReader) -> Crc:
-    """What the checksums of a log that was decoded amount to."""
-    if any("CRC" in problem.what for problem in reader.problems):
-        return "bad"
-    return "absent" if reader.crc_absent() else "ok"
 
 
 def moved(problem: Problem, copy: Path, place: Location) -> Problem:
