@@ -24,7 +24,7 @@ from recorder.log.files import (
     prepared_folder,
     refuse_existing,
     refuse_taken,
-    refuse_unless_png,
+    refuse_unless,
 )
 from recorder.log.manifest import RecordingSpec, RecordingStart, store_start
 from recorder.log.resume import (
@@ -392,7 +392,7 @@ def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = Fa
         able = " or ".join(able for able, entry in SCENES.items() if entry.picture)
         raise UsageError(f"the scene {name} has no picture: --scene-picture is for {able}")
     path = Path(path)
-    refuse_unless_png(path)
+    refuse_unless(path, "the picture is a PNG", ".png")
     refuse_taken(path, force=force)
     image = draw(config)
     with atomic_write(path) as partial:

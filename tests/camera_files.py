@@ -50,21 +50,24 @@ def packed(image: np.ndarray) -> bytes:
     return bytes(CompressedImage(data=encoded(image), format="png").SerializeToString())
 
 
-def write_cameras(path: Path, cameras: Mapping[str, tuple[int, int]]) -> None:
+def write_cameras(path: Path, cameras: Mapping[str, tuple[int, int]], **options: bool) -> None:
     """A log of foxglove.RawImage: topic to count and milliseconds between images, by time."""
     topics = {}
     for seed, (topic, (count, step)) in enumerate(cameras.items()):
         images = enumerate(pictures(count, seed))
         topics[topic] = [(START_MS + i * step, image) for i, image in images]
-    write_images(path, topics)
+    write_images(path, topics, **options)
 
 
 def write_images(
-    path: Path, topics: Mapping[str, Iterable[tuple[int, np.ndarray]]], profile: str = ""
+    path: Path,
+    topics: Mapping[str, Iterable[tuple[int, np.ndarray]]],
+    profile: str = "",
+    **options: bool,
 ) -> Path:
     """A log of foxglove.RawImage: on each topic milliseconds and images; by time."""
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4096)
+        writer = Writer(file, chunk_size=4096, **options)
         writer.start(profile)
         schema = writer.register_schema(RAW.schema, RAW.encoding, b"")
         messages = []

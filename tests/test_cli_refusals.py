@@ -54,6 +54,21 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn oscillatory --resume": ("-o",),
     "learnn": ("did you mean learn?",),
     "view x --web --save y.rrd": ("--save",),
+    # what is written has the name of its kind
+    "view RUN --save x.mp4": ("x.mp4: the view is a file of Rerun, name it x.rrd",),
+    "view REC --save x.mcap": ("x.mcap: the view is a file of Rerun, name it x.rrd",),
+    "view RUN --screenshot x.rrd": ("x.rrd: the picture is a PNG, name it x.png",),
+    "compare RUN RUN --save x.png": ("x.png: the view is a file of Rerun, name it x.rrd",),
+    "export RUN --to parquet -o z.csv": ("z.csv: parquet is written, name it z.parquet",),
+    "export REC --to images -o z.csv": ("z.csv: a folder is written, name it without .csv",),
+    "export REC --to mp4 -o z.parquet": ("z.parquet: a folder is written",),
+    "export REC --to lerobot -o z.parquet": ("z.parquet: a folder is written",),
+    "recover REC/x1.mcap -o x.csv": ("x.csv: the log is an MCAP file, name it x.mcap",),
+    "at RUN 3 --save-module x.csv": ("x.csv: the module is an NPZ file, name it x.npz",),
+    **{
+        f"{words} -o x.mcap": ("x.mcap: a folder is written, name it without .mcap",)
+        for words in ("record oscillatory", "learn oscillatory", "convert LOGS", "sweep REC")
+    },
     "view x --at 3": ("--screenshot",),
     # a scene is one, and has no options of cameras
     "learn oscillatory icub": (ONE,),

@@ -14,7 +14,6 @@ import io
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import NoReturn
 
 import click
@@ -23,6 +22,7 @@ from cdmisfa.cli.interrupts import end_at_once, ignore_at_the_end, interruptible
 from cdmisfa.cli.on_demand import names_on_demand
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.untrusted import printable
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
@@ -64,6 +64,9 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "doctor": ("doctor", "Say what this machine has and what it lacks."),
 }
 """Each command with its module in this package and its line of help."""
+
+LONGEST_NAME = 255
+"""Bytes of a file's name that file systems take."""
 
 CREATED = 10_000
 """Objects after which Python collects garbage: imports create many and leave none, and with the
@@ -168,8 +171,19 @@ def run(args: Sequence[str]) -> int:
         except Exception as error:
             if os.environ.get("CDMISFA_TRACEBACK") == "1":
                 raise
+            if _was_interrupt(error):
+                return _fail("interrupted", stop.exit_code)
             return _explain(error)
     return code if isinstance(code, int) else 0
+
+
+def _was_interrupt(error: BaseException | None) -> bool:
+    """Whether an interrupt became this error; Python 3.11 makes one in `__set_name__` another."""
+    if isinstance(error, CdmisfaError | OSError):  # what failed on the way out is said
+        return False
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _refuse_odd_names(args: Sequence[str]) -> None:
@@ -196,8 +210,11 @@ def _explain(error: Exception) -> int:
         case click.ClickException():
             return _fail(error.format_message(), error.exit_code)
         case OSError(errno=errno.ENAMETOOLONG):
-            name = max(Path(str(error.filename)).parts, key=len)
-            return _fail(f"{name[:20]}... has {len(name)} letters: choose a shorter name", 2)
+            path = os.fspath(error.filename)
+            name = max(path.split(os.sep), key=len)
+            what = "name" if len(os.fsencode(name)) > LONGEST_NAME else "path"
+            long = name if what == "name" else path
+            return _fail(f"{long[:20]}... has {len(long)} letters: choose a shorter {what}", 2)
         case OSError():
             where = f"{error.filename}: " if error.filename else ""
             return _fail(f"{where}{error.strerror or error}", 1)
@@ -212,5 +229,5 @@ def _explain(error: Exception) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    click.echo(f"cdmisfa: {' '.join(message.split())}", err=True)
+    click.echo(printable(f"cdmisfa: {' '.join(message.split())}"), err=True)
     return code

@@ -16,6 +16,7 @@ import click
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
+from cdmisfa.core.untrusted import printable
 
 if TYPE_CHECKING:
     from cdmisfa.cli.interrupts import Stop
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
     from cdmisfa.experiments.run_folder import RunResult
+    from replay.viewer.broadcast import Broadcast
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
@@ -39,11 +41,22 @@ def quoted(path: str | Path) -> str:
     return shlex.quote(str(path))
 
 
+def print_line(line: object = "", *, err: bool = False) -> None:
+    """A line on stdout, or stderr; names in it cannot steer the terminal."""
+    click.echo(printable(str(line)), err=err)
+
+
+def print_text(text: str) -> None:
+    """Several lines on stdout."""
+    for line in text.removesuffix("\n").split("\n"):
+        print_line(line)
+
+
 def print_json(document: Mapping[str, Any]) -> None:
     """One JSON document on stdout; see `plain`."""
     from cdmisfa.experiments.documents import plain
 
-    click.echo(json.dumps(plain(document), allow_nan=False))
+    print_line(json.dumps(plain(document), allow_nan=False))
 
 
 def print_document(**each: Any) -> None:
@@ -53,23 +66,23 @@ def print_document(**each: Any) -> None:
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Rows of cells in aligned columns under a ruled head, on stdout."""
-    cells = [[str(cell) for cell in row] for row in (head, *rows)]
+    cells = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     cells.insert(1, ["-" * width for width in widths])
     for row in cells:
-        click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
+        print_line("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
 
 
 def say_failed(rows: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
     """Say which trials failed."""
     for row in rows:
         at = " ".join(f"{key}={value}" for key, value in row["point"].items())
-        click.echo(f"failed: {at} seed {row['seed']}: {row['error']}", err=err)
+        print_line(f"failed: {at} seed {row['seed']}: {row['error']}", err=err)
 
 
 def tell(line: str) -> None:
     """A line on stderr."""
-    click.echo(line, err=True)
+    print_line(line, err=True)
 
 
 def warn(line: str) -> None:
@@ -137,27 +150,27 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
     ]  # fmt: skip
     print_table(head, cells)
     seconds = source.frames / source.spec.fps
-    click.echo(f"{source.frames} frames at {source.spec.fps:g} a second, {seconds:.6g} s")
+    print_line(f"{source.frames} frames at {source.spec.fps:g} a second, {seconds:.6g} s")
     unknown = [row["stream"] for row in rows if row["size_changes"] is None]
     if unknown:
         said = "whether images change their size shows when they are read"
-        click.echo(f"{said}: {' '.join(unknown)}")
+        print_line(f"{said}: {' '.join(unknown)}")
     for warning in warnings:
         warn(warning)
 
 
-def announce(address: str) -> None:
+def announce(broadcast: Broadcast) -> None:
     """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.program import has_display, open_privately
+    from replay.viewer.program import has_display
 
-    tell(f"live view {address}    look at it: rerun {address}")
+    tell(f"live view {broadcast.address}    look at it in a browser of this machine")
     if has_display():
-        open_privately(address)
+        broadcast.open_window()
 
 
 def outcome_line(outcome: Mapping[str, Any]) -> str:
     """What became of a stream, in words."""
-    came = outcome["state"].replace("_", " ")
+    came = "not decided" if outcome["state"] == "learning" else outcome["state"].replace("_", " ")
     if outcome["module"] is not None:
         came += f" by module {outcome['module']}"
     if outcome["slowness"] is not None:
@@ -190,14 +203,17 @@ def print_result(result: RunResult, *, as_json: bool) -> None:
         without = [(index, stream, iteration, eta) for index, stream, iteration, _, eta in rows]
         print_table(("module", "stream", "iteration", "eta"), without)
     else:
-        click.echo("no module was learned")
-    for outcome in result.summary.get("streams", ()):
-        click.echo(outcome_line(outcome))
-    click.echo(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
-    click.echo(f"signals sha256 {result.signals_sha256}")
+        print_line("no module was learned")
+    if "streams" in result.summary:
+        for outcome in result.summary["streams"]:
+            print_line(outcome_line(outcome))
+    elif result.undecided:
+        print_line(f"not decided: {', '.join(result.undecided)}")
+    print_line(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
+    print_line(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
         look = f"look at it: cdmisfa view {quoted(result.run)}"
-        click.echo(f"run {result.run}    {look}")
+        print_line(f"run {result.run}    {look}")
 
 
 class Bar:
@@ -262,7 +278,7 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
             progress.reset(task, description=title, total=None, note="")
 
         def say(self, line: str) -> None:
-            progress.console.print(line, markup=False, highlight=False)
+            progress.console.print(printable(line), markup=False, highlight=False, emoji=False)
 
     with progress:
         task = progress.add_task(title, total=None, note="")
@@ -297,6 +313,11 @@ class Reporter(Sink):
             note = f"{modules} saved, {left}"
             self._shown.update(learner.iteration, self._max_iterations, note)
 
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """See `Sink`."""
+        if level == "WARNING":
+            self._shown.say(text)
+
     def hashing(self, done: int, size: int) -> None:
         """Show how far the source's files are hashed, once that is waited for."""
         if not self._hashing:
@@ -308,13 +329,7 @@ class Reporter(Sink):
 
 
 @contextlib.contextmanager
-def learning(max_iterations: int | None, *, as_json: bool) -> Iterator[tuple[Stop, Reporter]]:
-    """Show the progress of a run, end it at a signal, and print its result if its source ended."""
-    from cdmisfa.experiments.run_folder import RunExhaustedError
-
-    try:
-        with bar("learning", "blocks") as shown, stoppable() as stop:
-            yield stop, Reporter(shown, max_iterations)
-    except RunExhaustedError as error:
-        print_result(error.result, as_json=as_json)
-        raise
+def learning(max_iterations: int | None) -> Iterator[tuple[Stop, Reporter]]:
+    """Show the progress of a run, and end it at a signal."""
+    with bar("learning", "blocks") as shown, stoppable() as stop:
+        yield stop, Reporter(shown, max_iterations)

@@ -13,8 +13,8 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.making import Command
-from cdmisfa.cli.printing import bar, quoted
-from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.cli.printing import bar, quoted, tell
+from cdmisfa.core.errors import CdmisfaError, UsageError
 
 if TYPE_CHECKING:
     from replay.storage.location import Url
@@ -113,21 +113,18 @@ def uploaded(
     if there and resume and not place.exists():
         with bar("fetching", "bytes") as shown:
             fetch(url, place, there, shown.update)
-        click.echo(f"{place} was fetched from {url}", err=True)
-    click.echo(f"written to {place}, and uploaded to {url} when it is finished", err=True)
+        tell(f"{place} was fetched from {url}")
+    tell(f"written to {place}, and uploaded to {url} when it is finished")
     again = f"cdmisfa upload {quoted(place)} {quoted(str(url))}"
     try:
         yield place
     except UsageError:
         raise
     except BaseException as error:
-        ended = isinstance(error, LogExhaustedError)  # the result is as far as its source goes
-        if isinstance(error, click.exceptions.Exit):
-            ended = error.exit_code < INTERRUPTED
-        if ended:
+        if isinstance(error, click.exceptions.Exit) and error.exit_code < INTERRUPTED:
             upload_now(place, url, again)
         elif place.exists():
-            click.echo(f"{place} is not uploaded: when it is finished, {again}", err=True)
+            tell(f"{place} is not uploaded: when it is finished, {again}")
         raise
     upload_now(place, url, again)
 
@@ -152,6 +149,6 @@ def upload_now(place: Path, url: Url, again: str) -> tuple[int, int]:
         raise KeyboardInterrupt(f"{place} is kept, upload it with {again}") from None
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        click.echo(f"warning: {url}{others[0]}{more} was there before, and is not of it", err=True)
-    click.echo(f"uploaded {url}: {files} files, {size} bytes, checked", err=True)
+        tell(f"warning: {url}{others[0]}{more} was there before, and is not of it")
+    tell(f"uploaded {url}: {files} files, {size} bytes, checked")
     return files, size

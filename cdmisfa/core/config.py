@@ -203,7 +203,7 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
             text = _preset_text(name)
         else:
             if name not in presets():
-                raise UsageError(f"no preset {name!r}: {did_you_mean(name, presets())}")
+                raise UsageError(f"no preset {name[:40]!r}: {did_you_mean(name, presets())}")
             text = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_text("utf-8")
         document = copy.deepcopy(_parsed(text))
     except OSError as error:

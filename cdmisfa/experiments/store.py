@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, parse_json
-from recorder.log.files import held, make_folder, refuse_special, to_disk
+from recorder.log.files import held, make_folder, refuse_named_as_file, refuse_special, to_disk
 
 ROWS = "rows.jsonl"
 """The rows, in a folder."""
@@ -214,6 +214,7 @@ def run_trials(
         EngineError: no scheduler answers.
     """
     refuse_special(folder)
+    refuse_named_as_file(folder)
 
     def is_missing(trial: Task) -> bool:
         row = store.rows.get(trial.id)

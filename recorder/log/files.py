@@ -30,6 +30,11 @@ RECORDING = "recording.json"
 Beside the logs, because these hold the same bytes whatever length was wanted first.
 """
 
+OF_FILES: Final = frozenset(
+    {".arrow", ".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"}
+)
+"""Endings of what is a file wherever it is written."""
+
 _HELD: Final[set[tuple[int, int]]] = set()
 """Folders that this process holds."""
 
@@ -95,10 +100,22 @@ def refuse_taken(path: Path, *, force: bool) -> None:
         raise UsageError(f"{path} exists: choose another name or overwrite with --force")
 
 
-def refuse_unless_png(path: Path) -> None:
-    """Refuse to write a picture, which is a PNG, under the name of something else."""
-    if path.suffix.lower() != ".png":
-        raise UsageError(f"{path}: the picture is a PNG, name it {path.stem}.png")
+def refuse_unless(path: Path, what: str, *endings: str) -> None:
+    """Refuse to write a file under the name of another kind.
+
+    Args:
+        path: of the file.
+        what: it is, as "the picture is a PNG".
+        endings: that it may have, the first is its own.
+    """
+    if path.suffix.lower() not in endings:
+        raise UsageError(f"{path}: {what}, name it {path.stem}{endings[0]}")
+
+
+def refuse_named_as_file(folder: Path) -> None:
+    """Refuse to make a folder under the name of a file."""
+    if (ending := folder.suffix.lower()) in OF_FILES:
+        raise UsageError(f"{folder}: a folder is written, name it without {ending}")
 
 
 def refuse_special(*paths: Path) -> None:
@@ -122,6 +139,7 @@ def refuse_existing(folder: Path, *, force: bool, goes_on: bool = True) -> None:
     """
     refuse_special(folder)
     refuse_file(folder)
+    refuse_named_as_file(folder)
     if folder.exists() and not force and any(folder.iterdir()):
         other = ", go on with --resume" if goes_on else ""
         raise UsageError(f"{folder} exists: choose another folder{other} or overwrite with --force")

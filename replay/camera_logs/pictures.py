@@ -51,6 +51,8 @@ class FolderImages(ImageStream):
         for file in self._files:
             check_regular(file, MAX_PICTURE)
         self.encoding = " ".join(sorted({p.suffix.lower()[1:] for p in self._files}))
+        if self.encoding != "png":
+            self.warnings = [f"{path}: a JPEG has no checksums, damaged pixels may go unnoticed"]
         self.times = np.empty(0, np.uint64)
 
     @property

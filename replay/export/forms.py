@@ -11,12 +11,12 @@ from typing import Any, Literal
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
-from recorder.log.files import atomic_write, refuse_special
+from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
 from replay.camera_logs.options import CameraOptions
 from replay.export.frames import write_film, write_films, write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
-from replay.inputs import Logged, holds_run, open_to_look
+from replay.inputs import About, holds_run, open_to_look
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def export(
     force: bool = False,
     lossless: bool = False,
     cameras: CameraOptions | None = None,
-    about: Callable[[Logged], None] = lambda source: None,
+    about: About = lambda source: None,
 ) -> int:
     """Write a run's signals, or a recording's frames, in another form.
 
@@ -101,6 +101,10 @@ def export(
     for named in paths:
         if not named.exists():
             raise UsageError(f"{named}: no such file or folder")
+    if form in TABLES:
+        refuse_unless(out, f"{form} is written", f".{form}", "")
+    elif form in ("images", "lerobot") or (form == "mp4" and out.suffix != ".mp4"):
+        refuse_named_as_file(out)
     if described.of == "recording":
         return _export_recording(paths, out, form, lossless, cameras, about)
     if out.is_dir():
@@ -124,7 +128,7 @@ def _export_recording(
     form: str,
     lossless: bool,
     cameras: CameraOptions | None,
-    about: Callable[[Logged], None],
+    about: About,
 ) -> int:
     path = paths[0]
     if holds_run(path):

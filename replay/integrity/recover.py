@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.log.files import make_folder
+from recorder.log.files import make_folder, refuse_unless
 from recorder.log.logfile import LogFile
 from recorder.mcap.chunks import UNUSED
 from recorder.mcap.mending import mended
@@ -101,6 +101,8 @@ def _recover(src: Path, dst: Path, force: bool) -> Recovery:
         if dst.exists() and not dst.is_dir():
             raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
         targets = [dst / file.name.removesuffix(PARTIAL) for file in files]
+    else:
+        refuse_unless(dst, "the log is an MCAP file", ".mcap", "")
     try:
         make_folder(dst if src.is_dir() else dst.parent)
     except OSError as error:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -31,6 +30,7 @@ from replay.viewer.program import (
     open_privately,
     private_host,
     running,
+    tell,
     wait_until,
 )
 from replay.viewer.web import page_of, page_server, served
@@ -122,7 +122,7 @@ def served_table(folder: Path, port: int | None = None) -> Iterator[Table | None
             return
         refused = _register(dataset, files, ROWS)
         for file, reason in refused.items():
-            print(f"{runs[files.index(file)]} has no row: {reason}", file=sys.stderr, flush=True)
+            tell(f"{runs[files.index(file)]} has no row: {reason}")
         table = f"{address}/entry/{dataset.entry_details().id}"
         yield Table(server, runs, len(runs) - len(refused), dataset, Path(place), table)
 
@@ -160,18 +160,18 @@ def serve_catalogue(
         if web:
             page = opened.enter_context(_served_page(table.address, port))
             shown = f"{table.rows} runs at {page}"
-        print(shown, file=sys.stderr, flush=True)
+        tell(shown)
         if has_display() and not web:
             open_privately(table.address)
         try:
             set_layout(table.runs, table.dataset, table.place, tab)
         except (CdmisfaError, *REFUSALS) as error:
-            print(f"runs are shown without their layout: {error}", file=sys.stderr, flush=True)
+            tell(f"runs are shown without their layout: {error}")
         try:
             add_views(table.runs, table.dataset, table.place, progress)
         except REFUSALS as error:
             time.sleep(1.0)  # when interrupted the server may die before us; that is no error
-            print(f"views are not served: {error}", file=sys.stderr, flush=True)
+            tell(f"views are not served: {error}")
         table.server.wait()
 
 
@@ -258,7 +258,7 @@ def add_views(
             try:
                 views.append(ready_view(run))
             except (CdmisfaError, OSError) as error:
-                print(f"{run} has no view: {error}", file=sys.stderr, flush=True)
+                tell(f"{run} has no view: {error}")
             if progress is not None:
                 progress(i, len(runs))
         # The rows hold the properties too, perhaps in other types: a table's column has one.
@@ -267,7 +267,7 @@ def add_views(
             for i, view in enumerate(_register(dataset, views, LAYER))
         }
         for copy, reason in _register(dataset, list(bare), LAYER).items():
-            print(f"{bare[copy]} is not served: {reason}", file=sys.stderr, flush=True)
+            tell(f"{bare[copy]} is not served: {reason}")
 
 
 def _register(dataset: Any, files: Sequence[Path], layer: str) -> dict[Path, str]:

@@ -14,7 +14,10 @@ from cdmisfa.core.config import (
     positive,
 )
 
-ATTENTIONS = ("progress", "random", "robin", "novel", "sticky", "gamma", "ucb")
+ATTENTIONS = (
+    "progress", "random", "robin", "novel", "sticky", "gamma", "ucb", "prediction", "rnd", "alp",
+    "lpm",
+)  # fmt: skip
 """How the stream to watch is chosen, see `attention`."""
 
 

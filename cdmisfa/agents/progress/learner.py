@@ -41,6 +41,7 @@ from cdmisfa.agents.progress.judging import (
     stale,
     take_output,
 )
+from cdmisfa.agents.progress.surprise import MEASURES
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand, expanded_size
@@ -91,6 +92,9 @@ class ProgressLearner:
         self._streams = new_streams(len(spec.streams))
         size = 8 * self._n_inputs * (2 * config.components + self._n_outputs + 4)
         self._candidates = Candidates(self._new_candidate, size)
+        measure = MEASURES.get(config.attention)
+        n = len(spec.streams)
+        self._surprise = None if measure is None else measure(n, RECENT, self._n_inputs)
         self._freeze()
 
     @property
@@ -143,7 +147,7 @@ class ProgressLearner:
     def state(self) -> LearnerState:
         """The learner's state, a copy."""
         arrays = self._candidates.arrays
-        arrays["streams"], arrays["counts"] = self._streams.copy(), self._counts.copy()
+        arrays |= {name: array.copy() for name, array in self._own.items()}
         return LearnerState(arrays, tuple(self.modules), self._rng.bit_generator.state)
 
     def restore(self, state: LearnerState) -> None:
@@ -152,7 +156,7 @@ class ProgressLearner:
         Raises:
             ValueError: an array is missing or of another shape or type.
         """
-        overwrite({"streams": self._streams, "counts": self._counts}, state.arrays)
+        overwrite(self._own, state.arrays)
         self._candidates.restore(state.arrays)
         self.modules = list(state.modules)
         self._freeze()
@@ -177,6 +181,8 @@ class ProgressLearner:
         y_frozen = kernels.outputs(self._phi, self._offset, frames)
         error = candidate.error
         candidate.learn(frames, gap=int(own["next"]) != block.t)
+        if self._surprise is not None:
+            self._surprise.take(stream, frames, candidate)
         own["next"], own["last"] = block.t + len(block), counts["iteration"]
         own["visits"] += 1
         counts["iteration"] += 1
@@ -228,6 +234,12 @@ class ProgressLearner:
                 self.spec.streams, self._streams, self._candidates, self.config.test_frames
             ),
         }
+
+    @property
+    def _own(self) -> dict[str, NDArray[Any]]:
+        """Everything that changes in it but for its candidates, by name; no copies."""
+        own = {"streams": self._streams, "counts": self._counts}
+        return own if self._surprise is None else own | self._surprise.arrays
 
     @property
     def _learning(self) -> NDArray[np.bool_]:
@@ -350,8 +362,16 @@ class ProgressLearner:
         if (learning & held).sum() >= self._candidates.most:
             learning &= held
         errors = {s: c.recent_errors(RECENT) for s, c in self._candidates.items()}
+        measured = np.empty((len(learning), 0)) if self._surprise is None else self._surprise.errors
         situation = Situation(
-            self.stream, learning, errors, self._streams["visits"], draws, self.config.explore
+            stream=self.stream,
+            learning=learning,
+            changed=learning & (self._streams["module"] >= 0),
+            errors=errors,
+            surprise=measured,
+            visits=self._streams["visits"],
+            draws=draws,
+            explore=self.config.explore,
         )
         counts["stay"] += 1
         explored = False

@@ -14,7 +14,9 @@ from cdmisfa.cli.making import flag, option
 from cdmisfa.cli.printing import (
     print_document,
     print_json,
+    print_line,
     print_table,
+    print_text,
     quoted,
     say_about,
     tell,
@@ -34,33 +36,34 @@ if TYPE_CHECKING:
 def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
     """Say what is in a recording, a run, any MCAP file, or a camera log.
 
-    PATH may be several, a pattern such as 'logs/*.mcap', or a URL. Exits with 3 when a checksum
-    is wrong.
+    PATH may be several, a pattern such as 'logs/*.mcap', or a URL. Exits with 3 when one is cut
+    short or damaged.
     """
     from replay.integrity.info import describe
+    from replay.integrity.state import EXIT_CODES
 
     found = describe(*path)
     if as_json:
         print_json(found.as_json())
     else:
         _print_info(found)
-    if found.crc == "bad":
-        ctx.exit(LogDamagedError.exit_code)
+    ctx.exit(EXIT_CODES[found.state])
 
 
 def _print_info(found: LogInfo) -> None:
-    state = "complete" if found.complete else "cut short"
-    words = [found.kind, state, f"checksums {found.crc}"]
+    words = [found.kind, found.state, f"checksums {found.crc}"]
     if found.seed is not None:
         words.append(f"seed {found.seed}")
     if found.ended is not None:
         from cdmisfa.experiments.loop import ENDINGS
 
         words.append(f"ended: {ENDINGS.get(found.ended, found.ended)}")
-    click.echo(f"{found.path}: {', '.join(words)}")
+    print_line(f"{found.path}: {', '.join(words)}")
+    for line in (*(f"{p.where}: {p.what}" for p in found.problems), *found.notes):
+        print_line(line)
     if found.signals is not None and found.signals.missing:
         version, lacks = found.signals.version, ", ".join(found.signals.missing)
-        click.echo(f"signals of version {version}: {lacks} are not in it, read as NaN")
+        print_line(f"signals of version {version}: {lacks} are not in it, read as NaN")
     head: tuple[str, ...] = ("topic", "messages", "encoding", "schema", "from", "to")
     rows: list[tuple[object, ...]] = [
         (c.topic, c.messages, c.encoding, c.schema, _clock(c.start_ns), _clock(c.end_ns))
@@ -92,19 +95,19 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
     Of a camera log without checksums every image is decoded. PATH may be several, a pattern such
     as 'logs/*.mcap', or a URL. Exits with 3 when anything is wrong.
     """
+    from replay.integrity.state import EXIT_CODES
     from replay.integrity.verify import check_logs
 
     found = check_logs(*path)
     if as_json:
         print_json(found.as_json())
-    elif found.ok:
-        click.echo(f"{' '.join(path)}: whole")
-        for note in found.notes:
-            click.echo(note)
     else:
-        print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
-    if not found.ok:
-        ctx.exit(LogDamagedError.exit_code)
+        if found.problems:
+            print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
+        print_line(f"{' '.join(path)}: {found.state}")
+        for note in found.notes:
+            print_line(note)
+    ctx.exit(EXIT_CODES[found.state])
 
 
 @click.command("recover")
@@ -134,7 +137,7 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
             print_table(("lost", "what"), [(p.where, p.what) for p in found.lost])
         for mended in found.mended:
             tell(f"{mended.where}: {mended.what}")
-        click.echo(f"written {out}")
+        print_line(f"written {out}")
     if not found.complete:
         ctx.exit(LogDamagedError.exit_code)
 
@@ -198,14 +201,14 @@ def compare_command(
             view=save,
         )
     elif len(runs) == 2:
-        click.echo(str(different[0]) if different else "identical, bit for bit")
+        print_line(str(different[0]) if different else "identical, bit for bit")
     else:
         print_table(HEAD, [row.cells() for row in rows])
     for explanation in filter(None, (row.explanation() for row in rows)):
         if not as_json:
-            click.echo(explanation)
+            print_line(explanation)
     if first and second and not as_json:
-        click.echo(f"signals of iteration {at}:")
+        print_line(f"signals of iteration {at}:")
         print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
     if save is not None and not as_json:
         tell(f"view {save}    look at it: cdmisfa view {quoted(save)}")
@@ -233,7 +236,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
         print_document(run=str(run), figures=[str(file) for file in files])
         return
     for file in files:
-        click.echo(file)
+        print_line(file)
     if not files:
         tell(f"nothing is drawn of {run}: it has no iterations")
 
@@ -284,7 +287,7 @@ def export_command(
     if as_json:
         print_document(path=" ".join(map(str, path)), file=str(out), rows=rows)
         return
-    click.echo(f"{rows} {FORMS[form].unit} written to {out}")
+    print_line(f"{rows} {FORMS[form].unit} written to {out}")
 
 
 def _is_film(out: Path) -> bool:
@@ -306,7 +309,7 @@ def signals_command(markdown: bool, as_json: bool) -> None:
     columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "show", "since", "about")
     rows = [[signal[column] for column in columns] for signal in signals]
     if markdown:
-        click.echo(_page(SCHEMA_VERSION, columns, rows))
+        print_text(_page(SCHEMA_VERSION, columns, rows))
     else:
         print_table(columns, rows)
 

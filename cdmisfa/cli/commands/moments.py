@@ -9,7 +9,15 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.making import number, option, word
-from cdmisfa.cli.printing import learning, outcome_line, print_document, print_result, quoted, tell
+from cdmisfa.cli.printing import (
+    learning,
+    outcome_line,
+    print_document,
+    print_line,
+    print_result,
+    quoted,
+    tell,
+)
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
 source = word(
@@ -64,31 +72,32 @@ def at_command(
             arrays=state.arrays,
         )
         return
-    click.echo(f"after {iterations} iterations: frame {t}, next {streams[learner.stream]}")
+    print_line(f"after {iterations} iterations: frame {t}, next {streams[learner.stream]}")
     learned = ", ".join(f"{m.index} {m.stream}" for m in learner.modules)
-    click.echo(f"modules: {learned or 'none'}")
+    print_line(f"modules: {learned or 'none'}")
     summary = learner.summary()
     for outcome in summary.get("streams", ()):
-        click.echo(outcome_line(outcome))
+        print_line(outcome_line(outcome))
     if "streams" not in summary and "final_policy" in summary:
         policy = zip(streams, summary["final_policy"], strict=True)
-        click.echo(f"policy: {', '.join(f'{name} {ACTIONS[action]}' for name, action in policy)}")
+        print_line(f"policy: {', '.join(f'{name} {ACTIONS[action]}' for name, action in policy)}")
     size = sum(array.nbytes for array in state.arrays.values()) / 1000
-    click.echo(f"memory: {len(state.arrays)} arrays, {size:.1f} kB; --json prints all of it")
+    print_line(f"memory: {len(state.arrays)} arrays, {size:.1f} kB; --json prints all of it")
     if save_module is not None:
-        click.echo(f"module written to {save_module}")
+        print_line(f"module written to {save_module}")
 
 
 def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
     """Write what a learner is learning as a file of one module."""
     import dataclasses
 
-    from recorder.log.files import refuse_taken
+    from recorder.log.files import refuse_taken, refuse_unless
     from replay.runs.modules import save_modules
 
     module = getattr(learner, "unfinished", None)
     if module is None:
         raise UsageError("nothing is being learned then: choose another iteration")
+    refuse_unless(path, "the module is an NPZ file", ".npz", "")
     refuse_taken(path, force=force)
     save_modules(path, [dataclasses.replace(module, index=1)])
 
@@ -127,7 +136,7 @@ def check_command(
     if as_json:
         print_document(run=str(run), **checked.as_json())
     else:
-        click.echo(str(checked))
+        print_line(str(checked))
     if not checked.holds:
         ctx.exit(NotReproducedError.exit_code)
 
@@ -171,7 +180,7 @@ def fork_command(
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
     limits = {name: value for name, value in given.items() if value is not None}
     with (
-        learning(max_iterations, as_json=as_json) as (stop, reporter),
+        learning(max_iterations) as (stop, reporter),
         Session.fork(run, folder=out, limits=limits, **told) as session,
     ):
         result = session.learn(

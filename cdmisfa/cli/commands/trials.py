@@ -18,7 +18,9 @@ from cdmisfa.cli.printing import (
     bar,
     print_document,
     print_json,
+    print_line,
     print_table,
+    print_text,
     quoted,
     say_failed,
     tell,
@@ -100,12 +102,12 @@ def sweep_command(
         each = {name: getattr(report, name) for name in counts}
         print_document(sweep=report.folder, **each, failed=failed)
     else:
-        click.echo(
+        print_line(
             f"{report.trials} trials: {report.computed} computed, {report.skipped} finished "
             f"before, {len(failed)} failed"
         )
         say_failed(failed)
-        click.echo(f"look at it: cdmisfa results {quoted(out)}")
+        print_line(f"look at it: cdmisfa results {quoted(out)}")
     if failed:
         ctx.exit(1)
 
@@ -157,9 +159,9 @@ def results_command(folder: Path, csv: bool, latex: bool, as_json: bool) -> None
     if as_json:
         print_json(results.as_json(points))
     elif csv:
-        click.echo(results.as_csv(points), nl=False)
+        print_text(results.as_csv(points))
     elif latex:
-        click.echo(results.as_latex(points), nl=False)
+        print_text(results.as_latex(points))
     else:
         print_table(*results.as_table(points))
 
@@ -225,7 +227,7 @@ def reproduce_command(
             lines.append(f"{holds}  {claim['claim']}: {claim['detail']}")
         lines.append("")
     if not as_json:
-        click.echo("\n".join(lines), nl=False)
+        print_text("\n".join(lines))
     for document in documents:
         check_claims(document)
 
@@ -257,7 +259,8 @@ def _reproduce(name: str, request: Request, **where: Any) -> dict[str, Any]:
 @options.seeds("Seeds of learners and streams", "0:10")
 @options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
 @options.path("--streams", "Folder of the streams [default: OUT/streams].")
-@number("--frames", "Stop a run after so many frames, instead of the set's number.", 1)
+@number("--budget", "Stop a run after so many frames, instead of the set's number.", 1)
+@number("--switch-cost", "Frames lost at each change of view.", 0, default=0)
 @options.settings()
 @options.jobs
 @options.engine
@@ -276,17 +279,18 @@ def arena_command(
 ) -> None:
     """Compare learners on sets of streams: what they learn, and how soon.
 
-    SET is one of those that docs/arena.md lists, or all; without one the six of the public suite
-    are run, or, with --page, the page made from the results that are there. Most sets need the
-    extra [arena]; the set small needs nothing.
+    SET is one of those that docs/arena.md lists, all, tuning, or reported: those on which nothing
+    was tuned, which are run where none is named, or, with --page, the page is made from the results
+    that are there. Most sets need the extra [arena]; the set small needs nothing.
     """
     from cdmisfa.studies.arena.arena import arena_results
-    from cdmisfa.studies.arena.page import arena_table, draw_curves, write_arena_page
+    from cdmisfa.studies.arena.figure import draw_figure
+    from cdmisfa.studies.arena.page import arena_table, write_arena_page
 
     folder = out or Path("arena")
     failed = () if page is not None and not sets else _run_arena(folder, sets, **each)
     document = arena_results(folder)
-    figure, _ = draw_curves(document, folder)
+    figure, _ = draw_figure(document, folder)
     if page is not None:
         write_arena_page(document, figure, page)
     tell(f"figure {figure}" + (f", page {page}" if page is not None else ""))
@@ -304,14 +308,13 @@ def _run_arena(
 ) -> Any:
     """Compute what is missing; the rows of the trials that failed."""
     from cdmisfa.studies.arena.arena import run_arena
-    from cdmisfa.studies.arena.streams import SETS, SUITE
+    from cdmisfa.studies.arena.streams import chosen_sets
 
-    names = [name for word in sets for name in (SETS if word == ALL else (word,))]
     chosen = [name.strip() for name in (learners or "").split(",") if name.strip()]
     with bar("arena", "trials") as shown:
         report = run_arena(
             folder,
-            names or SUITE,
+            chosen_sets(sets or ("reported",)),
             chosen,
             parse_seeds(seeds),
             making=lambda done, total, note: shown.update(done, total, "streams, made first"),
@@ -347,11 +350,11 @@ def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
     told = {"policy": " ".join, "correlation": "{:.3f}".format}
     rows = [[told.get(key, str)(module[key]) for key in head] for module in report["modules"]]
     print_table(head, rows)
-    click.echo()
+    print_line()
     for figure in report["figures"]:
         if figure.suffix == ".png":
-            click.echo(f"figure     {figure}")
-    click.echo(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
+            print_line(f"figure     {figure}")
+    print_line(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
 
 
 @contextmanager
