@@ -15,7 +15,7 @@ from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, open_live
-from recorder.config import RecordConfig, SceneConfig, view_names
+from recorder.config import RecordConfig, SceneConfig
 from recorder.images.options import ImageOptions
 from recorder.world.scenes import SCENES, open_scene
 from replay.camera_logs.options import CameraOptions
@@ -393,4 +393,4 @@ def convert(source: ForeignSource, folder: Path, **options: Any) -> list[ViewRec
 
     if source.spec.length is None:
         raise UsageError("a source that loops has no end: convert it without looping")
-    return record(source, folder, names=view_names(source.spec.streams), **options)
+    return record(source, folder, **options)

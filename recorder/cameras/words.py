@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.blocks import FrameSource, stream_names
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.cameras.options import LiveOptions
-from recorder.config import view_names
 from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, Reading
 
 if TYPE_CHECKING:
@@ -171,7 +170,7 @@ def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions)
 
 def live_names(words: Sequence[str]) -> tuple[str, ...]:
     """A name for each stream, that can be one of a file: rtsp://host/left is left."""
-    return view_names([_stream_of(word) for word in words])
+    return stream_names([_stream_of(word) for word in words])
 
 
 def _stream_of(word: str) -> str:
