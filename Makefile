@@ -36,7 +36,7 @@ fuzz: $(INSTALLED)
 # The streams of the arena take minutes to make: they are kept.
 torture: $(INSTALLED) sanitized
 	test -e build/torture/streams || $(BIN)/cdmisfa arena small --learners progress \
-	    --seeds 0:2 --frames 2000 --jobs 2 -o build/torture/arena --streams build/torture/streams
+	    --seeds 0:2 --budget 2000 --jobs 2 -o build/torture/arena --streams build/torture/streams
 	$(BIN)/python -m tools.torture --seed $(or $(SEED),0) --page docs/reliability.md
 
 # Tests of what attacks the product, with some cases of each kind.

@@ -6,12 +6,9 @@ Imported by `world` and `log`. What only one scene has stands with that scene.
 from __future__ import annotations
 
 import re
-import unicodedata
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from cdmisfa.core.blocks import distinct_names
 from cdmisfa.core.clock import RECORDED_FPS, START_NS
 from cdmisfa.core.config import in_range
 from cdmisfa.core.errors import UsageError
@@ -121,16 +118,3 @@ def check_view_names(names: tuple[str, ...], key: str) -> None:
     for name in names:
         if not (name.isidentifier() and name.isascii() and len(name) <= 64):
             raise UsageError(f"{key} has {name!r}: use letters, digits and _")
-
-
-def view_names(streams: Sequence[str]) -> tuple[str, ...]:
-    """Names of views, valid as file names, from names of streams: "/cam/left" is cam_left.
-
-    Letters lose their accents, those of other scripts stay.
-    """
-    names: list[str] = []
-    for stream in streams:
-        letters = unicodedata.normalize("NFKD", stream)
-        bare = "".join(c for c in letters if not unicodedata.combining(c))
-        names.append(re.sub(r"[^\w.-]+", "_", bare).strip("._-") or "stream")
-    return distinct_names(names)

@@ -26,6 +26,14 @@ def fading(patterns: int) -> Callable[[Rng, int], Footage]:
     return make
 
 
+def late(rng: Rng, n: int) -> Footage:
+    """A fading pattern, of which a pixel flickers once a learner has seen all it is shown."""
+    footage = fading(0)(rng, n)
+    footage.frames[: -n // 4, 0, 0] = 127
+    footage.frames[-n // 4 :, 0, 0] = rng.integers(0, 256, n - n * 3 // 4)
+    return footage
+
+
 def hiss(rng: Rng, n: int) -> Footage:
     """Noise."""
     return stateless(rng.integers(0, 256, (n, *SHAPE), dtype=np.uint8))
@@ -40,6 +48,7 @@ KINDS = {
     "sway": Kind(fading(0)),
     "echo": Kind(fading(0)),
     "swing": Kind(fading(1)),
+    "late": Kind(late),
     "hiss": Kind(hiss, learnable=False),
     "blank": Kind(blank, learnable=False),
     "short": Kind(lambda rng, n: fading(2)(rng, 400), loops=True),

@@ -50,21 +50,24 @@ def packed(image: np.ndarray) -> bytes:
     return bytes(CompressedImage(data=encoded(image), format="png").SerializeToString())
 
 
-def write_cameras(path: Path, cameras: Mapping[str, tuple[int, int]]) -> None:
+def write_cameras(path: Path, cameras: Mapping[str, tuple[int, int]], **options: bool) -> None:
     """A log of foxglove.RawImage: topic to count and milliseconds between images, by time."""
     topics = {}
     for seed, (topic, (count, step)) in enumerate(cameras.items()):
         images = enumerate(pictures(count, seed))
         topics[topic] = [(START_MS + i * step, image) for i, image in images]
-    write_images(path, topics)
+    write_images(path, topics, **options)
 
 
 def write_images(
-    path: Path, topics: Mapping[str, Iterable[tuple[int, np.ndarray]]], profile: str = ""
+    path: Path,
+    topics: Mapping[str, Iterable[tuple[int, np.ndarray]]],
+    profile: str = "",
+    **options: bool,
 ) -> Path:
     """A log of foxglove.RawImage: on each topic milliseconds and images; by time."""
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4096)
+        writer = Writer(file, chunk_size=4096, **options)
         writer.start(profile)
         schema = writer.register_schema(RAW.schema, RAW.encoding, b"")
         messages = []
@@ -96,13 +99,19 @@ def write_video(
     fps: int = 25,
     first: int = 0,
     drop: frozenset[int] = frozenset(),
+    options: Mapping[str, str] | None = None,
 ) -> list[np.ndarray]:
-    """Four pixels for each of an image's; `first` and `drop` move and leave out frames."""
+    """Four pixels for each of an image's; `first` and `drop` move and leave out frames.
+
+    The options are those of the container and, as g, of the codec.
+    """
     import av
 
     written = []
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=fps)
+    chosen = dict(options or {})
+    group = {"g": chosen.pop("g")} if "g" in chosen else {}
+    with av.open(str(path), "w", options=chosen) as container:
+        stream = container.add_stream(codec, rate=fps, options=group)
         stream.width, stream.height, stream.pix_fmt = 4 * WIDTH, 4 * HEIGHT, pixels
         stream.codec_context.time_base = Fraction(1, fps)
         for i, image in enumerate(images):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
+import dataclasses
+import importlib.util
 import os
 from pathlib import Path
 
@@ -12,15 +13,16 @@ from arena_streams import tiny as tiny
 
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import UsageError
-from cdmisfa.studies.arena import pictures
+from cdmisfa.studies.arena import cameras, elsewhere, pictures
 from cdmisfa.studies.arena.library import BEGIN_APART, ArenaSource, Library
-from cdmisfa.studies.arena.pictures import LEARNED_FROM
+from cdmisfa.studies.arena.pictures import Footage, stateless
 from cdmisfa.studies.arena.streams import (
-    HELD_OUT,
+    CAMERAS,
+    FRAMES,
     SETS,
     STREAMS,
-    SUITE,
     Showing,
+    chosen_sets,
     make_footage,
     parse,
 )
@@ -29,8 +31,12 @@ from cdmisfa.testing.sources import SourceContract
 pytestmark = pytest.mark.usefixtures("tiny")
 
 NUMPY_MADE = (
-    "light", "waves", "noise", "jumping", "constant", "still", "gaussian-0.1", "uniform-0.3"
+    "light", "drift", "waves", "noise", "jumping", "constant", "still", "gaussian-0.1",
+    "uniform-0.3", "pink", "salt", "speckle", "shot", "bands", "lit:waves", "occluded:waves",
+    "pausing:waves", "flicker:waves",
 )  # fmt: skip
+
+SHOWN = FRAMES * 3 // 4
 
 
 def library(folder: Path, *names: str, seed: int = 0) -> Library:
@@ -70,7 +76,18 @@ def test_every_set_shows_streams_that_there_are() -> None:
         phases = [parse(word) for word in entry.words]
         assert len(set(entry.words)) == len(entry.words), name
         assert any(signal.learnable for of_stream in phases for signal in of_stream), name
-    assert set(SUITE) <= set(SETS)
+    reported, tuning = chosen_sets(["reported"]), chosen_sets(["tuning"])
+    assert sorted([*reported, *tuning]) == sorted(chosen_sets(["all"])) == sorted(SETS)
+    assert chosen_sets(["small", "reported"]) == ["small", *reported]
+    noise = {
+        word
+        for name in reported
+        for word in SETS[name].words
+        if not any(signal.learnable for signal in parse(word))
+    }
+    assert len(noise) == 8
+    tuned = {word for name in tuning for word in SETS[name].words}
+    assert not (tuned & {w for name in reported for w in SETS[name].words}) - noise
     counts = {
         name: (len(SETS[name].words), sum(parse(w)[0].learnable for w in SETS[name].words))
         for name in ("five-of-twenty", "hundred")
@@ -82,8 +99,9 @@ def test_every_set_shows_streams_that_there_are() -> None:
 def test_a_stream_is_the_same_every_time_and_another_with_another_seed(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cdmisfa.studies.arena.streams.LEARNED_FROM", 60)
-    monkeypatch.setattr("cdmisfa.studies.arena.streams.HELD_OUT", 20)
+    kind = parse(name)[0].kind
+    short = dataclasses.replace(STREAMS[kind], frames=80)
+    monkeypatch.setattr("cdmisfa.studies.arena.streams.STREAMS", {kind: short})
     one, again, other = make_footage(name, 3), make_footage(name, 3), make_footage(name, 4)
     assert one.frames.shape == (80, 48, 64)
     assert one.frames.dtype == np.uint8
@@ -105,9 +123,11 @@ def test_bad_cameras_do_what_they_say() -> None:
     jumping = pictures.jumping(rng, 20).frames
     assert np.flatnonzero((jumping[1:] != jumping[:-1]).any(axis=(1, 2))).tolist() == [9]
     frames = np.repeat(jumping, 20, axis=0)
-    exposure = pictures.flicker(rng, frames).mean(axis=(1, 2)) / frames.mean(axis=(1, 2))
+    exposure = cameras.flicker(rng, stateless(frames)).frames.mean(axis=(1, 2)) / frames.mean(
+        axis=(1, 2)
+    )
     assert exposure.std() == pytest.approx(0.1, rel=0.15)
-    shaken = pictures.shake(rng, frames)
+    shaken = cameras.shake(rng, stateless(frames)).frames
     moves = {
         (down, right)
         for frame, seen in zip(frames, shaken, strict=True)
@@ -116,16 +136,47 @@ def test_bad_cameras_do_what_they_say() -> None:
         if (np.roll(frame, (down, right), (0, 1))[2:-2, 2:-2] == seen[2:-2, 2:-2]).all()
     }
     assert len(moves) == 9
-    assert pictures.low_contrast(rng, frames).std(axis=0).mean() == pytest.approx(
+    assert cameras.low_contrast(rng, stateless(frames)).frames.std(axis=0).mean() == pytest.approx(
         0.1 * frames.std(axis=0).mean(), rel=0.05
     )
+
+
+def test_what_is_before_a_camera_is_known() -> None:
+    rng = np.random.default_rng(0)
+    shown = stateless(np.full((3000, 48, 64), 120, np.uint8))
+    bright = cameras.lit(rng, shown)
+    np.testing.assert_allclose(bright.frames.mean(axis=(1, 2)) / 120, bright.state[:, 0], atol=0.01)
+    assert 0.8 < bright.state.min() < 0.9 < 1.1 < bright.state.max() < 1.2
+    hidden = cameras.occluded(rng, shown)
+    dark = np.array([np.nonzero(frame < 60)[1].mean() for frame in hidden.frames])
+    whole = np.abs(hidden.state[:, 0] - 0.5) < 0.25
+    np.testing.assert_allclose(dark[whole] / 64, hidden.state[whole, 0], atol=0.02)
+
+
+def test_a_picture_that_pauses_stands_still_for_long_half_of_the_time() -> None:
+    count = np.arange(20_000)
+    moving = Footage((count[:, None, None] % 256).astype(np.uint8), count[:, None] * 1.0)
+    paused = CAMERAS["pausing"](np.random.default_rng(1), moving)
+    steps = np.diff(paused.state[:, 0])
+    assert set(steps) == {0.0, 1.0}
+    assert steps.mean() == pytest.approx(0.5, abs=0.15)
+    assert np.flatnonzero(np.diff(steps)).size < 120
+    np.testing.assert_array_equal(paused.frames[:, 0, 0], paused.state[:, 0] % 256)
+
+
+@pytest.mark.parametrize("memory", [10, 40])
+def test_a_random_course_is_as_slow_as_its_memory(memory: int) -> None:
+    course = pictures.wandering(np.random.default_rng(0), 60_000, memory)
+    assert course.mean() == pytest.approx(0, abs=0.1)
+    assert course.std() == pytest.approx(1, abs=0.1)
+    assert np.diff(course).std() == pytest.approx(1 / memory, rel=0.1)
 
 
 def test_a_stream_is_made_once_and_again_only_where_it_is_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames = library(tmp_path, "sway").stream("sway", 0).frames
-    assert len(frames) == LEARNED_FROM + HELD_OUT
+    assert len(frames) == FRAMES
     kept = tmp_path / "sway-0" / "frames.npy"
     stamp = kept.stat().st_mtime_ns
     library(tmp_path, "sway")
@@ -161,9 +212,9 @@ def test_a_stream_begins_again_and_elsewhere_and_changes(tmp_path: Path) -> None
     found = library(tmp_path, "sway", "hiss", "short")
     source = ArenaSource(("sway", "sway#2", "sway>hiss", "short"), found, 0, change=100)
     sway, hiss, short = (found.stream(n, 0) for n in ("sway", "hiss", "short"))
-    source.seek(LEARNED_FROM - 5)
+    source.seek(SHOWN - 5)
     again = source.take(0, 10).frames
-    np.testing.assert_array_equal(again[:5], sway.frames[LEARNED_FROM - 5 : LEARNED_FROM])
+    np.testing.assert_array_equal(again[:5], sway.frames[SHOWN - 5 : SHOWN])
     np.testing.assert_array_equal(again[5:], sway.frames[:5])
     source.seek(0)
     elsewhere = source.take(1, 10).frames
@@ -175,25 +226,33 @@ def test_a_stream_begins_again_and_elsewhere_and_changes(tmp_path: Path) -> None
     source.seek(400)
     np.testing.assert_array_equal(source.take(3, 10).frames, short.frames[:10])
     assert [source.shown(2, t).kind for t in (99, 100, 10**6)] == ["sway", "hiss", "hiss"]
-    np.testing.assert_array_equal(short.held_out, short.frames[[*range(400), 0]])
-    np.testing.assert_array_equal(sway.held_out, sway.frames[LEARNED_FROM:])
+    np.testing.assert_array_equal(short.part("following"), short.frames[[*range(400), 0]])
+    np.testing.assert_array_equal(sway.part("following"), sway.frames[SHOWN:])
 
 
 def test_the_reference_is_the_slowest_output_there_is(tmp_path: Path) -> None:
     made = library(tmp_path, "sway")
     stream = made.stream("sway", 0)
     found = made.reference("sway", 0, 8, "none")
-    y = found.slowest.transform(stream.held_out)[:, 0]
-    assert found.slowness == pytest.approx(1 / 400, rel=0.05)
-    assert abs(np.corrcoef(y, stream.state[LEARNED_FROM:, 0])[0, 1]) > 0.99
-    x = stream.learned_from.reshape(LEARNED_FROM, -1) / 255
+    y = found.slowest.transform(stream.part("following"))[:, 0]
+    assert found.slowness["following"] == pytest.approx(1 / 400, rel=0.05)
+    assert abs(np.corrcoef(y, stream.state[SHOWN:, 0])[0, 1]) > 0.99
+    x = stream.shown.reshape(SHOWN, -1) / 255
     largest = np.linalg.eigvalsh(np.cov(x.T))[::-1][:2]
-    variance = found.components.transform(stream.learned_from).var(axis=0)[:2]
+    variance = found.components.transform(stream.shown).var(axis=0)[:2]
     np.testing.assert_allclose(variance, largest, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("name", "package", "n"), [("cartpole", "gymnasium", 40), ("pong", "ale_py", 150)]
+    ("name", "package", "n"),
+    [
+        ("cartpole", "gymnasium", 40),
+        ("cliff", "gymnasium", 150),
+        ("pong", "ale_py", 150),
+        ("china", "sklearn", 60),
+        ("hopper", "matplotlib", 60),
+        ("cheetah", "pybullet", 60),
+    ],
 )
 def test_what_is_played_is_seen_and_known(name: str, package: str, n: int) -> None:
     pytest.importorskip(package)
@@ -220,9 +279,12 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(UsageError, match=r"needs gymnasium.*cdmisfa\[gym\]"):
         make_footage("pong", 0)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"needs scikit-learn.*cdmisfa\[arena\]"):
+        make_footage("china", 0)
 
 
-@pytest.mark.skipif(not pictures.SAMPLE.is_dir(), reason="the sample recording is not there")
+@pytest.mark.skipif(not elsewhere.SAMPLE.is_dir(), reason="the sample recording is not there")
 def test_the_sample_recording_is_a_stream() -> None:
     shown = make_footage("icub-right", 0)
     assert shown.frames.shape == (4000, 48, 128)

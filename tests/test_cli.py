@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -65,7 +66,7 @@ class TestJson:
     ) -> None:
         done = cdmisfa("info", oscillatory_run)
         assert done.code == 0
-        assert "run, complete, checksums ok, seed 0, ended: the asked number of iter" in done.out
+        assert "run, whole, checksums ok, seed 0, ended: the asked number of iter" in done.out
         assert "2016-01-01 00:00:00.000Z" in done.out
         torn = tmp_path / "x1.mcap"
         data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())
@@ -120,8 +121,6 @@ class TestRuns:
     def test_settings_win_over_the_preset_and_stand_in_the_run(
         self, cdmisfa: Cdmisfa, tmp_path: Path
     ) -> None:
-        import json
-
         run = tmp_path / "run"
         words = ("--set", "learner.tau=50", "--set", "learner.nu=0.02", "--no-rerun")
         document = cdmisfa("learn", "oscillatory", "-o", run, *words, *SHORT).json
@@ -165,19 +164,51 @@ class TestRuns:
         assert (done.code, done.out) == (0, "")
         assert done.err == f"nothing is drawn of {tmp_path}: it has no iterations\n"
 
-    def test_end_of_a_recording_is_an_error_that_keeps_the_run(
-        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
+    @pytest.mark.parametrize(
+        ("algorithm", "blocks", "said"),
+        [
+            ("2.0", 20, "not decided: x1, x2, x3\n"),
+            ("progress", 50, "x3: not decided, slowness 0.00"),
+        ],
+    )
+    def test_a_recording_that_ends_is_the_end_of_its_run(
+        self,
+        cdmisfa: Cdmisfa,
+        oscillatory_recording: Path,
+        tmp_path: Path,
+        algorithm: str,
+        blocks: int,
+        said: str,
     ) -> None:
-        run = tmp_path / "run"
-        done = cdmisfa("learn", oscillatory_recording, "-o", run, "--no-rerun")
-        assert "look at it" in done.out
-        assert_one_line(Outcome(done.code, "", done.err), 1, "--loop", str(run))
-        assert "ended after 20 iterations: the recording ended" in done.out
-        assert cdmisfa("info", run, "--json").json["complete"] is True
-        again = cdmisfa("learn", oscillatory_recording, "--json")
-        assert (again.json["ended"], again.json["iterations"]) == ("log_exhausted", 20)
-        looped = cdmisfa("learn", oscillatory_recording, "--loop", "--max-iterations", 25, "--json")
-        assert looped.json["iterations"] == 25
+        run, fork = tmp_path / "run", tmp_path / "fork"
+        words = ("learn", oscillatory_recording, "--algorithm", algorithm)
+        done = cdmisfa(*words, "-o", run, "--no-rerun")
+        assert done.code == 0
+        assert "0 frames are left at frame 2000" in done.err
+        assert "--loop" in done.err
+        assert said in done.out
+        assert f"ended after {blocks} iterations: there were no more frames" in done.out
+        result = json.loads((run / "run.json").read_text())["result"]
+        again = cdmisfa(*words, "--json").json | {"run": str(run)}
+        resumed = cdmisfa("learn", "--resume", "-o", run, "--no-rerun", "--json").json
+        assert result == again == resumed
+        assert (result["ended"], result["iterations"]) == ("log_exhausted", blocks)
+        assert result["undecided"] == ["x1", "x2", "x3"]
+        assert cdmisfa("check", run).code == cdmisfa("at", run, blocks).code == 0
+        forked = cdmisfa("fork", run, "--at", 5, "-o", fork, "--no-rerun", "--json")
+        assert (forked.code, forked.json["ended"]) == (0, "log_exhausted")
+        info = cdmisfa("info", run)
+        assert "whole" in info.out
+        assert "ended: there were no more frames" in info.out
+        looped = cdmisfa(*words, "--loop", "--max-iterations", blocks + 5, "--json").json
+        assert looped["iterations"] == blocks + 5
+
+    def test_a_recording_of_less_than_a_block_is_not_enough(
+        self, cdmisfa: Cdmisfa, tmp_path: Path
+    ) -> None:
+        cdmisfa("record", "oscillatory", "-o", tmp_path / "short", "--frames", 80)
+        done = cdmisfa("learn", tmp_path / "short")
+        assert_one_line(done, 1, "80 frames are left at frame 0, 100 are needed", "--loop")
 
 
 class TestErrors:

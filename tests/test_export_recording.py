@@ -275,16 +275,6 @@ def test_an_export_replaces_another(tmp_path):
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["left.mp4"]
 
 
-def test_a_view_s_name_leads_nowhere_else_and_no_two_have_one():
-    names = ("../../x", "a/b", "a_b", ".hidden", "", "left")
-    found = frames.file_names(SourceSpec(names, (2, 2), "uint8", (), 50.0, 0, None))
-    assert len(set(found)) == len(names)
-    assert not any("/" in name or name.startswith(".") for name in found)
-    assert found[-1] == "left"
-    spec = SourceSpec(("a_-3", "a_", "a?", "a!", "a"), (2, 2), "uint8", (), 50.0, 0, None)
-    assert frames.file_names(spec) == ("a_-3", "a_", "a_-4", "a_-5", "a")
-
-
 def test_the_command_says_what_is_lost(cdmisfa, tmp_path):
     record_images(tmp_path / "r")
     said = cdmisfa("export", tmp_path / "r", "--to", "mp4", "-o", tmp_path / "films")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from camera_files import write_pictures
+from conftest import Cdmisfa
 from test_modules import learned, with_width
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
@@ -79,7 +81,7 @@ def test_only_regular_files_are_read_of_a_run(tmp_path: Path, make: Callable[[Pa
     for name in ("run.json", "modules.npz"):
         make(tmp_path / name)
     assert read_run_json(tmp_path) == {}
-    with pytest.raises(LogDamagedError, match="no regular file"):
+    with pytest.raises(UsageError, match="no regular file"):
         load_modules(tmp_path)
 
 
@@ -88,7 +90,7 @@ def test_a_huge_document_or_file_of_modules_is_refused_unread(tmp_path: Path) ->
         with (tmp_path / name).open("xb") as file:
             file.truncate(size)
     assert read_run_json(tmp_path) == {}
-    with pytest.raises(LogDamagedError, match="above the limit"):
+    with pytest.raises(UsageError, match="above the limit"):
         load_modules(tmp_path)
 
 
@@ -272,3 +274,34 @@ def test_what_cannot_be_unpacked_ends_what_is_resumed(tmp_path: Path, compressio
         held.add(frames_held(path, "x1").stop)
     assert 0 < len(held) < 300
     assert max(held) <= 300
+
+
+WAYS = ("info", "verify", "learn", "convert -o out", "play", "export -o out --to images")
+"""Commands that take any log."""
+
+
+def make_socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(path))
+
+
+NO_FILES = {
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "fifo": os.mkfifo,
+    "socket": make_socket,
+    "broken link": lambda path: path.symlink_to("nothing"),
+    "link to itself": lambda path: path.symlink_to(path),
+}
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.mp4", "a.bag", "a.db3", "a.csv", "a"])
+@pytest.mark.parametrize("kind", NO_FILES)
+def test_what_is_no_file_is_refused_by_every_command(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    NO_FILES[kind](Path(name))
+    for way in WAYS:
+        command, *options = way.split()
+        done = cdmisfa(command, name, *options)
+        assert (done.code, done.err.count("\n"), name in done.err) == (2, 1, True), (way, done.err)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import pkgutil
 import signal
+import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +18,7 @@ import pytest
 from conftest import Cdmisfa, Outcome
 from folders import contents
 
+from cdmisfa.cli import app
 from cdmisfa.cli.app import run
 from cdmisfa.cli.interrupts import SIGNALS, interruptible, stoppable
 from replay.playing.feed import Feed, Playback, Played, paced
@@ -153,8 +156,61 @@ def test_an_interrupt_says_what_is_missing_of_a_run(
     assert cdmisfa("verify", out).code == 0
 
 
+@pytest.fixture
+def silent() -> Iterator[str]:
+    """The place of a server that takes connections and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"127.0.0.1:{server.getsockname()[1]}"
+
+
+WAITING = "recorder.cameras.readers.Readers.wait"
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize(
+    ("source", "command", "where"),
+    [
+        ("tcp://{}", "record", WAITING),
+        ("rtsp://{}/left", "learn", WAITING),
+        ("http://{}/left.mjpg", "convert", WAITING),
+        ("foxglove://{}/left", "record", WAITING),
+        ("gym:Pendulum-v1", "record", "gymnasium.make"),
+        ("gym:Pendulum-v1", "learn", "gymnasium.make"),
+    ],
+)
+def test_while_a_source_is_opened_nothing_else_is_blamed(
+    cdmisfa: Cdmisfa,
+    silent: str,
+    tmp_path: Path,
+    monkeypatch: Any,
+    source: str,
+    command: str,
+    where: str,
+    number: signal.Signals,
+) -> None:
+    words = (command, source.format(silent), "-o", tmp_path / "out")
+    done = _signalled(cdmisfa, words, where, 1, monkeypatch, number)
+    assert (done.code, done.err.strip()) == (128 + number, "cdmisfa: interrupted")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_that_python_makes_another_error_is_one(monkeypatch: Any, capsys: Any) -> None:
+    class Named:
+        def __set_name__(self, owner: type, name: str) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(app.cli, "main", lambda **words: type("Made", (), {"name": Named()}))
+    assert run([]) == 143
+    assert capsys.readouterr().err == "cdmisfa: interrupted\n"
+
+
 def _signalled(
-    cdmisfa: Cdmisfa, words: tuple[Any, ...], last: str, times: int, monkeypatch: Any
+    cdmisfa: Cdmisfa,
+    words: tuple[Any, ...],
+    last: str,
+    times: int,
+    monkeypatch: Any,
+    number: signal.Signals = signal.SIGINT,
 ) -> Outcome:
     """What a command says to signals that come when it does the last of its work."""
     work = pkgutil.resolve_name(last)
@@ -162,7 +218,7 @@ def _signalled(
     def signalled(*args: Any, **options: Any) -> Any:
         monkeypatch.undo()
         for _ in range(times):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         return work(*args, **options)
 
     monkeypatch.setattr(last, signalled)

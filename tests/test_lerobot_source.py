@@ -57,7 +57,7 @@ def test_episodes_follow_one_another_after_a_pause(dataset: Path, kept: str) -> 
     if kept == "pictures":
         as_pictures(dataset)
     source = ForeignSource(dataset)
-    assert source.pauses[KEY] == [(FIRST, FIRST + PAUSE)]
+    assert source.pauses["cam"] == [(FIRST, FIRST + PAUSE)]
     expected = np.stack(list(pictures(COUNT)))
     blocks = source.take_all(COUNT + PAUSE)
     assert [(block.t, len(block)) for block in blocks] == [

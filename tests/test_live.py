@@ -9,11 +9,10 @@ import signal
 import socket
 import sys
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from urllib.error import URLError
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 from urllib.request import urlopen
 
 import numpy as np
@@ -24,6 +23,7 @@ from rerun.chunk import RrdReader
 from run_data import IMAGE, VECTOR, having, read_signals, run_of
 from test_view_world import LIVE as SCENE_SOURCE
 from test_view_world import SCENE, without_models
+from waiting import wait_for
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
@@ -34,7 +34,7 @@ from replay.view.bindings import viewer_client, viewer_program
 from replay.viewer import headless, live, program
 from replay.viewer.broadcast import Pieces
 from replay.viewer.live import LiveView
-from replay.viewer.program import open_privately
+from replay.viewer.web import DATA
 
 MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
 
@@ -101,7 +101,7 @@ def test_the_robot_turns_to_what_is_watched(tmp_path, monkeypatch):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
 def test_it_listens_on_this_machine_only():
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:
-        port = urlsplit(view.address).port
+        port = urlsplit(view.broadcast.address).port
         with socket.create_connection(("127.0.0.1", port), timeout=5):
             pass
         listening = Path("/proc/net/tcp").read_text("utf-8")
@@ -114,19 +114,21 @@ def test_only_who_has_the_address_is_given_the_run(tmp_path):
     """All of it, until its end; nothing to another name that leads here, nor without the token."""
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:
         feed(view, VECTOR)
-        port = urlsplit(view.address).port
+        address = urljoin(view.broadcast.address, DATA)
+        port, place = urlsplit(address).port, urlsplit(address).path
         for path, host, status in (
-            ("/live.rrd", f"127.0.0.1:{port}", 403),
-            (urlsplit(view.address).path, f"example.org:{port}", 403),
-            (urlsplit(view.address).path, "example.org", 403),
-            (urlsplit(view.address).path.replace("live", "other"), f"127.0.0.1:{port}", 404),
+            (f"/{DATA}", f"127.0.0.1:{port}", 403),
+            (place, f"example.org:{port}", 403),
+            (place, "example.org", 403),
+            (place.replace("run", "other"), f"127.0.0.1:{port}", 404),
+            (place.replace(DATA, ""), f"127.0.0.1:{port}", 200),
         ):
             connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
             connection.request("GET", path, headers={"Host": host})
             assert connection.getresponse().status == status, (path, host)
             connection.close()
         taken = []
-        reader = threading.Thread(target=lambda: taken.append(urlopen(view.address).read()))
+        reader = threading.Thread(target=lambda: taken.append(urlopen(address).read()))
         reader.start()
     reader.join()
     (data,) = taken
@@ -134,7 +136,7 @@ def test_only_who_has_the_address_is_given_the_run(tmp_path):
     paths = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()}
     assert {"/signals/epsilon", "/events"} <= paths
     with pytest.raises(URLError):
-        urlopen(view.address, timeout=10)
+        urlopen(address, timeout=10)
 
 
 def test_what_does_not_fit_goes_from_behind_the_beginning():
@@ -151,8 +153,8 @@ def test_what_does_not_fit_goes_from_behind_the_beginning():
 
 
 @pytest.mark.skipif(bool(program.missing_driver()), reason=program.missing_driver())
-def test_a_window_shows_the_run_and_nobody_the_address(tmp_path, monkeypatch):
-    """The window is one without a screen here."""
+def test_a_window_shows_the_run_as_it_grows_and_nobody_the_address(tmp_path, monkeypatch):
+    """It is given no address, whose data it would take for 30 s; and has no screen here."""
     real, words = viewer_program(), tmp_path / "words"
     monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: tmp_path / "viewer")
     script = f"""#!/bin/sh
@@ -161,21 +163,28 @@ def test_a_window_shows_the_run_and_nobody_the_address(tmp_path, monkeypatch):
     """
     (tmp_path / "viewer").write_text(script)
     (tmp_path / "viewer").chmod(0o755)
+
+    def given():
+        return words.read_text().split()
+
+    def place():
+        return f"{given()[given().index('--bind') + 1]}:{given()[given().index('--port') + 1]}"
+
+    def shows(frame):
+        """Whether the window has come so far."""
+        with contextlib.suppress(OSError, RuntimeError):
+            state = viewer_client().connect(f"rerun+http://{place()}/proxy").get_state()
+            return any(line.end >= frame for r in state.recordings for line in r.timelines)
+
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:
-        feed(view, VECTOR)
-        open_privately(view.address)
-        recordings, end = [], time.monotonic() + 60
-        while not recordings:
-            assert time.monotonic() < end
-            time.sleep(0.2)
-            with contextlib.suppress(OSError, RuntimeError):
-                given = words.read_text().split()
-                place = f"{given[given.index('--bind') + 1]}:{given[given.index('--port') + 1]}"
-                client = viewer_client().connect(f"rerun+http://{place}/proxy")
-                recordings = client.get_state().recordings
-    os.kill(int(given[0]), signal.SIGTERM)
-    assert place.startswith("127.")
-    assert urlsplit(view.address).path.split("/")[1] not in words.read_text()
+        view.broadcast.open_window()
+        for iterations in (30, 60):
+            feed(view, VECTOR, iterations)
+            view.flush()
+            wait_for(lambda last=iterations * 40 - 1: shows(last), 60)
+    os.kill(int(given()[0]), signal.SIGTERM)
+    assert place().startswith("127.")
+    assert urlsplit(view.broadcast.address).path.split("/")[1] not in words.read_text()
 
 
 def test_a_run_gives_the_same_with_and_without(tmp_path):
@@ -240,7 +249,7 @@ def test_a_viewer_that_connects_shows_it(tmp_path):
 
         def open_it():  # waits for what never ends to be loaded
             with contextlib.suppress(OSError):
-                viewer.open(view.address)
+                viewer.open(urljoin(view.broadcast.address, DATA))
 
         threading.Thread(target=open_it, daemon=True).start()
         views = opened.ask(connected, seconds=30)

@@ -107,17 +107,20 @@ def test_every_sink_is_told_everything_in_order() -> None:
     assert two.told == one.told
 
 
-def test_the_end_of_a_recording_is_an_error_after_the_sinks_are_finished() -> None:
+def test_the_end_of_a_recording_ends_the_run_and_is_told() -> None:
     source, notes = OscillatorySource(length=130), Notes()
-    with pytest.raises(LogExhaustedError):
+    assert learn(source, learner_for(source), (notes,)) == "log_exhausted"
+    (t, iteration, why, level), *last = notes.told[3:]
+    assert (notes.told[:3], t, iteration, level) == ([0, 1, 2], 120, 2, "WARNING")
+    assert "the streams end after 130 frames" in why
+    assert last == [(120, 2, f"ended: {ENDINGS['log_exhausted']}", "INFO"), "finished"]
+
+
+def test_less_than_a_block_is_not_enough() -> None:
+    source, notes = OscillatorySource(length=39), Notes()
+    with pytest.raises(LogExhaustedError, match="the streams end after 39 frames"):
         learn(source, learner_for(source), (notes,))
-    assert notes.told == [
-        0,
-        1,
-        2,
-        (120, 2, f"ended: {ENDINGS['log_exhausted']}", "INFO"),
-        "finished",
-    ]
+    assert notes.told == []
 
 
 def test_asked_to_stop_while_it_waits_for_frames_it_is_interrupted() -> None:

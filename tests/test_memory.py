@@ -15,7 +15,8 @@ import resource, sys
 import numpy as np
 from PIL import Image
 from cdmisfa.core.errors import CdmisfaError
-from recorder.images.pixels import MAX_PIXELS, MalformedImage, raw_image
+from recorder.images.pixels import MAX_PIXELS, raw_image
+from recorder.images.whole import MalformedImage
 from replay.camera_logs.opening import open_images
 from replay.runs.modules import load_modules
 from pathlib import Path

@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin
 
 import numpy as np
 import pytest
@@ -38,6 +39,8 @@ from replay.playing.feed import (
     paced,
 )
 from replay.recordings.source import RecordedSource
+from replay.viewer.broadcast import Broadcast
+from replay.viewer.web import DATA
 
 FRAMES, FPS = 21, 8.0  # of so few a second that a busy machine is not late by a tick
 TOPIC = Topic("/x", "json", "", "", b"")
@@ -229,9 +232,9 @@ def test_the_viewer_is_handed_every_frame(recording: Path, tmp_path: Path) -> No
 
     taken: list[bytes] = []
 
-    def watch(address: str) -> None:
+    def watch(broadcast: Broadcast) -> None:
         def read() -> None:
-            with urllib.request.urlopen(address) as answer:
+            with urllib.request.urlopen(urljoin(broadcast.address, DATA)) as answer:
                 taken.append(answer.read())
 
         threads.append(threading.Thread(target=read))

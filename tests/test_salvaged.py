@@ -60,7 +60,7 @@ def test_a_broken_image_is_refused_with_the_remedy_and_passed_over_with_it(tmp_p
     with contextlib.closing(ForeignSource(path, salvage=True)) as source:
         assert source.take(0, 8).frames.shape[0] == 8
         assert "2 broken of 40 images" in source.salvaged()[0]
-    with pytest.raises(LogDamagedError, match=r"/cam.*broken \(\w+\)$"):
+    with pytest.raises(LogDamagedError, match=r"/cam.*its PNG is cut short$"):
         ForeignSource(write(tmp_path / "b.mcap", range(3), 3), salvage=True)
 
 

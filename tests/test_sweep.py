@@ -455,15 +455,17 @@ def test_a_folder_without_a_sweep_is_refused(tmp_path: Path) -> None:
 
 def test_the_command_prints_one_document_and_says_what_failed(tmp_path: Path) -> None:
     record_scene("oscillatory", tmp_path / "log", frames=1000)
-    words = [str(tmp_path / "log"), "--grid", "learner.tau=40,100", "--seeds", "0:2"]
+    words = [str(tmp_path / "log"), "--grid", "learner.tau=100,2000", "--seeds", "0:2"]
     words += ["--max-iterations", "20", "-o", str(tmp_path / "s"), "--json"]
     found = CliRunner().invoke(sweep_command, words)
     document = json.loads(found.stdout)
     assert found.exit_code == 1
     assert (document["trials"], document["computed"], len(document["failed"])) == (4, 2, 2)
-    assert {row["point"]["learner.tau"] for row in document["failed"]} == {"100"}
+    assert {row["point"]["learner.tau"] for row in document["failed"]} == {"2000"}
     assert all("frames" in row["error"] for row in document["failed"])
-    assert CliRunner().invoke(results_command, [str(tmp_path / "s")]).exit_code == 0
+    shown = CliRunner().invoke(results_command, [str(tmp_path / "s"), "--json"])
+    ended = json.loads(shown.stdout)["points"][0]
+    assert (ended["done"], ended["measures"]["iterations"]["mean"]) == (2, 10.0)  # as the log did
 
 
 def test_the_page_s_python_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

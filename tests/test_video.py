@@ -177,7 +177,7 @@ def test_videos_of_one_name_are_told_apart_by_their_folders(
         file.write_bytes(video.read_bytes())
         file.with_name("é.mp4").write_bytes(video.read_bytes())
     copies = [file.with_name("é.mp4") for file in files]
-    assert ForeignSource(files, size=SIZE).spec.streams == ("l/cam", "r/cam")
+    assert ForeignSource(files, size=SIZE).spec.streams == ("l_cam", "r_cam")
     done = cdmisfa("convert", *copies, "-o", tmp_path / "rec", "--size", "16x12")
     assert done.code == 0, done.err
     assert {p.name for p in (tmp_path / "rec").iterdir()} == {"l_e.mcap", "r_e.mcap"}

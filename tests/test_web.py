@@ -24,7 +24,7 @@ from run_data import VECTOR, write_run
 from waiting import started
 
 from replay.viewer import web
-from replay.viewer.web import POLICY, page_of, served
+from replay.viewer.web import POLICY, page_of, pieces_of, served
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -186,7 +186,7 @@ def page():
     with tempfile.TemporaryFile() as run:
         run.write(RUN)
         run.flush()
-        with served(page_of(viewer.server_port, run)) as address:
+        with served(page_of(viewer.server_port, lambda: pieces_of(run))) as address:
             yield urlsplit(address), viewer
     viewer.shutdown()
     viewer.server_close()

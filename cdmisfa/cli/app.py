@@ -171,8 +171,19 @@ def run(args: Sequence[str]) -> int:
         except Exception as error:
             if os.environ.get("CDMISFA_TRACEBACK") == "1":
                 raise
+            if _was_interrupt(error):
+                return _fail("interrupted", stop.exit_code)
             return _explain(error)
     return code if isinstance(code, int) else 0
+
+
+def _was_interrupt(error: BaseException | None) -> bool:
+    """Whether an interrupt became this error; Python 3.11 makes one in `__set_name__` another."""
+    if isinstance(error, CdmisfaError | OSError):  # what failed on the way out is said
+        return False
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _refuse_odd_names(args: Sequence[str]) -> None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
     from cdmisfa.experiments.run_folder import RunResult
+    from replay.viewer.broadcast import Broadcast
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
@@ -158,18 +159,18 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
         warn(warning)
 
 
-def announce(address: str) -> None:
+def announce(broadcast: Broadcast) -> None:
     """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.program import has_display, open_privately
+    from replay.viewer.program import has_display
 
-    tell(f"live view {address}    look at it: rerun {address}")
+    tell(f"live view {broadcast.address}    look at it in a browser of this machine")
     if has_display():
-        open_privately(address)
+        broadcast.open_window()
 
 
 def outcome_line(outcome: Mapping[str, Any]) -> str:
     """What became of a stream, in words."""
-    came = outcome["state"].replace("_", " ")
+    came = "not decided" if outcome["state"] == "learning" else outcome["state"].replace("_", " ")
     if outcome["module"] is not None:
         came += f" by module {outcome['module']}"
     if outcome["slowness"] is not None:
@@ -203,8 +204,11 @@ def print_result(result: RunResult, *, as_json: bool) -> None:
         print_table(("module", "stream", "iteration", "eta"), without)
     else:
         print_line("no module was learned")
-    for outcome in result.summary.get("streams", ()):
-        print_line(outcome_line(outcome))
+    if "streams" in result.summary:
+        for outcome in result.summary["streams"]:
+            print_line(outcome_line(outcome))
+    elif result.undecided:
+        print_line(f"not decided: {', '.join(result.undecided)}")
     print_line(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
     print_line(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
@@ -309,6 +313,11 @@ class Reporter(Sink):
             note = f"{modules} saved, {left}"
             self._shown.update(learner.iteration, self._max_iterations, note)
 
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """See `Sink`."""
+        if level == "WARNING":
+            self._shown.say(text)
+
     def hashing(self, done: int, size: int) -> None:
         """Show how far the source's files are hashed, once that is waited for."""
         if not self._hashing:
@@ -320,13 +329,7 @@ class Reporter(Sink):
 
 
 @contextlib.contextmanager
-def learning(max_iterations: int | None, *, as_json: bool) -> Iterator[tuple[Stop, Reporter]]:
-    """Show the progress of a run, end it at a signal, and print its result if its source ended."""
-    from cdmisfa.experiments.run_folder import RunExhaustedError
-
-    try:
-        with bar("learning", "blocks") as shown, stoppable() as stop:
-            yield stop, Reporter(shown, max_iterations)
-    except RunExhaustedError as error:
-        print_result(error.result, as_json=as_json)
-        raise
+def learning(max_iterations: int | None) -> Iterator[tuple[Stop, Reporter]]:
+    """Show the progress of a run, and end it at a signal."""
+    with bar("learning", "blocks") as shown, stoppable() as stop:
+        yield stop, Reporter(shown, max_iterations)

@@ -14,7 +14,7 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.making import Command
 from cdmisfa.cli.printing import bar, quoted, tell
-from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 
 if TYPE_CHECKING:
     from replay.storage.location import Url
@@ -121,10 +121,7 @@ def uploaded(
     except UsageError:
         raise
     except BaseException as error:
-        ended = isinstance(error, LogExhaustedError)  # the result is as far as its source goes
-        if isinstance(error, click.exceptions.Exit):
-            ended = error.exit_code < INTERRUPTED
-        if ended:
+        if isinstance(error, click.exceptions.Exit) and error.exit_code < INTERRUPTED:
             upload_now(place, url, again)
         elif place.exists():
             tell(f"{place} is not uploaded: when it is finished, {again}")

@@ -7,6 +7,8 @@ whichever is watched, as the channels of a television do.
 from __future__ import annotations
 
 import itertools
+import re
+import unicodedata
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -22,6 +24,9 @@ UINT8 = np.dtype(np.uint8)
 
 PIXEL = 1.0 / 255.0
 """What one step of a uint8 pixel counts."""
+
+_OF_VIEWS = re.compile(r"(/view/|observation\.images\.)+(?=.)")
+_LONGEST = 64
 
 _TYPES = (np.dtype(np.float64), UINT8)
 
@@ -261,13 +266,25 @@ def description(
     return described
 
 
-def distinct_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Distinct names of streams: a number behind those like an earlier one, as cam-2.
+def stream_name(said: str) -> str:
+    """The name of a stream, valid as one of a file, from what a log or a camera calls it.
+
+    The topic /cam/left is cam_left. A view has its own name also where it is a topic (/view/left)
+    or a column of a dataset (observation.images.left). Letters lose their accents, those of other
+    scripts stay.
+    """
+    letters = unicodedata.normalize("NFKD", _OF_VIEWS.sub("", said))
+    bare = "".join(c for c in letters if not unicodedata.combining(c))
+    return re.sub(r"[^\w.-]+", "_", bare).strip("._-")[:_LONGEST].rstrip("._-") or "stream"
+
+
+def stream_names(said: Iterable[str]) -> tuple[str, ...]:
+    """`stream_name` of each stream, distinct: a number behind those like an earlier one, as cam-2.
 
     One with which an earlier one begins, as cam after cam-left, counts as like it.
     """
     found: list[str] = []
-    for name in names:
+    for name in map(stream_name, said):
         like = sum(other == name or other.startswith(f"{name}-") for other in found)
         numbered = (f"{name}-{number}" for number in itertools.count(like + 1))
         found.append(next(n for n in numbered if n not in found) if like else name)

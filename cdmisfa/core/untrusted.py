@@ -7,6 +7,7 @@ held to a length instead: what it says takes up to twenty times as much memory.
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import json
 import os
@@ -137,10 +138,12 @@ def check_regular(path: Path, limit: int | None = None) -> None:
     """Refuse a path that is no regular file, or a file that is too large, without opening it.
 
     Raises:
-        UsageError: so it is; or it cannot be looked at.
+        UsageError: so it is; or it may not be read.
     """
     try:
         _check(path, os.stat(path), limit)
+        if not os.access(path, os.R_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except FileNotFoundError:
         raise UsageError(f"{path}: no regular file (No such file or directory)") from None
     except OSError as error:
@@ -151,22 +154,39 @@ def read_regular(path: Path, limit: int) -> bytes:
     """The bytes of a regular file; never waits as for a pipe, never reads more than the limit.
 
     Raises:
-        UsageError: it is no regular file, or has more bytes.
+        UsageError: it is no regular file that may be read, or has more bytes.
         LogDamagedError: the disk does not give it.
     """
     with opened_regular(path, limit) as file:
-        return file.read(limit)
+        return file.read(limit) or b""  # nothing of what would be waited for, as in /proc
 
 
 @contextlib.contextmanager
 def opened_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
     """A regular file, open to be read; raises as `read_regular` does, in the body, too."""
+    check_regular(path, limit)
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-            _check(path, os.fstat(file.fileno()), limit)
+        with open(open_regular(path, limit), "rb") as file:
             yield file
     except OSError as error:
         raise LogDamagedError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def open_regular(path: Path, limit: int | None = None) -> int:
+    """Open a regular file to be read, by its number; nothing else is opened or waited for.
+
+    Raises:
+        OSError: it cannot be opened.
+        UsageError: it is no regular file, or has more bytes.
+    """
+    _check(path, os.stat(path), limit)  # opening alone does something to some devices
+    number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        _check(path, os.fstat(number), limit)
+    except BaseException:
+        os.close(number)
+        raise
+    return number
 
 
 def read_json(path: Path, remedy: str, *, most: int = MAX_JSON) -> Any:

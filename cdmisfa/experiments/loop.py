@@ -16,12 +16,15 @@ if TYPE_CHECKING:
 INTERRUPTED: Final = "interrupted"
 """Why a run ended that was stopped before it came to an end of its own."""
 
+EXHAUSTED: Final = "log_exhausted"
+"""Why a run ended of which the source had no further block, before it came to its own end."""
+
 ENDINGS: Mapping[str, str] = {
     "max_modules": "as many modules as asked for were learned",
     "max_iterations": "the asked number of iterations is over",
     "nothing_left": "exploration ended long ago and no further abstraction converged",
     "all_decided": "every stream is learned, known or given up",
-    "log_exhausted": "the recording ended",
+    EXHAUSTED: "there were no more frames",
     INTERRUPTED: "it was interrupted",
 }
 """Why a run ended, in words."""
@@ -56,9 +59,8 @@ def learn(
         Why it ended, a key of `ENDINGS`.
 
     Raises:
-        LogExhaustedError: a recording ended first; the sinks are finished.
+        LogExhaustedError: the source has not enough for a single block.
     """
-    exhausted: LogExhaustedError | None = None
     modules = learner.max_modules if max_modules is None else max_modules
     while True:
         ended = ending(learner, modules, max_iterations) or (INTERRUPTED if stop() else "")
@@ -69,7 +71,11 @@ def learn(
         except LogExhaustedError as error:
             if stop():  # while it waited for frames to be recorded
                 continue
-            ended, exhausted = "log_exhausted", error
+            if not learner.iteration:
+                raise
+            ended = EXHAUSTED
+            for sink in sinks:
+                sink.event(source.t, learner.iteration - 1, str(error), "WARNING")
             break
         signals = learner.step(block)
         for sink in sinks:
@@ -79,8 +85,6 @@ def learn(
     for sink in sinks:
         sink.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
         sink.finish()
-    if exhausted is not None:
-        raise exhausted
     return ended
 
 

@@ -22,6 +22,7 @@ from cdmisfa.core.errors import (
 )
 from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.names import named, same_names
 from cdmisfa.experiments.resume import (
     config_history,
     read_command,
@@ -36,8 +37,8 @@ from replay.runs.keyframes import arrays_of, read_keyframe, read_keyframes
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.run import other_files, stated_source
 
-SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
-"""What a source must have in common with the one that a run learned from."""
+SAME = ("frame_shape", "dtype", "fps", "start_ns")
+"""What besides its streams a source must have in common with the one that a run learned from."""
 
 ROUNDING = 1e-6
 """Share of a signal's largest number up to which another arithmetic explains a difference."""
@@ -135,7 +136,7 @@ class Recomputation:
         self.learner: Learner = open_learner(span.config, self.header.spec, span.seed)
         self.t = 0
         if keyframe is not None:
-            restore(self.learner, keyframe)
+            restore(self.learner, keyframe, self.header.spec.streams)
             self.t = keyframe.t
 
     @classmethod
@@ -274,7 +275,8 @@ class Recomputation:
     def _difference_from(self, keyframe: Keyframe, rounding: float) -> Difference | None:
         """Where a keyframe differs from the learner after as many iterations."""
         last, state = keyframe.iteration - 1, self.learner.state
-        kept, own = arrays_of(keyframe.state), arrays_of(state)
+        kept = arrays_of(named(keyframe.state, self.header.spec.streams))
+        own = arrays_of(state)
         if kept.keys() != own.keys():
             return Difference(last, "keyframe", (), ", ".join(kept), ", ".join(own))
         for name, array in kept.items():
@@ -298,7 +300,8 @@ class Recomputation:
                 "iterations, where it stands in its log: name it with --source)"
             ) from error
         now, then = source.spec, self.header.spec
-        if any(getattr(now, name) != getattr(then, name) for name in SAME):
+        same = same_names(then.streams, now.streams)
+        if not same or any(getattr(now, name) != getattr(then, name) for name in SAME):
             source.close()
             raise UsageError(
                 f"{' '.join(self._words) or 'its source'} shows other streams than {self.log} was "

@@ -18,6 +18,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.documents import versions
+from cdmisfa.experiments.names import named, renamed, same_names
 from cdmisfa.experiments.sources import CLOCK, open_logs, open_source
 from recorder.cameras.words import is_live
 from recorder.log.files import found_path, partial_path, relative_path
@@ -196,14 +197,14 @@ def header_to_resume(run: Path) -> tuple[Path, RunHeader | None]:
         return log, None
 
 
-def restore(learner: Learner, keyframe: Keyframe) -> None:
-    """Put a learner into the state of a keyframe.
+def restore(learner: Learner, keyframe: Keyframe, streams: Sequence[str]) -> None:
+    """Put a learner into the state of a keyframe, for streams of these names.
 
     Raises:
         LogDamagedError: the keyframe is of another configuration.
     """
     try:
-        learner.restore(keyframe.state)
+        learner.restore(named(keyframe.state, streams))
     except (LookupError, TypeError, ValueError) as error:
         what = f"the keyframe after {keyframe.iteration} iterations is of another learner"
         raise LogDamagedError(f"{what} ({one_line(error)})") from error
@@ -232,7 +233,7 @@ def restore_from(
         raise UsageError(f"{log.parent} was cut before its fork: fork again with --force")
     if keyframe is None:
         return None
-    restore(learner, keyframe)
+    restore(learner, keyframe, source.spec.streams)
     if keyframe.taken is not None:
         records = (signals for columns in read_columns(log) for signals in columns.records())
         for signals in itertools.islice(records, keyframe.iteration):
@@ -271,6 +272,10 @@ def refuse_difference(
         COMMAND: None,
     }
     streams = manifest["config"].get("scene", {}).get("kind")
+    if same_names(header.spec.streams, spec.streams):
+        names = dict(zip(header.spec.streams, spec.streams, strict=True))
+        before["spec"]["streams"] = spec.streams
+        before["source"] = renamed(source_then, names)
     for key, old, new in differences(_json(before), _json(now)):
         if key == "config.learner.portable":
             continue  # begun when it had an effect

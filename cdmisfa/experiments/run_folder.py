@@ -11,7 +11,7 @@ from typing import Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
-from cdmisfa.core.errors import LogExhaustedError, LogWriteError, UsageError
+from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
@@ -43,6 +43,7 @@ class RunResult:
         modules: what was learned, in order.
         summary: what else the learner says of itself.
         ended: why, a key of `ENDINGS`.
+        undecided: streams of which the learner had not come to a result when it ended.
     """
 
     run: str | None
@@ -55,6 +56,7 @@ class RunResult:
     modules: tuple[Module, ...]
     summary: Mapping[str, Any]
     ended: str
+    undecided: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
         """The result as `learn --json` prints it."""
@@ -69,17 +71,8 @@ class RunResult:
             "modules": [module_table(module) for module in self.modules],
             **self.summary,
             "ended": self.ended,
+            "undecided": list(self.undecided),
         }
-
-
-class RunExhaustedError(LogExhaustedError):
-    """The recording of a run ended before the run did; `result` is what it came to."""
-
-    def __init__(self, ended: LogExhaustedError, result: RunResult) -> None:
-        kept = f"{len(result.modules)} modules of {result.iterations} iterations"
-        saved = "" if result.run is None else f"; {kept} are in {result.run}"
-        super().__init__(f"{ended}{saved}")
-        self.result = result
 
 
 def module_table(module: Module) -> dict[str, Any]:

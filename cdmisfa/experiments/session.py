@@ -10,14 +10,15 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
-from cdmisfa.core.errors import LogExhaustedError, LogWriteError, UsageError
+from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.experiments.loop import Digest, Keyframes, learn
+from cdmisfa.experiments.names import named
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
     COMMAND,
@@ -34,7 +35,6 @@ from cdmisfa.experiments.resume import (
 )
 from cdmisfa.experiments.run_folder import (
     OpenLog,
-    RunExhaustedError,
     RunResult,
     opened_log,
     versions_used,
@@ -44,6 +44,9 @@ from recorder.log.files import folder_here
 from replay.runs.folders import run_log
 from replay.runs.run import stated_source, states_whole
 from replay.runs.writer import RunWriter
+
+if TYPE_CHECKING:
+    from replay.viewer.broadcast import Broadcast
 
 Hashing = Callable[[int, int], None]
 """Told of bytes of the source that were hashed and of how many, while that is waited for."""
@@ -227,8 +230,9 @@ class Session:
                 "before": {k: manifest[k] for k in ("config", "seed", FORK) if k in manifest},
             }
             session.before = log
-            session.keyframe = Keyframe(at, stopped.t, state, session._versions)
-            restore(session.learner, session.keyframe)
+            streams = stopped.source.spec.streams
+            session.keyframe = Keyframe(at, stopped.t, named(state, streams), session._versions)
+            restore(session.learner, session.keyframe, streams)
             yield session
 
     at = staticmethod(Recomputation.after)
@@ -243,7 +247,7 @@ class Session:
         fsync_every: float | None = None,
         rerun: bool = True,
         live: bool = False,
-        announce: Callable[[str], None] = lambda address: None,
+        announce: Callable[[Broadcast], None] = lambda broadcast: None,
         hashing: Hashing = _not_told,
     ) -> RunResult:
         """Learn until nothing is left to learn, and log every signal.
@@ -256,13 +260,13 @@ class Session:
                 more; None leaves it to the operating system until the run is finished.
             rerun: also build the Rerun view.
             live: also show the run in Rerun while it learns, to viewers on this machine.
-            announce: called with the address of the live view.
+            announce: called with what viewers of the live view are served.
             hashing: told of bytes of the source that were hashed, and of how many, while the run
                 waits for what it states of its source at its end.
 
         Raises:
             UsageError: the folder is not empty and is not to be replaced, or is in use.
-            RunExhaustedError: a recording ended first; what was learned is saved.
+            LogExhaustedError: the source has not enough for a single block.
         """
         digest, log = Digest(), None
         told: list[Sink] = [digest]
@@ -288,27 +292,22 @@ class Session:
                 tau, outputs = self.learner.tau, len(self.learner.phi)
                 view = LiveView(self.source.spec, self.manifest, tau, outputs, run=self.folder)
                 told.append(opened.enter_context(view))
-                announce(view.address)
+                announce(view.broadcast)
             if log is not None and self.before is not None:
                 self._copy_log(log, digest)
                 if live:
                     view.earlier(log.path.parent)
-            ended, exhausted = "log_exhausted", None
-            try:
-                ended = learn(self.source, self.learner, (*told, *sinks), stop=stop, **self._limits)
-            except LogExhaustedError as error:
-                exhausted = error
+            ended = learn(self.source, self.learner, (*told, *sinks), stop=stop, **self._limits)
             described = description(self.source, told=hashing)
             result = self._result(described, digest.hexdigest(), ended)
             if log is not None:
                 stated = {**self.manifest, "versions": self._versions}
                 write_results(log, result, stated, view=rerun)
-        if exhausted is not None:
-            raise RunExhaustedError(exhausted, result) from exhausted
         return result
 
     def _result(self, described: Mapping[str, Any], signals_sha256: str, ended: str) -> RunResult:
         learner = self.learner
+        summary = learner.summary()
         return RunResult(
             run=str(self.folder) if self.folder is not None else None,
             source=described,
@@ -318,8 +317,9 @@ class Session:
             frames=learner.iteration * learner.tau,
             signals_sha256=signals_sha256,
             modules=tuple(learner.modules),
-            summary=learner.summary(),
+            summary=summary,
             ended=ended,
+            undecided=() if learner.over else _undecided(learner, self.source, summary),
         )
 
     def _copy_log(self, log: RunWriter, digest: Digest) -> None:
@@ -347,6 +347,16 @@ class Session:
                 before.unlink()
             except OSError as error:
                 raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
+
+
+def _undecided(
+    learner: Learner, source: FrameSource, summary: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """The streams that are still being learned, or, where a learner says none, without a module."""
+    if "streams" in summary:
+        return tuple(one["stream"] for one in summary["streams"] if one["state"] == "learning")
+    learned = {module.stream_index for module in learner.modules}
+    return tuple(name for s, name in enumerate(source.spec.streams) if s not in learned)
 
 
 def _changes(changed: Mapping[str, Sequence[Any]]) -> list[str]:

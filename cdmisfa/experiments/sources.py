@@ -15,7 +15,7 @@ from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, open_live
-from recorder.config import RecordConfig, SceneConfig, view_names
+from recorder.config import RecordConfig, SceneConfig
 from recorder.images.options import ImageOptions
 from recorder.world.scenes import SCENES, open_scene
 from replay.camera_logs.options import CameraOptions
@@ -337,7 +337,6 @@ def open_cameras_now(
     preset: str | None = None,
     settings: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
-    stop: Callable[[], bool] = lambda: False,
 ) -> tuple[FrameSource, Configuration]:
     """Open live streams, as `is_live` finds them, on one clock; see `open_live`.
 
@@ -348,7 +347,6 @@ def open_cameras_now(
         preset: instead of that of cameras.
         settings: `section.key=value` words.
         say: told in a line when a camera's state changes.
-        stop: asked while waiting for the first pictures.
 
     Raises:
         UsageError: a word names no live stream or one that cannot be opened, or a wrong
@@ -366,7 +364,7 @@ def open_cameras_now(
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
     live = replace(live, **framing)
     told = log_settings(settings, words[0])
-    source = open_live([str(word) for word in words], live, say=say, stop=stop)
+    source = open_live([str(word) for word in words], live, say=say)
     try:
         configuration = configure_for(source.spec, source.describe(), preset, told, live.seed)
     except BaseException:
@@ -395,4 +393,4 @@ def convert(source: ForeignSource, folder: Path, **options: Any) -> list[ViewRec
 
     if source.spec.length is None:
         raise UsageError("a source that loops has no end: convert it without looping")
-    return record(source, folder, names=view_names(source.spec.streams), **options)
+    return record(source, folder, **options)

@@ -47,7 +47,7 @@ from replay.storage.location import Limits, limited, limits
 REQUEST = "sweep.json"
 """What was asked for last."""
 
-UNKEPT = ("schema", "run", "source", "seed", "signals_sha256")
+UNKEPT = ("schema", "run", "source", "seed", "signals_sha256", "undecided")
 """What of a run's result a trial's row has elsewhere, or not at all."""
 
 

@@ -95,10 +95,9 @@ class LiveSource(ForwardSource):
         about: what identifies the cameras.
         rate: ticks a second; by default the first camera's rate, stated or measured.
         hold: seconds for which a picture stands for those that are missing.
-        stop: asked while waiting; true ends the wait as if the cameras had ended.
 
     Attributes:
-        stop: as given; it may be replaced.
+        stop: asked while waiting; true ends the wait as if the cameras had ended.
 
     Raises:
         UsageError: a camera shows nothing, or tells no rate.
@@ -114,9 +113,8 @@ class LiveSource(ForwardSource):
         *,
         rate: float | None = None,
         hold: float = HOLD,
-        stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        self.stop = stop
+        self.stop: Callable[[], bool] = lambda: False
         self._readers = readers
         self._hold = round(hold * NANOSECONDS)
         self._streams = [_Stream() for _ in names]
@@ -239,7 +237,7 @@ class LiveSource(ForwardSource):
                     missing.append(names[number])
             if not missing:
                 return found
-            if self.stop() or now >= deadline:
+            if now >= deadline:
                 raise UsageError(f"{missing[0]} shows no picture: look at the camera and its name")
             readers.wait(min(deadline, now + _POLL))
 

@@ -23,7 +23,7 @@ QUEUE_BYTES: Final = 64 * 1024 * 1024
 _DELAYS: Final = (0.5, 30.0)
 """Seconds from a loss to the first try to reconnect, and most that there are between two."""
 
-_LEAVE: Final = 1.0
+_LEAVE: Final = 0.5
 """Seconds for which closing waits for the threads; they are daemons, and end with the process."""
 
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.blocks import FrameSource, stream_names
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.cameras.options import LiveOptions
-from recorder.config import view_names
 from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, Reading
 
 if TYPE_CHECKING:
@@ -89,7 +88,6 @@ def open_live(
     options: LiveOptions,
     *,
     say: Callable[[str], None] = lambda line: None,
-    stop: Callable[[], bool] = lambda: False,
 ) -> FrameSource:
     """Open live streams on one clock.
 
@@ -97,7 +95,6 @@ def open_live(
         words: a stream each.
         options: see there.
         say: told in a line when a camera's state changes.
-        stop: asked while waiting for the first pictures.
 
     Raises:
         UsageError: a word names nothing, a package is missing, or a camera cannot be opened.
@@ -131,7 +128,7 @@ def open_live(
         about["range_metres"] = list(options.depth)
     frames = CameraFrames(names, options.size, options.fit, color=options.color, say=say)
     readers = Readers(cameras, frames.frame, on_loss=options.on_loss, stall=options.stall, say=say)
-    source = LiveSource(readers, names, about, rate=options.rate, hold=options.hold, stop=stop)
+    source = LiveSource(readers, names, about, rate=options.rate, hold=options.hold)
     may_show = [
         "depth" in kind.takes and getattr(camera, "distances", None) is not False
         for kind, camera in zip(kinds, cameras, strict=True)
@@ -177,7 +174,7 @@ def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions)
 
 def live_names(words: Sequence[str]) -> tuple[str, ...]:
     """A name for each stream, that can be one of a file: rtsp://host/left is left."""
-    return view_names([_stream_of(word) for word in words])
+    return stream_names([_stream_of(word) for word in words])
 
 
 def _stream_of(word: str) -> str:

@@ -17,7 +17,7 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.images.fields import Field, field_value, members, numbers_of
 from recorder.images.messages import SCHEMAS, Decoder, foxglove_image, image_decoder, ros_stamp
 from recorder.images.options import Reading
-from recorder.images.pixels import MalformedImage
+from recorder.images.whole import MalformedImage
 
 Opened = Callable[[bytes], Any]
 """Turns a message into what has its fields; raises MalformedImage."""

@@ -22,13 +22,13 @@ from cdmisfa.core.clock import NANOSECONDS
 from recorder.images.options import Depth
 from recorder.images.pixels import (
     DISTANCES,
-    MalformedImage,
     Shown,
     compressed_image,
     compressed_words,
     raw_image,
 )
 from recorder.images.videos import Packet, VideoPackets
+from recorder.images.whole import MalformedImage
 
 Decoder = Callable[[bytes | memoryview], Shown]
 """Turns a message into an image or numbers; raises MalformedImage.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,9 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.options import Depth
+from recorder.images.whole import MalformedImage, load_picture, open_picture
 
 Shown = NDArray[Any]
 """What one message shows: a gray image, (height, width) uint8, or one in colours, (height, width,
@@ -60,10 +60,6 @@ _TURNS: Final = (
     *("ROTATE_270", "TRANSVERSE", "ROTATE_90"),
 )
 """What puts an image upright, by its orientation from 2 on; 1 is."""
-
-
-class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where
-    """No image that can be read; the caller adds where it was."""
 
 
 class UnknownPixels(MalformedImage):
@@ -240,21 +236,22 @@ def compressed_words(data: bytes) -> NDArray[np.uint16]:
 
 @contextmanager
 def _opened(data: bytes) -> Iterator[Image.Image]:
-    """Open a JPEG or PNG, turned upright; Pillow decodes it when its pixels are read."""
+    """Decode a JPEG or PNG, turned upright."""
     limit = f"more than {BUDGET >> 20} MiB of memory, the limit"
     try:
         with budget(), warnings.catch_warnings():
             warnings.simplefilter("error")
-            image: Image.Image = Image.open(io.BytesIO(data), formats=["JPEG", "PNG"])
-            if not 0 < image.width * image.height <= MAX_PIXELS:
-                raise MalformedImage(f"an image of {image.width}x{image.height} is not read")
+            file = open_picture(data)
+            if not 0 < file.width * file.height <= MAX_PIXELS:
+                raise MalformedImage(f"an image of {file.width}x{file.height} is not read")
             # Of a progressive JPEG all coefficients are held until its end.
-            held = image.width * image.height * (2 * len(image.getbands()) + 4)
-            if image.info.get("progressive") and held > BUDGET:
+            held = file.width * file.height * (2 * len(file.getbands()) + 4)
+            if file.info.get("progressive") and held > BUDGET:
                 raise MalformedImage(
-                    f"a progressive JPEG of {image.width}x{image.height} in {image.mode} takes "
-                    f"{limit}"
+                    f"a progressive JPEG of {file.width}x{file.height} in {file.mode} takes {limit}"
                 )
+            load_picture(file, data)
+            image: Image.Image = file
             if 2 <= (orientation := _orientation(image)) <= 8:
                 image = image.transpose(Image.Transpose[_TURNS[orientation - 2]])
             yield image

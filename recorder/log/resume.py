@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
+from cdmisfa.core.errors import LogWriteError, UsageError
+from cdmisfa.core.untrusted import opened_regular
 from recorder.config import Split
 from recorder.log.files import (
     RECORDING,
@@ -365,11 +366,8 @@ def _opened(path: Path) -> LogReader | None:
     Raises:
         LogDamagedError: the disk does not give it.
     """
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(MAGIC))
-    except OSError as error:
-        raise LogDamagedError(f"{path} cannot be read: {error.strerror}") from error
+    with opened_regular(path) as file:
+        start = file.read(len(MAGIC))
     return LogReader(path, salvage=True, check="chunks") if start == MAGIC else None
 
 

@@ -31,6 +31,8 @@ from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]
 
+NO_CHECKSUMS = "it has no checksums, nothing vouches for its bytes"
+
 _SENT_LESS = (
     "the server sends less than the log, or the log was cut (cdmisfa recover saves what is there)"
 )
@@ -125,9 +127,14 @@ class LogReader:
 
     @property
     def warnings(self) -> list[str]:
-        """What is missing and what was left out, a line each that names the file."""
+        """What is missing, was left out or is unproven, a line each that names the file."""
         problems = [f"{p.where}: {p.what}" for p in self.problems]
-        return [f"{self.path}: {text}" for text in (self.missing, *problems) if text]
+        said = (f"{self.path}: {text}" for text in (self.missing, *problems) if text)
+        return [*said, *self.unproven()]
+
+    def unproven(self) -> list[str]:
+        """What nothing vouches for, a line that names the file."""
+        return [f"{self.path}: {NO_CHECKSUMS}"] if self.crc_absent() else []
 
     @property
     def segments(self) -> list[Segment]:
@@ -271,7 +278,8 @@ class LogReader:
             return self._chunks.table(segment)
         except MalformedRecord as error:
             self._failed.add(segment.offset)
-            self._refuse(segment.name, str(error))
+            if not (segment.cut and self.salvage):  # that the file ends in it is said anyway
+                self._refuse(segment.name, str(error))
             return None
 
     def index(self, segment: Segment) -> Pairs:

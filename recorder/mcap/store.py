@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import stat
 import sys
 import threading
 from abc import ABC, abstractmethod
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.untrusted import open_regular
 from recorder.mcap.records import Place, crc32
 
 PARTIAL: Final = ".partial"
@@ -143,8 +143,9 @@ class FileStore(Store):
         self._closed = False
         self._mark = b""
         try:
-            self._seen = _regular(path)
-            self._keep(_Descriptor(path))
+            file = _Descriptor(path)
+            self._seen = os.fstat(file.number)
+            self._keep(file)
         except OSError as error:
             raise UsageError(f"{path}: {error.strerror}") from None
         self.size = self._seen.st_size
@@ -225,15 +226,17 @@ class FileStore(Store):
     def _opened_again(self) -> _Descriptor:
         """Open the very file that was opened before."""
         try:
-            file = _Descriptor(Path(str(self.path)))
-            now = os.fstat(file.number)
-            known = self._unchanged(now) or self._is_grown(file)
+            path = Path(str(self.path))
+            if os.path.samestat(os.stat(path), self._seen):  # else it may be no file any more
+                file = _Descriptor(path)
+                now = os.fstat(file.number)
+                known = self._unchanged(now) or self._is_grown(file)
+                if known and os.path.samestat(now, self._seen):
+                    self._keep(file)
+                    return file
         except OSError as error:
             raise LogDamagedError(f"{self.path}: {error.strerror} while it was read") from None
-        if not (os.path.samestat(now, self._seen) and known):
-            raise LogDamagedError(f"{self.path}: it was replaced while it was read")
-        self._keep(file)
-        return file
+        raise LogDamagedError(f"{self.path}: it was replaced while it was read")
 
     def _unchanged(self, now: os.stat_result) -> bool:
         return (now.st_size, now.st_mtime_ns) == (self.size, self._seen.st_mtime_ns)
@@ -266,18 +269,11 @@ class _Descriptor:
     number = -1
 
     def __init__(self, path: Path) -> None:
-        self.number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        self.number = open_regular(path)
 
     def __del__(self, close: Callable[[int], None] = os.close) -> None:
         if self.number >= 0:
             close(self.number)
-
-
-def _regular(path: Path) -> os.stat_result:
-    found = os.stat(path)
-    if not stat.S_ISREG(found.st_mode):
-        raise UsageError(f"{path}: not a file")
-    return found
 
 
 _LOCK: Final = threading.RLock()

@@ -169,7 +169,7 @@ class LogStructure:
                     break
         self._close_loose()
         if self.data_crc is not None and self._limit is None and not self.missing:
-            self.missing = "the summary at its end is cut, every message is there"
+            self.missing = "cut short: its summary is not all there, every message is"
         self.complete = self._limit is not None and self.data_crc is not None
         if self.complete:
             self._compare_with_summary()
@@ -342,7 +342,7 @@ class LogStructure:
                 if self._at < limit
                 else "the data section has no end record"
             )
-        self.missing = what
+        self.missing = f"cut short: {what}"
         return False
 
     def _resume_after(self) -> bool:
@@ -364,7 +364,7 @@ class LogStructure:
 
     def _resume_after_cut(self) -> bool:
         """Continue where it was a length that made the file look cut."""
-        what = self.missing
+        what = self.missing.removeprefix("cut short: ")
         torn = self.tail is None and self._at < self._file.size
         if not (self._resync and torn and self._resume_after()):
             return False

@@ -253,6 +253,7 @@ def _unpacked_bag(path: Path) -> Iterator[tuple[Path, bool]]:
         LogDamagedError: it is no rosbag2, or unpacks to far more than it is.
     """
     if not path.is_dir():
+        check_regular(path)
         yield path, False
         return
     from ruamel.yaml import YAML

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import IntArray
+from cdmisfa.core.blocks import stream_name, stream_names
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import VIDEO_RECIPE, Size
-from recorder.images.pixels import MalformedImage, Shown
+from recorder.images.pixels import Shown
 from recorder.images.videos import VideoPackets
+from recorder.images.whole import MalformedImage
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, UnreadableError, sorted_times
 from replay.storage.location import Location, Url
@@ -302,15 +304,15 @@ class WholeImages(Selected):
         )
 
 
-def unique_names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
-    """Topics as names of streams, with the file's and folders' where topics are shared.
+def names_of(streams: Sequence[ImageStream]) -> tuple[str, ...]:
+    """Names of streams by their topics, with the file's and folders' where topics are shared.
 
     Raises:
         UsageError: a topic of a log is named twice.
     """
     topics = [s.topic for s in streams]
     if len(set(topics)) == len(topics):
-        return tuple(topics)
+        return stream_names(topics)
     paths = [s.path.address if isinstance(s.path, Url) else str(s.path.resolve()) for s in streams]
     places = list(zip(paths, topics, strict=True))
     for i, place in enumerate(places):
@@ -319,14 +321,15 @@ def unique_names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
     for folders in range(max(len(Path(path).parts) for path in paths)):
         names = [_in_folders(stream, folders) for stream in streams]
         if len(set(names)) == len(names):
-            return tuple(names)
-    return tuple(f"{i + 1}/{topic}" for i, topic in enumerate(topics))
+            return stream_names(names)
+    return stream_names([f"{i + 1}/{topic}" for i, topic in enumerate(topics)])
 
 
 def _in_folders(stream: ImageStream, folders: int) -> str:
     """A stream's name with those of its file, and of some of the folders this is in."""
-    path, topic = stream.path, stream.topic
-    of_file = topic == path.stem or (isinstance(path, Path) and topic == path.resolve().name)
-    own = topic if of_file else path.stem + topic
+    path, own = stream.path, stream_name(stream.topic)
+    stems = [path.stem, *([path.resolve().name] if isinstance(path, Path) else [])]
+    if own not in map(stream_name, stems):
+        own = f"{path.stem}/{own}"
     above = Path(str(path) if isinstance(path, Url) else os.path.abspath(path)).parts[:-1]
-    return "/".join([*above[max(len(above) - folders, 0) :], own]).removeprefix("//")
+    return "/".join([*above[max(len(above) - folders, 0) :], own])

@@ -42,7 +42,7 @@ from replay.camera_logs.selected import (
     WholeImages,
     excerpts,
     join_parts,
-    unique_names,
+    names_of,
 )
 from replay.camera_logs.stream import ImageStream
 from replay.storage.identity import Identity, LoggedSource
@@ -122,7 +122,7 @@ class ForeignSource(LoggedSource):
             self.close()
             raise
         self._count = len(self._rows[0])
-        names, length = unique_names(self._streams), None if loop else self._count
+        names, length = names_of(self._streams), None if loop else self._count
         shape, dtype = self._framings[0].shape, str(firsts[0].dtype)
         self._spec = SourceSpec(names, shape, dtype, (), self._fps, start_ns, length)
         self.gaps = options.gaps == "skip" and any(self._gaps)

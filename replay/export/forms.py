@@ -16,7 +16,7 @@ from replay.camera_logs.options import CameraOptions
 from replay.export.frames import write_film, write_films, write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
-from replay.inputs import Logged, holds_run, open_to_look
+from replay.inputs import About, holds_run, open_to_look
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def export(
     force: bool = False,
     lossless: bool = False,
     cameras: CameraOptions | None = None,
-    about: Callable[[Logged], None] = lambda source: None,
+    about: About = lambda source: None,
 ) -> int:
     """Write a run's signals, or a recording's frames, in another form.
 
@@ -128,7 +128,7 @@ def _export_recording(
     form: str,
     lossless: bool,
     cameras: CameraOptions | None,
-    about: Callable[[Logged], None],
+    about: About,
 ) -> int:
     path = paths[0]
     if holds_run(path):

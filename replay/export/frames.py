@@ -8,10 +8,8 @@ it does not either.
 from __future__ import annotations
 
 import functools
-import itertools
 import json
 import math
-import re
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -20,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.blocks import Block, stream_names
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.images.videos import pyav
 from replay.inputs import Logged
@@ -44,8 +42,6 @@ NEUTRAL = 128
 
 FULL_RANGE = 2
 """FFmpeg's number for luma from 0 to 255."""
-
-_UNSAFE = re.compile(r"[^\w.-]|^\.")
 
 
 def pieces(source: Logged, stream: int, spans: Sequence[Span] | None = None) -> Iterator[Block]:
@@ -85,22 +81,9 @@ def _held(source: Logged, stream: int) -> list[Span]:
     return source.spans(stream, first, first + source.frames)
 
 
-def file_names(spec: SourceSpec) -> tuple[str, ...]:
-    """A name for each view that can be one of a file, no two of them the same.
-
-    A log may come from anywhere, and call its view `../x`.
-    """
-    names: list[str] = []
-    for view in spec.streams:
-        name = _UNSAFE.sub("_", view)[:64] or "_"
-        numbered = (f"{name}-{number}" for number in itertools.count(len(names) + 1))
-        names.append(next(n for n in itertools.chain([name], numbered) if n not in names))
-    return tuple(names)
-
-
 def write_images(source: Logged, folder: Path) -> int:
     """Write every frame of every view as VIEW/FRAME.png, and return how many there are."""
-    for stream, name in enumerate(file_names(source.spec)):
+    for stream, name in enumerate(stream_names(source.spec.streams)):
         (folder / name).mkdir(parents=True)
         for block in pieces(source, stream):
             for i, frame in enumerate(block.frames):
@@ -111,7 +94,7 @@ def write_images(source: Logged, folder: Path) -> int:
 def write_films(source: Logged, folder: Path, *, lossless: bool) -> int:
     """Write each view as VIEW.mp4, see `write_film`, and return how many frames they have."""
     folder.mkdir()
-    for stream, name in enumerate(file_names(source.spec)):
+    for stream, name in enumerate(stream_names(source.spec.streams)):
         write_film(source, stream, folder / f"{name}.mp4", lossless=lossless)
     return count(source)
 

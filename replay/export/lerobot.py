@@ -17,8 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cdmisfa.core.blocks import stream_names
 from cdmisfa.core.errors import UsageError
-from replay.export.frames import file_names, pieces, pixel_format, shared_spans, write_film
+from replay.export.frames import pieces, pixel_format, shared_spans, write_film
 from replay.inputs import Logged
 from replay.stored import Span
 
@@ -79,7 +80,7 @@ def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) ->
         for end, length in zip(ends, lengths, strict=True)
     ]
     videos = []
-    for stream, view in enumerate(file_names(source.spec) if source.spec.images else ()):
+    for stream, view in enumerate(stream_names(source.spec.streams) if source.spec.images else ()):
         videos.append(key := f"observation.images.{view}")
         file = _place(folder / "videos" / key, "mp4")
         write_film(source, stream, file, lossless=lossless, key_every=KEY_EVERY, spans=spans)
@@ -120,7 +121,7 @@ def _columns(
         truth = np.concatenate([block.truth for block in pieces(source, 0, spans)])
         add(STATE, truth.astype(np.float32), list(spec.truth))
     if not spec.images:
-        for stream, view in enumerate(file_names(spec)):
+        for stream, view in enumerate(stream_names(spec.streams)):
             frames = np.concatenate([block.frames for block in pieces(source, stream, spans)])
             names = [f"x{i + 1}" for i in range(frames.shape[1])]
             add(f"observation.{view}", frames.astype(np.float32), names)

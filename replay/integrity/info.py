@@ -20,6 +20,7 @@ from recorder.mcap.records import Channel, MalformedRecord, Problem, Segment
 from recorder.mcap.tables import MessageTable
 from replay.camera_logs.opening import channels_of, only_foreign
 from replay.inputs import locations
+from replay.integrity.state import Crc, State, crc_of, state_of, worst
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
@@ -32,7 +33,6 @@ CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""
 
 Kind = Literal["recording", "run", "foreign"]
-Crc = Literal["ok", "absent", "bad", "unchecked"]
 Times = NDArray[np.uint64]
 
 
@@ -92,6 +92,9 @@ class LogInfo:
         seed: the one that all files name, if they do.
         ended: why a run ended, where its folder says so.
         signals: of a run.
+        state: the worst of the files.
+        notes: what is no problem, and what nothing proves.
+        files: each file by itself.
     """
 
     path: str
@@ -105,6 +108,9 @@ class LogInfo:
     seed: int | None = None
     ended: str | None = None
     signals: RecordInfo | None = None
+    state: State = "whole"
+    notes: tuple[str, ...] = ()
+    files: tuple[LogInfo, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The description as JSON values."""
@@ -122,9 +128,10 @@ def describe(*words: str | Location) -> LogInfo:
         LogDamagedError: not an MCAP file, or a camera log that cannot be read.
     """
     named = locations(words)
-    files = [found for place in named for found in _describe_place(place)]
-    kinds, states = {f.kind for f in files}, {f.crc for f in files}
-    worst: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
+    logs = [file for place in named for file in _logs_at(place)]
+    files = [_describe_log(log, alone=len(logs) == 1) for log in logs]
+    kinds, states = {f.kind for f in files if f.channels or f.metadata}, {f.crc for f in files}
+    by_weight: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
     named_alike = Counter(name for f in files for name in f.metadata)
     metadata = {
         name if named_alike[name] == 1 else f.path: records
@@ -138,23 +145,54 @@ def describe(*words: str | Location) -> LogInfo:
         channels=tuple(c for f in files for c in f.channels),
         chunks=sum(f.chunks for f in files),
         complete=all(f.complete for f in files),
-        crc=next(state for state in worst if state in states),
+        crc=next(state for state in by_weight if state in states),
         problems=tuple(p for f in files for p in f.problems),
         metadata=metadata,
         seed=_seed(records),
         ended=_ended(named[0]) if len(named) == 1 and isinstance(named[0], Path) else None,
         signals=next((f.signals for f in files if f.signals is not None), None),
+        state=worst(f.state for f in files),
+        notes=tuple(note for f in files for note in f.notes),
+        files=tuple(files),
     )
 
 
-def _describe_place(place: Location) -> list[LogInfo]:
-    if not isinstance(place, Path) or not only_foreign(place):
-        return [_describe_file(file) for file in log_files(place)]
+def _logs_at(place: Location) -> list[Location]:
+    foreign = isinstance(place, Path) and only_foreign(place)
+    return [place] if foreign else log_files(place)
+
+
+def _describe_log(place: Location, *, alone: bool) -> LogInfo:
+    """Describe a log; of several one that cannot be read is described as such."""
+    try:
+        if isinstance(place, Path) and only_foreign(place):
+            return _describe_foreign(place)
+        return _describe_file(place)
+    except LogDamagedError as error:
+        if alone:
+            raise
+        wrong = (as_problem(place, error),)
+        return LogInfo(str(place), "foreign", (), 0, False, "bad", wrong, {}, state="damaged")
+
+
+def _describe_foreign(place: Path) -> LogInfo:
+    known = channels_of(place)
     channels = [
         ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
-        for c in channels_of(place)
+        for c in known
     ]
-    return [LogInfo(str(place), "foreign", tuple(channels), 0, True, "absent", (), {})]
+    problems = tuple(Problem(str(place), c.missing) for c in known if c.missing)
+    return LogInfo(
+        path=str(place),
+        kind="foreign",
+        channels=tuple(channels),
+        chunks=0,
+        complete=not problems,
+        crc="absent",
+        problems=problems,
+        metadata={},
+        state="cut short" if problems else "whole",
+    )
 
 
 def _describe_file(path: Location) -> LogInfo:
@@ -183,6 +221,8 @@ def _describe_file(path: Location) -> LogInfo:
             problems=problems_of(reader),
             metadata={path.name: metadata},
             signals=RecordInfo(version, missing_signals(version)) if version else None,
+            state=state_of(reader),
+            notes=tuple(reader.unproven()),
         )
 
 
@@ -192,13 +232,6 @@ def kind_of(reader: LogReader) -> Kind:
     if RECORDING_METADATA in names:
         return "recording"
     return "run" if RUN_METADATA in names else "foreign"
-
-
-def crc_of(reader: LogReader) -> Crc:
-    """What the checksums of a log that was decoded amount to."""
-    if any("CRC" in problem.what for problem in reader.problems):
-        return "bad"
-    return "absent" if reader.crc_absent() else "ok"
 
 
 def moved(problem: Problem, copy: Path, place: Location) -> Problem:

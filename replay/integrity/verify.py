@@ -6,29 +6,34 @@ import contextlib
 import itertools
 import json
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
-from recorder.mcap.reader import LogReader
+from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
-from replay.camera_logs.opening import channels_of, log_format, only_foreign, open_images
+from replay.camera_logs.opening import (
+    channels_of,
+    image_topics,
+    log_format,
+    only_foreign,
+    open_images,
+)
 from replay.camera_logs.stream import ImageStream
 from replay.camera_logs.table import table_notes
 from replay.inputs import locations
 from replay.integrity.info import (
     SCHEMA,
-    Crc,
     as_problem,
     count_messages,
-    crc_of,
     kind_of,
     moved,
     problems_of,
 )
+from replay.integrity.state import Crc, State, crc_of, state_of, worst
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
@@ -147,10 +152,11 @@ def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
 
 @dataclass(frozen=True, slots=True)
 class FileCheck:
-    """The checksums of one log: "absent" where nothing protects its messages."""
+    """One log: its checksums, "absent" where nothing protects its messages, and its state."""
 
     file: str
     crc: Crc
+    state: State
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,9 +172,15 @@ class LogCheck:
         """Whether nothing is wrong."""
         return not self.problems
 
+    @property
+    def state(self) -> State:
+        """The worst of the files; "damaged" where these are whole, and hold what they must not."""
+        found = worst(file.state for file in self.files)
+        return "damaged" if self.problems and found == "whole" else found
+
     def as_json(self) -> dict[str, Any]:
         """What was found as JSON values."""
-        return {"schema": SCHEMA, "ok": self.ok, **asdict(self)}
+        return {"schema": SCHEMA, "ok": self.ok, "state": self.state, **asdict(self)}
 
 
 def check_logs(*words: str | Location) -> LogCheck:
@@ -190,7 +202,7 @@ def check_log(path: str | Location) -> LogCheck:
     final record states. Of a recording also: each view has every frame once; of a folder, that
     the views have the same frames and none is missing.
 
-    Of a camera log that is not in MCAP files every image is decoded.
+    Of a camera log every image is decoded.
 
     Raises:
         UsageError: no such log.
@@ -206,35 +218,60 @@ def check_log(path: str | Location) -> LogCheck:
     beside = isinstance(place, Path) and place.is_dir()
     with fetched(place) as copy:
         for file in log_files(copy):
-            crc, found, passed = _check_file(file, beside=beside)
+            checked, found, passed = _check_file(file, beside=beside)
             problems += found
-            files.append(FileCheck(str(file).replace(str(copy), str(place)), crc))
+            files.append(replace(checked, file=checked.file.replace(str(copy), str(place))))
+            if checked.crc == "absent":
+                notes.append(f"{files[-1].file}: {NO_CHECKSUMS}")
             if isinstance(passed, _ViewPass):
                 views.append(passed)
             elif passed is not None and not found:
                 problems += passed.problems()
                 notes += passed.notes()
+            elif not found:
+                told = _check_topics(file, image_topics(file))
+                problems += told.problems
+                notes += told.notes
         if views:
             problems += _check_views(views, alone=copy.is_file())
     unique = dict.fromkeys(moved(problem, copy, place) for problem in problems)
-    return LogCheck(tuple(unique), tuple(files), tuple(notes))
+    return LogCheck(tuple(unique), tuple(files), tuple(dict.fromkeys(notes)))
 
 
 def _check_images(path: Path) -> LogCheck:
     """Decode every image of a camera log that has no checksums."""
-    problems: list[Problem] = []
-    notes: dict[str, None] = {}
     try:
-        if log_format(path) == "table":
-            notes |= dict.fromkeys(table_notes(path))
-        for channel in channels_of(path, whole=True):
-            if channel.images and channel.messages:
-                with contextlib.closing(open_images(path, channel.topic)) as images:
-                    problems += _broken(images)
-                    notes |= dict.fromkeys(images.warnings)
+        kind = log_format(path)
+        notes = table_notes(path) if kind == "table" else []
+        if kind == "bag":
+            notes = [f"{path}: a ROS bag has no checksums, changed bytes may go unnoticed"]
+        channels = channels_of(path, whole=True)
     except LogDamagedError as error:
-        problems.append(as_problem(path, error))
-    return LogCheck(tuple(problems), (FileCheck(str(path), "absent"),), tuple(notes))
+        return LogCheck((as_problem(path, error),), (FileCheck(str(path), "absent", "damaged"),))
+    found = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _check_topics(path: Location, topics: Iterable[str]) -> LogCheck:
+    """Decode every image on some topics of a camera log."""
+    problems: list[Problem] = []
+    missing: dict[str, None] = {}
+    notes: dict[str, None] = {}
+    for topic in topics:
+        try:
+            with contextlib.closing(open_images(path, topic)) as images:
+                problems += _broken(images)
+                missing |= dict.fromkeys([images.missing] if images.missing else [])
+                notes |= dict.fromkeys(images.warnings)
+        except LogDamagedError as error:
+            problems.append(as_problem(path, error))
+        except UsageError as error:  # it needs an option, or what is not installed
+            said = str(error).removeprefix(f"{path}: ")
+            notes[f"{path}: {topic} is not decoded: {said}"] = None
+    state: State = "damaged" if problems else "cut short" if missing else "whole"
+    problems += [Problem(str(path), what) for what in missing]
+    told = (note for note in notes if note.removeprefix(f"{path}: ") not in missing)
+    return LogCheck(tuple(problems), (FileCheck(str(path), "absent", state),), tuple(told))
 
 
 def _broken(images: ImageStream) -> Iterator[Problem]:
@@ -275,7 +312,7 @@ class _ViewPass:
 
 def _check_file(
     path: Location, *, beside: bool
-) -> tuple[Crc, list[Problem], _ViewPass | RunPass | None]:
+) -> tuple[FileCheck, list[Problem], _ViewPass | RunPass | None]:
     try:
         with LogReader(open_store(path), salvage=True, check="pass") as reader:
             passed = _pass_of(path, reader, beside)
@@ -292,9 +329,10 @@ def _check_file(
             if stated != there and not reader.problems:
                 wrong.append(f"its summary states {stated} messages, there are {there}")
             problems = [Problem(str(path), what) for what in wrong]
-            return crc_of(reader), [*problems, *problems_of(reader)], passed
+            checked = FileCheck(str(path), crc_of(reader), state_of(reader))
+            return checked, [*problems, *problems_of(reader)], passed
     except LogDamagedError as error:
-        return "bad", [as_problem(path, error)], None
+        return FileCheck(str(path), "bad", "damaged"), [as_problem(path, error)], None
 
 
 def _pass_of(path: Location, reader: LogReader, beside: bool) -> _ViewPass | RunPass | None:

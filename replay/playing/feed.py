@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.messages import (
     ENCODING,
     TRUTH_TOPIC,
@@ -23,10 +23,11 @@ from recorder.log.messages import (
     VectorEncoder,
     view_topic,
 )
-from recorder.mcap.reader import LogReader
+from recorder.mcap.reader import Check, LogReader
 from replay.camera_logs.opening import fits_topic
 from replay.camera_logs.options import CameraOptions
-from replay.inputs import Logged, open_to_look, refuse_what_is_no_log
+from replay.inputs import About, Logged, open_to_look, refuse_what_is_no_log
+from replay.storage.identity import AT_ONCE
 from replay.storage.opening import log_files, open_store, starts_as_log
 
 READ_AHEAD: Final = 50
@@ -46,6 +47,7 @@ class Playback:
         fps: frames a second of logs that tell none, as folders of pictures.
         cameras: what is taken of camera logs of others; their rate is `fps`.
         about: given what is played frame by frame before that, to say what it is.
+        warn: told what is wrong with logs of which messages are played as they are.
         stop: asked while waiting; true ends it.
         progress: told the seconds that were played, and all that there are.
     """
@@ -54,7 +56,8 @@ class Playback:
     loop: bool = False
     fps: float | None = None
     cameras: CameraOptions = CameraOptions()
-    about: Callable[[Logged], None] = lambda source: None
+    about: About = lambda source: None
+    warn: Callable[[str], None] = lambda line: None
     stop: Callable[[], bool] = lambda: False
     progress: Callable[[float, float | None], None] = lambda done, total: None
 
@@ -201,7 +204,12 @@ def opened_messages(paths: Sequence[Path], how: Playback) -> Iterator[Feed[DueMe
     with contextlib.ExitStack() as stack:
         if as_they_are and all(map(_is_mcap, paths)):
             files = log_files(paths)
-            readers = [stack.enter_context(LogReader(open_store(file))) for file in files]
+            size = sum(file.stat().st_size for file in files if isinstance(file, Path))
+            check: Check = "data" if size <= AT_ONCE else "chunks"  # as `open_to_look`
+            opened = (LogReader(open_store(file), check=check) for file in files)
+            readers = [stack.enter_context(reader) for reader in opened]
+            for line in (line for reader in readers for line in reader.warnings):
+                how.warn(line)
             yield _logged_messages(readers, how.cameras.topics)
         else:
             yield _encoded_frames(stack.enter_context(opened_source(paths, how)))
@@ -230,6 +238,8 @@ def _logged_messages(readers: Sequence[LogReader], wanted: Sequence[str]) -> Fee
         chosen = {name for name in there if any(fits_topic(name, asked) for asked in wanted)}
         known = [{n: t for n, t in one.items() if t.name in chosen} for one in known]
     segments = [s for reader in readers for s in reader.segments if s.size]
+    if not segments and (cut := next((r for r in readers if r.missing), None)):
+        raise LogDamagedError(f"{cut.path}: {cut.missing}: there is no message before")
     if not segments:
         raise UsageError(f"{path} has no messages: there is nothing to play")
 

@@ -16,8 +16,9 @@ from replay.view.columns import Target
 from replay.view.labels import label
 from replay.viewer.broadcast import Broadcast
 
-PER_SECOND: Final = 60
-"""Most times a second that viewers are handed what they show."""
+PER_SECOND: Final = 20
+"""Most times a second that viewers are handed what they show: a browser that draws without a
+graphics card takes about 25 pieces a second, and would come to lag behind."""
 
 
 def play_in_rerun(
@@ -25,7 +26,7 @@ def play_in_rerun(
     how: Playback,
     *,
     port: int | None = None,
-    announce: Callable[[str], None] = lambda address: None,
+    announce: Callable[[Broadcast], None] = lambda broadcast: None,
 ) -> Played:
     """Serve a recording's frames to Rerun viewers on this machine when they are due.
 
@@ -33,7 +34,7 @@ def play_in_rerun(
         paths: the recording's folder, or files; or camera logs of others.
         how: it is played.
         port: to listen at; by default a free one.
-        announce: called with the address.
+        announce: called with what viewers are served.
 
     Raises:
         UsageError: no such log.
@@ -54,7 +55,7 @@ def play_in_rerun(
         if spec.truth:
             columns.append(target.lines("world/truth", spec.truth, every_frame=True))
         broadcast.hand_over()
-        announce(broadcast.address)
+        announce(broadcast)
         next_time = 0.0
         for number, (_, frame) in enumerate(paced(feed, how, played)):
             for column, value in zip(columns, (*frame.shown, frame.truth), strict=False):

@@ -176,6 +176,8 @@ class ViewFile:
 
     def _channel(self, topic: str, schema: str) -> ChannelRows:
         channels = [c for c in self.reader.channels.values() if c.topic == topic]
+        if not channels and self.reader.missing:
+            raise LogDamagedError(f"{self.path}: {self.reader.missing}: there is no message before")
         if len(channels) != 1:
             raise LogDamagedError(
                 f"{self.path}: {len(channels)} channels on {topic}, a recording has one"

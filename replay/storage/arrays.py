@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import stat
 import struct
 import sys
 import zipfile
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import one_line
+from cdmisfa.core.untrusted import open_regular
 
 MAX_BYTES: Final = 192 * 1024 * 1024
 """Largest file of arrays that is read."""
@@ -39,18 +39,15 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         OSError: the file cannot be opened.
+        UsageError: it is no regular file, or too large.
         ValueError: it holds something else; it says what in one short line.
     """
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-        found = os.fstat(file.fileno())
-        if not stat.S_ISREG(found.st_mode):
-            raise ValueError("it is no regular file")
-        if found.st_size > MAX_BYTES:
-            raise ValueError(f"it has {found.st_size} bytes, above the limit of {MAX_BYTES}")
+    with open(open_regular(path, MAX_BYTES), "rb") as file:
+        size = os.fstat(file.fileno()).st_size
         try:
             with np.load(file, allow_pickle=False) as stored:
                 members = stored.zip.infolist()
-                if sum(member.file_size for member in members) > found.st_size:
+                if sum(member.file_size for member in members) > size:
                     raise ValueError("its arrays overlap, or are compressed")
                 if len(members) != _stated_members(stored.zip):
                     raise ValueError("its directory is cut")

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.untrusted import opened_regular
 from recorder.mcap.records import MAGIC
 from recorder.mcap.store import PARTIAL, FileStore, Store
 from replay.storage.location import Location, Url, location
@@ -82,13 +83,11 @@ def starts_as_log(path: Path) -> bool:
     """Whether a file begins as every MCAP file does.
 
     Raises:
-        CdmisfaError: it cannot be read.
+        UsageError: it is no regular file, or may not be read.
+        LogDamagedError: the disk does not give it.
     """
-    try:
-        with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError as error:
-        raise CdmisfaError(f"{path}: {error.strerror}") from None
+    with opened_regular(path) as file:
+        return file.read(len(MAGIC)) == MAGIC
 
 
 @contextlib.contextmanager

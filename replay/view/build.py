@@ -20,7 +20,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.camera_logs.options import CameraOptions
-from replay.inputs import Logged, holds_run, open_to_look
+from replay.inputs import About, Logged, holds_run, open_to_look
 from replay.recordings.source import RecordedSource, head_poses
 from replay.runs.columns import Blocks
 from replay.runs.folders import MODULES_FILE, run_log
@@ -54,6 +54,7 @@ def build_view(
     beside: Sequence[Path] = (),
     cameras: CameraOptions | None = None,
     body: bool = True,
+    about: About = lambda source: None,
 ) -> None:
     """Write the view of a run, a recording or camera logs as an .rrd file, whole or not at all.
 
@@ -67,6 +68,7 @@ def build_view(
         beside: more camera logs, or files of the recording.
         cameras: which streams of camera logs; by default all of images.
         body: show the robot's body in a run's view.
+        about: given a recording or camera logs before they are shown, to say what they are.
 
     Raises:
         UsageError: there is no such run or recording, `every` is below 1, `out` exists and
@@ -88,12 +90,16 @@ def build_view(
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
         with recording_to(out, path.resolve().stem, path, force=force) as recording:
-            write_recording(recording, [path, *beside], every, tab, cameras)
+            write_recording(recording, [path, *beside], every, tab, cameras, about)
 
 
 @contextlib.contextmanager
 def view_of(
-    path: Path, every: int, all_views: Path | None, tab: str | None = None
+    path: Path,
+    every: int,
+    all_views: Path | None,
+    tab: str | None = None,
+    about: About = lambda source: None,
 ) -> Iterator[Path]:
     """The view of a run, a recording or an .rrd file, there for as long as it is looked at.
 
@@ -109,7 +115,7 @@ def view_of(
         return
     with tempfile.TemporaryDirectory(prefix="cdmisfa-view-") as folder:
         view = Path(folder) / f"{path.resolve().stem}.rrd"
-        build_view(path, view, every=every, all_views=all_views, tab=tab)
+        build_view(path, view, every=every, all_views=all_views, tab=tab, about=about)
         yield view
 
 
@@ -199,6 +205,7 @@ def write_recording(
     every: int,
     tab: str | None = None,
     cameras: CameraOptions | None = None,
+    about: About = lambda source: None,
 ) -> None:
     """Write a recording's views and ground truth, and the layout for them.
 
@@ -208,12 +215,14 @@ def write_recording(
         every: show images of every this many frames; values are all shown.
         tab: name of the tab that is open.
         cameras: which streams of camera logs; by default all of images.
+        about: see `build_view`.
 
     Raises:
         UsageError: there is no such recording or tab.
         LogDamagedError: it cannot be read.
     """
     with contextlib.closing(open_to_look(paths, cameras)) as source:
+        about(source)
         first, count, spec = source.t, source.frames, source.spec
         ours = isinstance(source, RecordedSource)
         scenery = world_of_recording(paths[0]) if ours else None

@@ -7,18 +7,18 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler
 
 import rerun as rr
 
 from cdmisfa.core.errors import CdmisfaError
 from replay.view.properties import APPLICATION
-from replay.viewer.web import served
+from replay.viewer.program import free_port, open_growing, running
+from replay.viewer.web import page_of, page_server, served, shown_at
 
 FIRST = 2
 """Pieces at the beginning, which name the recording and its lines, and never go."""
 
-LAST_SECONDS = 5.0
+LAST_SECONDS = 1.0
 """Longest wait for viewers to take the last piece."""
 
 MEMORY = 1 << 30
@@ -28,13 +28,16 @@ MEMORY = 1 << 30
 class Broadcast:
     """A new Rerun recording, and what it is given served piece by piece.
 
+    A browser and a window's standard input wait for what comes as long as it takes. A window that
+    is given the address of the data ends its request after 30 s: Rerun knows no other limit.
+
     Args:
         kind: of recording, a word for its name.
         port: to listen at; by default a free one.
 
     Attributes:
         recording: what is served; ended by `close`.
-        address: where viewers find it.
+        address: of the page that shows it.
 
     Raises:
         CdmisfaError: the port is taken, or Rerun is switched off.
@@ -45,22 +48,18 @@ class Broadcast:
         if not rr.is_enabled(self.recording):
             raise CdmisfaError("no live view: Rerun is switched off, unset the variable RERUN")
         self.recording.set_log_time_enabled(False)
-        self._name = f"{kind}.rrd"
         self._encoded = rr.binary_stream(self.recording)
         self._pieces = Pieces(MEMORY)
-        self._serving = contextlib.ExitStack()
-        self.address = f"{self._serving.enter_context(served(self._answer, port))}{self._name}"
+        with contextlib.ExitStack() as serving:
+            viewer_port = free_port()
+            page = page_of(viewer_port, self._pieces.read)
+            self.address = shown_at(serving.enter_context(served(page, port)))
+            serving.enter_context(running(page_server(viewer_port)))
+            self._serving = serving.pop_all()
 
-    def _answer(self, request: BaseHTTPRequestHandler, path: str) -> None:
-        if path != self._name:
-            request.send_error(404)
-            return
-        request.send_response(200)
-        request.send_header("Content-Type", "application/octet-stream")
-        request.send_header("Cache-Control", "no-store")
-        request.end_headers()
-        for piece in self._pieces.read():
-            request.wfile.write(piece)
+    def open_window(self) -> None:
+        """Open a viewer that shows it; it stays open when we have ended."""
+        open_growing(self._pieces.read())
 
     def hand_over(self) -> None:
         """Let viewers have what the recording was given."""
@@ -71,7 +70,8 @@ class Broadcast:
         """Hand over the rest and stop serving; a viewer keeps what it has."""
         self.hand_over()
         self._pieces.end(LAST_SECONDS)
-        self._serving.close()
+        with contextlib.suppress(CdmisfaError):  # the page's program may have got our Ctrl-C, too
+            self._serving.close()
         self.recording.disconnect()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.camera_logs.source import ForeignSource
-from replay.inputs import holds_run, open_to_look
+from replay.inputs import About, holds_run, open_to_look
 from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
 from replay.view.bindings import viewer_client
 from replay.view.build import view_of
@@ -51,6 +51,7 @@ def screenshot(
     tab: str | None = None,
     force: bool = False,
     window: str = WINDOW,
+    about: About = lambda source: None,
 ) -> None:
     """Draw the view of a run or recording without a screen.
 
@@ -63,6 +64,7 @@ def screenshot(
         tab: name of the tab that is shown; by default the first.
         force: replace an existing file.
         window: size, as "1600x1000".
+        about: see `build_view`.
 
     Raises:
         UsageError: `out` is no .png, or exists and `force` is not set, there is no such moment or
@@ -71,7 +73,7 @@ def screenshot(
     """
     frame = None if at is None else frame_at(path, str(at))
     _refuse(out, window, force=force)
-    with view_of(path, every, all_views, tab) as view, headless_viewer(window) as viewer:
+    with view_of(path, every, all_views, tab, about) as view, headless_viewer(window) as viewer:
         viewer.ask(lambda client: client.open(str(view)))
         viewer.ask(lambda client: _painted(client.get_state()))
         if frame is not None:

@@ -55,6 +55,9 @@ class LiveView(Sink):
         run: its folder, where it has one.
         port: to listen at; by default a free one.
 
+    Attributes:
+        broadcast: what viewers are served.
+
     Raises:
         CdmisfaError: the port is taken, or Rerun is switched off.
     """
@@ -70,8 +73,8 @@ class LiveView(Sink):
         port: int | None = None,
     ) -> None:
         outline = _nothing_yet(RunHeader(SCHEMA_VERSION, spec, manifest), tau, outputs)
-        self._broadcast = Broadcast("live", port)
-        self._recording, self.address = self._broadcast.recording, self._broadcast.address
+        self.broadcast = Broadcast("live", port)
+        self._recording = self.broadcast.recording
         self._recording.send_recording_name("live")
         self._recording.log("summary", rr.TextDocument(SUMMARY), static=True)
         streams = outline.streams(MOST_STREAMS)
@@ -85,7 +88,7 @@ class LiveView(Sink):
             self._view.event(0, 0, note, "WARN")
         self._images = spec.images
         self._next = time.monotonic() + EVERY_SECONDS
-        self._broadcast.hand_over()
+        self.broadcast.hand_over()
         self._forget()
 
     def _forget(self) -> None:
@@ -158,12 +161,12 @@ class LiveView(Sink):
                     self._view.weights(place, t, iteration, weights[t])
         self._view.flush()
         self._world.flush()
-        self._broadcast.hand_over()
+        self.broadcast.hand_over()
 
     def close(self) -> None:
         """Hand over the rest and stop serving; a viewer keeps what it has."""
         self.flush()
-        self._broadcast.close()
+        self.broadcast.close()
 
     def __enter__(self) -> Self:
         return self

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -158,22 +158,14 @@ def ends_with_parent() -> Callable[[], None] | None:
     return ask
 
 
-def open_privately(address: str, memory_limit: str = "2GB") -> None:
-    """Open a viewer on what is served at an address; it stays open when we have ended.
+def open_privately(address: str) -> None:
+    """Open a viewer on what a server of Rerun's has; it stays open when we have ended.
 
     It is told the address once it runs: others can see a program's arguments.
     """
     host = private_host()
     port = str(free_port(host))
-    place = ["--bind", host, "--port", port, "--expect-data-soon"]
-    viewer = subprocess.Popen(
-        [str(viewer_program()), *place, "--memory-limit", memory_limit],
-        env=environment(),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    viewer = _window(host, port, subprocess.DEVNULL)
 
     def open_it() -> bool:
         viewer_client().connect(f"rerun+http://{host}:{port}/proxy").open(address)
@@ -185,6 +177,41 @@ def open_privately(address: str, memory_limit: str = "2GB") -> None:
         viewer.wait()
 
     threading.Thread(target=tell, daemon=True).start()
+
+
+def open_growing(pieces: Iterable[bytes]) -> None:
+    """Open a viewer on a recording that grows; it stays open when we have ended.
+
+    One of its threads does nothing but wait for its standard input: with the default, two fewer
+    than the machine has processors, there might be no other.
+    """
+    host, threads = private_host(), 1 + (os.cpu_count() or 1)
+    how = ("--threads", str(threads), "-")
+    viewer = _window(host, str(free_port(host)), subprocess.PIPE, *how)
+    given = viewer.stdin
+    assert given is not None
+
+    def feed() -> None:
+        with contextlib.suppress(OSError), given:  # the window may have been closed
+            for piece in pieces:
+                given.write(piece)
+                given.flush()
+        viewer.wait()
+
+    threading.Thread(target=feed, daemon=True).start()
+
+
+def _window(host: str, port: str, given: int, *arguments: str) -> subprocess.Popen[bytes]:
+    """A viewer in a window, which outlives us."""
+    place = ["--bind", host, "--port", port, "--expect-data-soon", "--memory-limit", "2GB"]
+    return subprocess.Popen(
+        [str(viewer_program()), *place, *arguments],
+        env=environment(),
+        stdin=given,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
 
 
 def wait_until(

@@ -15,7 +15,7 @@ import secrets
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import BinaryIO
 from urllib.parse import quote, urlsplit
@@ -127,28 +127,36 @@ def page_server(viewer_port: int) -> list[str]:
     return ["--serve-web", "--bind", HOST, "--web-viewer-port", str(viewer_port), place]
 
 
-def page_of(viewer_port: int, view: BinaryIO | None = None, data: str = "") -> Answer:
+def pieces_of(view: BinaryIO) -> Iterator[bytes]:
+    """An .rrd file piece by piece; it may have no name any more, and others may read it, too."""
+    at = 0
+    while piece := os.pread(view.fileno(), PIECE, at):
+        yield piece
+        at += len(piece)
+
+
+def page_of(
+    viewer_port: int, run: Callable[[], Iterable[bytes]] | None = None, data: str = ""
+) -> Answer:
     """What is served: the files of the viewer's page, with the policy, and a run beside it.
 
     Args:
         viewer_port: where the viewer's own server has the page, on this machine.
-        view: of the run, an .rrd file; it may have no name any more.
+        run: gives the run piece by piece, to each who asks for it.
         data: where else on this machine the page may ask for data, as http://host:port.
     """
     policy = POLICY.replace("connect-src 'self'", f"connect-src 'self' {data}".rstrip())
 
     def answer(request: BaseHTTPRequestHandler, path: str) -> None:
-        if view is None or urlsplit(path).path != DATA:
+        if run is None or urlsplit(path).path != DATA:
             _pass_on(request, path, viewer_port, policy)
             return
         request.send_response(200)
         request.send_header("Content-Type", "application/octet-stream")
         request.send_header("Cache-Control", "no-store")
         request.end_headers()
-        at = 0
-        while piece := os.pread(view.fileno(), PIECE, at):
+        for piece in run():
             request.wfile.write(piece)
-            at += len(piece)
 
     return answer
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from cdmisfa.core.errors import CdmisfaError
+from replay.inputs import About
 from replay.view.build import view_of
 from replay.viewer.program import (
     check_limit,
@@ -19,7 +20,7 @@ from replay.viewer.program import (
     run_program,
     tell,
 )
-from replay.viewer.web import page_of, page_server, served, shown_at
+from replay.viewer.web import page_of, page_server, pieces_of, served, shown_at
 
 
 def open_window(
@@ -30,6 +31,7 @@ def open_window(
     tab: str | None = None,
     memory_limit: str = "2GB",
     size: str | None = None,
+    about: About = lambda source: None,
 ) -> None:
     """Show a run or recording in the viewer, until its window is closed.
 
@@ -44,7 +46,7 @@ def open_window(
             "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
             "--screenshot"
         )
-    with _opened(path, every, all_views, tab) as (name, view):
+    with _opened(path, every, all_views, tab, about) as (name, view):
         host = private_host()
         place = ("--bind", host, "--port", str(free_port(host)))
         run_program([name, *place, *window, "--memory-limit", memory_limit], view)
@@ -58,6 +60,7 @@ def serve(
     tab: str | None = None,
     memory_limit: str = "2GB",
     port: int | None = None,
+    about: About = lambda source: None,
 ) -> None:
     """Serve the viewer and a run to browsers on this machine, until interrupted.
 
@@ -70,16 +73,17 @@ def serve(
     check_limit(memory_limit)
     viewer_port = free_port()
     with contextlib.ExitStack() as opened:
-        name, file = opened.enter_context(_opened(path, every, all_views, tab))
+        name, file = opened.enter_context(_opened(path, every, all_views, tab, about))
         view = file or opened.enter_context(open(name, "rb"))
-        address = opened.enter_context(served(page_of(viewer_port, view), port))
+        page = page_of(viewer_port, lambda: pieces_of(view))
+        address = opened.enter_context(served(page, port))
         tell(shown_at(address))
         run_program(page_server(viewer_port))
 
 
 @contextlib.contextmanager
 def _opened(
-    path: Path, every: int, all_views: Path | None, tab: str | None
+    path: Path, every: int, all_views: Path | None, tab: str | None, about: About
 ) -> Iterator[tuple[str, BinaryIO | None]]:
     """The view of a run as the viewer's argument, and as its standard input.
 
@@ -87,7 +91,7 @@ def _opened(
     whatever ends us. Windows cannot do that and keeps the name.
     """
     with contextlib.ExitStack() as until_read:
-        view = until_read.enter_context(view_of(path, every, all_views, tab))
+        view = until_read.enter_context(view_of(path, every, all_views, tab, about))
         if os.name == "nt" or view == path:
             yield str(view), None
             return

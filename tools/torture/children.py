@@ -63,7 +63,7 @@ CHILDREN: Mapping[str, Work] = {
     "arena --jobs 2": Work(
         lambda place, shared: (
             *("arena", "small", "--learners", "progress,2.0", "--seeds", "0:2", "--jobs", 2),
-            *("--frames", 2000, "--streams", STREAMS, "-o", place),
+            *("--budget", 2000, "--streams", STREAMS, "-o", place),
         ),
         *((), arena, 2),
     ),

@@ -27,7 +27,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
-from cdmisfa.experiments.run_folder import RunExhaustedError, RunResult
+from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from recorder.config import Split
 from recorder.recording import record
@@ -163,9 +163,8 @@ class History:
         def work() -> None:
             with contextlib.closing(self._opened(follow=follow)) as source:
                 words = {"force": how == "force", "resume": how == "resume", "rerun": False}
-                with contextlib.suppress(RunExhaustedError):
-                    limits = {"max_iterations": iterations, "max_modules": 99}
-                    found.append(run(source, CONFIG, self.run, keyframes=3, **limits, **words))
+                limits = {"max_iterations": iterations, "max_modules": 99}
+                found.append(run(source, CONFIG, self.run, keyframes=3, **limits, **words))
 
         self._do(work, die, self.run)
         for result in found:

@@ -27,7 +27,7 @@ EXTRAS = {
     "foxglove": (("foxglove", "websockets"), "foxglove:// streams of robots; play as a robot"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs; -o s3://"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
-    "arena": (("ale_py", "av", "gymnasium", "skvideo"), "streams of the arena"),
+    "arena": (("ale_py", "av", "gymnasium", "skvideo", "sklearn"), "streams of the arena"),
     "sklearn": (("sklearn",), "the transformer for scikit-learn"),
     "testing": (("pytest",), "the contract tests of cdmisfa.testing"),
     "dask": (("distributed",), "sweep and reproduce --engine dask"),

@@ -36,23 +36,22 @@ if TYPE_CHECKING:
 def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
     """Say what is in a recording, a run, any MCAP file, or a camera log.
 
-    PATH may be several, a pattern such as 'logs/*.mcap', or a URL. Exits with 3 when a checksum
-    is wrong.
+    PATH may be several, a pattern such as 'logs/*.mcap', or a URL. Exits with 3 when one is cut
+    short or damaged.
     """
     from replay.integrity.info import describe
+    from replay.integrity.state import EXIT_CODES
 
     found = describe(*path)
     if as_json:
         print_json(found.as_json())
     else:
         _print_info(found)
-    if found.crc == "bad":
-        ctx.exit(LogDamagedError.exit_code)
+    ctx.exit(EXIT_CODES[found.state])
 
 
 def _print_info(found: LogInfo) -> None:
-    state = "complete" if found.complete else "cut short"
-    words = [found.kind, state, f"checksums {found.crc}"]
+    words = [found.kind, found.state, f"checksums {found.crc}"]
     if found.seed is not None:
         words.append(f"seed {found.seed}")
     if found.ended is not None:
@@ -60,6 +59,8 @@ def _print_info(found: LogInfo) -> None:
 
         words.append(f"ended: {ENDINGS.get(found.ended, found.ended)}")
     print_line(f"{found.path}: {', '.join(words)}")
+    for line in (*(f"{p.where}: {p.what}" for p in found.problems), *found.notes):
+        print_line(line)
     if found.signals is not None and found.signals.missing:
         version, lacks = found.signals.version, ", ".join(found.signals.missing)
         print_line(f"signals of version {version}: {lacks} are not in it, read as NaN")
@@ -94,19 +95,19 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
     Of a camera log without checksums every image is decoded. PATH may be several, a pattern such
     as 'logs/*.mcap', or a URL. Exits with 3 when anything is wrong.
     """
+    from replay.integrity.state import EXIT_CODES
     from replay.integrity.verify import check_logs
 
     found = check_logs(*path)
     if as_json:
         print_json(found.as_json())
-    elif found.ok:
-        print_line(f"{' '.join(path)}: whole")
+    else:
+        if found.problems:
+            print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
+        print_line(f"{' '.join(path)}: {found.state}")
         for note in found.notes:
             print_line(note)
-    else:
-        print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
-    if not found.ok:
-        ctx.exit(LogDamagedError.exit_code)
+    ctx.exit(EXIT_CODES[found.state])
 
 
 @click.command("recover")

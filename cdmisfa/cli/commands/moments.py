@@ -180,7 +180,7 @@ def fork_command(
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
     limits = {name: value for name, value in given.items() if value is not None}
     with (
-        learning(max_iterations, as_json=as_json) as (stop, reporter),
+        learning(max_iterations) as (stop, reporter),
         Session.fork(run, folder=out, limits=limits, **told) as session,
     ):
         result = session.learn(

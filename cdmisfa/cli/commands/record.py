@@ -25,7 +25,7 @@ from cdmisfa.cli.printing import (
     say_counts,
     tell,
 )
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 
 if TYPE_CHECKING:
     from recorder.cameras.options import LiveOptions
@@ -231,28 +231,26 @@ def record_streams(
     from recorder.recording import DEFAULT_FRAMES
 
     refuse_existing(out, force=force, goes_on=False)
-    with stoppable(notice="finishing the recording; again to stop at once\n") as stop:
-        how: dict[str, Any] = {"preset": preset, "settings": settings}
-        source, configuration = open_cameras_now(
-            words, live, cameras=images, say=tell, stop=stop, **how
+    how: dict[str, Any] = {"preset": preset, "settings": settings}
+    source, configuration = open_cameras_now(words, live, cameras=images, say=tell, **how)
+    notice = "finishing the recording; again to stop at once\n"
+    with contextlib.closing(source), stoppable(notice=notice) as stop:
+        recorded = RecordedWhileWatched(
+            source,
+            out,
+            settings=configuration.record,
+            split=None if split is None else Split.parse(split),
+            fsync_every=fsync_every,
+            force=force,
         )
-        with contextlib.closing(source):
-            recorded = RecordedWhileWatched(
-                source,
-                out,
-                settings=configuration.record,
-                split=None if split is None else Split.parse(split),
-                fsync_every=fsync_every,
-                force=force,
+        frames = frames or (None if recorded.gaps else DEFAULT_FRAMES)
+        with bar("recording", "frames") as shown:
+            record_watched(
+                recorded,
+                frames=frames,
+                stop=stop,
+                progress=lambda done: shown.update(done, frames),
             )
-            frames = frames or (None if recorded.gaps else DEFAULT_FRAMES)
-            with bar("recording", "frames") as shown:
-                record_watched(
-                    recorded,
-                    frames=frames,
-                    stop=stop,
-                    progress=lambda done: shown.update(done, frames),
-                )
     if recorded.ended and not stop():
         tell(f"ended at frame {recorded.t}: {recorded.ended}")
     say_counts(recorded)
@@ -331,6 +329,8 @@ def convert_command(
             )
         say_changes(frames)
     print_recording(out, files, as_json=as_json)
+    if frames.left_out:
+        ctx.exit(LogDamagedError.exit_code)
 
 
 def say_complete(folder: Path) -> None:

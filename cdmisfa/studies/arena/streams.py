@@ -7,21 +7,22 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry, did_you_mean
-from cdmisfa.studies.arena import pictures
-from cdmisfa.studies.arena.pictures import LEARNED_FROM, Footage, Maker, Rng, atari, classic
+from cdmisfa.studies.arena import cameras, elsewhere, pictures
+from cdmisfa.studies.arena.cameras import Camera
+from cdmisfa.studies.arena.elsewhere import atari, classic, grid, photograph, robot
+from cdmisfa.studies.arena.pictures import DRIFT, Footage, Maker, Rng
 
-HELD_OUT: Final = 4_000
-"""Frames after those that a learner is shown, on which it is judged."""
+FRAMES: Final = 16_000
+"""Of a stream, unless its `Kind` says another number."""
 
 NOISE_SD: Final = (0.01, 0.03, 0.1, 0.3, 1.0)
 """Of the distractors, as shares of the full range."""
@@ -39,15 +40,23 @@ class Kind:
         learnable: it has a slow feature that a linear learner can find.
         loops: its frames are few and fixed, so that it is judged on those it was learned from.
         images: its frames are pictures, and not a few values.
+        frames: how many it has.
     """
 
     make: Maker
     learnable: bool = True
     loops: bool = False
     images: bool = True
+    frames: int = FRAMES
 
 
 CARS: Final = {"player": 14, **{f"car {k}": 108 + k for k in range(10)}}
+
+IMAGES: Final = ("datasets", "images")
+"""Where scikit-learn has its photographs."""
+
+SAMPLES: Final = ("mpl-data", "sample_data")
+"""Where Matplotlib has its own."""
 
 STREAMS: Registry[Kind] = Registry(
     "stream",
@@ -61,32 +70,61 @@ STREAMS: Registry[Kind] = Registry(
         "pong": Kind(atari("Pong", {"player": 51, "enemy": 50, "ball x": 49, "ball y": 54})),
         "breakout": Kind(atari("Breakout", {"player": 72, "ball x": 99, "ball y": 101})),
         "freeway": Kind(atari("Freeway", CARS)),
-        "bikes": Kind(pictures.clip("bikes"), loops=True),
-        "bigbuckbunny": Kind(pictures.clip("bigbuckbunny"), loops=True),
-        "carphone": Kind(pictures.clip("carphone_pristine"), loops=True),
-        "icub-left": Kind(pictures.icub("left", "object1"), loops=True),
-        "icub-center": Kind(pictures.icub("center", "object2"), learnable=False, loops=True),
-        "icub-right": Kind(pictures.icub("right", "object3"), loops=True),
+        "enduro": Kind(atari("Enduro")),
+        "invaders": Kind(atari("SpaceInvaders", {"player": 28, "invaders": 26})),
+        "bowling": Kind(atari("Bowling", {"ball x": 30, "ball y": 41})),
+        "boxing": Kind(atari("Boxing", {"player x": 32, "player y": 34, "enemy x": 33})),
+        "tennis": Kind(atari("Tennis", {"player x": 26, "enemy x": 27, "ball x": 16})),
+        "frozenlake": Kind(grid("FrozenLake8x8-v1", 8)),
+        "cliff": Kind(grid("CliffWalking-v1", 12)),
+        "taxi": Kind(grid("Taxi-v4", 5, 20)),
+        "ant": Kind(robot("mjcf/ant.xml", 2.2)),
+        "cheetah": Kind(robot("mjcf/half_cheetah.xml", 2.2)),
+        "arm": Kind(robot("kuka_iiwa/model.urdf", 2.8)),
+        "china": Kind(photograph("sklearn", "scikit-learn", *IMAGES, "china.jpg")),
+        "flower": Kind(photograph("sklearn", "scikit-learn", *IMAGES, "flower.jpg")),
+        "hopper": Kind(photograph("matplotlib", "matplotlib", *SAMPLES, "grace_hopper.jpg")),
+        "bikes": Kind(elsewhere.clip("bikes"), loops=True),
+        "bigbuckbunny": Kind(elsewhere.clip("bigbuckbunny"), loops=True),
+        "carphone": Kind(elsewhere.clip("carphone_pristine"), loops=True),
+        "icub-left": Kind(elsewhere.icub("left", "object1"), loops=True),
+        "icub-center": Kind(elsewhere.icub("center", "object2"), learnable=False, loops=True),
+        "icub-right": Kind(elsewhere.icub("right", "object3"), loops=True),
         "x1": Kind(pictures.oscillatory("x1", lambda a: np.sin(4 * a - np.pi / 4)), images=False),
         "x2": Kind(pictures.oscillatory("x2", lambda a: np.sin(3 * a)), images=False),
         "x3": Kind(pictures.oscillatory("x3", lambda a: np.cos(2 * a)), images=False),
         "vector-noise": Kind(pictures.vector_noise, learnable=False, images=False),
         "light": Kind(pictures.light),
         "waves": Kind(pictures.waves),
+        "drift": Kind(pictures.drifting, frames=12 * DRIFT // 5),
         "noise": Kind(pictures.full_noise, learnable=False),
         "jumping": Kind(pictures.jumping, learnable=False),
         "constant": Kind(pictures.constant, learnable=False),
         "still": Kind(pictures.still, learnable=False),
+        "pink": Kind(pictures.pink, learnable=False),
+        "salt": Kind(pictures.salt, learnable=False),
+        "speckle": Kind(pictures.speckle, learnable=False),
+        "shot": Kind(pictures.shot, learnable=False),
+        "bands": Kind(pictures.bands, learnable=False),
+        "shuffled": Kind(elsewhere.shuffled("bikes"), learnable=False),
         **{f"gaussian-{sd:g}": Kind(pictures.gaussian_noise(sd), False) for sd in NOISE_SD},
         **{f"uniform-{sd:g}": Kind(pictures.uniform_noise(sd), False) for sd in NOISE_SD},
     },
 )
 """Every stream; `STREAMS.add` adds one."""
 
-CAMERAS: Registry[Callable[[Rng, ByteArray], ByteArray]] = Registry(
-    "camera", {"flicker": pictures.flicker, "shake": pictures.shake, "dim": pictures.low_contrast}
+CAMERAS: Registry[Camera] = Registry(
+    "camera",
+    {
+        "flicker": cameras.flicker,
+        "shake": cameras.shake,
+        "dim": cameras.low_contrast,
+        "lit": cameras.lit,
+        "occluded": cameras.occluded,
+        "pausing": cameras.pausing,
+    },
 )
-"""Bad cameras, through which any stream of pictures may be seen."""
+"""Bad cameras, and what may be before one, through which any stream of pictures may be seen."""
 
 _WORD: Final = re.compile(r"(?:(?P<camera>\w+):)?(?P<kind>[\w.-]+?)(?:#(?P<apart>\d+))?")
 
@@ -152,11 +190,10 @@ def make_footage(name: str, seed: int, plain: Footage | None = None) -> Footage:
     (showing,) = parse(name)
     kind = STREAMS[showing.kind]
     if plain is None:
-        plain = kind.make(_generator(showing.kind, seed), LEARNED_FROM + HELD_OUT)
-    if not showing.camera:
-        return replace(plain, loops=kind.loops)
-    seen = CAMERAS[showing.camera](_generator(name, seed), plain.frames)
-    return Footage(seen, plain.state, plain.names, kind.loops)
+        plain = kind.make(_generator(showing.kind, seed), kind.frames)
+    if showing.camera:
+        plain = CAMERAS[showing.camera](_generator(name, seed), plain)
+    return replace(plain, loops=kind.loops)
 
 
 def _generator(name: str, seed: int) -> Rng:
@@ -172,21 +209,20 @@ class ArenaSet:
         about: what the set asks of a learner.
         frames: after so many a run is stopped that does not end by itself.
         goes_on: runs are not ended before, because something happens late.
+        switch_cost: frames that are lost at each change of view, as of a head that has to turn.
     """
 
     words: tuple[str, ...]
     about: str
     frames: int = 240_000
     goes_on: bool = False
+    switch_cost: int = 0
 
     @property
     def images(self) -> bool:
         """Whether frames are pictures."""
         return all(STREAMS[s.kind].images for word in self.words for s in parse(word))
 
-
-SUITE: Final = ("control", "pendulum-pong", "clips", "games", "light", "cameras")
-"""The sets that are run where none is named."""
 
 SETS: Registry[ArenaSet] = Registry(
     "set",
@@ -196,3 +232,17 @@ SETS: Registry[ArenaSet] = Registry(
     },
 )
 """Every set; `SETS.add` adds one."""
+
+REPORTED: Final = "reported-"
+"""What sets begin with on which nothing may be tuned; all others are for that."""
+
+
+def chosen_sets(words: Sequence[str]) -> list[str]:
+    """Names of sets: of all, of those that are `reported`, of those for `tuning`, or as named."""
+    reported = [name for name in SETS if name.startswith(REPORTED)]
+    groups = {
+        "all": list(SETS),
+        "reported": reported,
+        "tuning": [name for name in SETS if name not in reported],
+    }
+    return [name for word in words for name in groups.get(word, [word])]

@@ -9,7 +9,6 @@ import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,13 +19,16 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import STATES
 from cdmisfa.experiments.loop import ending
 from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.store import StoredTrial
 from cdmisfa.features.sfa import slowness
 from cdmisfa.studies.arena.library import ArenaSource, Library, Reference
-from cdmisfa.studies.arena.pictures import Footage
+from cdmisfa.studies.arena.pictures import FITTED, FOLLOWING, PARTS, Footage, Part
 from cdmisfa.studies.arena.streams import ArenaSet, parse
+
+LEARNING: Final = STATES.index("learning")
 
 SLOW_ENOUGH: Final = 1.25
 """A learned output may be so many times as fast as the slowest that batch SFA finds."""
@@ -98,6 +100,7 @@ class Course:
     Attributes:
         saved: the modules, in order.
         watched: of every block, the frame at which it begins and its stream.
+        decided: blocks of each stream that was decided, watched until it was so first.
         frames: how many were seen.
         ended: why the learner ended by itself, a key of `ENDINGS`; "" where it did not, None
             where it was not asked.
@@ -105,6 +108,7 @@ class Course:
 
     saved: Sequence[SavedModule]
     watched: Sequence[tuple[int, int]]
+    decided: Mapping[int, int]
     frames: int
     ended: str | None
 
@@ -114,52 +118,54 @@ def run_arena_trial(trial: ArenaTrial) -> dict[str, Any]:
     library = Library(trial.library)
     with contextlib.closing(ArenaSource(trial.streams.words, library, trial.seed)) as source:
         learner = open_learner(trial.learner, source.spec, trial.seed)
-        course = run_learner(learner, source, trial.streams.frames, goes_on=trial.streams.goes_on)
+        course = run_learner(learner, source, trial.streams)
         learnable = [name for name in source.streams if parse(name)[0].learnable]
         references = {n: library.reference(n, trial.seed, *trial.reference) for n in learnable}
         return Judge(course, source, references).row()
 
 
-def run_learner(learner: Learner, source: ArenaSource, frames: int, *, goes_on: bool) -> Course:
+def run_learner(learner: Learner, source: ArenaSource, streams: ArenaSet) -> Course:
     """Let a learner learn until it ends by itself, or the frames are over.
 
     Args:
         learner: at its beginning.
         source: at its beginning.
-        frames: after so many it is stopped.
-        goes_on: it is not asked whether it wants to end.
+        streams: the set, which says how long, and what it costs to look elsewhere.
     """
     saved: list[SavedModule] = []
     watched: list[tuple[int, int]] = []
+    decided: dict[int, int] = {}
+    visits = np.zeros(len(streams.words), dtype=int)
     ended = ""
-    while source.t < frames:
-        if not goes_on and (ended := ending(learner, learner.max_modules, None)):
+    while source.t < streams.frames:
+        if not streams.goes_on and (ended := ending(learner, learner.max_modules, None)):
             break
         block = source.take(learner.stream, learner.tau)
-        learner.step(block)
+        signals = learner.step(block)
         watched.append((block.t, block.stream))
+        visits[block.stream] += 1
+        for stream in np.flatnonzero(signals.state > LEARNING).tolist():
+            decided.setdefault(stream, int(visits[stream]))
         shown = source.shown(block.stream, source.t - 1)
         about = block.stream, shown.name, shown.learnable, source.t, len(watched)
         saved += [SavedModule(module, *about) for module in learner.modules[len(saved) :]]
-    return Course(saved, watched, source.t, None if goes_on else ended)
+        if learner.stream != block.stream:
+            source.seek(source.t + streams.switch_cost)
+    return Course(saved, watched, decided, source.t, None if streams.goes_on else ended)
 
 
 def slowest_output(module: Module, frames: NDArray[Any]) -> tuple[FloatArray, float]:
-    """The slowest output of a module on frames, (n,), and its slowness.
+    """What a module says is its slowest output, its first, on frames, (n,), and its slowness.
 
     That is infinite where the output does not vary.
     """
-    y = module.transform(frames)
-    still = y.max(axis=0) == y.min(axis=0)
-    eta = np.full(y.shape[1], math.inf)
-    eta[~still] = slowness(y[:, ~still])
-    first = int(np.argmin(eta))
-    return y[:, first], float(eta[first])
+    y = module.transform(frames)[:, 0]
+    return y, float(slowness(y[:, None])[0]) if y.max() > y.min() else math.inf
 
 
-def allowed_slowness(stream: Footage, reference: Reference) -> float:
-    """The slowness up to which a stream counts as learned."""
-    return reference.slowness * (SLOW_ENOUGH_LOOPED if stream.loops else SLOW_ENOUGH)
+def allowed_slowness(stream: Footage, reference: Reference, part: Part) -> float:
+    """The slowness on a part of its frames up to which a stream counts as learned."""
+    return reference.slowness[part] * (SLOW_ENOUGH_LOOPED if stream.loops else SLOW_ENOUGH)
 
 
 class Judge:
@@ -176,7 +182,7 @@ class Judge:
     ) -> None:
         self._course, self._source, self._references = course, source, references
         self._streams = source.streams
-        self._outputs: dict[tuple[int, str], tuple[FloatArray, float]] = {}
+        self._outputs: dict[tuple[int, str, Part], tuple[FloatArray, float]] = {}
 
     def row(self) -> dict[str, Any]:
         """All of it, as JSON values."""
@@ -186,57 +192,73 @@ class Judge:
             "blocks": len(course.watched),
             "ended": course.ended,
             "targets": self._targets(),
-            "modules": [
-                {
-                    "stream": self._source.spec.streams[one.stream],
-                    "signal": one.signal,
-                    "learnable": one.learnable,
-                    "frame": one.frame,
-                    "block": one.block,
-                    "slowness": self._output(k, one.signal)[1],
-                    "allowed": self._allowed(one.signal) if one.learnable else None,
-                }
-                for k, one in enumerate(course.saved)
-            ],
+            "modules": [self._of_module(k) for k in range(len(course.saved))],
             "wrong": sum(not one.learnable for one in course.saved),
             "doubles": sum(self._double(k) for k in range(len(course.saved))),
+            "in_vain": self._in_vain(),
+            "told": self._told(),
             "probes": self._probes(),
         }
 
-    def _output(self, k: int, signal: str) -> tuple[FloatArray, float]:
-        """The slowest output of module k on a signal's held-out frames, and its slowness."""
-        if (k, signal) not in self._outputs:
-            module, frames = self._course.saved[k].module, self._streams[signal].held_out
-            self._outputs[k, signal] = slowest_output(module, frames)
-        return self._outputs[k, signal]
+    def _of_module(self, k: int) -> dict[str, Any]:
+        """A module: slowness on the frames that follow and on those fitted to, and batch SFA's."""
+        one = self._course.saved[k]
+        found: dict[str, Any] = {
+            "stream": self._source.spec.streams[one.stream],
+            "signal": one.signal,
+            "learnable": one.learnable,
+            "frame": one.frame,
+            "block": one.block,
+        }
+        for part in PARTS:
+            batch = self._references[one.signal].slowness[part] if one.learnable else None
+            found |= {part: self._output(k, one.signal, part)[1], f"{part}_of_batch": batch}
+        return found
 
-    def _allowed(self, signal: str) -> float:
-        return allowed_slowness(self._streams[signal], self._references[signal])
+    def _in_vain(self) -> float:
+        """Share of the blocks on what cannot be learned."""
+        watched, source = self._course.watched, self._source
+        vain = sum(not source.shown(stream, t).learnable for t, stream in watched)
+        return vain / len(watched) if watched else 0.0
 
-    @cached_property
-    def _sound(self) -> list[int]:
+    def _told(self) -> dict[str, int]:
+        """Blocks of each stream that never can be learned, until it was said to be so."""
+        never = [not any(s.learnable for s in phases) for phases in self._source.phases]
+        names = self._source.spec.streams
+        return {names[s]: blocks for s, blocks in self._course.decided.items() if never[s]}
+
+    def _output(self, k: int, signal: str, part: Part = FOLLOWING) -> tuple[FloatArray, float]:
+        """Module k's first output on a part of a signal's frames, and its slowness."""
+        if (k, signal, part) not in self._outputs:
+            module, frames = self._course.saved[k].module, self._streams[signal].part(part)
+            self._outputs[k, signal, part] = slowest_output(module, frames)
+        return self._outputs[k, signal, part]
+
+    def _sound(self, part: Part) -> list[int]:
         """The modules that are slow enough on the learnable signal they were learned on."""
         saved = self._course.saved
-        return [k for k, s in enumerate(saved) if s.learnable and self._slow(k, s.signal)]
+        return [k for k, s in enumerate(saved) if s.learnable and self._slow(k, s.signal, part)]
 
-    def _slow(self, k: int, signal: str) -> bool:
-        return self._output(k, signal)[1] <= self._allowed(signal)
+    def _slow(self, k: int, signal: str, part: Part) -> bool:
+        allowed = allowed_slowness(self._streams[signal], self._references[signal], part)
+        return self._output(k, signal, part)[1] <= allowed
 
-    def _knows(self, k: int, signal: str) -> bool:
+    def _knows(self, k: int, signal: str, part: Part) -> bool:
         """Whether a module's output on a signal is slow, and that of batch SFA."""
         slowest = self._references[signal].slowest
-        answer = slowest.transform(self._streams[signal].held_out)[:, 0]
-        return self._slow(k, signal) and correlation(self._output(k, signal)[0], answer) > KNOWS
+        answer = slowest.transform(self._streams[signal].part(part))[:, 0]
+        mine = self._output(k, signal, part)[0]
+        return self._slow(k, signal, part) and correlation(mine, answer) > KNOWS
 
-    def _learned(self, signal: str) -> SavedModule | None:
-        """The first module of a learnable signal, if any.
+    def _learned(self, signal: str, part: Part) -> SavedModule | None:
+        """The first module of a learnable signal, if any, as a part of its frames tells.
 
         That is one that was learned on it and is slow enough. Where there is none, one counts
         that is slow enough where it was learned and knows this signal, too.
         """
-        saved, sound = self._course.saved, self._sound
+        saved, sound = self._course.saved, self._sound(part)
         own = [k for k in sound if saved[k].signal == signal]
-        found = own or [k for k in sound if self._knows(k, signal)]
+        found = own or [k for k in sound if self._knows(k, signal, part)]
         return saved[found[0]] if found else None
 
     def _double(self, k: int) -> bool:
@@ -262,8 +284,13 @@ class Judge:
             for phase, showing in enumerate(phases):
                 if not showing.learnable:
                     continue
-                begins, module = self._source.begins(phase), self._learned(showing.name)
-                target = {"stream": self._source.spec.streams[stream], "signal": showing.name}
+                begins = self._source.begins(phase)
+                module = self._learned(showing.name, FOLLOWING)
+                target = {
+                    "stream": self._source.spec.streams[stream],
+                    "signal": showing.name,
+                    "fitted": self._learned(showing.name, FITTED) is not None,
+                }
                 when: dict[str, Any] = dict.fromkeys(("frame", "block", "watched"))
                 if module is not None:
                     frame = max(begins, module.frame)

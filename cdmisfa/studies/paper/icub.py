@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.documents import plain, write_json
@@ -200,8 +199,7 @@ def learn_curves(source: FrameSource, config: LearnerConfig, seed: int, iteratio
     """Learn from a source: a trial's row, and the curves and each module's last outputs."""
     learner = open_learner(config, source.spec, seed)
     curves = Curves(learner.tau, source.spec.truth)
-    with contextlib.suppress(LogExhaustedError):
-        learn(source, learner, (curves,), max_iterations=iterations, max_modules=iterations)
+    learn(source, learner, (curves,), max_iterations=iterations, max_modules=iterations)
     encoded, done = curves.encoded, learner.iteration
     row = {**module_row(learner.modules), "correlation": encoded, "iterations": done}
     return row, curves.arrays

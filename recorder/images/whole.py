@@ -1,0 +1,131 @@
+"""JPEG and PNG files, decoded by Pillow, and refused where they tell that they are damaged.
+
+A PNG has checksums of all of it, of which Pillow checks few. A JPEG has none, but an end, and where
+it is of one scan its pixels end where its data do. Pillow silences what libjpeg says of both.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zlib
+from typing import Final
+
+from PIL.ImageFile import ImageFile
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+
+from cdmisfa.core.errors import LogDamagedError
+
+
+class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where
+    """No image that can be read; the caller adds where it was."""
+
+
+_JPEG: Final = b"\xff\xd8"
+_PNG_HEAD: Final = 8
+_MARKER: Final = re.compile(rb"\xff(?=[^\x00\xff])")
+_END: Final = 0xD9
+_RESTARTS: Final = range(0xD0, 0xD8)
+_ARITHMETIC: Final = b"\xff\xc9"
+"""Begins a JPEG of arithmetic coding, whose data may end before its pixels."""
+
+_AHEAD: Final = b"\xff\x00" * 8
+"""Bits that stand for nothing; libjpeg reads up to 64 before it needs them."""
+
+_NO_END: Final = "its JPEG is damaged: it lacks its end marker"
+_LEFT: Final = 64
+"""Bytes before the end that may stand for nothing, too: some cameras leave a few."""
+
+
+def open_picture(data: bytes) -> ImageFile:
+    """Read the head of a JPEG or PNG; its pixels are for `load_picture`.
+
+    Raises:
+        MalformedImage: it is a damaged PNG.
+        Exception: whatever Pillow raises where it is neither, or broken.
+    """
+    if data.startswith(_JPEG):
+        return JpegImageFile(io.BytesIO(data))
+    image = PngImageFile(io.BytesIO(data))
+    _check_chunks(data)
+    return image
+
+
+def load_picture(image: ImageFile, data: bytes) -> None:
+    """Decode what `open_picture` opened.
+
+    Raises:
+        MalformedImage: it is a damaged JPEG.
+        Exception: whatever Pillow raises where it is broken.
+    """
+    if isinstance(image, JpegImageFile):
+        _load_jpeg(image, data)
+    else:
+        image.load()
+
+
+def _check_chunks(data: bytes) -> None:
+    """Check the length and the CRC-32 of each chunk of a PNG; see its specification, 5.3."""
+    view, at, kind = memoryview(data), _PNG_HEAD, b""
+    while kind != b"IEND":
+        end = at + 8 + int.from_bytes(view[at : at + 4], "big")
+        kind = bytes(view[at + 4 : at + 8])
+        if end + 4 > len(data):
+            raise MalformedImage("its PNG is cut short")
+        if zlib.crc32(view[at + 4 : end]) != int.from_bytes(view[end : end + 4], "big"):
+            raise MalformedImage(f"its PNG is damaged: bytes {at} to {end + 3} do not match a CRC")
+        at = end + 4
+
+
+def _load_jpeg(image: JpegImageFile, data: bytes) -> None:
+    """Decode a JPEG; where its pixels are in one scan, without its end, see `_Scan`."""
+    file = image.fp
+    assert file is not None
+    start = file.tell()
+    scans = image.info.get("progressive") or data[start - 4 - 2 * image.layers] != image.layers
+    if scans or data.find(_ARITHMETIC, 0, start) >= 0:
+        if data.find(b"\xff\xd9", start) < 0:
+            raise MalformedImage(_NO_END)
+        image.load()
+        return
+    image.fp = scan = _Scan(data, start, _end_of(data, start))
+    image.load()
+    if scan.tell() <= scan.most:
+        raise MalformedImage("its JPEG is damaged: its pixels end before its data")
+
+
+def _end_of(data: bytes, start: int) -> int:
+    """Where the end marker is of a scan; restarts, as FFmpeg numbers them, are in any order."""
+    for found in _MARKER.finditer(data, start):
+        kind = data[found.end()]
+        if kind == _END:
+            return found.start()
+        if kind not in _RESTARTS:
+            raise MalformedImage(f"its JPEG is damaged: no marker {kind:02x} belongs there")
+    raise MalformedImage(_NO_END)
+
+
+class _Scan(io.BytesIO):
+    """A JPEG without its end, from where on libjpeg would make up the pixels that are missing.
+
+    What follows is enough for what it reads ahead. Pixels that need more are an error of Pillow's:
+    the file is truncated. Pixels that need less leave the last part, which is read by itself.
+
+    Args:
+        data: the file.
+        start: where its scan begins.
+        end: where its scan ends.
+
+    Attributes:
+        most: where the last part begins.
+    """
+
+    def __init__(self, data: bytes, start: int, end: int) -> None:
+        super().__init__(data[:end] + _AHEAD)
+        self.most = max(end - _LEFT, start)
+
+    def read(self, size: int | None = -1) -> bytes:
+        """The next bytes, up to the last part, or of it."""
+        before = self.most - self.tell()
+        return super().read(min(size or before, before) if before > 0 else size)

@@ -1,0 +1,142 @@
+"""A stream has one name, whatever the way it came, so that modules of one know the other."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from camera_files import START_MS, pictures, write_images
+from conftest import Cdmisfa
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdmisfa.core.blocks import stream_name, stream_names
+from recorder.cameras.words import live_names
+from replay.runs.modules import load_modules
+
+TOPICS = ("/camera/left/image_raw", "/camera/right é/image_raw")
+NAMES = ("camera_left_image_raw", "camera_right_e_image_raw")
+BOTH = ("--topic", TOPICS[0], "--topic", TOPICS[1])
+QUICK = ("--max-iterations", "3", "--no-rerun", "--set", "learner.tau=10")
+
+
+def write_log(folder: Path) -> Path:
+    images = [[(START_MS + 20 * i, p) for i, p in enumerate(pictures(50, s))] for s in range(2)]
+    return write_images(folder / "robot.mcap", dict(zip(TOPICS, images, strict=True)))
+
+
+def recorded(cdmisfa: Cdmisfa, folder: Path) -> Path:
+    log = write_log(folder)
+    assert cdmisfa("convert", log, *BOTH, "-o", folder / "rec").code == 0
+    return folder / "rec"
+
+
+def exported(cdmisfa: Cdmisfa, folder: Path, form: str) -> Path:
+    done = cdmisfa("export", recorded(cdmisfa, folder), "--to", form, "-o", folder / form)
+    assert done.code == 0, done.err
+    return folder / form
+
+
+def each(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir())
+
+
+WAYS: dict[str, Callable[[Cdmisfa, Path], list[object]]] = {
+    "log": lambda run, at: [write_log(at), *BOTH],
+    "pattern of topics": lambda run, at: [write_log(at), "--topic", "/camera/*"],
+    "recording": lambda run, at: [recorded(run, at)],
+    "files of a recording": lambda run, at: each(recorded(run, at)),
+    "views as logs": lambda run, at: [*each(recorded(run, at)), "--size", "8x6"],
+    "folders of pictures": lambda run, at: [*each(exported(run, at, "images")), "--rate", "50"],
+    "videos": lambda run, at: each(exported(run, at, "mp4")),
+    "dataset": lambda run, at: [exported(run, at, "lerobot"), "--topic", "observation.images.*"],
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_learned_from_has_one_name(cdmisfa: Cdmisfa, tmp_path: Path, way: str) -> None:
+    if way in ("videos", "dataset"):
+        pytest.importorskip("av")
+    done = cdmisfa("learn", *WAYS[way](cdmisfa, tmp_path), *QUICK, "-o", tmp_path / "run", "--json")
+    assert done.code == 0, done.err
+    assert done.json["undecided"] == list(NAMES)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["streams"] == list(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        ([f"foxglove://robot:8765{topic}" for topic in TOPICS], NAMES),
+        ([f"foxglove://127.0.0.1:8765/view/{name}" for name in NAMES], NAMES),  # that is played
+        (["foxglove://robot/camera/right%20e/image_raw"], NAMES[1:]),
+        ([f"av:films/{name}.mp4" for name in NAMES], NAMES),
+        ([f"rtsp://10.0.0.1/{name}" for name in NAMES], NAMES),
+    ],
+)
+def test_a_live_stream_has_the_name_of_its_log(words: list[str], names: tuple[str, ...]) -> None:
+    assert live_names(words) == names
+
+
+@pytest.mark.parametrize(
+    ("said", "name"),
+    [
+        ("/camera/left/image_raw", "camera_left_image_raw"),
+        ("/view/left", "left"),
+        ("observation.images.left", "left"),
+        ("observation.state", "observation.state"),
+        ("view_left", "view_left"),
+        ("../../etc", "etc"),
+        (".hidden", "hidden"),
+        ("é ü", "e_u"),
+        ("左", "左"),
+        ("/view/", "view"),
+        ("", "stream"),
+        ("\x1b[31m/cam", "31m_cam"),
+        ("x" * 300, "x" * 64),
+    ],
+)
+def test_a_name_is_one_of_a_file(said: str, name: str) -> None:
+    assert stream_name(said) == name == stream_name(name)
+
+
+@given(st.lists(st.text(), max_size=6))
+def test_names_are_distinct_and_stay_as_they_are(said: list[str]) -> None:
+    names = stream_names(said)
+    assert len(set(names)) == len(names) == len(said)
+    assert all(stream_name(name) == name for name in map(stream_name, said))
+    assert not any("/" in name or name.startswith(".") or not name for name in names)
+
+
+def test_of_logs_with_one_topic_the_file_is_named_too(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    write_log(tmp_path)
+    files = [tmp_path / name for name in ("a.mcap", "b.mcap")]
+    for file in files:
+        shutil.copy(tmp_path / "robot.mcap", file)
+    words = (*files, "--topic", TOPICS[0], "--align", "index")
+    found = cdmisfa("learn", *words, *QUICK, "--json").json["undecided"]
+    assert found == [f"a_{NAMES[0]}", f"b_{NAMES[0]}"]
+
+
+def test_a_run_whose_streams_were_named_by_their_topics_goes_on(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, fork, words = tmp_path / "run", tmp_path / "fork", (*BOTH, "--loop", *QUICK[2:])
+    log = write_log(tmp_path)
+    straight = cdmisfa("learn", log, *words, "--max-iterations", 220, "--json").json
+    with monkeypatch.context() as before:
+        before.setattr("replay.camera_logs.source.names_of", lambda streams: TOPICS)
+        done = cdmisfa("learn", log, *words, "--max-iterations", 200, "-o", run, "--json")
+    assert {module["stream"] for module in done.json["modules"]} <= set(TOPICS)
+    assert done.json["modules"]
+    assert cdmisfa("check", run).code == cdmisfa("at", run, 197).code == 0
+    assert cdmisfa("fork", run, "--at", 196, "--max-iterations", 205, "-o", fork).code == 0
+    resumed = cdmisfa("learn", "--resume", "-o", run, "--max-iterations", 220, "--json")
+    assert resumed.code == 0, resumed.err
+    assert resumed.json["signals_sha256"] == straight["signals_sha256"]
+    assert resumed.json["modules"] == straight["modules"]
+    assert cdmisfa("check", run).code == cdmisfa("check", fork).code == 0
+    for folder in (run, fork):
+        assert {module.stream for module in load_modules(folder)} <= set(NAMES)
