@@ -216,9 +216,11 @@ class LoggedSource(StoredSource):
 
     Attributes:
         left_out: a line for each log that could not be read, and is no part of it.
+        copies: a line for each stream that shows the same as one of another log.
     """
 
     left_out: tuple[str, ...] = ()
+    copies: tuple[str, ...] = ()
     _identities: Sequence[Identity] | None = None
 
     @abstractmethod
