@@ -96,6 +96,7 @@ class VideoImages(ImageStream):
         self._container: Any = None
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a video has no topics, leave {topic} out")
+        check_regular(path)
         try:
             before = data_bytes()
             with explained(path, "FFmpeg"):
