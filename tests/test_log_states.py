@@ -94,6 +94,47 @@ def test_commands_that_judge_a_log_agree(cdmisfa: Cdmisfa, tmp_path: Path, state
         assert (done.code, done.json["state"], done.json["crc"]) == (code, word, crc)
 
 
+def broken_among_whole(folder: Path) -> tuple[Path, Path, Path]:
+    """Two logs of one topic each, and one between them that is none."""
+    one, two = folder / "one.mcap", folder / "two.mcap"
+    write_cameras(one, {"/one": (COUNT, 20)})
+    write_cameras(two, {"/two": (COUNT, 20)})
+    return one, in_state(folder / "bad.mcap", "empty"), two
+
+
+def test_one_broken_log_does_not_hide_the_others(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    logs = broken_among_whole(tmp_path)
+    for command in ("info", "verify"):
+        done = cdmisfa(command, *logs)
+        assert (done.code, str(logs[1]) in done.out) == (3, True)
+    assert "/two" in cdmisfa("info", *logs).out
+    document = cdmisfa("info", *logs, "--json").json
+    assert [file["path"] for file in document["files"]] == [str(log) for log in logs]
+    assert [file["state"] for file in document["files"]] == ["whole", "damaged", "whole"]
+    assert [c["topic"] for c in document["files"][2]["channels"]] == ["/two"]
+    assert document["problems"] == [{"where": str(logs[1]), "what": "empty, nothing was written"}]
+
+
+@pytest.mark.parametrize("topics", [(), ("/one", "/bad", "/two")])
+@pytest.mark.parametrize("use", ["learn", "convert"])
+def test_what_cannot_be_read_is_left_out_of_what_is_salvaged(
+    cdmisfa: Cdmisfa, tmp_path: Path, use: str, topics: tuple[str, ...]
+) -> None:
+    one, bad, two = broken_among_whole(tmp_path)
+    chosen = [word for topic in topics for word in ("--topic", topic)]
+    how = (*chosen, "-o", tmp_path / "out", "--json")
+    how += ("--set", "learner.tau=10", "--no-rerun") if use == "learn" else ()
+    assert cdmisfa(use, one, bad, two, *how).code == 3  # and there is nothing
+    assert not (tmp_path / "out").exists()
+    done = cdmisfa(use, one, bad, two, *how, "--salvage")
+    assert done.code == 3
+    assert f"warning: {bad}: empty, nothing was written: this log is left out\n" in done.err
+    streams = "streams" if use == "learn" else "views"
+    assert [own.get("stream", own.get("name")) for own in done.json[streams]] == (
+        ["/one", "/two"] if use == "learn" else ["one", "two"]
+    )
+
+
 @pytest.mark.parametrize("use", USES)
 @pytest.mark.parametrize("state", STATES)
 def test_commands_that_use_a_log_say_the_same(

@@ -251,25 +251,29 @@ def _check_images(path: Path) -> LogCheck:
     except LogDamagedError as error:
         return LogCheck((as_problem(path, error),), (FileCheck(str(path), "absent", "damaged"),))
     found = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
-    files = (FileCheck(str(path), "absent", found.state),)
-    return LogCheck(found.problems, files, (*notes, *found.notes))
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def _check_topics(path: Location, topics: Iterable[str]) -> LogCheck:
     """Decode every image on some topics of a camera log."""
     problems: list[Problem] = []
+    missing: dict[str, None] = {}
     notes: dict[str, None] = {}
     for topic in topics:
         try:
             with contextlib.closing(open_images(path, topic)) as images:
                 problems += _broken(images)
+                missing |= dict.fromkeys([images.missing] if images.missing else [])
                 notes |= dict.fromkeys(images.warnings)
         except LogDamagedError as error:
             problems.append(as_problem(path, error))
         except UsageError as error:  # it needs an option, or what is not installed
             said = str(error).removeprefix(f"{path}: ")
             notes[f"{path}: {topic} is not decoded: {said}"] = None
-    return LogCheck(tuple(problems), (), tuple(notes))
+    state: State = "damaged" if problems else "cut short" if missing else "whole"
+    problems += [Problem(str(path), what) for what in missing]
+    told = (note for note in notes if note.removeprefix(f"{path}: ") not in missing)
+    return LogCheck(tuple(problems), (FileCheck(str(path), "absent", state),), tuple(told))
 
 
 def _broken(images: ImageStream) -> Iterator[Problem]:

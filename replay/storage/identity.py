@@ -215,8 +215,13 @@ class _RemoteIdentity(Identity):
 
 
 class LoggedSource(StoredSource):
-    """A source of frames in logs, identified by their bytes."""
+    """A source of frames in logs, identified by their bytes.
 
+    Attributes:
+        left_out: a line for each log that could not be read, and is no part of it.
+    """
+
+    left_out: tuple[str, ...] = ()
     _identities: Sequence[Identity] | None = None
 
     @abstractmethod

@@ -1,4 +1,8 @@
-"""Where to look: the rules that choose the next stream, by the name `learner.attention`."""
+"""Where to look: the rules that choose the next stream, by the name `learner.attention`.
+
+Those that others have found are brought down to what there is here: streams in place of tasks,
+states or actions, and the learning error of each stream's candidate.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +25,9 @@ RECENT = 2 * HALF
 LEAVE = 0.2
 """Probability with which the rule `sticky` leaves a stream after a visit."""
 
+AT_RANDOM = 0.2
+"""Share of the choices of the rule `alp` that are drawn evenly."""
+
 
 @dataclass(frozen=True, slots=True)
 class Situation:
@@ -29,7 +36,10 @@ class Situation:
     Attributes:
         stream: the one watched last.
         learning: (S,) whether each is being learned, and may be watched now.
+        changed: (S,) whether it had been learned before, and no longer shows that.
         errors: the last learning errors of each stream whose candidate is held, the newest last.
+        surprise: (S, n) what the rule measured of late on each stream, the newest last, NaN
+            before; of the rules in `MEASURES`.
         visits: (S,) blocks each was watched so far.
         draws: (2,) uniform in [0, 1): whether to explore, and which.
         explore: probability of any stream, of the rules that explore.
@@ -37,7 +47,9 @@ class Situation:
 
     stream: int
     learning: NDArray[np.bool_]
+    changed: NDArray[np.bool_]
     errors: Mapping[int, FloatArray]
+    surprise: FloatArray
     visits: NDArray[np.int64]
     draws: FloatArray
     explore: float
@@ -45,8 +57,11 @@ class Situation:
     @property
     def any_stream(self) -> int:
         """A stream drawn at random."""
-        n = len(self.learning)
-        return min(int(self.draws[1] * n), n - 1)
+        return self.drawn(np.arange(len(self.learning)))
+
+    def drawn(self, streams: NDArray[np.intp]) -> int:
+        """One of some streams, drawn at random."""
+        return int(streams[min(int(self.draws[1] * len(streams)), len(streams) - 1)])
 
 
 Rule = Callable[[Situation], tuple[int, bool]]
@@ -131,15 +146,60 @@ def _upper_bound(s: Situation) -> FloatArray:
 
 
 def _robin(s: Situation) -> tuple[int, bool]:
-    return (s.stream + 1) % len(s.learning), False
+    """The next stream that is being learned, of all where none is."""
+    turn = (s.stream + 1 + np.arange(len(s.learning))) % len(s.learning)
+    return int((turn[s.learning[turn]] if s.learning.any() else turn)[0]), False
 
 
 def _while_novel(s: Situation) -> tuple[int, bool]:
-    return (s.stream, False) if s.learning[s.stream] else _robin(s)
+    """A stream until it is decided, those first that have changed; now and then a decided one."""
+    decided = np.flatnonzero(~s.learning)
+    if not s.learning.any() or (s.draws[0] < s.explore and len(decided)):
+        return s.drawn(decided), True
+    begun = np.where(s.learning, s.visits, -1)
+    return int(np.argmax(np.where(s.changed, begun + s.visits.sum(), begun))), False
 
 
 def _sticky(s: Situation) -> tuple[int, bool]:
     return (s.stream, False) if s.draws[0] >= LEAVE else (s.any_stream, True)
+
+
+def _absolute_progress(s: Situation) -> tuple[int, bool]:
+    """Absolute learning progress, drawn in proportion (ALP-GMM, Portelas et al. 2019).
+
+    Streams have no distance from one another, so that each is a Gaussian of its own.
+    """
+    streams = np.flatnonzero(s.learning) if s.learning.any() else np.arange(len(s.learning))
+    if s.draws[0] < AT_RANDOM or not s.learning.any():
+        return s.drawn(streams), True
+    short = [k for k in streams if len(s.errors.get(int(k), ())) < RECENT]
+    if short:
+        return int(short[0]), False
+
+    def value(errors: FloatArray, _: int) -> float:
+        return abs(float(errors[:HALF].mean()) - float(errors[HALF:].mean()))
+
+    sums = np.add.accumulate(_of_each(s, lambda e, n: value(e, n) if len(e) else 0.0, 0.0))
+    return int(min(np.searchsorted(sums, s.draws[1] * sums[-1], "right"), streams[-1])), False
+
+
+def _monitored(s: Situation) -> FloatArray:
+    """Fall of the prediction error below what it was (learning progress monitoring, Hou 2025).
+
+    The error of the model before is expected to be its mean over the blocks before the last.
+    """
+    before, now = s.surprise[:, :HALF].mean(axis=1), s.surprise[:, HALF:].mean(axis=1)
+    return _of_learned(s, before - now)
+
+
+def _surprising(s: Situation) -> FloatArray:
+    """What was measured of late: the prediction error (as ICM, Pathak et al. 2017), or novelty."""
+    return _of_learned(s, s.surprise[:, HALF:].mean(axis=1))
+
+
+def _of_learned(s: Situation, values: FloatArray) -> FloatArray:
+    """(S,) values; most of those that were watched too little, none of what is not learned."""
+    return np.where(s.learning, np.where(np.isfinite(values), values, np.inf), -np.inf)
 
 
 RULES: Mapping[str, Rule] = {
@@ -150,5 +210,9 @@ RULES: Mapping[str, Rule] = {
     "sticky": _sticky,
     "gamma": _exploring(_gamma_progress),
     "ucb": lambda s: (int(np.argmax(_upper_bound(s))), False),
+    "prediction": _exploring(_surprising),
+    "rnd": _exploring(_surprising),
+    "alp": _absolute_progress,
+    "lpm": _exploring(_monitored),
 }
 """Every rule by its name."""

@@ -24,7 +24,7 @@ from cdmisfa.cli.printing import (
     say_counts,
     tell,
 )
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
@@ -157,6 +157,8 @@ def learn_command(
         if result.run is not None and not of_cameras:
             tell(f"go on with cdmisfa learn --resume -o {quoted(result.run)}")
         ctx.exit(stop.exit_code)
+    if getattr(frames, "left_out", ()):
+        ctx.exit(LogDamagedError.exit_code)
 
 
 @contextlib.contextmanager

@@ -25,7 +25,7 @@ from cdmisfa.cli.printing import (
     say_counts,
     tell,
 )
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 
 if TYPE_CHECKING:
     from recorder.cameras.options import LiveOptions
@@ -329,6 +329,8 @@ def convert_command(
             )
         say_changes(frames)
     print_recording(out, files, as_json=as_json)
+    if frames.left_out:
+        ctx.exit(LogDamagedError.exit_code)
 
 
 def say_complete(folder: Path) -> None:
