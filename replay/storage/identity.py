@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.untrusted import check_regular
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Place
 from replay.storage.location import Url
@@ -114,6 +115,8 @@ class FilesIdentity(_ByteIdentity):
         self.path: Path = path
         self._files = [path] if files is None else sorted(files)
         self._names = [] if files is None else [str(f.relative_to(path)) for f in self._files]
+        for file in self._files:
+            check_regular(file)
         self._then = self._now()
         self.size = sum(size for size, _ in self._then)
 
