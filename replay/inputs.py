@@ -9,11 +9,18 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.mcap.reader import LogReader
-from replay.camera_logs.opening import ALL, WHOLE_FILES, only_foreign
+from replay.camera_logs.opening import (
+    ALL,
+    WHOLE_FILES,
+    channels_of,
+    image_logs,
+    image_topics,
+    only_foreign,
+)
 from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.pictures import by_number
 from replay.camera_logs.source import ForeignSource, UnequalError
@@ -54,12 +61,15 @@ def open_log(
     cameras = cameras or CameraOptions()
     for path in paths:
         refuse_what_is_no_log(path)
+    left_out: list[str] = []
+    if salvage:
+        paths, cameras, left_out = _readable(paths, cameras)
     if cameras == CameraOptions() and not any(map(only_foreign, paths)):
         with contextlib.suppress(NoRecordingError):
-            return RecordedSource(paths, loop=loop, salvage=salvage)
+            return _without(left_out, RecordedSource(paths, loop=loop, salvage=salvage))
         for path in paths:
             _refuse_remote_run(path)
-    return open_cameras(paths, cameras, loop=loop, salvage=salvage, goal=goal)
+    return _without(left_out, _open(paths, cameras, loop=loop, salvage=salvage, goal=goal))
 
 
 def open_to_look(
@@ -109,9 +119,56 @@ def open_cameras(
     salvage: bool = False,
     goal: tuple[str, str] = ("learn", "RUN"),
 ) -> ForeignSource:
-    """Open the camera logs of others as streams on one clock; see `ForeignSource`."""
+    """Open the camera logs of others as streams on one clock; see `ForeignSource`.
+
+    With `salvage` a log of several that cannot be read is left out: `left_out` of the source says
+    so, as its warnings do.
+    """
+    left_out: list[str] = []
+    if salvage:
+        paths, cameras, left_out = _readable(image_logs(paths), cameras)
+    return _without(left_out, _open(paths, cameras, loop=loop, salvage=salvage, goal=goal))
+
+
+def _open(paths: Sequence[str | Location], cameras: CameraOptions, **how: Any) -> ForeignSource:
     chosen: dict[str, Any] = {each.name: getattr(cameras, each.name) for each in fields(cameras)}
-    return ForeignSource(paths, **chosen, loop=loop, salvage=salvage, goal=goal)
+    return ForeignSource(paths, **chosen, **how)
+
+
+def _readable(
+    paths: Sequence[Location], cameras: CameraOptions
+) -> tuple[list[Location], CameraOptions, list[str]]:
+    """The logs of several that can be read, with their topics, and why the others cannot.
+
+    Raises:
+        LogDamagedError: none can be read.
+    """
+    broken: dict[Location, LogDamagedError] = {}
+    for path in paths if len(paths) > 1 else ():
+        try:
+            if isinstance(path, Path) and only_foreign(path):
+                channels_of(path)
+            elif isinstance(path, Url) or path.is_file():
+                image_topics(path)
+        except LogDamagedError as error:
+            broken[path] = error
+    if len(broken) == len(paths):
+        raise broken[paths[0]]
+    if len(cameras.topics) == len(paths):  # one of each
+        pairs = zip(paths, cameras.topics, strict=True)
+        cameras = replace(cameras, topics=tuple(t for path, t in pairs if path not in broken))
+    said = [f"{error}: this log is left out" for error in broken.values()]
+    return [path for path in paths if path not in broken], cameras, said
+
+
+Opened = TypeVar("Opened", RecordedSource, ForeignSource)
+
+
+def _without(left_out: Sequence[str], source: Opened) -> Opened:
+    """A source that says which logs were left out of it."""
+    source.left_out = tuple(left_out)
+    source.warnings = (*left_out, *source.warnings)
+    return source
 
 
 def holds_run(path: Path) -> bool:

@@ -18,6 +18,7 @@ CUT, NO_CHECKSUMS = "cut short: ", "it has no checksums, nothing vouches for its
 STATES = {
     # the state, its checksums, and what is said of it
     "whole": ("whole", "ok", ""),
+    "checksums of chunks alone": ("whole", "ok", ""),
     "no checksums": ("whole", "absent", NO_CHECKSUMS),
     "cut in a chunk": ("cut short", "unchecked", CUT),
     "cut between chunks": ("cut short", "unchecked", CUT),
@@ -53,12 +54,16 @@ def in_state(path: Path, state: str) -> Path:
     without = path.read_bytes()
     write_cameras(path, {"/cam": (COUNT, 20)}, enable_crcs=True, enable_data_crcs=True)
     data = path.read_bytes()
+    write_cameras(path, {"/cam": (COUNT, 20)}, enable_crcs=True, enable_data_crcs=False)
+    chunks_alone = path.read_bytes()
+    path.write_bytes(data)
     with LogReader(path) as reader:
         first, *_, last = reader.segments
     summary = struct.unpack_from("<Q", data, len(data) - 28)[0]
     path.write_bytes(
         {
             "whole": data,
+            "checksums of chunks alone": chunks_alone,
             "no checksums": without,
             "cut in a chunk": data[: last.data_offset + last.stored // 2],
             "cut between chunks": data[: last.offset],
@@ -94,6 +99,45 @@ def test_commands_that_judge_a_log_agree(cdmisfa: Cdmisfa, tmp_path: Path, state
         assert (done.code, done.json["state"], done.json["crc"]) == (code, word, crc)
 
 
+def broken_among_whole(folder: Path) -> tuple[Path, Path, Path]:
+    """Two logs of one topic each, and one between them that is none."""
+    one, two = folder / "one.mcap", folder / "two.mcap"
+    write_cameras(one, {"/one": (COUNT, 20)})
+    write_cameras(two, {"/two": (COUNT, 20)})
+    return one, in_state(folder / "bad.mcap", "empty"), two
+
+
+def test_one_broken_log_does_not_hide_the_others(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    logs = broken_among_whole(tmp_path)
+    for command in ("info", "verify"):
+        done = cdmisfa(command, *logs)
+        assert (done.code, str(logs[1]) in done.out) == (3, True)
+    assert "/two" in cdmisfa("info", *logs).out
+    document = cdmisfa("info", *logs, "--json").json
+    assert [file["path"] for file in document["files"]] == [str(log) for log in logs]
+    assert [file["state"] for file in document["files"]] == ["whole", "damaged", "whole"]
+    assert [c["topic"] for c in document["files"][2]["channels"]] == ["/two"]
+    assert document["problems"] == [{"where": str(logs[1]), "what": "empty, nothing was written"}]
+
+
+@pytest.mark.parametrize("topics", [(), ("/one", "/bad", "/two")])
+@pytest.mark.parametrize("use", ["learn", "convert"])
+def test_what_cannot_be_read_is_left_out_of_what_is_salvaged(
+    cdmisfa: Cdmisfa, tmp_path: Path, use: str, topics: tuple[str, ...]
+) -> None:
+    one, bad, two = broken_among_whole(tmp_path)
+    chosen = [word for topic in topics for word in ("--topic", topic)]
+    how = (*chosen, "-o", tmp_path / "out", "--json")
+    how += ("--set", "learner.tau=10", "--no-rerun") if use == "learn" else ()
+    assert cdmisfa(use, one, bad, two, *how).code == 3  # and there is nothing
+    assert not (tmp_path / "out").exists()
+    done = cdmisfa(use, one, bad, two, *how, "--salvage")
+    assert done.code == 3
+    assert f"warning: {bad}: empty, nothing was written: this log is left out\n" in done.err
+    streams = "streams" if use == "learn" else "views"
+    assert [own.get("stream", own.get("name")) for own in done.json[streams]] == ["one", "two"]
+
+
 @pytest.mark.parametrize("use", USES)
 @pytest.mark.parametrize("state", STATES)
 def test_commands_that_use_a_log_say_the_same(
@@ -101,11 +145,12 @@ def test_commands_that_use_a_log_say_the_same(
 ) -> None:
     """What is damaged is not used; of what is cut short all that is there, which is said."""
     path = in_state(tmp_path / "log.mcap", state)
-    word, _, said = STATES[state]
+    word, crc, said = STATES[state]
     words = USES[use].replace("LOG", str(path)).replace("OUT", str(tmp_path / "out"))
     done = cdmisfa(*words.split())
     assert done.code == (3 if word == "damaged" or state == NOTHING else 0), done.err
     assert said in done.err
+    assert (NO_CHECKSUMS in done.err) == (crc == "absent")
     if said and done.code == 0:
         assert f"warning: {path}: {said}" in done.err
 

@@ -117,10 +117,10 @@ def test_what_only_drifts_does_not_hold_a_run_up() -> None:
 
 def test_what_is_too_slow_to_be_tested_says_so() -> None:
     own = new_streams(1)[0]
-    own["state"], own["module"], own["slowness"] = 1, 0, 0.001
-    assert "raise learner.test_frames and learner.window" in outcome("a", own, None, 800)["why"]
+    own["state"], own["module"], own["slowness"] = 1, 0, 0.0004
+    assert "raise learner.test_frames and learner.window" in outcome("a", own, None, 2000)["why"]
     own["slowness"] = 0.002
-    assert outcome("a", own, None, 800)["why"] == ""
+    assert outcome("a", own, None, 2000)["why"] == ""
 
 
 def test_what_does_not_change_is_not_learned_twice() -> None:

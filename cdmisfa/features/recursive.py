@@ -10,6 +10,7 @@ It is computed, and its sources are named, in `cdmisfa/kernels/recursive.c`.
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -24,6 +25,9 @@ PIECE: int = kernels.lib.PIECE
 """Frames taken in at once; longer blocks are cut into pieces of so many."""
 
 _TINY = 1e-300
+
+_SAME_DIRECTION = 1e-9
+"""Share of the largest variance below which what is left of an output is rounding noise."""
 
 
 class RecursiveState(NamedTuple):
@@ -49,6 +53,22 @@ class RecursiveState(NamedTuple):
     spectrum: FloatArray
     last: FloatArray
     counts: IntArray
+
+
+class Likeness(NamedTuple):
+    """What some outputs give of as many slow features of a stream, the slowest first.
+
+    Attributes:
+        variance: of the weighted sum of them that is most like the slowest, over the variance that
+            it has where the outputs have variance 1 and no correlation.
+        slowness: of that sum.
+        rho: root mean square of the correlations of the slow features with the sums that are most
+            like each, from 0 to 1.
+    """
+
+    variance: float
+    slowness: float
+    rho: float
 
 
 class RecursiveSFA:
@@ -139,22 +159,48 @@ class RecursiveSFA:
         """Mean of the input, (I,)."""
         return self.state.mean
 
-    def compare(self, phi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Other outputs on what was learned from, without its frames.
+    def compare(self, phi: FloatArray, frames: NDArray[Any] | None = None) -> Likeness:
+        """What other outputs give together on what was learned from, which is not kept.
 
         Args:
             phi: (R, I) their weights of the centred input.
-
-        Returns:
-            (R,) each: variance, slowness, and correlation with the slowest output, from 0 to 1.
+            frames: (n, I) the last that were learned from, which tell what the outputs take from
+                outside of the directions kept; without them that counts as nothing.
         """
         rank = self.state.counts[0]
-        basis = self.state.basis[:rank]
+        basis, variance = self.state.basis[:rank], self.state.variance[:rank]
         q = kernels.outputs(basis, np.zeros(len(basis)), phi)
-        own, variance = self.state.weights[0, :rank], self.state.variance[:rank]
-        power = (q * q * variance).sum(axis=1)
-        steps = ((q[:, :, None] * self.state.differences[:rank, :rank]).sum(axis=1) * q).sum(axis=1)
-        least = np.maximum(power, _TINY)
-        slowness = np.sqrt(np.maximum(steps, 0.0) / least) / (2.0 * np.pi)
-        rho = np.abs((q * own * variance).sum(axis=1)) / np.sqrt(least)
-        return power, slowness, np.minimum(rho, 1.0)
+        power = kernels.multiply(q * variance, q.T)
+        steps = kernels.multiply(kernels.multiply(q, self.state.differences[:rank, :rank]), q.T)
+        if frames is not None:
+            outside = phi - kernels.multiply(q, basis)
+            rest = kernels.outputs(outside, kernels.mean_output(outside, self.mean), frames)
+            power += kernels.multiply(rest.T, rest) / len(rest)
+            moved = np.diff(rest, axis=0)
+            steps += kernels.multiply(moved.T, moved) / max(len(moved), 1)
+        own = self.state.weights[: max(1, min(len(phi), rank)), :rank]
+        shared = kernels.multiply(q * variance, own.T)
+        sums = _solved(power, shared)
+        given, a = (sums * shared).sum(axis=0).clip(0.0, 1.0), sums[:, 0]
+        moves = max(float((a * (steps * a).sum(axis=1)).sum()), 0.0)
+        return Likeness(
+            variance=float(given[0]) / max(float((a * a).sum()), _TINY),
+            slowness=math.sqrt(moves / max(float(given[0]), _TINY)) / (2.0 * math.pi),
+            rho=math.sqrt(float(given.mean())),
+        )
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """The x of matrix x = right, of a covariance (R, R) and (R, n); 0 in what does not vary."""
+    matrix, x = matrix.copy(), right.copy()
+    least = _SAME_DIRECTION * matrix.diagonal().max(initial=0.0)
+    for i in range(len(x)):
+        if matrix[i, i] <= least:
+            matrix[i], x[i] = 0.0, 0.0
+            continue
+        x[i], matrix[i] = x[i] / matrix[i, i], matrix[i] / matrix[i, i]
+        for j in range(len(x)):
+            if j != i:
+                x[j] -= matrix[j, i] * x[i]
+                matrix[j] -= matrix[j, i] * matrix[i]
+    return x

@@ -23,6 +23,7 @@ from recorder.images.options import VIDEO_RECIPE, Size
 from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
 from recorder.images.videos import frame_colors, frame_gray, pyav
 from recorder.mcap.records import MalformedRecord
+from replay.camera_logs.containers import extent_of
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
@@ -92,10 +93,13 @@ class VideoImages(ImageStream):
         self.topic = path.stem
         self._av = pyav(f"{path} is a video, which")
         self._next = _NOWHERE
+        self._cut = _NOWHERE  # time of the last frame of a file that was cut, which may be a part
         self._frames: Iterator[Any] = iter(())
         self._container: Any = None
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a video has no topics, leave {topic} out")
+        extent = extent_of(path)
+        self.missing = extent.missing
         try:
             before = data_bytes()
             with explained(path, "FFmpeg"):
@@ -105,10 +109,15 @@ class VideoImages(ImageStream):
         except BaseException:
             self.close()
             raise
-        unsure = f"{path}: a video has no checksums, damaged pixels may go unnoticed"
+        said = ["a video has no checksums, damaged pixels may go unnoticed"]
+        if self.missing:
+            said.append(self.missing)
+        elif not extent.stated:
+            said.append("it does not state where it ends, a missing end would go unnoticed")
         last, stated = int(self.times[-1]) / NANOSECONDS, self._stated_seconds
-        short = f"{path}: it states {stated:g} s, its last frame is at {last:g} s"
-        self.warnings = [unsure, short] if stated > last + 1 else [unsure]
+        if stated > last + 1:
+            said.append(f"it states {stated:g} s, its last frame is at {last:g} s")
+        self.warnings = [f"{path}: {line}" for line in said]
 
     def image(self, row: int) -> ByteArray:
         stamp = int(self._stamps[row])
@@ -119,12 +128,17 @@ class VideoImages(ImageStream):
                     found = self._forward(row)
             if found is None:
                 self._container.seek(stamp, stream=self._stream, backward=True)
-                self._frames = self._container.decode(self._stream)
+                self._frames = self._decoded()
                 found = self._forward(row)
             if found is None:
                 raise MalformedRecord("the video is broken, no frame can be decoded")
             self._next = row + 1
             return self._shown(found)
+
+    def _decoded(self) -> Iterator[Any]:
+        for packet in self._container.demux(self._stream):
+            if packet.pts != self._cut:
+                yield from packet.decode()
 
     def _forward(self, row: int) -> Any:
         """Decode on to a frame; None if it is broken or not there."""
@@ -155,9 +169,7 @@ class VideoImages(ImageStream):
         self.encoding = str(stream.codec_context.name)
         self._tick = Fraction(stream.time_base)
         stamps = array("q")
-        packets = 0
         for packet in self._container.demux(stream):
-            packets += packet.size > 0
             if packet.size == 0 or packet.is_discard:
                 continue
             if packet.pts is None:
@@ -165,12 +177,10 @@ class VideoImages(ImageStream):
                     f"{self.path}: its frames have no times; copy it into an .mp4 or .mkv file"
                 )
             stamps.append(packet.pts)
+        if self.missing and stamps:
+            self._cut = stamps.pop()
         if not stamps:
             raise LogDamagedError(f"{self.path}: there is no frame in it")
-        if stream.frames not in (0, packets):
-            raise LogDamagedError(
-                f"{self.path}: it states {stream.frames} frames, {packets} are there"
-            )
         self._stamps = np.sort(np.array(stamps, np.int64))
         if (np.diff(self._stamps) == 0).any():
             raise LogDamagedError(f"{self.path}: two of its frames have the same time")

@@ -94,6 +94,7 @@ class LogInfo:
         signals: of a run.
         state: the worst of the files.
         notes: what is no problem, and what nothing proves.
+        files: each file by itself.
     """
 
     path: str
@@ -109,6 +110,7 @@ class LogInfo:
     signals: RecordInfo | None = None
     state: State = "whole"
     notes: tuple[str, ...] = ()
+    files: tuple[LogInfo, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The description as JSON values."""
@@ -126,8 +128,9 @@ def describe(*words: str | Location) -> LogInfo:
         LogDamagedError: not an MCAP file, or a camera log that cannot be read.
     """
     named = locations(words)
-    files = [found for place in named for found in _describe_place(place)]
-    kinds, states = {f.kind for f in files}, {f.crc for f in files}
+    logs = [file for place in named for file in _logs_at(place)]
+    files = [_describe_log(log, alone=len(logs) == 1) for log in logs]
+    kinds, states = {f.kind for f in files if f.channels or f.metadata}, {f.crc for f in files}
     by_weight: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
     named_alike = Counter(name for f in files for name in f.metadata)
     metadata = {
@@ -150,17 +153,46 @@ def describe(*words: str | Location) -> LogInfo:
         signals=next((f.signals for f in files if f.signals is not None), None),
         state=worst(f.state for f in files),
         notes=tuple(note for f in files for note in f.notes),
+        files=tuple(files),
     )
 
 
-def _describe_place(place: Location) -> list[LogInfo]:
-    if not isinstance(place, Path) or not only_foreign(place):
-        return [_describe_file(file) for file in log_files(place)]
+def _logs_at(place: Location) -> list[Location]:
+    foreign = isinstance(place, Path) and only_foreign(place)
+    return [place] if foreign else log_files(place)
+
+
+def _describe_log(place: Location, *, alone: bool) -> LogInfo:
+    """Describe a log; of several one that cannot be read is described as such."""
+    try:
+        if isinstance(place, Path) and only_foreign(place):
+            return _describe_foreign(place)
+        return _describe_file(place)
+    except LogDamagedError as error:
+        if alone:
+            raise
+        wrong = (as_problem(place, error),)
+        return LogInfo(str(place), "foreign", (), 0, False, "bad", wrong, {}, state="damaged")
+
+
+def _describe_foreign(place: Path) -> LogInfo:
+    known = channels_of(place)
     channels = [
         ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
-        for c in channels_of(place)
+        for c in known
     ]
-    return [LogInfo(str(place), "foreign", tuple(channels), 0, True, "absent", (), {})]
+    problems = tuple(Problem(str(place), c.missing) for c in known if c.missing)
+    return LogInfo(
+        path=str(place),
+        kind="foreign",
+        channels=tuple(channels),
+        chunks=0,
+        complete=not problems,
+        crc="absent",
+        problems=problems,
+        metadata={},
+        state="cut short" if problems else "whole",
+    )
 
 
 def _describe_file(path: Location) -> LogInfo:

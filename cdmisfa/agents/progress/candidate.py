@@ -138,8 +138,7 @@ class Candidate:
 
     def _look_back(self) -> None:
         if self._reference.any():
-            now = self.sfa.compare(self._reference)[1]
-            self.regret = log_ratio(float(now[0]), self.fitted)
+            self.regret = log_ratio(self.sfa.compare(self._reference).slowness, self.fitted)
         self._reference[0] = self.sfa.phi[0]
         self._reference_age = 0
 

@@ -37,7 +37,7 @@ class ProgressConfig:
     attention: str = "progress"
     visit: int = 5
     explore: float = 0.1
-    test_frames: int = 800
+    test_frames: int = 2000
     settled: float = 0.03
     agreement: float = 0.25
     slow: float = 0.75

@@ -14,8 +14,9 @@ from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import STATES
 from cdmisfa.features.outputs import window_rate
+from cdmisfa.features.recursive import Likeness
 
-FULL = 4.0
+FULL = 5.0
 """Windows of tests after which an output counts as settled at `learner.settled`; until then the
 threshold grows with the square of their number."""
 
@@ -29,10 +30,10 @@ HOPELESS = (CONSTANT, NOTHING_SLOW, NO_PROGRESS) = (
 )
 """Why a candidate is given up."""
 
-EARLY = 0.6
+EARLY = 0.24
 """Windows of tests before a candidate may be given up."""
 
-PATIENCE = 20
+PATIENCE = 8
 """Windows of tests after which a candidate that has made no progress of late is given up."""
 
 LIVELY = (0.5, 2.0)
@@ -54,9 +55,12 @@ PRESENT = (0.1, 10.0)
 """Variance of a module's output, which had 1, on a stream that shows what it encodes."""
 
 SAME = 0.8
-"""Correlation from which two outputs are one."""
+"""Correlation from which outputs are the same, see `Likeness`."""
 
-AS_SLOW = 1.15
+TOGETHER = 3
+"""Outputs, the slowest ones, by which a module and a candidate are compared."""
+
+AS_SLOW = 1.3
 """Slowness of a module over the candidate's, up to which it is as slow."""
 
 FAINT = 0.003
@@ -182,35 +186,47 @@ def promising(candidate: Candidate, config: ProgressConfig) -> bool:
     )
 
 
-def known_by(candidate: Candidate, modules: list[Module], own: int) -> int | None:
-    """Index in `modules` of the one that gives what the candidate found, its own first, if any.
+def gives(module: Module, candidate: Candidate, frames: NDArray[Any]) -> Likeness:
+    """What a module gives of what a candidate found, by its slowest outputs together.
 
     Args:
-        candidate: tells by the statistics of its stream, without frames.
+        module: frozen.
+        candidate: tells by the statistics of its stream.
+        frames: (n, I) the last block of that, see `RecursiveSFA.compare`.
+    """
+    return candidate.sfa.compare(module.phi[:TOGETHER], frames)
+
+
+def known_by(
+    candidate: Candidate, modules: list[Module], own: int, frames: NDArray[Any]
+) -> int | None:
+    """Index in `modules` of the one that `gives` what the candidate found, its own first, if any.
+
+    Args:
+        candidate: what was found.
         modules: frozen.
         own: index of the stream's own module, -1 where it has none.
+        frames: (n, I) the last block of the stream.
     """
     low, high = PRESENT
-    found = [tuple(float(v[0]) for v in candidate.sfa.compare(m.phi[:1])) for m in modules]
+    found = [gives(module, candidate, frames) for module in modules]
     for index in sorted(range(len(modules)), key=lambda index: index != own):
         variance, eta, rho = found[index]
         if low < variance < high and rho > SAME and eta <= AS_SLOW * candidate.fitted:
             return index
-    if own >= 0 and _still_there(candidate, modules[own], *found[own]):
+    if own >= 0 and _still_there(candidate, modules[own], found[own]):
         return own
     return None
 
 
-def _still_there(
-    candidate: Candidate, module: Module, variance: float, eta: float, rho: float
-) -> bool:
+def _still_there(candidate: Candidate, module: Module, like: Likeness) -> bool:
     """Whether a stream shows what its own module encodes, at times less and differently."""
-    if rho > SAME:
-        return variance > FAINT
-    itself = abs(log_ratio(eta, float(module.eta[0]))) < STRANGE
-    if not itself and eta > AS_SLOW * candidate.fitted:
+    if like.rho > SAME:
+        return like.variance > FAINT
+    itself = abs(log_ratio(like.slowness, float(module.eta[0]))) < STRANGE
+    if not itself and like.slowness > AS_SLOW * candidate.fitted:
         return False
-    return variance > (FAINT if rho > STILL_SAME else WEAK)
+    return like.variance > (FAINT if like.rho > STILL_SAME else WEAK)
 
 
 def strange(steps: float, power: float, blocks: int, window: int) -> bool:

@@ -31,6 +31,7 @@ from cdmisfa.agents.progress.judging import (
     begin_watching,
     decide,
     differs,
+    gives,
     hopeless,
     known_by,
     mastered,
@@ -51,8 +52,11 @@ from cdmisfa.core.signals import BlockSignals
 FEWEST_BLOCKS = 20
 """Of a window of tests, however long a block is."""
 
-SHADOW = 5
-"""Windows of tests after which the candidate of a stream that is not being learned begins anew."""
+WATCHED = 0.4
+"""Windows of tests that the output of a decided stream's module is told over."""
+
+DECIDING = 1
+"""Rises when something else is decided than before, so that runs of then are not gone on with."""
 
 COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle", "i8")])
 
@@ -81,6 +85,7 @@ class ProgressLearner:
         self._n_outputs = min(config.outputs, self._n_inputs)
         self._scale = PIXEL if spec.dtype == "uint8" else 1.0
         self._window = max(FEWEST_BLOCKS, -(-config.test_frames // config.tau))
+        self._watched = int(WATCHED * self._window)
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
@@ -105,7 +110,7 @@ class ProgressLearner:
     @property
     def arithmetic(self) -> int:
         """Version of how it computes; see `arithmetic_of`."""
-        return kernels.ARITHMETIC
+        return kernels.ARITHMETIC + DECIDING
 
     @property
     def iteration(self) -> int:
@@ -182,8 +187,8 @@ class ProgressLearner:
         own["visits"] += 1
         counts["iteration"] += 1
         if int(own["module"]) >= 0:
-            take_output(own, y_frozen[:, int(own["module"]) * self._n_outputs], self._window)
-        self.events = self._judge(stream, candidate) + self._look_again()
+            take_output(own, y_frozen[:, int(own["module"]) * self._n_outputs], self._watched)
+        self.events = self._judge(stream, candidate, frames) + self._look_again()
         counts["idle"] = 0 if self._learning.any() else counts["idle"] + 1
         interesting, explored = self._choose(self._rng.random(2))
         tested, gained = candidate.tested, error - candidate.error
@@ -250,13 +255,13 @@ class ProgressLearner:
         c = self.config
         return Candidate(self._n_inputs, c.components, c.outputs, c.window, self._window)
 
-    def _judge(self, stream: int, candidate: Candidate) -> tuple[str, ...]:
+    def _judge(self, stream: int, candidate: Candidate, frames: NDArray[Any]) -> tuple[str, ...]:
         """Decide what the stream has come to; the lines that say so."""
         own = self._streams[stream]
         state, module = int(own["state"]), int(own["module"])
         if mastered(candidate, self.config):
             del self._candidates[stream]
-            return self._settle(stream, candidate)
+            return self._settle(stream, candidate, frames)
         if state == LEARNING:
             why = hopeless(candidate, self.config)
             if not why and stale(candidate, self.config):
@@ -265,7 +270,7 @@ class ProgressLearner:
                     return self._say(stream, "is begun anew: what was slow in it has come to rest")
                 why = NO_PROGRESS
             if why == NO_PROGRESS and module >= 0:  # it gives what can be found there
-                return self._settle(stream, candidate, module)
+                return self._settle(stream, candidate, frames, module)
             if why:
                 decide(own, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
                 return self._say(stream, f"is given up after {own['decided']} blocks: {why}")
@@ -273,32 +278,32 @@ class ProgressLearner:
             if REASONS[int(own["why"])] != NO_PROGRESS and promising(candidate, self.config):
                 self._learn_again(stream, -1)
                 return self._say(stream, "is learned after all: something in it is slow")
-        elif differs(own, self._window):
+        elif differs(own, self._watched):
             self._learn_again(stream, module)
             return self._say(stream, f"no longer fits module {module + 1}")
-        if state != LEARNING and candidate.blocks >= SHADOW * self._window:
+        if state != LEARNING and candidate.blocks >= PATIENCE * self._window:
             del self._candidates[stream]
         return ()
 
     def _settle(
-        self, stream: int, candidate: Candidate, index: int | None = None
+        self, stream: int, candidate: Candidate, frames: NDArray[Any], index: int | None = None
     ) -> tuple[str, ...]:
         """Decide by which module a stream is learned or known; a new one where none gives it."""
         own = self._streams[stream]
         state, before = int(own["state"]), int(own["module"])
         if index is None:
-            index = known_by(candidate, self.modules, before)
+            index = known_by(candidate, self.modules, before, frames)
         new = index is None
         if index is None:
             self.modules.append(self._module(stream, candidate))
             self._freeze()
             index = len(self.modules) - 1
         module = self.modules[index]
-        power, slow, _ = (float(v[0]) for v in candidate.sfa.compare(module.phi[:1]))
-        begin_watching(own, power, slow)
+        alone = candidate.sfa.compare(module.phi[:1], frames)
+        begin_watching(own, alone.variance, alone.slowness)
         if index == before and state != LEARNING:
             return ()
-        eta = float(candidate.tested[0]) if new else slow
+        eta = float(candidate.tested[0]) if new else gives(module, candidate, frames).slowness
         learned = module.stream_index == stream
         decide(own, LEARNED if learned else KNOWN, index, eta)
         if index == before:
