@@ -120,6 +120,13 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         ArraySource({"a": np.zeros((5, 2, 2, 3), np.uint8)})
     with pytest.raises(UsageError, match="no stream given"):
         ArraySource({})
+    frames: Any = np.zeros((5, 2, 2), np.uint8)
+    for given in (frames, [frames], None, {"a": 5}, {1: frames}):
+        with pytest.raises(UsageError, match=r'given.*: name each, as \{"left": frames\}, with'):
+            ArraySource(given)
+    for tasks in ("CartPole-v1", [], None):
+        with pytest.raises(UsageError, match=r'give a list, as \["CartPole-v1"\]'):
+            GymSource(tasks)
     source = ArraySource({"a": np.zeros((5, 4), float), "b": np.zeros((5, 3), float)})
     with pytest.raises(UsageError, match="b shows float64"):
         source.take(0, 2)

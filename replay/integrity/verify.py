@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import json
 import shlex
@@ -13,6 +14,7 @@ from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
+from cdmisfa.core.untrusted import read_regular
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
 from replay.camera_logs.opening import (
@@ -40,7 +42,7 @@ from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FIL
 from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, read_header
 from replay.runs.modules import load_modules
 from replay.runs.run import facts_sha256
-from replay.storage.identity import file_sha256
+from replay.storage.arrays import MAX_BYTES
 from replay.storage.location import Location, location
 from replay.storage.opening import fetched, log_files, open_store
 
@@ -142,7 +144,7 @@ def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
     try:
         if not path.is_file():
             yield Problem(str(path), "is missing")
-        elif file_sha256(path) != stated:
+        elif hashlib.sha256(read_regular(path, MAX_BYTES)).hexdigest() != stated:
             yield Problem(str(path), "holds something else than the run's final record states")
         else:
             load_modules(path)

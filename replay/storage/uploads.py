@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.untrusted import check_regular
 from recorder.log.files import atomic_write
 from replay.storage.location import Url
 from replay.storage.opening import copied, open_store
@@ -85,6 +86,8 @@ def upload(
         CdmisfaError: the server has something else than was sent.
     """
     files = _files(local)
+    for file in files.values():
+        check_regular(file)
     there = objects_below(url)
     sizes = {rest: file.stat().st_size for rest, file in files.items()}
     done, total = 0, sum(sizes.values())
