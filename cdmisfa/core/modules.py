@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import prod
 from typing import Any
@@ -38,6 +39,8 @@ class Module:
         expansion: how its input was expanded; "" where modules.npz is from before that was
             kept, see `expansion_of`.
         scale: what one step of a uint8 counts: 1/255, or 1 where it learned from values.
+        slow: (J,) 1 where an output is slow on frames that it had not learned from, 0 where it is
+            not; empty but for the progress learner.
     """
 
     index: int
@@ -54,19 +57,24 @@ class Module:
     counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     expansion: str = ""
     scale: float = PIXEL
+    slow: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
-    def transform(self, frames: Any) -> NDArray[np.float64]:
+    def transform(
+        self, frames: Any, outputs: int | slice | Sequence[int] | None = None
+    ) -> NDArray[np.float64]:
         """Outputs on frames, y = phi (x - mean).
 
         Args:
             frames: (n, I) or (n, height, width), uint8 or values; it scales the former and
                 expands both as it learned them.
+            outputs: which of the outputs, from 0, the slowest first: a number of one, a slice, or
+                a list of some; all where it is not given.
 
         Returns:
-            (n, J).
+            (n, J), or as many columns as outputs were chosen.
 
         Raises:
-            UsageError: these are no frames as it learned from.
+            UsageError: these are no frames as it learned from, or it has no such outputs.
         """
         array = as_array(frames)
         if array.dtype != UINT8 and array.dtype.kind != "f":
@@ -84,13 +92,24 @@ class Module:
                 f"frames of {size} values given: this module has {self.phi.shape[1]} weights an "
                 "output, give frames of the size that it learned from"
             )
-        rows = array.reshape(n, size)
+        rows, phi = array.reshape(n, size), self._chosen(outputs)
         unit = self.scale if array.dtype == UINT8 else 1.0
-        y = np.empty((n, len(self.phi)))
+        y = np.empty((n, len(phi)))
         for start in range(0, n, CHUNK):
             x = expand(expansion, rows[start : start + CHUNK].astype(np.float64) * unit)
-            y[start : start + CHUNK] = (x - self.mean) @ self.phi.T
+            y[start : start + CHUNK] = (x - self.mean) @ phi.T
         return y
+
+    def _chosen(self, outputs: int | slice | Sequence[int] | None) -> NDArray[np.float64]:
+        """The weights of some outputs, see `transform`."""
+        if outputs is None:
+            return self.phi
+        try:
+            return self.phi[outputs if isinstance(outputs, slice) else np.atleast_1d(outputs)]
+        except (IndexError, TypeError) as error:
+            raise UsageError(
+                f"no outputs {outputs!r}: this module has {len(self.phi)}, counted from 0"
+            ) from error
 
     def expansion_of(self, size: int) -> str | None:
         """The expansion that makes this module's inputs of frames of so many values, if any.
