@@ -99,13 +99,19 @@ def write_video(
     fps: int = 25,
     first: int = 0,
     drop: frozenset[int] = frozenset(),
+    options: Mapping[str, str] | None = None,
 ) -> list[np.ndarray]:
-    """Four pixels for each of an image's; `first` and `drop` move and leave out frames."""
+    """Four pixels for each of an image's; `first` and `drop` move and leave out frames.
+
+    The options are those of the container and, as g, of the codec.
+    """
     import av
 
     written = []
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=fps)
+    chosen = dict(options or {})
+    group = {"g": chosen.pop("g")} if "g" in chosen else {}
+    with av.open(str(path), "w", options=chosen) as container:
+        stream = container.add_stream(codec, rate=fps, options=group)
         stream.width, stream.height, stream.pix_fmt = 4 * WIDTH, 4 * HEIGHT, pixels
         stream.codec_context.time_base = Fraction(1, fps)
         for i, image in enumerate(images):

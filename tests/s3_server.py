@@ -27,7 +27,16 @@ def buckets(endpoint: str, patch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The server's files, with botocore kept to this machine, whatever the user has set up."""
     for name in ("AWS_PROFILE", "AWS_SESSION_TOKEN", "HTTP_PROXY", "http_proxy"):
         patch.delenv(name, raising=False)
-    for name, value in {
+    for name, value in settings(endpoint).items():
+        patch.setenv(name, value)
+    files = s3_files()
+    yield files
+    forget(files)
+
+
+def settings(endpoint: str) -> dict[str, str]:
+    """Variables with which botocore uses the server, and nothing that the user has set up."""
+    return {
         "AWS_ENDPOINT_URL": endpoint,
         "AWS_ACCESS_KEY_ID": "nobody",
         "AWS_SECRET_ACCESS_KEY": "nothing",
@@ -35,11 +44,7 @@ def buckets(endpoint: str, patch: pytest.MonkeyPatch) -> Iterator[Any]:
         "AWS_CONFIG_FILE": "/nonexistent",
         "AWS_SHARED_CREDENTIALS_FILE": "/nonexistent",
         "AWS_EC2_METADATA_DISABLED": "true",
-    }.items():
-        patch.setenv(name, value)
-    files = s3_files()
-    yield files
-    forget(files)
+    }
 
 
 def s3_files() -> Any:

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import signal
+import socket
 
 import numpy as np
 import pytest
@@ -190,6 +191,13 @@ def test_a_run_opens_in_the_prepared_layout(sweep, tmp_path):
         url = table.dataset.segment_url(run_identity(table.runs[1]))
         viewer.ask(lambda client: client.open(url) or True)
         viewer.ask(lambda client: prepared <= {view.name for view in client.get_state().views})
+
+
+def test_a_port_that_another_has_is_refused(sweep):
+    with socket.create_server(("", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(CdmisfaError, match=f"--port {port}: Address already in use"):
+            serve_catalogue(sweep, port=port)
 
 
 def test_a_server_that_has_ended_is_not_waited_for(sweep, tmp_path, monkeypatch):

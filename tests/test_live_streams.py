@@ -120,6 +120,13 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         ArraySource({"a": np.zeros((5, 2, 2, 3), np.uint8)})
     with pytest.raises(UsageError, match="no stream given"):
         ArraySource({})
+    frames: Any = np.zeros((5, 2, 2), np.uint8)
+    for given in (frames, [frames], None, {"a": 5}, {1: frames}):
+        with pytest.raises(UsageError, match=r'given.*: name each, as \{"left": frames\}, with'):
+            ArraySource(given)
+    for tasks in ("CartPole-v1", [], None):
+        with pytest.raises(UsageError, match=r'give a list, as \["CartPole-v1"\]'):
+            GymSource(tasks)
     source = ArraySource({"a": np.zeros((5, 4), float), "b": np.zeros((5, 3), float)})
     with pytest.raises(UsageError, match="b shows float64"):
         source.take(0, 2)
@@ -457,6 +464,29 @@ def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(
         text=True,
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_server_whose_headers_never_end_is_told_of_once() -> None:
+    script = (
+        "import sys\n"
+        "from cdmisfa.core.errors import CdmisfaError\n"
+        "from recorder.cameras.foxglove import FoxgloveCamera\n"
+        "try: next(FoxgloveCamera(sys.argv[1], 'cam', timeout=0.3).pictures())\n"
+        "except CdmisfaError as error: print(error)\n"
+    )
+
+    def answer(listener: socket.socket) -> None:
+        connection, _ = listener.accept()
+        with contextlib.suppress(OSError), connection:
+            while True:
+                connection.sendall(b"HTTP/1.1 200 OK\r\n" + b"x: " + b"y" * (1 << 16))
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=answer, args=(listener,), daemon=True).start()
+        word = f"foxglove://127.0.0.1:{listener.getsockname()[1]}/cam"
+        done = subprocess.run([sys.executable, "-c", script, word], capture_output=True, text=True)
+    assert "does not answer" in done.stdout
+    assert done.stderr == ""
 
 
 REFUSED = {

@@ -242,6 +242,19 @@ def test_other_bytes_than_were_sent_are_found(
         upload(file, url)
 
 
+def test_a_server_that_speaks_no_s3_is_said(
+    cdmisfa: Cdmisfa, s3: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def silent(call: str, answer: Any) -> None:
+        answer.clear()
+
+    heard(monkeypatch, after=silent)
+    (tmp_path / "a.csv").write_bytes(b"1,2,3")
+    done = cdmisfa("upload", tmp_path / "a.csv", "s3://lab/a.csv")
+    assert (done.code, done.err.count("\n")) == (1, 1), done.err
+    assert "lacks ContentLength: it does not speak S3" in done.err
+
+
 @pytest.mark.parametrize(
     ("words", "why"),
     [

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
@@ -58,10 +58,17 @@ def end_at_once(code: int | None = None) -> None:
     """Make signals end this process at once from now on, where nothing else handles them.
 
     Args:
-        code: to end with; None for that of the signal.
+        code: to end with, without a word; None to say so, and end with that of the signal.
     """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        if code is None:
+            with suppress(OSError):
+                os.write(2, b"cdmisfa: interrupted\n")
+        os._exit(128 + number if code is None else code)
+
     for number in {*SIGNALS} - _ignored():
-        signal.signal(number, lambda n, _: os._exit(128 + n if code is None else code))
+        signal.signal(number, end)
 
 
 @contextmanager

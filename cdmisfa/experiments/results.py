@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -209,7 +210,7 @@ class PointResult:
     """One point of the grid.
 
     Attributes:
-        point: the grid's keys and this point's values.
+        point: the grid's keys and this point's values, as they were given.
         trials: how many were asked for.
         done: how many of them the measures are about.
         failed: how many of them failed.
@@ -218,7 +219,7 @@ class PointResult:
         orders: how often which streams were learned in which order, the most frequent first.
     """
 
-    point: Mapping[str, str]
+    point: Mapping[str, Any]
     trials: int
     done: int
     failed: int
@@ -227,23 +228,27 @@ class PointResult:
     orders: Mapping[str, int]
 
 
-def results(folder: Path) -> list[PointResult]:
+def results(folder: str | Path) -> list[PointResult]:
     """The points of a sweep as it was requested last, in the grid's order.
+
+    Args:
+        folder: of the sweep.
 
     Raises:
         UsageError: the folder holds no sweep.
         LogDamagedError: its files are damaged.
     """
+    folder = Path(folder)
     path = folder / REQUEST
     if not path.is_file():
         raise UsageError(f"{folder} holds no {REQUEST}: name the folder of a sweep")
     trials = read_request(folder)
     rows = {row["id"]: row for row in read_rows(folder)}
-    points: dict[tuple[tuple[str, str], ...], list[Any]] = {}
+    points: dict[str, tuple[dict[str, Any], list[Any]]] = {}
     for number, point in trials:
-        points.setdefault(tuple(point.items()), []).append(rows.get(number))
+        points.setdefault(json.dumps(point), (point, []))[1].append(rows.get(number))
     try:
-        return [_point(dict(key), found) for key, found in points.items()]
+        return [_point(point, found) for point, found in points.values()]
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise LogDamagedError(
             f"{folder / ROWS}: a row is no trial's result ({error}): remove the file and run the "
@@ -251,7 +256,7 @@ def results(folder: Path) -> list[PointResult]:
         ) from error
 
 
-def _point(point: Mapping[str, str], rows: Sequence[Mapping[str, Any] | None]) -> PointResult:
+def _point(point: Mapping[str, Any], rows: Sequence[Mapping[str, Any] | None]) -> PointResult:
     found = [row["result"] for row in rows if row is not None and row["status"] == DONE]
     measures = {
         "modules": summary([len(r["modules"]) for r in found]),
@@ -311,7 +316,9 @@ def as_table(points: Sequence[PointResult]) -> tuple[list[str], list[list[str]]]
         order, count = next(iter(p.orders.items()), ("", 0))
         shown = f"{order} ({count}/{p.done})" if order else ""
         cells = [_cell(p.measures.get(name, NOTHING)) for name in names]
-        rows.append([*p.point.values(), f"{p.done}/{p.trials}", str(p.failed), *cells, shown])
+        rows.append(
+            [*map(str, p.point.values()), f"{p.done}/{p.trials}", str(p.failed), *cells, shown]
+        )
     return head, rows
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import logging
 import struct
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -44,6 +45,9 @@ _AGAIN: Final = 0.2
 
 _HEADER: Final = struct.Struct("<BIQ")
 """Header of a message: opcode, subscription, log time in nanoseconds."""
+
+# What its threads meet is also raised here: nobody reads it twice, with a traceback.
+logging.getLogger("websockets").addHandler(logging.NullHandler())
 
 
 class FoxgloveCamera:

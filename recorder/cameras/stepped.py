@@ -71,6 +71,12 @@ class SteppedSource(ForwardSource):
         return tuple(blocks)
 
 
+_ARRAYS = (
+    'name each, as {"left": frames}, with an array (n, height, width) of uint8 or (n, I) of '
+    "float64, or an iterable of such frames"
+)
+
+
 class ArraySource(SteppedSource):
     """Frames that the caller has, or makes, as streams.
 
@@ -91,8 +97,13 @@ class ArraySource(SteppedSource):
         fps: float = 50.0,
         start_ns: int = START_NS,
     ) -> None:
+        if not isinstance(streams, Mapping):
+            raise UsageError(f"streams of {type(streams).__name__} given: {_ARRAYS}")
         if not streams:
             raise UsageError("no stream given: name one at least")
+        for name, frames in streams.items():
+            if not isinstance(name, str) or not isinstance(frames, Iterable):
+                raise UsageError(f"{type(frames).__name__} given as stream {name!r}: {_ARRAYS}")
         shown = {name: iter(frames) for name, frames in streams.items()}
         firsts = {name: as_array(next(frames, ())) for name, frames in shown.items()}
         for name, first in firsts.items():
@@ -158,6 +169,8 @@ class GymSource(SteppedSource):
         hold: int = 1,
         color: bool = False,
     ) -> None:
+        if not tasks or isinstance(tasks, str):
+            raise UsageError(f'tasks {tasks!r} given: give a list, as ["CartPole-v1"]')
         self._environments = environments = [
             make_environment(task) if isinstance(task, str) else task for task in tasks
         ]

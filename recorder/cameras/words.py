@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
-from urllib.parse import unquote, urlsplit
+from urllib.parse import SplitResult, unquote, urlsplit
 
 from cdmisfa.core.blocks import FrameSource, stream_names
 from cdmisfa.core.errors import UsageError
@@ -72,10 +72,14 @@ CAMERAS: Registry[CameraKind] = Registry(
 
 
 def is_live(word: str) -> bool:
-    """Whether a word on the command line names a live stream."""
+    """Whether a word on the command line names a live stream.
+
+    Raises:
+        UsageError: it is the address of no host.
+    """
     scheme = word.partition(":")[0].lower()
     if scheme in ("http", "https"):
-        return urlsplit(word).path.lower().endswith(_STREAMED)
+        return _split(word).path.lower().endswith(_STREAMED)
     return ":" in word and (scheme == "gym" or scheme in CAMERAS)
 
 
@@ -176,10 +180,18 @@ def live_names(words: Sequence[str]) -> tuple[str, ...]:
 def _stream_of(word: str) -> str:
     """The part of a word that names its stream."""
     scheme, _, rest = word.partition(":")
-    place = urlsplit(word)
+    place = _split(word)
     if scheme == "foxglove":
         return unquote(place.path)
     if place.netloc:
         last = place.path.rstrip("/").rpartition("/")[2].rpartition(".")[0] or place.path
         return unquote(last.strip("/")) or place.netloc.rpartition("@")[2]
     return re.sub(r"\.\w{2,4}$", "", re.split(r"[=,]", rest)[0].rpartition("/")[2])
+
+
+def _split(word: str) -> SplitResult:
+    try:
+        return urlsplit(word)
+    except ValueError as error:
+        shown = re.sub(r"(?<=://)[^/@]*@", "", word)
+        raise UsageError(f"{shown} names no host: {error}") from None

@@ -203,9 +203,10 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
     if kind == "table":
         return table_channels(path)
     with contextlib.closing(_open(path, None, salvage=False, reading=IMAGES)) as images:
-        ends = [int(t) for t in images.times[[0, -1]]] if len(images.times) else [None, None]
+        first, last = map(int, images.times[[0, -1]]) if len(images.times) else (None, None)
         kind_of_image = "picture" if kind == "pictures" else "video"
-        return [ChannelFacts(images.topic, images.encoding, kind_of_image, images.count, *ends)]
+        facts = (images.topic, images.encoding, kind_of_image, images.count, first, last)
+        return [ChannelFacts(*facts, missing=images.missing)]
 
 
 def named_streams(

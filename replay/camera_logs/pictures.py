@@ -23,6 +23,7 @@ from recorder.images.options import VIDEO_RECIPE, Size
 from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
 from recorder.images.videos import frame_colors, frame_gray, pyav
 from recorder.mcap.records import MalformedRecord
+from replay.camera_logs.containers import extent_of
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
@@ -32,6 +33,11 @@ MAX_PICTURE: Final = 64 * 1024 * 1024
 
 
 VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
+_UNTIMED: Final = ("avi", "asf")
+_UNSURE: Final = ("mpeg", "mpegts")
+"""Containers without an index, in which FFmpeg may find a place behind the one that is sought."""
+
+_BEGIN: Final = -(2**40)
 _NOWHERE: Final = 2**62
 _FORWARD: Final = 256
 """Frames that are decoded and passed over rather than sought."""
@@ -80,7 +86,7 @@ class VideoImages(ImageStream):
     """The frames of a video's first stream, at its presentation times.
 
     Raises:
-        UsageError: PyAV is missing, or it is no topic of the file.
+        UsageError: PyAV is missing, it is no topic of the file, or its frames have no times.
         LogDamagedError: it is no video, or a broken one.
     """
 
@@ -92,10 +98,13 @@ class VideoImages(ImageStream):
         self.topic = path.stem
         self._av = pyav(f"{path} is a video, which")
         self._next = _NOWHERE
+        self._cut = _NOWHERE  # time of the last frame of a file that was cut, which may be a part
         self._frames: Iterator[Any] = iter(())
         self._container: Any = None
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a video has no topics, leave {topic} out")
+        extent = extent_of(path)
+        self.missing = extent.missing
         try:
             before = data_bytes()
             with explained(path, "FFmpeg"):
@@ -105,10 +114,15 @@ class VideoImages(ImageStream):
         except BaseException:
             self.close()
             raise
-        unsure = f"{path}: a video has no checksums, damaged pixels may go unnoticed"
+        said = ["a video has no checksums, damaged pixels may go unnoticed"]
+        if self.missing:
+            said.append(self.missing)
+        elif not extent.stated:
+            said.append("it does not state where it ends, a missing end would go unnoticed")
         last, stated = int(self.times[-1]) / NANOSECONDS, self._stated_seconds
-        short = f"{path}: it states {stated:g} s, its last frame is at {last:g} s"
-        self.warnings = [unsure, short] if stated > last + 1 else [unsure]
+        if stated > last + 1:
+            said.append(f"it states {stated:g} s, its last frame is at {last:g} s")
+        self.warnings = [f"{path}: {line}" for line in said]
 
     def image(self, row: int) -> ByteArray:
         stamp = int(self._stamps[row])
@@ -118,13 +132,39 @@ class VideoImages(ImageStream):
                 with contextlib.suppress(self._av.FFmpegError):  # of a frame that this needs not
                     found = self._forward(row)
             if found is None:
-                self._container.seek(stamp, stream=self._stream, backward=True)
-                self._frames = self._container.decode(self._stream)
-                found = self._forward(row)
+                try:
+                    found = self._from(stamp, row)
+                except self._av.FFmpegError:
+                    if not self._unsure:
+                        raise
+            if found is None and self._unsure:
+                found = self._from(_BEGIN, row)
             if found is None:
                 raise MalformedRecord("the video is broken, no frame can be decoded")
             self._next = row + 1
             return self._shown(found)
+
+    def _waits(self) -> bool:
+        """Whether a container without times holds pictures that wait for later ones (B-frames)."""
+        context, form = self._stream.codec_context, self._container.format.name
+        return form in _UNTIMED and context.name in ("h264", "hevc") and context.has_b_frames
+
+    def _untimed(self) -> UsageError:
+        return UsageError(
+            f"{self.path}: its frames have no times; copy it into an .mp4 file with some "
+            "(ffmpeg -fflags +genpts -i ... -c copy)"
+        )
+
+    def _decoded(self) -> Iterator[Any]:
+        for packet in self._container.demux(self._stream):
+            if packet.pts != self._cut:
+                yield from packet.decode()
+
+    def _from(self, place: int, row: int) -> Any:
+        """Decode a frame from the whole picture before a place on; see `_forward`."""
+        self._container.seek(place, stream=self._stream, backward=True)
+        self._frames = self._decoded()
+        return self._forward(row)
 
     def _forward(self, row: int) -> Any:
         """Decode on to a frame; None if it is broken or not there."""
@@ -143,9 +183,10 @@ class VideoImages(ImageStream):
 
     def _open(self) -> None:
         """Find the times of all frames, without decoding one."""
-        if not self._container.streams.video:
+        found = self._container.streams.video
+        if not found or found[0].codec_context is None:
             raise LogDamagedError(f"{self.path}: there is no video in it")
-        self._stream = stream = self._container.streams.video[0]
+        self._stream = stream = found[0]
         stream.thread_type = "NONE"
         stream.codec_context.thread_count = 1
         stream.codec_context.options = {"err_detect": "explode"}  # rather than made up pixels
@@ -153,24 +194,21 @@ class VideoImages(ImageStream):
         if not 0 < pixels <= MAX_PIXELS:
             raise LogDamagedError(f"{self.path}: images of {pixels} pixels are not read")
         self.encoding = str(stream.codec_context.name)
+        self._unsure = self._container.format.name in _UNSURE
         self._tick = Fraction(stream.time_base)
         stamps = array("q")
-        packets = 0
         for packet in self._container.demux(stream):
-            packets += packet.size > 0
             if packet.size == 0 or packet.is_discard:
                 continue
             if packet.pts is None:
-                raise LogDamagedError(
-                    f"{self.path}: its frames have no times; copy it into an .mp4 or .mkv file"
-                )
+                raise self._untimed()
             stamps.append(packet.pts)
+        if self._waits() and (np.diff(stamps) >= 0).all():
+            raise self._untimed()
+        if self.missing and stamps:
+            self._cut = stamps.pop()
         if not stamps:
             raise LogDamagedError(f"{self.path}: there is no frame in it")
-        if stream.frames not in (0, packets):
-            raise LogDamagedError(
-                f"{self.path}: it states {stream.frames} frames, {packets} are there"
-            )
         self._stamps = np.sort(np.array(stamps, np.int64))
         if (np.diff(self._stamps) == 0).any():
             raise LogDamagedError(f"{self.path}: two of its frames have the same time")

@@ -44,6 +44,7 @@ class ChannelFacts:
         start_ns: time of the first, nanoseconds; None where it is not known.
         end_ns: time of the last.
         images: whether they are images that are read.
+        missing: what the file that they are in lacks, as it was cut, in words.
     """
 
     topic: str
@@ -53,6 +54,7 @@ class ChannelFacts:
     start_ns: int | None = None
     end_ns: int | None = None
     images: bool = True
+    missing: str = ""
 
 
 class ImageStream(ABC):
@@ -67,6 +69,7 @@ class ImageStream(ABC):
         recipe: how an image becomes a frame, for the record.
         fields: the numbers that are taken instead of images, in their order.
         warnings: what the user should know: what was cut or left out.
+        missing: what a file that was cut lacks, in words, which is a warning, too; "" for others.
         told_rounded: whether warnings say of every number that is held rounded.
         decode: what makes an image of a message; None where they are no messages of a log.
     """
@@ -78,6 +81,7 @@ class ImageStream(ABC):
     recipe: str = RECIPE
     fields: Sequence[str] = ()
     warnings: Sequence[str] = ()
+    missing: str = ""
     told_rounded: bool = False
     decode: Decoder | None = None
 

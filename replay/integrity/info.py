@@ -191,11 +191,23 @@ def _describe_log(place: Location, *, alone: bool) -> LogInfo:
 
 
 def _describe_foreign(place: Path) -> LogInfo:
+    known = channels_of(place)
     channels = [
         ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
-        for c in channels_of(place)
+        for c in known
     ]
-    return LogInfo(str(place), "foreign", tuple(channels), 0, True, "absent", (), {})
+    problems = tuple(Problem(str(place), c.missing) for c in known if c.missing)
+    return LogInfo(
+        path=str(place),
+        kind="foreign",
+        channels=tuple(channels),
+        chunks=0,
+        complete=not problems,
+        crc="absent",
+        problems=problems,
+        metadata={},
+        state="cut short" if problems else "whole",
+    )
 
 
 def _describe_file(path: Location) -> LogInfo:

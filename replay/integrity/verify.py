@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import json
 import shlex
@@ -13,6 +14,7 @@ from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
+from cdmisfa.core.untrusted import read_regular
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
 from replay.camera_logs.opening import (
@@ -40,7 +42,7 @@ from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FIL
 from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, read_header
 from replay.runs.modules import load_modules
 from replay.runs.run import facts_sha256
-from replay.storage.identity import file_sha256
+from replay.storage.arrays import MAX_BYTES
 from replay.storage.location import Location, location
 from replay.storage.opening import fetched, log_files, open_store
 
@@ -142,7 +144,7 @@ def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
     try:
         if not path.is_file():
             yield Problem(str(path), "is missing")
-        elif file_sha256(path) != stated:
+        elif hashlib.sha256(read_regular(path, MAX_BYTES)).hexdigest() != stated:
             yield Problem(str(path), "holds something else than the run's final record states")
         else:
             load_modules(path)
@@ -249,25 +251,29 @@ def _check_images(path: Path) -> LogCheck:
     except LogDamagedError as error:
         return LogCheck((as_problem(path, error),), (FileCheck(str(path), "absent", "damaged"),))
     found = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
-    files = (FileCheck(str(path), "absent", found.state),)
-    return LogCheck(found.problems, files, (*notes, *found.notes))
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def _check_topics(path: Location, topics: Iterable[str]) -> LogCheck:
     """Decode every image on some topics of a camera log."""
     problems: list[Problem] = []
+    missing: dict[str, None] = {}
     notes: dict[str, None] = {}
     for topic in topics:
         try:
             with contextlib.closing(open_images(path, topic)) as images:
                 problems += _broken(images)
+                missing |= dict.fromkeys([images.missing] if images.missing else [])
                 notes |= dict.fromkeys(images.warnings)
         except LogDamagedError as error:
             problems.append(as_problem(path, error))
         except UsageError as error:  # it needs an option, or what is not installed
             said = str(error).removeprefix(f"{path}: ")
             notes[f"{path}: {topic} is not decoded: {said}"] = None
-    return LogCheck(tuple(problems), (), tuple(notes))
+    state: State = "damaged" if problems else "cut short" if missing else "whole"
+    problems += [Problem(str(path), what) for what in missing]
+    told = (note for note in notes if note.removeprefix(f"{path}: ") not in missing)
+    return LogCheck(tuple(problems), (FileCheck(str(path), "absent", state),), tuple(told))
 
 
 def _broken(images: ImageStream) -> Iterator[Problem]:

@@ -15,6 +15,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.options import setting
 
 SCHEMES: Final = ("s3", "http", "https")
+_SECRET: Final = re.compile(r"(?<=://)[^/@]*@|[?#].*")
 _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://", re.ASCII)
 
 
@@ -92,8 +93,9 @@ def location(value: str | Path | Url) -> Location:
         _ = parts.port
     except ValueError:
         raise UsageError(f"{url} has no port: a port is a number up to 65535") from None
-    if not (parts.netloc and parts.path.strip("/")):
-        raise UsageError(f"{value} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
+    if not (parts.hostname and parts.path.strip("/")):
+        shown = _SECRET.sub("", url.address)
+        raise UsageError(f"{shown} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
     return url
 
 

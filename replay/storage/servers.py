@@ -129,7 +129,9 @@ class _HttpServer(Server):
                 data = await answer.content.readexactly(count)
                 return Part(data, total, _tag(answer.headers))
         except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError):
-            raise UnreachableError("the server sends us to what is no http address") from None
+            raise UnreachableError(
+                "this is no http address, or the server sends us to one that is none"
+            ) from None
         except aiohttp.TooManyRedirects:
             raise UnreachableError("the server sends us from address to address") from None
         except aiohttp.ClientResponseError as error:

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.untrusted import check_regular
 from recorder.log.files import atomic_write
 from replay.storage.location import Url
 from replay.storage.opening import copied, open_store
-from replay.storage.servers import ask_s3
+from replay.storage.servers import UnreachableError, ask_s3
 
 PART: Final = 16 * 1024 * 1024
 """Bytes of the parts in which a larger file is sent, each with its MD5, which the server checks."""
@@ -55,12 +56,13 @@ def objects_below(url: Url) -> dict[str, Stored]:
     while True:
         answer = _asked(url, "list_objects_v2", Bucket=bucket, Prefix=key, **more)
         for entry in answer.get("Contents", ()):
-            rest = str(entry["Key"])[len(key) :]
+            rest = str(_stated(url, entry, "Key"))[len(key) :]
             if rest in ("", NOTES) or rest.startswith("/"):
-                found[rest] = Stored(int(entry["Size"]), str(entry["ETag"]).strip('"'))
+                size, tag = _stated(url, entry, "Size"), str(_stated(url, entry, "ETag"))
+                found[rest] = Stored(int(size), tag.strip('"'))
         if not answer.get("IsTruncated"):
             return found
-        more = {"ContinuationToken": answer["NextContinuationToken"]}
+        more = {"ContinuationToken": _stated(url, answer, "NextContinuationToken")}
 
 
 def upload(
@@ -84,6 +86,8 @@ def upload(
         CdmisfaError: the server has something else than was sent.
     """
     files = _files(local)
+    for file in files.values():
+        check_regular(file)
     there = objects_below(url)
     sizes = {rest: file.stat().st_size for rest, file in files.items()}
     done, total = 0, sum(sizes.values())
@@ -133,19 +137,21 @@ def _put(file: Path, url: Url) -> None:
         _send(url, "put_object", file.read_bytes(), **place)
     else:
         begun = _asked(url, "create_multipart_upload", **place)
-        of = {**place, "UploadId": begun["UploadId"]}
+        of = {**place, "UploadId": _stated(url, begun, "UploadId")}
         try:
             sent = []
             for number, data in enumerate(_parts(file), start=1):
                 answer = _send(url, "upload_part", data, PartNumber=number, **of)
-                sent.append({"PartNumber": number, "ETag": answer["ETag"]})
+                sent.append({"PartNumber": number, "ETag": _stated(url, answer, "ETag")})
             _asked(url, "complete_multipart_upload", MultipartUpload={"Parts": sent}, **of)
         except BaseException:
             with contextlib.suppress(CdmisfaError):  # parts that nobody completes are paid for
                 _asked(url, "abort_multipart_upload", **of)
             raise
     answer = _asked(url, "head_object", **place)
-    stored = Stored(int(answer["ContentLength"]), str(answer.get("ETag", "")).strip('"'))
+    stored = Stored(
+        int(_stated(url, answer, "ContentLength")), str(answer.get("ETag", "")).strip('"')
+    )
     if not (_is_of(stored, file) or _same_bytes(url, file)):
         raise CdmisfaError(f"{url}: the server has other bytes than were sent")
 
@@ -154,6 +160,13 @@ def _asked(url: Url, call: str, **words: Any) -> Any:
     """The answer to a call of the S3 interface; raises as `ask_s3`."""
     count = len(words.get("Body", b""))
     return ask_s3(url, lambda files: files._call_s3(call, **words), count)
+
+
+def _stated(url: Url, answer: Mapping[str, Any], name: str) -> Any:
+    """What an answer states, as those of S3 do."""
+    if name not in answer:
+        raise UnreachableError(f"{url}: the server's answer lacks {name}: it does not speak S3")
+    return answer[name]
 
 
 def _send(url: Url, call: str, data: bytes, **place: Any) -> Any:

@@ -18,6 +18,7 @@ from rerun.chunk import Chunk
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.untrusted import check_regular
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.camera_logs.options import CameraOptions
 from replay.inputs import About, Logged, holds_run, open_to_look
@@ -109,6 +110,7 @@ def view_of(
     if path.suffix == ".rrd":
         if not path.is_file():
             raise UsageError(f"{path} does not exist: name a run, a recording or an .rrd file")
+        check_regular(path)
         if tab is not None:
             raise UsageError(f"--tab {tab}: {path} is built already, name its run or recording")
         yield path

@@ -103,13 +103,13 @@ def served_table(folder: Path, port: int | None = None) -> Iterator[Table | None
     Raises:
         UsageError: there is no run in it.
         LogDamagedError: a run without a run.json cannot be read.
-        CdmisfaError: the server ended with an error.
+        CdmisfaError: the port is taken, or the server ended with an error.
     """
     runs = runs_in(folder)
     if not runs:
         raise UsageError(f"{folder} holds no runs: sweep with --keep-logs")
     host = private_host()
-    port = port or free_port(host)
+    port = free_port(host, port or 0)  # else whoever has it might be asked instead of the server
     address = f"rerun+http://{host}:{port}"
     with (
         tempfile.TemporaryDirectory(prefix="cdmisfa-runs-") as place,

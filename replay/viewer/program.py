@@ -255,10 +255,21 @@ def private_host() -> str:
     return ".".join(str(part) for part in (127, *(1 + secrets.randbelow(254) for _ in range(3))))
 
 
-def free_port(host: str = "127.0.0.1") -> int:
-    """A port of this machine that nothing listens at."""
+def free_port(host: str = "127.0.0.1", port: int = 0) -> int:
+    """A port of this machine that nothing listens at.
+
+    Args:
+        host: on which of its addresses.
+        port: the one that is wanted; 0 for any.
+
+    Raises:
+        CdmisfaError: somebody listens there, or this user may not.
+    """
     with socket.socket() as probe:
-        probe.bind((host, 0))
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise CdmisfaError(f"--port {port}: {error.strerror}, choose another one") from error
         return int(probe.getsockname()[1])
 
 

@@ -25,6 +25,7 @@ from tools.torture.outcomes import (
     LOST,
     MEMORY,
     RIGHT,
+    SKIPPED,
     TRACEBACK,
     WRONG,
     Defect,
@@ -33,6 +34,8 @@ from tools.torture.outcomes import (
     Outcome,
 )
 from tools.torture.witness import due
+
+NAME = next(iter(CAMPAIGNS))
 
 
 def made(case: Any, results: harness.Results, **limits: Any) -> harness.Campaign:
@@ -173,18 +176,22 @@ def test_the_page_counts_what_was_found() -> None:
     shared, where = {"seconds": 36.0, "megabytes": 90}, "in /x/torture-x-1/case/out"
     lines = [
         {"run": {"commit": "abc", "python": "3.11", "platform": "here", "seed": 0}},
-        *({"campaign": CAMPAIGNS[0], "seed": n, **Outcome(RIGHT, "a", count=3).as_json(), **shared}
+        *({"campaign": NAME, "seed": n, **Outcome(RIGHT, "a", count=3).as_json(), **shared}
           for n in range(4)),
-        {"campaign": CAMPAIGNS[0], "seed": 9, **Outcome(LOST, "b", where).as_json(), **shared,
+        {"campaign": NAME, "seed": 8, **Outcome(SKIPPED, "a").as_json(), **shared},
+        {"campaign": NAME, "seed": 9, **Outcome(LOST, "b", where).as_json(), **shared,
          "defect": "lost: much"},
     ]  # fmt: skip
     found = page.summary(lines)
     text = page.markdown(json.loads(json.dumps(found)), "found.json")
-    assert found["campaigns"][0]["groups"] == [{"group": "a", RIGHT: 12}, {"group": "b", LOST: 1}]
-    assert "13 cases in 0.1 hours of work, 1 defects" in text
-    assert "| 13 | 12 | 0 | 1 | 90 |" in text
-    assert f"lost, {CAMPAIGNS[0]}, b: in out (" in text
-    assert f"python -m tools.torture {CAMPAIGNS[0]} --case 9" in text
+    assert found["campaigns"][0]["groups"] == [
+        {"group": "a", RIGHT: 12, SKIPPED: 1},
+        {"group": "b", LOST: 1},
+    ]
+    assert "at commit abc: 13 cases in 0.1 hours of work, of the first seed 0;" in text
+    assert f"| 13 | 12 | {CAMPAIGNS[NAME]} |" in text
+    assert f"lost, {NAME}, b: in out (" in text
+    assert f"python -m tools.torture {NAME} --case 9" in text
 
 
 def test_a_witness_tells_what_must_have_been_flushed(tmp_path: Path) -> None:
@@ -215,6 +222,13 @@ def test_every_campaign_is_what_the_harness_takes(name: str) -> None:
     module = campaign(name)
     assert module.__doc__
     assert callable(module.case)
+
+
+@pytest.mark.parametrize("name", CAMPAIGNS)
+def test_every_campaign_ends(name: str) -> None:
+    """By a number of its own, or with its list."""
+    module = campaign(name)
+    assert module.LIMITS.enough or module.prepare.__annotations__["return"].startswith("list")
 
 
 def test_an_unknown_campaign_is_refused() -> None:

@@ -34,6 +34,7 @@ MEMORY = Path("/dev/shm")
 """Where cases write, if there is room: what a killed process wrote is kept here as on a disk."""
 
 ROOM = 2 << 30
+DIRTY = "-dirty"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.torture", description=about)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("campaigns", nargs="*", metavar="CAMPAIGN", help=", ".join(CAMPAIGNS))
-    parser.add_argument("--minutes", type=float, default=60, help="with preparing; 0: page only")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop then; 0: page only")
     parser.add_argument("--seed", type=int, default=0, help="of each campaign's first case")
     parser.add_argument("--jobs", type=int, default=2, help="cases that compute at a time")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "build" / "torture")
@@ -54,13 +55,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     let_children_be_signalled()
     if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM:
         tempfile.tempdir = str(MEMORY)
-    names = chosen.campaigns or CAMPAIGNS
+    names = chosen.campaigns or list(CAMPAIGNS)
     results = chosen.out / harness.CASES
     if chosen.case is not None:
         return _alone(names[0], chosen.case)
+    told = {**_about(), "seed": chosen.seed}
+    if chosen.page and told["commit"].endswith(DIRTY):
+        parser.error("--page names the commit: commit first")
     if chosen.minutes > 0:
-        print(f"seed {chosen.seed}: {', '.join(names)} for {chosen.minutes:g} min", flush=True)
-        told = {**_about(), "seed": chosen.seed, "minutes": chosen.minutes}
+        print(f"commit {told['commit']}, seed {chosen.seed}: {', '.join(names)}", flush=True)
         kept = harness.Results(results)
         kept.begin(told)
         deadline = time.monotonic() + 60 * chosen.minutes
@@ -75,6 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     summary = page.summary(harness.Results(results).lines)
     if not summary["runs"]:
         parser.error(f"no results in {results}: run campaigns first")
+    if _about()["commit"] != told["commit"]:
+        parser.error(f"the files changed: they were those of {told['commit']}")
     (chosen.out / "torture.json").write_text(json.dumps(summary, indent=1) + "\n")
     if chosen.page is not None:
         data = chosen.page.with_suffix(".json")
@@ -128,16 +133,17 @@ def _alone(name: str, seed: int) -> int:
     return 1 if "defect" in line else 0
 
 
+def _git(*words: str) -> str:
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip()
+
+
 def _about() -> dict[str, str]:
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--abbrev=7", "--dirty", "--exclude=*"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    others = (".", ":!docs/reliability.md", ":!docs/reliability.json")
+    changed = _git("status", "--porcelain", "--untracked-files=no", "--", *others)
+    commit = _git("rev-parse", "--short=7", "HEAD") or "unknown"
     return {
-        "commit": commit.stdout.strip() or "unknown",
+        "commit": commit + (DIRTY if changed else ""),
         "python": platform.python_version(),
         "platform": platform.platform(),
     }

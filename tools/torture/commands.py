@@ -13,9 +13,10 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from cdmisfa.cli.interrupts import SIGNALS
@@ -102,10 +103,24 @@ def environment() -> dict[str, str]:
 
 
 class Process:
-    """A command as a process of its own; its streams are files beside `folder`."""
+    """A command as a process of its own; its streams are files beside `folder`.
 
-    def __init__(self, folder: Path, *words: object, shell: str = "") -> None:
+    Args:
+        folder: where it is begun.
+        words: of the command.
+        shell: redirections.
+        more: variables of its environment.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *words: object,
+        shell: str = "",
+        more: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         self.words = tuple(map(str, words))
+        self._environment = environment() | more
         self.code: int | None = None
         streams = Path(tempfile.mkdtemp(dir=folder.parent))
         self._out, self._err = streams / "out", streams / "err"
@@ -118,7 +133,12 @@ class Process:
         if shell:
             line = ["sh", "-c", f'exec "$@" {shell}', "sh", *line]
         process = subprocess.Popen(
-            line, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=out, stderr=err
+            line,
+            cwd=folder,
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=err,
         )
         process.returncode = 0  # it is waited for here, and by nobody else
         return process.pid

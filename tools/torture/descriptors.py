@@ -16,8 +16,6 @@ from .commands import Process, Ran, call, judge
 from .materials import camera_log, recording, run
 from .outcomes import RIGHT, WRONG, Defect, Job, Limits, Outcome
 
-LIMITS = Limits(seconds=180)
-
 Words = tuple[object, ...]
 
 QUICK = ("--max-iterations", 3, "--set", "learner.tau=10", "--no-rerun")
@@ -56,29 +54,35 @@ CLOSED = tuple(
 )
 STREAMS = (*CLOSED, ">/dev/full", "2>/dev/full")
 CASES = tuple(itertools.product(STREAMS, COMMANDS))
+LIMITS = Limits(seconds=180, enough=len(CASES))
 SAME_BYTES = (".mcap", ".npz", ".csv", ".png")
 
 
 def prepare(folder: Path) -> dict[str, Any]:
-    """What commands read."""
+    """What commands read, and what they come to with their streams open."""
     for make, name in ((recording, "recording"), (run, "run"), (camera_log, "camera log")):
         make(folder / name)
-    return {"folder": folder, "open": {}}
+    opened = {}
+    for name, words in COMMANDS.items():
+        place = folder / "open" / name
+        ran = call(folder, *words(folder, place))
+        opened[name] = ran.code, ran.out + ran.err != "", _files(place)
+    return {"folder": folder, "open": opened}
 
 
 def case(job: Job) -> Outcome:
-    """A command with its streams open, and not."""
+    """A command with other streams."""
     streams, name = CASES[job.seed % len(CASES)]
-    group, at = f"{name}", job.given["folder"]
-    opened = call(job.folder, *COMMANDS[name](at, job.folder / "open"))
-    process = Process(job.folder, *COMMANDS[name](at, job.folder / "closed"), shell=streams)
-    ran = process.wait(110, group, streams)
+    group, place = f"{name}", job.folder / "closed"
+    code, speaks, files = job.given["open"][name]
+    words = COMMANDS[name](job.given["folder"], place)
+    ran = Process(job.folder, *words, shell=streams).wait(110, group, streams)
     judged = _judged(ran, streams, group)
-    full = "full" in streams and ran.code == 1 and opened.out + opened.err != ""
-    if ran.code != opened.code and not full:
-        what = f"{ran.line} {streams}: exit {ran.code}, not {opened.code}: {ran.told()}"
+    full = "full" in streams and ran.code == 1 and speaks
+    if ran.code != code and not full:
+        what = f"{ran.line} {streams}: exit {ran.code}, not {code}: {ran.told()}"
         raise Defect(WRONG, group, what)
-    if not full and (found := _files(job.folder / "closed")) != _files(job.folder / "open"):
+    if not full and (found := _files(place)) != files:
         raise Defect(WRONG, group, f"{ran.line} {streams}: other files: {sorted(found)}")
     return judged
 

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from .commands import LIMIT, Fork, Ran, here, judge, must, until, worst
-from .kills import check_disk
+from .kills import check_disk, nothing_yet
 from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
 from .witness import due, witnessing
 from .works import EASY, files, run
 
-LIMITS = Limits(seconds=120, beside=2)
+LIMITS = Limits(seconds=120, enough=100, beside=3)
 
 FRAMES = 1500
 TIMEOUT = 2
@@ -76,7 +76,7 @@ def _goes_on(
         return
     begun = place.exists() and any(place.iterdir())
     ran = here(*words, *(("--resume",) if begun else ()))
-    if ran.code == 2 and "no run to resume" in ran.err:
+    if nothing_yet(ran):
         ran = here(*words, "--force")
     if ran.code != 0:
         raise Defect(WRONG, group, f"{ran.line}: after a kill: exit {ran.code}: {ran.told()}")

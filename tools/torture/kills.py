@@ -17,12 +17,24 @@ from recorder.mcap.reader import LogReader
 from replay.runs.log import SIGNALS_TOPIC
 
 from .commands import ERRORS, LIMIT, UNCLEAR, Fork, Process, Ran, here, until
-from .outcomes import HANG, LOST, MIXED, RIGHT, TRACEBACK, WRONG, Defect, Job, Limits, Outcome
+from .outcomes import (
+    HANG,
+    LOST,
+    MIXED,
+    RIGHT,
+    SKIPPED,
+    TRACEBACK,
+    WRONG,
+    Defect,
+    Job,
+    Limits,
+    Outcome,
+)
 from .processes import descendants, wait_gone
 from .witness import due, witnessing
 from .works import WORKS, Work, prepared
 
-LIMITS = Limits(seconds=150, share=9, enough=1_000, beside=2)
+LIMITS = Limits(seconds=150, share=9, enough=1_100, beside=3)
 
 SIGNALS = {
     "kill -9": (signal.SIGKILL,),
@@ -34,6 +46,7 @@ SIGNALS = {
     "INT, kill -9": (signal.SIGINT, signal.SIGKILL),
 }
 WEIGHTS = (60, 8, 8, 8, 6, 5, 5)
+RESUMED = ("", ", resumed", ", resumed twice")
 SECONDS = 2.5
 """For which a command is made to run that would be over sooner."""
 REAL = 0.1
@@ -53,15 +66,17 @@ def case(job: Job) -> Outcome:
     place, kills = job.folder / "out", Counter[str]()
     words: tuple[object, ...] = work.words(place, shared)
     for attempt in range(rng.choice((1, 1, 1, 2, 3))):
-        again = work.again if attempt and _begun(place) else ()
         (how,) = rng.choices(list(SIGNALS), WEIGHTS)
-        group = f"{name}: {how}"
-        kills[group] += 1
-        if _killed(job, (*words, *again), work, SIGNALS[how], group, job.given["seconds"][name]):
+        group = f"{name}{RESUMED[attempt]}: {how}"
+        line = going_on(place, words, work) if begun(place) else words
+        if _killed(job, line, work, SIGNALS[how], group, job.given["seconds"][name]):
             break
+        kills[group] += 1
     finish(place, words, work, group)
     if (found := work.result(place)) != job.given["results"][name]:
         raise Defect(MIXED, group, f"{name}, {dict(kills)}: gone on with, it gives {found}")
+    if not kills:
+        return Outcome(SKIPPED, group, "it had ended before")
     return Outcome(RIGHT, group, count=kills.total())
 
 
@@ -95,7 +110,8 @@ def _killed(
 
 def _check_end(ran: Ran, how: tuple[int, ...], group: str) -> None:
     codes = {0, *(128 + number for number in how), *(-number for number in how)}
-    if ran.code in ERRORS and not UNCLEAR.search(ran.err) and "over before" in ran.err:
+    refused = ran.code in ERRORS and not UNCLEAR.search(ran.err)
+    if refused and ("over before" in ran.err or nothing_yet(ran)):
         return
     early = "cdmisfa:" not in ran.err and "KeyboardInterrupt" in ran.err and ran.seconds < 2
     if early:  # before anything of ours was imported
@@ -104,15 +120,25 @@ def _check_end(ran: Ran, how: tuple[int, ...], group: str) -> None:
         raise Defect(TRACEBACK, group, f"{ran.line}: exit {ran.code}: {ran.told()}")
 
 
-def _begun(place: Path) -> bool:
+def begun(place: Path) -> bool:
     """Whether there is something to go on with."""
     return place.exists() and any(place.iterdir())
 
 
+def going_on(place: Path, words: tuple[object, ...], work: Work) -> tuple[object, ...]:
+    """The command that goes on with another."""
+    return work.on(place) if work.on else (*words, *work.again)
+
+
+def nothing_yet(ran: Ran) -> bool:
+    """Whether what would go on says that one has to begin anew."""
+    return ran.code == 2 and ("no run to resume" in ran.err or "fork again with --f" in ran.err)
+
+
 def finish(place: Path, words: tuple[object, ...], work: Work, group: str) -> None:
     """Go on to the end, or begin anew where nothing was there yet; that must be said clearly."""
-    ran = here(*words, *(work.again if _begun(place) else ()))
-    if ran.code == 2 and work.again and "no run to resume" in ran.err:
+    ran = here(*(going_on(place, words, work) if begun(place) else words))
+    if nothing_yet(ran):
         ran = here(*words, "--force")
     if ran.code != 0:
         kind = TRACEBACK if UNCLEAR.search(ran.err) else WRONG

@@ -10,7 +10,8 @@ from typing import Any
 RIGHT = "right"
 CLEAR_ERROR = "clear error"
 SKIPPED = "skipped"
-GOOD = (RIGHT, CLEAR_ERROR, SKIPPED)
+HELD = (RIGHT, CLEAR_ERROR)
+GOOD = (*HELD, SKIPPED)
 
 HANG = "hang"
 MIXED = "mixed"
@@ -19,19 +20,8 @@ TRACEBACK = "traceback"
 MEMORY = "memory"
 WRONG = "wrong"
 DEFECTS = (HANG, MIXED, LOST, TRACEBACK, MEMORY, WRONG)
-"""Over 5 s; of two inputs; more than the stated second; no clear error; over the limit; others."""
-
-MEANING = {
-    RIGHT: "the result, or what is left after a kill, is what it must be",
-    CLEAR_ERROR: "one line that names what is wrong, and nothing worse",
-    SKIPPED: "not possible on this machine",
-    HANG: "a command that was to end did not within 5 s",
-    MIXED: "results of other bytes than those that they name, or not the same bits after resuming",
-    LOST: "more lost than the last second before the end",
-    TRACEBACK: "an error that is no clear line",
-    MEMORY: "more memory than the limit",
-    WRONG: "anything else that must not be",
-}
+"""A command that was to end did not within 5 s; results of other bytes than those that they name;
+more lost than the last second; an error that is no clear line; memory over the limit; others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +83,8 @@ class Limits:
     Attributes:
         seconds: a case that takes longer hangs, whatever it is doing.
         megabytes: most memory of one process of a case; None where inputs are not hostile.
-        share: of the time of all campaigns; minutes of the hour in which each has enough.
-        enough: cases after which the campaign ends; None ends with its time, but what goes through
-            a list ends with that.
+        share: of the time of all campaigns, where that is limited.
+        enough: cases after which the campaign ends; what goes through a list ends with that.
         beside: cases at a time for each job; more than one where most of a case is waiting.
     """
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from .campaigns import CAMPAIGNS, campaign
-from .outcomes import DEFECTS, GOOD, MEANING
+from .outcomes import DEFECTS, GOOD, HELD
 
 MOST_SHOWN = 20
 """Defects that are told one by one."""
@@ -31,13 +31,14 @@ def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
             defects.append({k: line[k] for k in ("campaign", "seed", "kind", "group", "detail")})
     names = [name for name in CAMPAIGNS if name in seconds]
     return {
-        "schema": 1,
+        "schema": 2,
         "hours": round(sum(seconds.values()) / 3600, 1),
         "runs": [line["run"] for line in lines if "run" in line],
         "campaigns": [
             {
                 "name": name,
                 "cases": sum(sum(c.values()) for (of, _), c in counts.items() if of == name),
+                "mended": CAMPAIGNS[name],
                 "peak_megabytes": memory[name],
                 "groups": [
                     {"group": group, **counts[of, group]}
@@ -63,40 +64,41 @@ def short(found: dict[str, Any]) -> str:
 
 def markdown(found: dict[str, Any], data: str) -> str:
     """The page: a row for each campaign; its groups are in the file `data` beside it."""
-    cases = sum(each["cases"] for each in found["campaigns"])
     runs, defects = found["runs"], found["defects"]
-    totals = {each["name"]: _totals(each) for each in found["campaigns"]}
-    kinds = [k for k in (*GOOD, *DEFECTS) if k in GOOD[:2] or any(k in c for c in totals.values())]
-    lines = [
-        "# What was done to it, and what came of that",
-        "",
-        "Made by `make torture`, then `python -m tools.torture --minutes 0 --page "
-        "docs/reliability.md`;",
-        "figures are of the runs named here, failures included.",
-        "",
-        f"{cases} cases in {found['hours']} hours of work, {len(defects)} defects. "
-        f"Commit {_distinct(runs, 'commit')}; Python {_distinct(runs, 'python')}; "
-        f"{_distinct(runs, 'platform')}; first seeds {_distinct(runs, 'seed')}.",
-        f"[{data}]({data}) counts the commands and the kinds of damage apart.",
-        "",
-        *(f"- **{kind}**: {MEANING[kind]}" for kind in kinds),
-        "",
-        f"| campaign | | cases | {' | '.join(kinds)} | MB of one process |",
-        f"|---|---|{'---:|' * (len(kinds) + 2)}",
-    ]
+    rows, all_tried = [], 0
     for each in found["campaigns"]:
         about = (campaign(each["name"]).__doc__ or "").strip().partition("\n\n")[0]
-        counts = " | ".join(str(totals[each["name"]][kind]) for kind in kinds)
-        told = [each["name"], _plain(about), each["cases"], counts, each["peak_megabytes"]]
-        lines.append(f"| {' | '.join(map(str, told))} |")
-    lines += ["", "## Defects", "", "As they were found; the command repeats a case today.", ""]
+        kinds = _totals(each)
+        held = sum(kinds[kind] for kind in HELD)
+        tried = held + sum(kinds[kind] for kind in DEFECTS)
+        told = [each["name"], _plain(about), tried, held, each["mended"]]
+        rows.append(f"| {' | '.join(map(str, told))} |")
+        all_tried += tried
+    lines = [
+        "# What was done to it, and what held",
+        "",
+        f"Made by `make torture` at commit {_distinct(runs, 'commit')}: {all_tried} cases in "
+        f"{found['hours']} hours of work, of the first seed {_distinct(runs, 'seed')}; "
+        f"Python {_distinct(runs, 'python')}, {_distinct(runs, 'platform')}.",
+        f"[{data}]({data}) counts the commands, the moments and the kinds of damage apart.",
+        "",
+        "- **tried**: cases; what this machine cannot do, or was over before, is not among them",
+        "- **held**: the right bits, or one clear line in time where there can be none",
+        "- **mended**: faults that the campaign has found in all its runs, each with a test now",
+        "",
+        "| campaign | what is done | tried | held | mended |",
+        "|---|---|---:|---:|---:|",
+        *rows,
+        "",
+    ]
+    lines += ["What did not hold, and the command that does it again:", ""] if defects else []
     for defect in defects[:MOST_SHOWN]:
         again = f"python -m tools.torture {defect['campaign']} --case {defect['seed']}"
         what = f"{defect['kind']}, {defect['campaign']}, {defect['group']}"
         lines.append(f"- {what}: {_plain(defect['detail'])} (`{again}`)")
     if len(defects) > MOST_SHOWN:
         lines.append(f"- and {len(defects) - MOST_SHOWN} more")
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, ""] if defects else lines)
 
 
 def _totals(each: dict[str, Any]) -> Counter[str]:

@@ -1,0 +1,186 @@
+"""Whether a video's file has all that its container states.
+
+A container is a row of parts, each after its name and length. Of a file that was cut one is not all
+there; FFmpeg would give what comes before as if it were all.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Final, NamedTuple
+
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.untrusted import opened_regular
+
+
+class Extent(NamedTuple):
+    """How far a file goes.
+
+    Attributes:
+        missing: what it lacks of what it states, in words; "" where nothing is known to be.
+        stated: whether it states where it ends, so that a missing end is known.
+    """
+
+    missing: str = ""
+    stated: bool = True
+
+
+def extent_of(path: Path) -> Extent:
+    """How far the file of a video goes, by the parts of its container.
+
+    Raises:
+        UsageError: it is no regular file, or may not be read.
+        LogDamagedError: it is empty, or the disk does not give it.
+    """
+    with opened_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        head = file.read(16)
+        if not size or not head:
+            raise LogDamagedError(f"{path}: it is empty")
+        if head[4:8] in _FIRST_BOXES:
+            return _boxes(file, size)
+        if head.startswith(_EBML):
+            return _elements(file, size)
+        if head.startswith(b"RIFF"):
+            return _chunks(file, size)
+        return _objects(file, size) if head == _ASF else Extent(stated=False)
+
+
+def _ended(what: str, stop: int, size: int) -> Extent:
+    return Extent(f"the file ends at byte {size}, {what} would at byte {stop}")
+
+
+def _zeros(at: int) -> Extent:
+    return Extent(f"it holds zeros at byte {at}, where a part of it would begin")
+
+
+def _at(file: BinaryIO, place: int, count: int) -> bytes:
+    """The bytes at a place, zeros for those that the file does not have."""
+    file.seek(place)
+    return file.read(count).ljust(count, b"\0")
+
+
+# MP4, MOV: ISO/IEC 14496-12, 4.2
+
+_FIRST_BOXES: Final = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp")
+
+
+def _boxes(file: BinaryIO, size: int) -> Extent:
+    """In one piece a file ends with its last box; in fragments, moof, their index mfra ends it."""
+    kinds: set[bytes] = set()
+    at = 0
+    while at < size:
+        length, kind, long = struct.unpack(">I4sQ", _at(file, at, 16))
+        if kind == bytes(4):  # behind the last box of a file in one piece it is room for others
+            return _zeros(at) if b"moof" in kinds else Extent()
+        kinds.add(kind)
+        if length == 0:  # to the end, wherever that is
+            return Extent(stated=False)
+        stop = at + max(long if length == 1 else length, 8)
+        if stop > size:
+            return _ended(f"its {kind.decode('latin-1')!r}", stop, size)
+        at = stop
+    return Extent(stated=b"moof" not in kinds or b"mfra" in kinds)
+
+
+# Matroska, WebM: RFC 8794 and RFC 9559
+
+_EBML: Final = b"\x1a\x45\xdf\xa3"
+_SEGMENT, _CLUSTER = 0x18538067, 0x1F43B675
+
+
+def _elements(file: BinaryIO, size: int) -> Extent:
+    """The segment states its length, if what wrote it could go back; then clusters and blocks."""
+    at, end, stated = 0, size, True
+    while at < end:
+        head = _at(file, at, 12)
+        kind, more, _ = _number(head)
+        if head[0] == 0 or head[more] == 0:
+            return _zeros(at)
+        length, width, unknown = _number(head[more:], keep=False)
+        body = at + more + width
+        holds = kind in (_SEGMENT, _CLUSTER)
+        if unknown and not holds:
+            return Extent(f"it holds no length of its part at byte {at}")
+        if not unknown and body + length > size:
+            return _ended(_NAMES.get(kind, "a part"), body + length, size)
+        if kind == _SEGMENT:
+            stated = not unknown
+            end = size if unknown else body + length
+        at = body if holds else body + length
+    return Extent(stated=stated)
+
+
+_NAMES: Final = {_SEGMENT: "its segment", _CLUSTER: "a cluster"}
+
+
+def _number(data: bytes, *, keep: bool = True) -> tuple[int, int, bool]:
+    """A number of variable width, that width, and whether it stands for an unknown length.
+
+    Args:
+        data: begins with it.
+        keep: the mark of the width is a part of the number, as of names.
+    """
+    width = 9 - data[0].bit_length()
+    value = int.from_bytes(data[:width], "big")
+    ones = (1 << 7 * width) - 1
+    return (value if keep else value & ones), width, value & ones == ones
+
+
+# AVI: RIFF, with further ones behind the first where it is large (OpenDML)
+
+
+def _chunks(file: BinaryIO, size: int) -> Extent:
+    at = 0
+    while at < size and _at(file, at, 4) == b"RIFF":
+        stop = at + 8 + int.from_bytes(_at(file, at + 4, 4), "little")
+        if stop - at - 8 in (0, 0xFFFFFFFF):  # what wrote it could not go back
+            return Extent(stated=False)
+        if stop > size:
+            return _ended("its 'RIFF'", stop, size)
+        for name, start, end in _inner_chunks(file, at + 12, stop):
+            if name == bytes(4):
+                return _zeros(start)
+            if end > stop:
+                return _ended(f"its {name.decode('latin-1')!r}", end, size)
+        at = stop + stop % 2
+    return Extent()
+
+
+def _inner_chunks(file: BinaryIO, at: int, stop: int) -> Iterator[tuple[bytes, int, int]]:
+    while at + 8 <= stop:
+        name, length = struct.unpack("<4sI", _at(file, at, 8))
+        yield name, at, at + 8 + length
+        at += 8 + length + length % 2
+
+
+# WMV: the Advanced Systems Format, 3.2
+
+_ASF: Final = bytes.fromhex("3026b2758e66cf11a6d900aa0062ce6c")
+_PROPERTIES: Final = bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")
+_BROADCAST: Final = 1
+_DATA_HEAD: Final = 50
+"""Bytes before the first packet, which all have one length."""
+
+
+def _objects(file: BinaryIO, size: int) -> Extent:
+    header = _at(file, 0, 1 << 16)
+    found = header.find(_PROPERTIES)
+    if found < 0:
+        return Extent(stated=False)
+    (stop,) = struct.unpack_from("<Q", header, found + 40)
+    (flags,) = struct.unpack_from("<I", header, found + 88)
+    if flags & _BROADCAST:
+        return Extent(stated=False)
+    if stop > size:
+        return _ended("what it states of itself", stop, size)
+    (length,) = struct.unpack_from("<I", header, found + 92)
+    at = int.from_bytes(header[16:24], "little") + _DATA_HEAD
+    while length and at + length <= min(size, stop):
+        if not any(_at(file, at, 8)):
+            return _zeros(at)
+        at += length
+    return Extent()
