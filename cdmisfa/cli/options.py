@@ -64,6 +64,9 @@ dry_run = flag(
 )
 loop = flag("--loop", "Start a recording or log again at its end.", group="Source")
 salvage = flag("--salvage", "Pass over damaged parts and images of a log.", group="Source")
+strict = flag(
+    "--strict", "Refuse a log that shows the same as another, as a copy does.", group="Source"
+)
 force = flag("--force", "Overwrite what is already there.")
 no_rerun = flag("--no-rerun", "Do not build the Rerun view run.rrd.")
 retry_failed = flag("--retry-failed", "Compute trials again that failed before.")

@@ -117,6 +117,16 @@ def say_about(source: FrameSource) -> None:
         )
 
 
+def refuse_copies(source: FrameSource, *, strict: bool) -> None:
+    """Refuse logs of which one shows the same as another, where that is asked for.
+
+    Raises:
+        UsageError: one does.
+    """
+    if strict and (said := getattr(source, "copies", ())):
+        raise UsageError(f"{said[0]}: leave one out, or leave out --strict")
+
+
 def say_changes(source: FrameSource) -> None:
     """Say on stderr what showed while a source was read: changes of size, broken images."""
     changes = getattr(source, "changes", {}).values()  # only logs of others have these

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.mcap.records import MAGIC, crc32
+from recorder.mcap.records import MAGIC, RECORD_HEADER, Segment, crc32
 from recorder.mcap.store import Store
 from recorder.mcap.summary import FOOTER_BYTES
 from recorder.mcap.walk import DATA_END_BYTES, LogStructure
 
+_CHUNK_HEADER: Final = 256
 _BEGINNING: Final = 64 * 1024
 """Bytes that are read of a log behind a URL before its end is known."""
 
@@ -50,6 +51,19 @@ class DataSection:
         """Check it for a chunk that has no checksum of its own; of a URL not all is read for it."""
         if self._structure.by_index and not self._remote:
             self.check()
+
+    def unprotected(self, segments: Sequence[Segment]) -> int:
+        """Count the segments that no checksum protects.
+
+        Of a file opened by its index, which states none, the first chunk stands for all; of a URL
+        opened so that is not known, and 0.
+        """
+        if self._structure.data_crc or self._remote:
+            return 0
+        if self._structure.by_index:
+            places = [s.offset + RECORD_HEADER.size for s in segments[:1]]
+            segments = [Segment.of_chunk(p, self._file.peek(p, _CHUNK_HEADER)) for p in places]
+        return sum(1 for s in segments if s.crc == 0 and s.size)
 
     def confirm(self) -> None:
         """Check that a log behind a URL is still the one that was opened.

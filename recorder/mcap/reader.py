@@ -184,9 +184,8 @@ class LogReader:
         self.data.confirm()
 
     def crc_absent(self) -> int:
-        """Count the segments that no CRC protects."""
-        alone = [] if self._structure.data_crc else self.segments
-        return sum(1 for s in alone if s.crc == 0 and s.size)
+        """Count the segments that no CRC protects; see `DataSection.unprotected`."""
+        return self.data.unprotected(self.segments)
 
     # Messages
 

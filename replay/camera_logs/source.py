@@ -34,6 +34,7 @@ from replay.camera_logs.alignment import (
     step_of,
     unlike,
 )
+from replay.camera_logs.copies import copies
 from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
 from replay.camera_logs.options import Align, CameraOptions
 from replay.camera_logs.selected import (
@@ -108,7 +109,10 @@ class ForeignSource(LoggedSource):
         self._shown: dict[int, tuple[int, Shown]] = {}
         try:
             self._open()
-            start_ns, self._rows, self._gaps = self._put_on_clock()
+            try:
+                start_ns, self._rows, self._gaps = self._put_on_clock()
+            except UsageError as error:
+                raise self._of_copies(error) from None
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
             images = firsts[0].ndim > 1
             if options.depth and images and not any(s.distances() for s in self._streams):
@@ -132,6 +136,7 @@ class ForeignSource(LoggedSource):
         self.pauses = dict(zip(names, self._gaps, strict=True))
         self.shapes = dict(zip(names, map(str, self._framings), strict=True))
         self._held = [outside(own, self._count) for own in self._gaps]
+        self.copies = tuple(copies(self._streams))
         self.warnings = tuple(dict.fromkeys(self._warned()))
 
     def _open(self) -> None:
@@ -158,6 +163,7 @@ class ForeignSource(LoggedSource):
     def _warned(self) -> Iterator[str]:
         for images in self._streams:
             yield from images.warnings
+        yield from self.copies
         held = "no block reaches across" if self.gaps else "the last image is shown"
         for images, own in zip(self._streams, self._gaps, strict=True):
             if own:
@@ -322,6 +328,11 @@ class ForeignSource(LoggedSource):
             one = self._streams[0]
             raise UsageError(f"{one.path}: {one.topic}: {error}") from None
         return int(first[0]), [shows] * len(self._times), [shared] * len(self._times)
+
+    def _of_copies(self, error: UsageError) -> UsageError:
+        """Why streams cannot be put on one clock; where one is a copy of another, that."""
+        said = next(copies(self._streams), None)
+        return error if said is None else type(error)(f"{said}: leave one out")
 
     def _refuse_unequal(self) -> None:
         """Refuse streams that are not on one clock, or not of the rate asked for."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import filecmp
 import functools
 import itertools
 import math
@@ -320,12 +321,24 @@ def _of_several(opened: Sequence[ViewFile]) -> UsageError | None:
     for number, path in enumerate(paths):
         if path in paths[:number]:
             return UsageError(f"{path} is named twice: leave one out")
+    copied = _copied([view.path for view in opened])
     folders = list(dict.fromkeys(str(view.path.parent) for view in opened))
     if len(folders) < 2:
-        return None
-    refused = f"{folders[0]} and {folders[1]} are recordings of their own: name one of them"
+        return UsageError(copied) if copied else None
+    refused = (
+        copied or f"{folders[0]} and {folders[1]} are recordings of their own: name one of them"
+    )
     if not opened[0].facts.spec.images:
         return UsageError(refused)
     return SeveralRecordingsError(
         f"{refused}, or put their streams on one clock with --align index"
     )
+
+
+def _copied(paths: Sequence[Location]) -> str:
+    """Which file is a copy of another, byte for byte; "" where none is."""
+    files = [path for path in paths if isinstance(path, Path)]
+    for one, two in itertools.combinations(files, 2):
+        if filecmp.cmp(one, two, shallow=False):
+            return f"{two} is a copy of {one}: leave one out"
+    return ""

@@ -49,6 +49,7 @@ class Identity(ABC):
         """What is known before all of it is read, as JSON values.
 
         Raises:
+            LogDamagedError: it is not any more what was opened.
             CdmisfaError: it cannot be read.
         """
 
@@ -80,11 +81,10 @@ class _ByteIdentity(Identity):
         """Whether it may hold something else than when it was opened."""
 
     def sample(self) -> dict[str, Any]:
-        return {
-            "file": self.path.name,
-            "bytes": self.size,
-            "sample_sha256": self.sample_sha256(),
-        }
+        found = self.sample_sha256()
+        if self.changed():
+            raise self._was_changed()
+        return {"file": self.path.name, "bytes": self.size, "sample_sha256": found}
 
     def whole(self, counted: Counted) -> dict[str, Any]:
         if self._sha256 is None:
@@ -219,9 +219,11 @@ class LoggedSource(StoredSource):
 
     Attributes:
         left_out: a line for each log that could not be read, and is no part of it.
+        copies: a line for each stream that shows the same as one of another log.
     """
 
     left_out: tuple[str, ...] = ()
+    copies: tuple[str, ...] = ()
     _identities: Sequence[Identity] | None = None
 
     @abstractmethod

@@ -19,6 +19,7 @@ from cdmisfa.cli.printing import (
     print_plan,
     print_result,
     quoted,
+    refuse_copies,
     say_about,
     say_changes,
     say_counts,
@@ -59,6 +60,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 @options.loop
 @flag("--resume", "Resume the run in -o where it was stopped.")
 @options.salvage
+@options.strict
 @flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
 @flag("--follow", "Wait for the frames of a recording being written.", group="Source")
@@ -186,6 +188,7 @@ def opened_logs(
         **{name: told[name] for name in ("preset", "seed", "loop", "salvage")},
     )
     with contextlib.closing(frames):
+        refuse_copies(frames, strict=told["strict"])
         if told["dry_run"]:
             yield frames, configuration
             return

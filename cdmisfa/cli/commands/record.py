@@ -20,6 +20,7 @@ from cdmisfa.cli.printing import (
     print_document,
     print_plan,
     print_table,
+    refuse_copies,
     say_about,
     say_changes,
     say_counts,
@@ -266,6 +267,7 @@ def record_streams(
 @options.dry_run
 @options.live_options
 @options.salvage
+@options.strict
 @flag("--resume", "Resume an attempt that was stopped.")
 @options.server_limits
 @options.fsync_every
@@ -278,6 +280,7 @@ def convert_command(
     source: tuple[str, ...],
     out: Path | None,
     salvage: bool,
+    strict: bool,
     resume: bool,
     fsync_every: float | None,
     force: bool,
@@ -314,6 +317,7 @@ def convert_command(
         refuse_existing(out, force=force)
     opened = open_cameras(named, cameras, salvage=salvage, goal=("convert", str(out)))
     with contextlib.closing(opened) as frames:
+        refuse_copies(frames, strict=strict)
         if dry_run:
             print_plan(frames, as_json=as_json)
             return
@@ -340,7 +344,7 @@ def say_complete(folder: Path) -> None:
 
 @contextlib.contextmanager
 def recording(
-    ctx: click.Context, out: Path, *, resume: bool, **notice: str
+    ctx: click.Context, out: Path, *, resume: bool, **notice: Any
 ) -> Iterator[tuple[Callable[[float, float], None], Stop]]:
     """Show how far a recording is; a signal ends its block, says how to resume, and exits."""
     from recorder.recording import RecordingStoppedError

@@ -1,0 +1,112 @@
+"""Logs of which one is a copy of another are told, or refused with --strict."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from camera_files import START_MS, pictures, write_cameras, write_images, write_pictures
+from conftest import Cdmisfa
+from message_files import write_table
+
+COUNT = 60
+LEARN = ("--set", "learner.tau=10", "--max-iterations", "1")
+
+
+def byte_copy(folder: Path) -> Sequence[Path]:
+    one, two = folder / "one.mcap", folder / "two.mcap"
+    write_cameras(one, {"/cam": (COUNT, 20)})
+    shutil.copy(one, two)
+    return one, two
+
+
+def written_otherwise(folder: Path) -> Sequence[Path]:
+    one, two = folder / "one.mcap", folder / "two.mcap"
+    write_cameras(one, {"/cam": (COUNT, 20)})
+    images = enumerate(pictures(COUNT))
+    write_images(two, {"/other": [(START_MS + i * 20, image) for i, image in images]}, "x")
+    return one, two
+
+
+def renamed_pictures(folder: Path) -> Sequence[Path]:
+    one, two = folder / "one", folder / "two"
+    write_pictures(one, COUNT)
+    two.mkdir()
+    for path in one.iterdir():
+        shutil.copy(path, two / f"image-{path.name}")
+    return one, two, Path("--rate"), Path("50")
+
+
+def table_and_its_copy(folder: Path) -> Sequence[Path]:
+    import numpy as np
+
+    one, two = folder / "one.csv", folder / "two.csv"
+    write_table(one, {"a": np.arange(COUNT) % 7})
+    shutil.copy(one, two)
+    return one, two, Path("--field"), Path("a"), Path("--rate"), Path("50")
+
+
+MAKE = (byte_copy, written_otherwise, renamed_pictures, table_and_its_copy)
+
+
+@pytest.mark.parametrize("make", MAKE)
+@pytest.mark.parametrize("command", ["learn", "convert"])
+def test_a_copy_is_told_with_both_names_and_refused_where_asked(
+    cdmisfa: Cdmisfa, tmp_path: Path, command: str, make: type
+) -> None:
+    one, two, *how = make(tmp_path)
+    out = ("-o", tmp_path / "out", *(LEARN if command == "learn" else ()))
+    refused = cdmisfa(command, one, two, *how, *out, "--strict")
+    assert (refused.code, refused.err.count("\n")) == (2, 1)
+    assert not (tmp_path / "out").exists()
+    done = cdmisfa(command, one, two, *how, *out)
+    assert done.code == 0, done.err
+    (line,) = [line for line in done.err.splitlines() if "as a copy does" in line]
+    assert line.startswith(f"warning: {two}: ")
+    assert f" of {one}, " in line
+    assert line.removeprefix("warning: ") in refused.err
+
+
+def test_cameras_that_differ_are_no_copies(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    """Though they begin and end alike, or are topics of one log."""
+    one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
+    write_cameras(one, {"/cam": (COUNT, 20)})
+    images = [(START_MS + i * 20, image) for i, image in enumerate(pictures(COUNT))]
+    for i in range(20, 40):
+        images[i] = (images[i][0], 255 - images[i][1])
+    write_images(two, {"/cam": images})
+    done = cdmisfa("learn", one, two, *LEARN, "--strict")
+    assert (done.code, "copy" in done.err) == (0, False)
+
+
+@pytest.mark.parametrize("align", [(), ("--align", "time")])
+def test_a_copy_among_parts_is_named_as_the_cause(
+    cdmisfa: Cdmisfa, tmp_path: Path, align: tuple[str, ...]
+) -> None:
+    parts = [tmp_path / f"part-{i}.mcap" for i in range(3)]
+    for i, part in enumerate(parts):
+        images = list(pictures(3 * COUNT))[i * COUNT : (i + 1) * COUNT]
+        start = START_MS + i * COUNT * 20
+        write_images(part, {"/cam": [(start + k * 20, image) for k, image in enumerate(images)]})
+    assert cdmisfa("learn", *parts, *LEARN).code == 0
+    copy = Path(shutil.copy(parts[1], tmp_path / "again.mcap"))
+    done = cdmisfa("learn", *parts, copy, *align, *LEARN)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    said = f"{copy}: /cam shows the same as /cam of {parts[1]}, as a copy does: leave one out"
+    assert done.err == f"cdmisfa: {said}\n"
+
+
+@pytest.mark.parametrize("place", ["x1-again.mcap", "other/x1.mcap"])
+def test_a_copy_of_a_view_is_named(
+    cdmisfa: Cdmisfa, tmp_path: Path, oscillatory_recording: Path, place: str
+) -> None:
+    rec = tmp_path / "rec"
+    shutil.copytree(oscillatory_recording, rec)
+    copy = tmp_path / "rec" / place
+    copy.parent.mkdir(exist_ok=True)
+    shutil.copy(rec / "x1.mcap", copy)
+    done = cdmisfa("learn", rec / "x1.mcap", rec / "x2.mcap", copy, *LEARN)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert f"{copy} is a copy of {rec / 'x1.mcap'}: leave one out" in done.err
