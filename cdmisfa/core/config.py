@@ -320,7 +320,10 @@ def convert_value(value: Any, hint: Any, key: str) -> Any:
     if origin is types.UnionType or origin is typing.Union:
         if value is None or value == "auto" or (value == "none" and str not in arguments):
             return None
-        return convert_value(value, next(a for a in arguments if a is not types.NoneType), key)
+        try:
+            return convert_value(value, next(a for a in arguments if a is not types.NoneType), key)
+        except UsageError as error:
+            raise UsageError(f"{error}, or auto") from None
     if origin is tuple:
         parts = value.strip("()[] ").split(",") if isinstance(value, str) else value
         if not isinstance(parts, list | tuple):

@@ -177,6 +177,7 @@ def opened_logs(
     """
     from cdmisfa.experiments.sources import open_source
 
+    options.refuse_live_options(live, source)
     if told["record_to"] is not None:
         raise UsageError("--record is for live streams: leave it out, or see cdmisfa record")
     frames, configuration = open_source(

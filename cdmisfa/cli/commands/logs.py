@@ -206,7 +206,7 @@ def compare_command(
         print_table(HEAD, [row.cells() for row in rows])
     for explanation in filter(None, (row.explanation() for row in rows)):
         if not as_json:
-            print_line(explanation)
+            print_text(explanation)
     if first and second and not as_json:
         print_line(f"signals of iteration {at}:")
         print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
