@@ -6,7 +6,6 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,7 @@ from conftest import Cdmisfa
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import STATES
+from cdmisfa.modules import Module
 from cdmisfa.studies.arena import arena
 from cdmisfa.studies.arena.arena import arena_results, plan_arena
 from cdmisfa.studies.arena.library import ArenaSource, Library, linear
@@ -35,7 +33,6 @@ from cdmisfa.studies.arena.trial import (
 
 pytestmark = pytest.mark.usefixtures("tiny")
 
-LEARNING, GIVEN_UP = STATES.index("learning"), STATES.index("given_up")
 WORDS = ("sway", "hiss", "swing>hiss", "sway#1", "blank")
 UNLEARNED = {"frame": None, "block": None, "watched": None, "fitted": False}
 REFERENCE = 0, 8, "none"
@@ -214,12 +211,11 @@ class Chooser:
     def over(self) -> str:
         return "nothing_left" if self.iteration >= self.ends else ""
 
-    def step(self, block: Any) -> Any:
+    def step(self, block: Any) -> None:
         self.iteration += 1
         if self.iteration in self.saves:
             self.modules.append(self.saves[self.iteration])
-        decided = [LEARNING, GIVEN_UP if self.iteration > 3 else LEARNING]
-        return SimpleNamespace(state=np.array(decided))
+        self.events = ("stream hiss is given up after 2 blocks",) if self.iteration % 4 == 0 else ()
 
 
 @pytest.mark.parametrize(
@@ -233,7 +229,7 @@ def test_a_run_ends_by_itself_or_with_its_frames(
     entry = ArenaSet(("sway", "hiss"), "", frames=800, goes_on=goes_on)
     course = run_learner(learner, ArenaSource(entry.words, library, 0), entry)
     assert [at for at, _ in course.watched] == [40 * k for k in range(blocks)]
-    assert course.decided == {1: 2}
+    assert course.given_up == {1: 2}
     assert (len(course.watched), course.frames, course.ended) == (blocks, 40 * blocks, ended)
     assert [(s.stream, s.signal, s.frame, s.block) for s in course.saved] == [(0, "sway", 200, 5)]
 

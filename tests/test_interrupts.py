@@ -81,6 +81,27 @@ def test_a_signal_while_python_ends_leaves_the_exit_code(number: signal.Signals)
     assert done.stdout.startswith("cdmisfa ")
 
 
+IN_THE_BEGINNING = """
+import signal, sys
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "click":
+            signal.raise_signal(int(sys.argv.pop()))
+
+sys.meta_path.insert(0, Finder())
+from cdmisfa.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_while_the_command_line_is_imported_says_so(number: signal.Signals) -> None:
+    words = [sys.executable, "-c", IN_THE_BEGINNING, str(int(number))]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (128 + number, "cdmisfa: interrupted\n")
+
+
 def test_what_else_a_destructor_raises_is_told(capsys: Any, monkeypatch: Any) -> None:
     told: list[Any] = []
     monkeypatch.setattr("sys.unraisablehook", told.append)

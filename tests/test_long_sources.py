@@ -289,19 +289,28 @@ def test_a_checksum_of_the_data_that_does_not_match_is_told_at_the_end(
     assert cdmisfa("info", tmp_path / "run", "--json").json["state"] == "cut short"
 
 
-def test_a_second_signal_ends_the_wait_and_the_run_is_resumed(
+def test_a_stopped_run_does_nothing_that_takes_as_long_as_its_log_and_is_resumed(
     recording: Path, tmp_path: Path
 ) -> None:
-    def again(done: int, size: int) -> None:
-        raise KeyboardInterrupt
+    def never(done: int, size: int) -> None:
+        pytest.fail("it was waited for all of the log")
 
     out, stops = tmp_path / "run", iter([False, False, True])
-    with pytest.raises(KeyboardInterrupt, match="go on with --resume"):
-        learn(recording, out, stop=lambda: next(stops, True), hashing=again)
-    assert sorted(file.name for file in out.iterdir()) == ["run.mcap.partial"]
+    how: dict[str, Any] = {"stop": lambda: next(stops, True), "hashing": never, "rerun": True}
+    stopped = learn(recording, out, **how)
+    assert (stopped.ended, stopped.iterations) == ("interrupted", 2)
+    assert all("sample_sha256" in view for view in stopped.source["views"])
+    assert sorted(file.name for file in out.iterdir()) == ["modules.npz", "run.json", "run.mcap"]
+    build_view(out, tmp_path / "v.rrd", all_views=recording)
     whole = learn(recording, tmp_path / "whole")
     resumed = learn(recording, out, resume=True)
     assert resumed.as_json() | {"run": ""} == whole.as_json() | {"run": ""}
+
+
+def test_a_log_that_was_changed_before_a_stop_is_damage(recording: Path, tmp_path: Path) -> None:
+    touch, stops = Then(lambda: os.utime(recording / "x1.mcap", ns=(1, 1))), iter([False])
+    with pytest.raises(LogDamagedError, match=r"x1\.mcap: it was changed while it was read"):
+        learn(recording, tmp_path / "run", touch, stop=lambda: next(stops, True))
 
 
 def test_a_view_of_a_killed_run_takes_its_recording_alone(recording: Path, tmp_path: Path) -> None:

@@ -121,3 +121,15 @@ def test_a_file_without_a_byte_is_no_video(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     path = tmp_path / "film.mp4"
     path.touch()
     assert cdmisfa("learn", path).err == f"cdmisfa: {path}: it is empty\n"
+
+
+@pytest.mark.parametrize(("ending", "codec"), [("avi", "libx264"), ("mpg", "libx264")])
+def test_frames_without_times_are_refused_and_not_called_damaged(
+    cdmisfa: Cdmisfa, tmp_path: Path, ending: str, codec: str
+) -> None:
+    """An AVI file states none, and pictures that wait for later ones (B-frames) need them."""
+    path = written(tmp_path, ending, codec, "yuv420p", {})
+    for command in ("verify", "info", "learn"):
+        done = cdmisfa(command, path)
+        assert (done.code, done.err.count("\n")) == (2, 1), (command, done.err)
+        assert f"{path}: its frames have no times" in done.err

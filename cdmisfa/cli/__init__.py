@@ -1,5 +1,21 @@
 """The command line: a thin shell over the library."""
 
-from cdmisfa.cli.app import main, run
+from collections.abc import Sequence
+from typing import NoReturn
 
-__all__ = ["main", "run"]
+
+def main() -> NoReturn:
+    """Run the command line of this process."""
+    from cdmisfa.cli.interrupts import end_at_once
+
+    end_at_once()  # while the rest is imported, too
+    from cdmisfa.cli import app
+
+    app.main()
+
+
+def run(args: Sequence[str]) -> int:
+    """Run one command and return its exit code; see `app.run`."""
+    from cdmisfa.cli import app
+
+    return app.run(args)

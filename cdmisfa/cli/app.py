@@ -121,7 +121,6 @@ def main() -> NoReturn:
     _open_standard_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
         sys.stdout.reconfigure(errors="replace")
-    end_at_once()
     ignore_at_the_end()
     names_on_demand("rerun")  # of 550 modules a view needs 200
     code = run(sys.argv[1:])

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
@@ -24,14 +24,17 @@ class Stop:
     Attributes:
         number: of the last signal, 0 for none.
         ended: the work is over, and a signal changes nothing any more.
+        asked: somebody looks whether to stop.
     """
 
     def __init__(self) -> None:
         self.number: int = 0
         self.ended = False
+        self.asked = False
 
     def __call__(self) -> bool:
         """Whether to stop."""
+        self.asked = True
         return self.number != 0
 
     @property
@@ -58,21 +61,33 @@ def end_at_once(code: int | None = None) -> None:
     """Make signals end this process at once from now on, where nothing else handles them.
 
     Args:
-        code: to end with; None for that of the signal.
+        code: to end with, without a word; None to say so, and end with that of the signal.
     """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        if code is None:
+            with suppress(OSError):
+                os.write(2, b"cdmisfa: interrupted\n")
+        os._exit(128 + number if code is None else code)
+
     for number in {*SIGNALS} - _ignored():
-        signal.signal(number, lambda n, _: os._exit(128 + n if code is None else code))
+        signal.signal(number, end)
 
 
 @contextmanager
 def stoppable(
     notice: str = "finishing what is begun; again to stop at once\n",
+    *,
+    opens: bool = False,
 ) -> Iterator[Stop]:
-    """Let the body end its step at the first signal, and say so; the second one interrupts it."""
+    """Let the body end its step at the first signal, and say so; the second one interrupts it.
+
+    Where it `opens` something before its steps, the first one does, until it is asked for.
+    """
     stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}
 
     def ask(number: int, frame: FrameType | None) -> None:
-        if stop():
+        if stop.number or (opens and not stop.asked):
             if callable(handle := outer[number]):  # which knows the exit code
                 handle(number, frame)
             raise KeyboardInterrupt

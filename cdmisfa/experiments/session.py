@@ -17,8 +17,8 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
-from cdmisfa.experiments.loop import Digest, Keyframes, learn
-from cdmisfa.experiments.names import named
+from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn
+from cdmisfa.experiments.names import placed
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
     COMMAND,
@@ -230,9 +230,9 @@ class Session:
                 "before": {k: manifest[k] for k in ("config", "seed", FORK) if k in manifest},
             }
             session.before = log
-            streams = stopped.source.spec.streams
-            session.keyframe = Keyframe(at, stopped.t, named(state, streams), session._versions)
-            restore(session.learner, session.keyframe, streams)
+            spec = stopped.source.spec
+            session.keyframe = Keyframe(at, stopped.t, placed(state, spec), session._versions)
+            restore(session.learner, session.keyframe, spec)
             yield session
 
     at = staticmethod(Recomputation.after)
@@ -254,7 +254,8 @@ class Session:
 
         Args:
             sinks: told of everything, after the log.
-            stop: asked before every iteration; true ends the run cleanly.
+            stop: asked before every iteration; true ends the run cleanly, without a view, and a
+                long source is known by a sample.
             keyframes: iterations between keyframes, see `Keyframes`.
             fsync_every: seconds after which the disk has the log, so that a power cut takes no
                 more; None leaves it to the operating system until the run is finished.
@@ -298,11 +299,12 @@ class Session:
                 if live:
                     view.earlier(log.path.parent)
             ended = learn(self.source, self.learner, (*told, *sinks), stop=stop, **self._limits)
-            described = description(self.source, told=hashing)
+            stopped = ended == INTERRUPTED  # then nothing is done that takes as long as the log
+            described = description(self.source, at_once=stopped, told=hashing)
             result = self._result(described, digest.hexdigest(), ended)
             if log is not None:
                 stated = {**self.manifest, "versions": self._versions}
-                write_results(log, result, stated, view=rerun)
+                write_results(log, result, stated, view=rerun and not stopped)
         return result
 
     def _result(self, described: Mapping[str, Any], signals_sha256: str, ended: str) -> RunResult:

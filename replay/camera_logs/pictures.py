@@ -33,6 +33,11 @@ MAX_PICTURE: Final = 64 * 1024 * 1024
 
 
 VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
+_UNTIMED: Final = ("avi", "asf")
+_UNSURE: Final = ("mpeg", "mpegts")
+"""Containers without an index, in which FFmpeg may find a place behind the one that is sought."""
+
+_BEGIN: Final = -(2**40)
 _NOWHERE: Final = 2**62
 _FORWARD: Final = 256
 """Frames that are decoded and passed over rather than sought."""
@@ -81,7 +86,7 @@ class VideoImages(ImageStream):
     """The frames of a video's first stream, at its presentation times.
 
     Raises:
-        UsageError: PyAV is missing, or it is no topic of the file.
+        UsageError: PyAV is missing, it is no topic of the file, or its frames have no times.
         LogDamagedError: it is no video, or a broken one.
     """
 
@@ -127,18 +132,39 @@ class VideoImages(ImageStream):
                 with contextlib.suppress(self._av.FFmpegError):  # of a frame that this needs not
                     found = self._forward(row)
             if found is None:
-                self._container.seek(stamp, stream=self._stream, backward=True)
-                self._frames = self._decoded()
-                found = self._forward(row)
+                try:
+                    found = self._from(stamp, row)
+                except self._av.FFmpegError:
+                    if not self._unsure:
+                        raise
+            if found is None and self._unsure:
+                found = self._from(_BEGIN, row)
             if found is None:
                 raise MalformedRecord("the video is broken, no frame can be decoded")
             self._next = row + 1
             return self._shown(found)
 
+    def _waits(self) -> bool:
+        """Whether a container without times holds pictures that wait for later ones (B-frames)."""
+        context, form = self._stream.codec_context, self._container.format.name
+        return form in _UNTIMED and context.name in ("h264", "hevc") and context.has_b_frames
+
+    def _untimed(self) -> UsageError:
+        return UsageError(
+            f"{self.path}: its frames have no times; copy it into an .mp4 file with some "
+            "(ffmpeg -fflags +genpts -i ... -c copy)"
+        )
+
     def _decoded(self) -> Iterator[Any]:
         for packet in self._container.demux(self._stream):
             if packet.pts != self._cut:
                 yield from packet.decode()
+
+    def _from(self, place: int, row: int) -> Any:
+        """Decode a frame from the whole picture before a place on; see `_forward`."""
+        self._container.seek(place, stream=self._stream, backward=True)
+        self._frames = self._decoded()
+        return self._forward(row)
 
     def _forward(self, row: int) -> Any:
         """Decode on to a frame; None if it is broken or not there."""
@@ -157,9 +183,10 @@ class VideoImages(ImageStream):
 
     def _open(self) -> None:
         """Find the times of all frames, without decoding one."""
-        if not self._container.streams.video:
+        found = self._container.streams.video
+        if not found or found[0].codec_context is None:
             raise LogDamagedError(f"{self.path}: there is no video in it")
-        self._stream = stream = self._container.streams.video[0]
+        self._stream = stream = found[0]
         stream.thread_type = "NONE"
         stream.codec_context.thread_count = 1
         stream.codec_context.options = {"err_detect": "explode"}  # rather than made up pixels
@@ -167,16 +194,17 @@ class VideoImages(ImageStream):
         if not 0 < pixels <= MAX_PIXELS:
             raise LogDamagedError(f"{self.path}: images of {pixels} pixels are not read")
         self.encoding = str(stream.codec_context.name)
+        self._unsure = self._container.format.name in _UNSURE
         self._tick = Fraction(stream.time_base)
         stamps = array("q")
         for packet in self._container.demux(stream):
             if packet.size == 0 or packet.is_discard:
                 continue
             if packet.pts is None:
-                raise LogDamagedError(
-                    f"{self.path}: its frames have no times; copy it into an .mp4 or .mkv file"
-                )
+                raise self._untimed()
             stamps.append(packet.pts)
+        if self._waits() and (np.diff(stamps) >= 0).all():
+            raise self._untimed()
         if self.missing and stamps:
             self._cut = stamps.pop()
         if not stamps:

@@ -196,10 +196,10 @@ def _describe_foreign(place: Path) -> LogInfo:
 
 
 def _describe_file(path: Location) -> LogInfo:
-    check: Check = "chunks"
-    if isinstance(path, Path) and path.stat().st_size <= CHECK_BYTES:
-        check = "pass"
-    with LogReader(open_store(path), salvage=True, check=check) as reader:
+    store = open_store(path)
+    small = isinstance(path, Path) and store.size <= CHECK_BYTES
+    check: Check = "pass" if small else "chunks"
+    with LogReader(store, salvage=True, check=check) as reader:
         decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
         counts, channels = count_messages(reader, decode=decode), []
         for number, found in sorted(counts.items()):

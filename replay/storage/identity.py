@@ -49,6 +49,7 @@ class Identity(ABC):
         """What is known before all of it is read, as JSON values.
 
         Raises:
+            LogDamagedError: it is not any more what was opened.
             CdmisfaError: it cannot be read.
         """
 
@@ -80,11 +81,10 @@ class _ByteIdentity(Identity):
         """Whether it may hold something else than when it was opened."""
 
     def sample(self) -> dict[str, Any]:
-        return {
-            "file": self.path.name,
-            "bytes": self.size,
-            "sample_sha256": self.sample_sha256(),
-        }
+        found = self.sample_sha256()
+        if self.changed():
+            raise self._was_changed()
+        return {"file": self.path.name, "bytes": self.size, "sample_sha256": found}
 
     def whole(self, counted: Counted) -> dict[str, Any]:
         if self._sha256 is None:

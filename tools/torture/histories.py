@@ -43,7 +43,7 @@ from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
 
 LIMITS = Limits(seconds=120, share=17, enough=10_000)
 TAU = 20
-MOST = 400
+MOST = 240
 """Frames of the longest recording."""
 CONFIG = LearnerConfig(tau=TAU, delta=1.0, eta_dot_window=2, min_variance=0.0, warm_up=0)
 PER_CASE = 20

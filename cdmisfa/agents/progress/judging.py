@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from cdmisfa.agents.progress.candidate import Candidate, log_ratio
 from cdmisfa.agents.progress.config import ProgressConfig
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import STATES
 from cdmisfa.features.outputs import window_rate
 from cdmisfa.features.recursive import Likeness
+from cdmisfa.modules import Module
 
 FULL = 5.0
 """Windows of tests after which an output counts as settled at `learner.settled`; until then the

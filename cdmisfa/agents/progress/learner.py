@@ -46,8 +46,8 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.learning import LearnerState, overwrite
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
+from cdmisfa.modules import Module
 
 FEWEST_BLOCKS = 20
 """Of a window of tests, however long a block is."""
@@ -346,6 +346,7 @@ class ProgressLearner:
             policy=self._policy,
             expansion=self._expansion,
             scale=self._scale,
+            frame_shape=self.spec.frame_shape,
         )
 
     def _freeze(self) -> None:

@@ -346,7 +346,7 @@ def say_complete(folder: Path) -> None:
 
 @contextlib.contextmanager
 def recording(
-    ctx: click.Context, out: Path, *, resume: bool, **notice: str
+    ctx: click.Context, out: Path, *, resume: bool, **notice: Any
 ) -> Iterator[tuple[Callable[[float, float], None], Stop]]:
     """Show how far a recording is; a signal ends its block, says how to resume, and exits."""
     from recorder.recording import RecordingStoppedError

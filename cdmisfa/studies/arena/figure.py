@@ -29,7 +29,8 @@ def draw_figure(document: Mapping[str, Any], folder: Path) -> list[Path]:
 
     from replay.export.figures import STYLE
 
-    plain = [entry for entry in document["entries"] if not conditions(entry)]
+    entries = document["entries"]
+    plain = [entry for entry in entries if not conditions(entry)] or entries
     mine = [entry for entry in plain if entry["point"]["learner"] == DEFAULT]
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(2, 2, 4.4, 3.3)
@@ -58,7 +59,7 @@ def _draw_curves(panel: Any, entries: Sequence[Entry]) -> None:
     """The share learned by frames seen, a line a learner: mean over the sets it was run on."""
     last = max((e["curve"]["frames"][-1] for e in entries if e["curve"]["frames"]), default=1e4)
     at = np.geomspace(1000, last, POINTS)
-    for learner in CONTESTANTS:
+    for learner in dict.fromkeys(entry["point"]["learner"] for entry in entries):
         curves = [e["curve"] for e in entries if e["point"]["learner"] == learner]
         found = [np.interp(at, c["frames"], c["mean"]) for c in curves if c["frames"]]
         if found:
@@ -69,7 +70,8 @@ def _draw_curves(panel: Any, entries: Sequence[Entry]) -> None:
     panel.set_ylim(-0.03, 1.03)
     panel.set_xlabel("frames seen")
     panel.set_ylabel("share learned")
-    panel.legend(fontsize=6)
+    if panel.get_lines():
+        panel.legend(fontsize=6)
 
 
 def _draw_slowness(panel: Any, entries: Sequence[Entry]) -> None:
@@ -112,5 +114,5 @@ def _draw_blocks(panel: Any, found: Mapping[str, Sequence[float]], about: str) -
         panel.plot(np.mean(values), row, "|", color="black", markersize=9)
     panel.set_yticks(range(len(found)), list(found), fontsize=7)
     panel.set_xlim(0, 1.05 * max((max(values) for values in found.values()), default=1) or 1)
-    panel.set_ylim(len(found) - 0.5, -0.5)
+    panel.set_ylim(max(len(found), 1) - 0.5, -0.5)
     panel.set_xlabel(about)

@@ -27,6 +27,7 @@ COLUMNS: Final[Mapping[str, tuple[str, int]]] = {
     "ended": ("ends", 2),
     "blocks": ("blocks", 0),
     "blocks_learned": ("all learned", 0),
+    "frames_learned": ("frames", 0),
 }
 """Of the measures that a table shows, in their order: the head and digits."""
 

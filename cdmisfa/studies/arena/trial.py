@@ -18,17 +18,14 @@ from numpy.typing import NDArray
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.learning import Learner
-from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import STATES
 from cdmisfa.experiments.loop import ending
 from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.store import StoredTrial
 from cdmisfa.features.sfa import slowness
+from cdmisfa.modules import Module
 from cdmisfa.studies.arena.library import ArenaSource, Library, Reference
 from cdmisfa.studies.arena.pictures import FITTED, FOLLOWING, PARTS, Footage, Part
 from cdmisfa.studies.arena.streams import ArenaSet, parse
-
-LEARNING: Final = STATES.index("learning")
 
 SLOW_ENOUGH: Final = 1.25
 """A learned output may be so many times as fast as the slowest that batch SFA finds."""
@@ -100,7 +97,7 @@ class Course:
     Attributes:
         saved: the modules, in order.
         watched: of every block, the frame at which it begins and its stream.
-        decided: blocks of each stream that was decided, watched until it was so first.
+        given_up: blocks of each stream that was given up, watched until it first was.
         frames: how many were seen.
         ended: why the learner ended by itself, a key of `ENDINGS`; "" where it did not, None
             where it was not asked.
@@ -108,7 +105,7 @@ class Course:
 
     saved: Sequence[SavedModule]
     watched: Sequence[tuple[int, int]]
-    decided: Mapping[int, int]
+    given_up: Mapping[int, int]
     frames: int
     ended: str | None
 
@@ -134,24 +131,26 @@ def run_learner(learner: Learner, source: ArenaSource, streams: ArenaSet) -> Cou
     """
     saved: list[SavedModule] = []
     watched: list[tuple[int, int]] = []
-    decided: dict[int, int] = {}
+    given_up: dict[int, int] = {}
+    names = [f"stream {name} is given up" for name in streams.words]
     visits = np.zeros(len(streams.words), dtype=int)
     ended = ""
     while source.t < streams.frames:
         if not streams.goes_on and (ended := ending(learner, learner.max_modules, None)):
             break
         block = source.take(learner.stream, learner.tau)
-        signals = learner.step(block)
+        learner.step(block)
         watched.append((block.t, block.stream))
         visits[block.stream] += 1
-        for stream in np.flatnonzero(signals.state > LEARNING).tolist():
-            decided.setdefault(stream, int(visits[stream]))
+        # Told by its event: the state is not kept where all that was given up is looked at again.
+        if any(text.startswith(names[block.stream]) for text in learner.events):
+            given_up.setdefault(block.stream, int(visits[block.stream]))
         shown = source.shown(block.stream, source.t - 1)
         about = block.stream, shown.name, shown.learnable, source.t, len(watched)
         saved += [SavedModule(module, *about) for module in learner.modules[len(saved) :]]
         if learner.stream != block.stream:
             source.seek(source.t + streams.switch_cost)
-    return Course(saved, watched, decided, source.t, None if streams.goes_on else ended)
+    return Course(saved, watched, given_up, source.t, None if streams.goes_on else ended)
 
 
 def slowest_output(module: Module, frames: NDArray[Any]) -> tuple[FloatArray, float]:
@@ -225,7 +224,7 @@ class Judge:
         """Blocks of each stream that never can be learned, until it was said to be so."""
         never = [not any(s.learnable for s in phases) for phases in self._source.phases]
         names = self._source.spec.streams
-        return {names[s]: blocks for s, blocks in self._course.decided.items() if never[s]}
+        return {names[s]: blocks for s, blocks in self._course.given_up.items() if never[s]}
 
     def _output(self, k: int, signal: str, part: Part = FOLLOWING) -> tuple[FloatArray, float]:
         """Module k's first output on a part of a signal's frames, and its slowness."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa import kernels
 from cdmisfa.core.blocks import PIXEL, UINT8, as_array
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, expanded_size
@@ -38,6 +39,8 @@ class Module:
         expansion: how its input was expanded; "" where modules.npz is from before that was
             kept, see `expansion_of`.
         scale: what one step of a uint8 counts: 1/255, or 1 where it learned from values.
+        frame_shape: of the frames it learned from, (height, width) or (values,); empty where
+            modules.npz is from before that was kept.
     """
 
     index: int
@@ -54,16 +57,17 @@ class Module:
     counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     expansion: str = ""
     scale: float = PIXEL
+    frame_shape: tuple[int, ...] = ()
 
     def transform(self, frames: Any) -> NDArray[np.float64]:
-        """Outputs on frames, y = phi (x - mean).
+        """Outputs on frames, y = phi (x - mean), the same bits on every machine.
 
         Args:
-            frames: (n, I) or (n, height, width), uint8 or values; it scales the former and
-                expands both as it learned them.
+            frames: (n, *frame_shape), or these as rows (n, I), uint8 or values; it scales the
+                former and expands both as it learned them.
 
         Returns:
-            (n, J).
+            (n, J), to the bit what the run that learned it recorded as y_frozen.
 
         Raises:
             UsageError: these are no frames as it learned from.
@@ -71,26 +75,39 @@ class Module:
         array = as_array(frames)
         if array.dtype != UINT8 and array.dtype.kind != "f":
             raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float values")
-        if array.ndim < 2:
-            raise UsageError(f"frames of shape {array.shape} given: give (n, values)")
-        n, size = len(array), prod(array.shape[1:])
-        expansion = self.expansion_of(size)
-        if expansion is None and self.expansion_of(array.size) is not None:
-            raise UsageError(
-                f"a single frame of shape {array.shape} given: give (n, values), as frame[None]"
-            )
-        if expansion is None:
-            raise UsageError(
-                f"frames of {size} values given: this module has {self.phi.shape[1]} weights an "
-                "output, give frames of the size that it learned from"
-            )
-        rows = array.reshape(n, size)
-        unit = self.scale if array.dtype == UINT8 else 1.0
-        y = np.empty((n, len(self.phi)))
-        for start in range(0, n, CHUNK):
-            x = expand(expansion, rows[start : start + CHUNK].astype(np.float64) * unit)
-            y[start : start + CHUNK] = (x - self.mean) @ self.phi.T
+        rows, expansion = self._rows(array)
+        if rows.dtype != UINT8 or self.scale != PIXEL:
+            rows = rows.astype(np.float64)
+        phi = np.ascontiguousarray(self.phi, np.float64)
+        offset = kernels.mean_output(phi, np.ascontiguousarray(self.mean, np.float64))
+        y = np.empty((len(rows), len(phi)))
+        for start in range(0, len(rows), CHUNK):
+            x = expand(expansion, rows[start : start + CHUNK])
+            y[start : start + CHUNK] = kernels.outputs(phi, offset, x)
         return y
+
+    def _rows(self, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
+        """Frames as rows, and how they are expanded."""
+        shape, size, own = array.shape[1:], prod(array.shape[1:]), self.frame_shape
+        expansion = self.expansion_of(size)
+        right = shape in (own, (prod(own),)) if own else expansion is not None
+        if expansion is not None and right and array.ndim > 1:
+            return array.reshape(len(array), size), expansion
+        wanted = f"give ({', '.join(map(str, ('n', *(own or ('values',)))))})"
+        if array.shape == own or (not own and self.expansion_of(array.size) is not None):
+            raise UsageError(
+                f"a single frame of shape {array.shape} given: {wanted}, as frame[None]"
+            )
+        if array.ndim < 2:
+            raise UsageError(f"frames of shape {array.shape} given: {wanted}")
+        if own:
+            raise UsageError(
+                f"frames of shape {shape} given: this module learned from {own}, {wanted}"
+            )
+        raise UsageError(
+            f"frames of {size} values given: this module has {self.phi.shape[1]} weights an "
+            "output, give frames of the size that it learned from"
+        )
 
     def expansion_of(self, size: int) -> str | None:
         """The expansion that makes this module's inputs of frames of so many values, if any.
