@@ -28,10 +28,8 @@ from cdmisfa.core.registry import did_you_mean
 Section = TypeVar("Section")
 
 LN_2 = 0.6931471805599453
-
 LARGEST = 2**63 - 1
 """Largest whole number a key takes."""
-
 
 MAX_COMPONENTS = 1000
 """More whitening components than this would take minutes a frame."""
@@ -364,9 +362,9 @@ def _number(value: Any) -> float:
 
 
 def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError
-    return value
+    if isinstance(value, str):
+        return value
+    raise TypeError
 
 
 _SCALARS: Mapping[Any, tuple[str, Callable[[Any], Any]]] = {

@@ -247,8 +247,6 @@ def open_source(
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
     if follow is None and is_scene(words, cameras):
-        if vain := [name for name, on in (("--loop", loop), ("--salvage", salvage)) if on]:
-            raise UsageError(f"{words[0]} is a scene: {are_for(vain, 'logs')}")
         configuration = configure(str(words[0]), preset, settings, seed)
         return configuration.open_scene(), configuration
     told = log_settings(settings, None if resumed else words[0])
