@@ -64,7 +64,7 @@ def test_a_picture_that_became_something_else_is_not_waited_for(tmp_path: Path) 
     images = open_images(tmp_path / "pictures", None)
     (tmp_path / "pictures" / "1.png").unlink()
     os.mkfifo(tmp_path / "pictures" / "1.png")
-    with pytest.raises(CdmisfaError, match=r"1\.png: no regular file"):
+    with pytest.raises(LogDamagedError, match=r"1\.png: no regular file"):
         images.image(1)
 
 

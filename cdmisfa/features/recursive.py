@@ -83,9 +83,6 @@ class RecursiveSFA:
         outputs: J.
         window: frames of the exponential window; the first so many all count the same.
 
-    Attributes:
-        state: every array it consists of.
-
     Example:
         >>> t = np.arange(2000.0)
         >>> sfa = RecursiveSFA(2, components=2)
@@ -134,6 +131,16 @@ class RecursiveSFA:
             UsageError: these are no frames of I values.
         """
         return kernels.recursive_update(self._record, frames, gap)
+
+    @property
+    def state(self) -> RecursiveState:
+        """Every array it consists of; others may be set in their place."""
+        return self._state
+
+    @state.setter
+    def state(self, state: RecursiveState) -> None:
+        self._state = state
+        vars(self).pop("_record", None)  # it is of the arrays of before
 
     @cached_property
     def _record(self) -> kernels.Struct:
