@@ -212,8 +212,8 @@ def compare_command(
     else:
         print_table(HEAD, [row.cells() for row in rows])
     for explanation in filter(None, (row.explanation() for row in rows)):
-        for line in () if as_json else explanation.splitlines():
-            print_line(line)
+        if not as_json:
+            print_text(explanation)
     if first and second and not as_json:
         print_line(f"signals of iteration {at}:")
         print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
