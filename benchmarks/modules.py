@@ -12,9 +12,9 @@ from threadpoolctl import threadpool_limits
 from benchmarks.report import SAMPLE, interleaved, middle, ratio, save
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals, canonical_bytes
 from cdmisfa.features.outputs import project
+from cdmisfa.modules import Module
 from replay.recordings.source import RecordedSource
 
 MODULES = (0, 1, 10, 100)

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from cdmisfa.core.errors import CdmisfaError as CdmisfaError
     from cdmisfa.core.learning import Learner as Learner
     from cdmisfa.core.learning import Sink as Sink
-    from cdmisfa.core.modules import Module as Module
     from cdmisfa.core.signals import SIGNALS as SIGNALS
     from cdmisfa.core.signals import BlockSignals as BlockSignals
     from cdmisfa.experiments.loop import learn as learn
     from cdmisfa.experiments.recompute import Run as Run
+    from cdmisfa.modules import Module as Module
     from recorder.cameras.stepped import ArraySource as ArraySource
     from recorder.cameras.stepped import GymSource as GymSource
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
@@ -43,7 +43,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.core.config": "LearnerConfig",
         "cdmisfa.core.errors": "CdmisfaError",
         "cdmisfa.core.learning": "Learner Sink",
-        "cdmisfa.core.modules": "Module",
+        "cdmisfa.modules": "Module",
         "cdmisfa.core.signals": "SIGNALS BlockSignals",
         "cdmisfa.experiments.loop": "learn",
         "recorder.cameras.stepped": "ArraySource GymSource",

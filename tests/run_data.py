@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS, BlockSignals
+from cdmisfa.modules import Module
 from replay.runs.log import read_batches, read_columns
 from replay.runs.writer import RunWriter
 

@@ -16,7 +16,7 @@ from conftest import Cdmisfa
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.modules import Module
+from cdmisfa.modules import Module
 from cdmisfa.studies.arena import arena
 from cdmisfa.studies.arena.arena import arena_results, plan_arena
 from cdmisfa.studies.arena.library import ArenaSource, Library, linear

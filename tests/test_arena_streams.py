@@ -80,14 +80,14 @@ def test_every_set_shows_streams_that_there_are() -> None:
     assert sorted([*reported, *tuning]) == sorted(chosen_sets(["all"])) == sorted(SETS)
     assert chosen_sets(["small", "reported"]) == ["small", *reported]
     noise = {
-        word
+        word.partition("#")[0]
         for name in reported
         for word in SETS[name].words
         if not any(signal.learnable for signal in parse(word))
     }
     assert len(noise) == 8
     tuned = {word for name in tuning for word in SETS[name].words}
-    assert not (tuned & {w for name in reported for w in SETS[name].words}) - noise
+    assert not (tuned & {w for name in reported for w in SETS[name].words if "#" not in w}) - noise
     counts = {
         name: (len(SETS[name].words), sum(parse(w)[0].learnable for w in SETS[name].words))
         for name in ("five-of-twenty", "hundred")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.agents.learners import open_learner
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.blocks import Block, SourceSpec, as_frames
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -18,6 +21,7 @@ from cdmisfa.features.incsfa import IncSFA
 from cdmisfa.features.outputs import project
 from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import lib
+from recorder.world.oscillatory import OscillatorySource
 
 SMALL, LARGE = 5, lib.MANY_INPUTS + 50
 CONFIG = LearnerConfig(components=3)
@@ -131,6 +135,25 @@ def test_a_learner_takes_blocks_only(block: Any) -> None:
     learner = CuriousLearner(LearnerConfig(), SourceSpec(("a",), (2,), "float64"), 0)
     with pytest.raises(UsageError, match=r"given: a learner takes the blocks of a source"):
         learner.step(block)
+
+
+@pytest.mark.parametrize("t", [2**70, -1, 1.5, "3"])
+@pytest.mark.parametrize("config", [LearnerConfig(), ProgressConfig()])
+def test_a_block_of_no_frame_number_is_refused_before_anything_is_drawn(
+    t: Any, config: Any
+) -> None:
+    source = OscillatorySource()
+    learner = open_learner(config, source.spec, 0)
+    block, before = source.take(learner.stream, learner.tau), learner.state.policy_rng
+    with pytest.raises(UsageError, match="frames have numbers from 0 on"):
+        learner.step(replace(block, t=t))
+    assert learner.state.policy_rng == before
+
+
+def test_a_source_in_place_of_its_spec_is_refused() -> None:
+    source: Any = OscillatorySource()
+    with pytest.raises(UsageError, match=r"OscillatorySource given as spec: .*source\.spec"):
+        CuriousLearner(LearnerConfig(), source, 0)
 
 
 def test_a_block_of_another_order_in_memory_gives_the_same_bits() -> None:

@@ -64,7 +64,7 @@ def test_a_picture_that_became_something_else_is_not_waited_for(tmp_path: Path) 
     images = open_images(tmp_path / "pictures", None)
     (tmp_path / "pictures" / "1.png").unlink()
     os.mkfifo(tmp_path / "pictures" / "1.png")
-    with pytest.raises(CdmisfaError, match=r"1\.png: no regular file"):
+    with pytest.raises(LogDamagedError, match=r"1\.png: no regular file"):
         images.image(1)
 
 
@@ -305,3 +305,31 @@ def test_what_is_no_file_is_refused_by_every_command(
         command, *options = way.split()
         done = cdmisfa(command, name, *options)
         assert (done.code, done.err.count("\n"), name in done.err) == (2, 1, True), (way, done.err)
+
+
+@pytest.mark.parametrize("kind", ["fifo", "socket"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "record oscillatory --frames 20 -o out",
+        "learn oscillatory --max-iterations 1 -o out",
+        "export RUN --to csv -o out.csv",
+        "plot RUN -o out",
+        "reproduce stability --trials 1 -o out",
+    ],
+)
+def test_what_is_no_file_is_not_replaced(
+    cdmisfa: Cdmisfa,
+    oscillatory_run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: str,
+    kind: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = Path(words.split()[-1])
+    NO_FILES[kind](out)
+    before = out.stat()
+    done = cdmisfa(*words.replace("RUN", str(oscillatory_run)).split(), "--force")
+    assert (done.code, f"{out} is no file but" in done.err) == (2, True), done.err
+    assert os.path.samestat(out.stat(), before)

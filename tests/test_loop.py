@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.cli.printing import Bar, Reporter
 from cdmisfa.core.blocks import Block
-from cdmisfa.core.errors import LogExhaustedError
+from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn
@@ -121,6 +122,14 @@ def test_less_than_a_block_is_not_enough() -> None:
     with pytest.raises(LogExhaustedError, match="the streams end after 39 frames"):
         learn(source, learner_for(source), (notes,))
     assert notes.told == []
+
+
+def test_what_is_no_source_and_no_learner_is_refused() -> None:
+    source = OscillatorySource()
+    given: Any
+    for given in ((learner_for(source), source), ("icub", learner_for(source)), (source, CONFIG)):
+        with pytest.raises(UsageError, match="learn takes a source that is open, then a learner"):
+            learn(*given)
 
 
 def test_asked_to_stop_while_it_waits_for_frames_it_is_interrupted() -> None:

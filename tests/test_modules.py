@@ -14,7 +14,7 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
 from cdmisfa.core.learning import Keyframe
-from cdmisfa.core.modules import Module
+from cdmisfa.modules import Module
 from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.modules import SlowFeatures, load_modules, save_modules
 
@@ -47,11 +47,24 @@ def test_a_module_transforms_as_the_learner_did(dtype: str, expansion: str, tmp_
     save_modules(tmp_path / "modules.npz", learner.modules)
     (loaded, *_) = load_modules(tmp_path)
     for same in (module, loaded):
-        np.testing.assert_allclose(same.transform(frames), y, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(same.transform(frames.reshape(20, -1)), y, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(same.transform(frames), y)
+        np.testing.assert_array_equal(same.transform(frames.reshape(20, -1)), y)
+        assert same.frame_shape == (2, 3)
     np.testing.assert_array_equal(SlowFeatures(loaded).transform(frames), loaded.transform(frames))
     assert (loaded.expansion, loaded.scale) == (module.expansion, module.scale)
     assert type(loaded.expansion) is str
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (2, 3, 1), (1, 6), (6, 1), (2, 2), ()])
+def test_frames_have_the_shape_that_the_module_learned_from(shape: tuple[int, ...]) -> None:
+    module = with_width(6, expansion="none", frame_shape=(2, 3))
+    for given in (module, SlowFeatures(module)):
+        with pytest.raises(UsageError, match=r"given: .*give \(n, 2, 3\)"):
+            given.transform(np.zeros((5, *shape)))
+        with pytest.raises(UsageError, match=r"a single frame .* give \(n, 2, 3\), as frame\[None"):
+            given.transform(np.zeros((2, 3)))
+        assert given.transform(np.zeros((5, 6))).shape == (5, 1)  # as rows
+        assert given.transform(np.zeros((0, 2, 3))).shape == (0, 1)
 
 
 def test_the_width_does_not_decide_where_the_expansion_is_known() -> None:
@@ -93,10 +106,12 @@ def test_files_from_before_are_read_and_the_width_decides(tmp_path: Path) -> Non
     learner, (y, frames) = learned("uint8", "quadratic")
     save_modules(tmp_path / "modules.npz", learner.modules)
     with np.load(tmp_path / "modules.npz") as stored:
-        old = {k: v for k, v in stored.items() if not k.endswith(("_expansion", "_scale"))}
+        old = {
+            k: v for k, v in stored.items() if not k.endswith(("_expansion", "_scale", "_shape"))
+        }
     np.savez(tmp_path / "old.npz", **old)
     (module, *_) = load_modules(tmp_path / "old.npz")
-    assert module.expansion == ""
+    assert (module.expansion, module.frame_shape) == ("", ())
     np.testing.assert_allclose(module.transform(frames), y, rtol=1e-9, atol=1e-9)
 
 
@@ -157,3 +172,20 @@ def test_a_write_that_fails_leaves_the_earlier_modules_and_nothing_else(
     with pytest.raises(LogWriteError, match=r"modules\.npz cannot be written: No space left"):
         save_modules(path, [with_width(3)])
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [(path.name, before)]
+
+
+@pytest.mark.parametrize(
+    ("outputs", "columns"),
+    [(None, [0, 1, 2]), (0, [0]), (-1, [2]), (slice(2), [0, 1]), ([2, 0], [2, 0]), ((1,), [1])],
+)
+def test_outputs_are_chosen(outputs: Any, columns: list[int]) -> None:
+    module = replace(with_width(4), phi=np.random.default_rng(0).normal(size=(3, 4)))
+    frames = np.random.default_rng(1).normal(size=(6, 4))
+    y = module.transform(frames)
+    np.testing.assert_allclose(module.transform(frames, outputs=outputs), y[:, columns])
+
+
+@pytest.mark.parametrize("outputs", [3, [0, 5], 0.5, "first"])
+def test_outputs_that_it_lacks_are_refused(outputs: Any) -> None:
+    with pytest.raises(UsageError, match=r"this module has 1, counted from 0"):
+        with_width(4).transform(np.zeros((2, 4)), outputs=outputs)

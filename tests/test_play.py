@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import signal
 import socket
 import threading
@@ -28,6 +29,7 @@ from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
 from replay.camera_logs.options import CameraOptions
 from replay.inputs import Logged
+from replay.playing import feed
 from replay.playing.as_robot import play_as_robot
 from replay.playing.feed import (
     DueMessage,
@@ -293,3 +295,25 @@ def test_ctrl_c_ends_it_cleanly(recording: Path, loop: list[str], code: int) -> 
         out, err = process.communicate(timeout=30)
     assert (process.returncode, err) == (code, "")
     assert out.startswith("played ")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("to", ["rerun", "foxglove"])
+def test_a_signal_while_the_log_is_opened_ends_it(
+    cdmisfa: Cdmisfa,
+    recording: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    to: str,
+    number: signal.Signals,
+    code: int,
+) -> None:
+    def opening(path: object) -> None:
+        os.kill(os.getpid(), number)
+        time.sleep(30)
+        raise AssertionError("it was opened on")
+
+    monkeypatch.setattr(feed, "refuse_what_is_no_log", opening)
+    monkeypatch.setattr(feed, "open_to_look", lambda *paths: opening(paths))
+    done = cdmisfa("play", recording, "--to", to)
+    assert (done.code, done.out) == (code, "")
+    assert done.err.endswith("cdmisfa: interrupted\n")

@@ -125,15 +125,15 @@ def test_a_run_whose_streams_were_named_by_their_topics_goes_on(
 ) -> None:
     run, fork, words = tmp_path / "run", tmp_path / "fork", (*BOTH, "--loop", *QUICK[2:])
     log = write_log(tmp_path)
-    straight = cdmisfa("learn", log, *words, "--max-iterations", 220, "--json").json
+    straight = cdmisfa("learn", log, *words, "--max-iterations", 450, "--json").json
     with monkeypatch.context() as before:
         before.setattr("replay.camera_logs.source.names_of", lambda streams: TOPICS)
-        done = cdmisfa("learn", log, *words, "--max-iterations", 200, "-o", run, "--json")
+        done = cdmisfa("learn", log, *words, "--max-iterations", 420, "-o", run, "--json")
     assert {module["stream"] for module in done.json["modules"]} <= set(TOPICS)
     assert done.json["modules"]
-    assert cdmisfa("check", run).code == cdmisfa("at", run, 197).code == 0
-    assert cdmisfa("fork", run, "--at", 196, "--max-iterations", 205, "-o", fork).code == 0
-    resumed = cdmisfa("learn", "--resume", "-o", run, "--max-iterations", 220, "--json")
+    assert cdmisfa("check", run).code == cdmisfa("at", run, 417).code == 0
+    assert cdmisfa("fork", run, "--at", 412, "--max-iterations", 430, "-o", fork).code == 0
+    resumed = cdmisfa("learn", "--resume", "-o", run, "--max-iterations", 450, "--json")
     assert resumed.code == 0, resumed.err
     assert resumed.json["signals_sha256"] == straight["signals_sha256"]
     assert resumed.json["modules"] == straight["modules"]

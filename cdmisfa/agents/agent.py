@@ -14,8 +14,8 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import DENSE_STREAMS
+from cdmisfa.modules import Module
 
 
 def _record_type(kind: str) -> np.dtype[np.void]:

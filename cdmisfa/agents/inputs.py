@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expanded_size
+
+LAST_FRAME = 2**62
+"""Frames are numbered up to this: what follows a block has a number of 64 bits, too."""
 
 LARGEST_VALUE = 1e100
 """Squares and products of values up to this, and their sums, are finite."""
@@ -22,8 +26,10 @@ def count_inputs(expansion: str, spec: SourceSpec) -> int:
     """Number of inputs after expansion.
 
     Raises:
-        UsageError: too many to hold.
+        UsageError: too many to hold, or this is no spec.
     """
+    if not isinstance(spec, SourceSpec):
+        raise UsageError(f"{type(spec).__name__} given as spec: give the source's, source.spec")
     values = int(np.prod(spec.frame_shape))
     inputs = expanded_size(expansion, values)
     if inputs > MAX_INPUTS:
@@ -46,7 +52,7 @@ def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[An
         tau: the frames that were asked for.
 
     Raises:
-        UsageError: it is no block.
+        UsageError: it is no block, or of no frame number.
         ValueError: the block is of another stream, length, frame shape or type.
         CdmisfaError: it holds a value that is no finite number.
     """
@@ -55,6 +61,8 @@ def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[An
             f"{type(block).__name__} given: a learner takes the blocks of a source, as "
             "source.take(learner.stream, learner.tau) gives them"
         )
+    if not isinstance(block.t, Integral) or not 0 <= block.t <= LAST_FRAME:
+        raise UsageError(f"a block at frame {block.t!r} given: frames have numbers from 0 on")
     if block.stream != stream or len(block) != tau:
         raise ValueError(
             f"the learner asked for {tau} frames of stream {stream}, "

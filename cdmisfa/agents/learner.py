@@ -31,9 +31,9 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState, overwrite
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import NO_STATE, BlockSignals
 from cdmisfa.features.incsfa import Feature, IncSFA, MakeFeature
+from cdmisfa.modules import Module
 
 POLICY_KEY, WEIGHTS_KEY = 1, 2
 """Spawn keys of the learner's two random generators, beneath the run's seed."""
@@ -335,6 +335,7 @@ class CuriousLearner:
             policy=agent.policy.copy(),
             expansion=self.config.expansion,
             scale=self.scale,
+            frame_shape=self.spec.frame_shape,
             centres=agent.centres.copy(),
             counts=agent.counts.copy(),
         )

@@ -15,8 +15,8 @@ if TYPE_CHECKING:  # sinks of the command line are imported without numpy
     from numpy.typing import NDArray
 
     from cdmisfa.core.blocks import Block
-    from cdmisfa.core.modules import Module
     from cdmisfa.core.signals import BlockSignals
+    from cdmisfa.modules import Module
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from cdmisfa.core.blocks import Block, FrameSource
-from cdmisfa.core.errors import LogExhaustedError
+from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
 
@@ -60,7 +60,11 @@ def learn(
 
     Raises:
         LogExhaustedError: the source has not enough for a single block.
+        UsageError: these are no source and no learner.
     """
+    if not hasattr(source, "take") or not hasattr(learner, "step"):
+        given = f"{type(source).__name__} and {type(learner).__name__}"
+        raise UsageError(f"{given} given: learn takes a source that is open, then a learner")
     modules = learner.max_modules if max_modules is None else max_modules
     while True:
         ended = ending(learner, modules, max_iterations) or (INTERRUPTED if stop() else "")

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from cdmisfa.core.blocks import stream_names
+from cdmisfa.core.blocks import SourceSpec, stream_names
 from cdmisfa.core.learning import LearnerState
 
 
@@ -15,12 +15,15 @@ def same_names(then: Sequence[str], now: Sequence[str]) -> bool:
     return tuple(now) in (tuple(then), stream_names(then))
 
 
-def named(state: LearnerState, streams: Sequence[str]) -> LearnerState:
-    """A state whose modules call their streams as a source does now."""
+def placed(state: LearnerState, spec: SourceSpec) -> LearnerState:
+    """A state whose modules are of a source's streams, by their names now, and frames."""
+    names = dict(enumerate(spec.streams))
     modules = [
-        replace(module, stream=streams[module.stream_index])
-        if 0 <= module.stream_index < len(streams)
-        else module
+        replace(
+            module,
+            stream=names.get(module.stream_index, module.stream),
+            frame_shape=spec.frame_shape,
+        )
         for module in state.modules
     ]
     return replace(state, modules=tuple(modules))

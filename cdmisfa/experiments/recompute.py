@@ -22,7 +22,7 @@ from cdmisfa.core.errors import (
 )
 from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.names import named, same_names
+from cdmisfa.experiments.names import placed, same_names
 from cdmisfa.experiments.resume import (
     config_history,
     read_command,
@@ -136,7 +136,7 @@ class Recomputation:
         self.learner: Learner = open_learner(span.config, self.header.spec, span.seed)
         self.t = 0
         if keyframe is not None:
-            restore(self.learner, keyframe, self.header.spec.streams)
+            restore(self.learner, keyframe, self.header.spec)
             self.t = keyframe.t
 
     @classmethod
@@ -275,7 +275,7 @@ class Recomputation:
     def _difference_from(self, keyframe: Keyframe, rounding: float) -> Difference | None:
         """Where a keyframe differs from the learner after as many iterations."""
         last, state = keyframe.iteration - 1, self.learner.state
-        kept = arrays_of(named(keyframe.state, self.header.spec.streams))
+        kept = arrays_of(placed(keyframe.state, self.header.spec))
         own = arrays_of(state)
         if kept.keys() != own.keys():
             return Difference(last, "keyframe", (), ", ".join(kept), ", ".join(own))

@@ -18,7 +18,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.documents import versions
-from cdmisfa.experiments.names import named, renamed, same_names
+from cdmisfa.experiments.names import placed, renamed, same_names
 from cdmisfa.experiments.sources import CLOCK, open_logs, open_source
 from recorder.cameras.words import is_live
 from recorder.log.files import found_path, partial_path, relative_path
@@ -197,14 +197,14 @@ def header_to_resume(run: Path) -> tuple[Path, RunHeader | None]:
         return log, None
 
 
-def restore(learner: Learner, keyframe: Keyframe, streams: Sequence[str]) -> None:
-    """Put a learner into the state of a keyframe, for streams of these names.
+def restore(learner: Learner, keyframe: Keyframe, spec: SourceSpec) -> None:
+    """Put a learner into the state of a keyframe, for a source of this spec.
 
     Raises:
         LogDamagedError: the keyframe is of another configuration.
     """
     try:
-        learner.restore(named(keyframe.state, streams))
+        learner.restore(placed(keyframe.state, spec))
     except (LookupError, TypeError, ValueError) as error:
         what = f"the keyframe after {keyframe.iteration} iterations is of another learner"
         raise LogDamagedError(f"{what} ({one_line(error)})") from error
@@ -233,7 +233,7 @@ def restore_from(
         raise UsageError(f"{log.parent} was cut before its fork: fork again with --force")
     if keyframe is None:
         return None
-    restore(learner, keyframe, source.spec.streams)
+    restore(learner, keyframe, source.spec)
     if keyframe.taken is not None:
         records = (signals for columns in read_columns(log) for signals in columns.records())
         for signals in itertools.islice(records, keyframe.iteration):
@@ -276,7 +276,9 @@ def refuse_difference(
         names = dict(zip(header.spec.streams, spec.streams, strict=True))
         before["spec"]["streams"] = spec.streams
         before["source"] = renamed(source_then, names)
-    for key, old, new in differences(_json(before), _json(now)):
+    found = differences(_json(before), _json(now))
+    # another learner first, for other keys and another arithmetic follow from it
+    for key, old, new in sorted(found, key=lambda one: one[0] != "config.learner.algorithm"):
         if key == "config.learner.portable":
             continue  # begun when it had an effect
         if key.startswith("config.scene.") and streams is not None and streams not in SCENES:

@@ -13,10 +13,10 @@ from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Learner, Sink
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import machine, versions, write_json
 from cdmisfa.experiments.resume import COMMAND, FORK, SET_ASIDE
+from cdmisfa.modules import Module
 from recorder.cameras.words import PACKAGES
 from recorder.log.files import (
     held,
@@ -84,6 +84,7 @@ def module_table(module: Module) -> dict[str, Any]:
         "iteration": module.iteration,
         "policy": module.policy.tolist(),
         "eta": module.eta.tolist(),
+        "slow": [bool(slow) for slow in module.slow],
     }
 
 

@@ -18,7 +18,7 @@ from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn
-from cdmisfa.experiments.names import named
+from cdmisfa.experiments.names import placed
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
     COMMAND,
@@ -230,9 +230,9 @@ class Session:
                 "before": {k: manifest[k] for k in ("config", "seed", FORK) if k in manifest},
             }
             session.before = log
-            streams = stopped.source.spec.streams
-            session.keyframe = Keyframe(at, stopped.t, named(state, streams), session._versions)
-            restore(session.learner, session.keyframe, streams)
+            spec = stopped.source.spec
+            session.keyframe = Keyframe(at, stopped.t, placed(state, spec), session._versions)
+            restore(session.learner, session.keyframe, spec)
             yield session
 
     at = staticmethod(Recomputation.after)

@@ -22,8 +22,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import Learner
-from cdmisfa.core.modules import Module
 from cdmisfa.experiments.loop import ending
+from cdmisfa.modules import Module
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
 
 CHUNK = 512

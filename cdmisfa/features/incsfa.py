@@ -109,9 +109,6 @@ def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) ->
 class IncSFA:
     """Incremental slow feature analysis, frame by frame.
 
-    Attributes:
-        state: every array the abstraction consists of.
-
     Example:
         >>> sfa = IncSFA(LearnerConfig(), 5, np.random.default_rng(0))
         >>> sfa.update(np.random.default_rng(1).random((100, 5))).shape
@@ -121,6 +118,16 @@ class IncSFA:
     def __init__(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> None:
         self.state = new_state(rng, n_inputs, config)
         self._nu, self._window = config.nu, config.mean_window
+
+    @property
+    def state(self) -> IncSFAState:
+        """Every array the abstraction consists of; others may be set in their place."""
+        return self._state
+
+    @state.setter
+    def state(self, state: IncSFAState) -> None:
+        self._state = state
+        vars(self).pop("kernel", None)  # it is of the arrays of before
 
     @cached_property
     def kernel(self) -> kernels.Struct:

@@ -83,9 +83,6 @@ class RecursiveSFA:
         outputs: J.
         window: frames of the exponential window; the first so many all count the same.
 
-    Attributes:
-        state: every array it consists of.
-
     Example:
         >>> t = np.arange(2000.0)
         >>> sfa = RecursiveSFA(2, components=2)
@@ -126,14 +123,24 @@ class RecursiveSFA:
             gap: the first frame does not follow the last one learned from.
 
         Returns:
-            (n,): at the last frame of each piece, the change of the outputs: sqrt(2 - 2 |rho|)
-            of their correlation rho with those before, from 0 to sqrt 2; NaN elsewhere, and
-            where there were none before.
+            (n,): at the last frame of each piece, the change of the slowest output:
+            sqrt(2 - 2 |rho|) of its correlation rho with the one before, from 0 to sqrt 2; NaN
+            elsewhere, and where there was none before.
 
         Raises:
             UsageError: these are no frames of I values.
         """
         return kernels.recursive_update(self._record, frames, gap)
+
+    @property
+    def state(self) -> RecursiveState:
+        """Every array it consists of; others may be set in their place."""
+        return self._state
+
+    @state.setter
+    def state(self, state: RecursiveState) -> None:
+        self._state = state
+        vars(self).pop("_record", None)  # it is of the arrays of before
 
     @cached_property
     def _record(self) -> kernels.Struct:

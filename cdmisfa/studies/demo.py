@@ -13,12 +13,12 @@ import numpy as np
 from cdmisfa.core.blocks import Block, SeekableSource
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.learning import Learner, Sink
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import ACTIONS, BlockSignals
 from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure, open_source
+from cdmisfa.modules import Module
 
 SCENE = "icub"
 MODULES = 2

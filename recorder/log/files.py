@@ -71,7 +71,7 @@ def make_folder(folder: Path) -> None:
     """Make a folder, with those above it, that a power cut cannot take away again.
 
     Raises:
-        UsageError: a file stands there.
+        UsageError: something stands there that is no folder.
     """
     above = (folder, *folder.parents)
     for path in above:
@@ -86,7 +86,8 @@ def make_folder(folder: Path) -> None:
 
 
 def refuse_file(folder: Path) -> None:
-    """Refuse to make a folder where a file stands."""
+    """Refuse to make a folder where a file stands, or a device or a pipe."""
+    refuse_special(folder)
     if folder.is_file():
         raise UsageError(f"{folder} is a file: name a folder, which is made if it is not there")
 
@@ -137,7 +138,6 @@ def refuse_existing(folder: Path, *, force: bool, goes_on: bool = True) -> None:
         force: what is there is overwritten.
         goes_on: whether what is there could be resumed instead, by --resume.
     """
-    refuse_special(folder)
     refuse_file(folder)
     refuse_named_as_file(folder)
     if folder.exists() and not force and any(folder.iterdir()):

@@ -66,7 +66,11 @@ class FolderImages(ImageStream):
         return len(self._files)
 
     def image(self, row: int) -> ByteArray:
-        return compressed_image(read_regular(self._files[row], MAX_PICTURE), color=self._color)
+        try:
+            data = read_regular(self._files[row], MAX_PICTURE)
+        except UsageError as error:
+            raise LogDamagedError(f"it was a picture when it was found: {error}") from None
+        return compressed_image(data, color=self._color)
 
     def stated_size(self, row: int) -> Size | None:
         with opened_regular(self._files[row], MAX_PICTURE) as file:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError, one_line
 from cdmisfa.core.learning import Keyframe, LearnerState
-from cdmisfa.core.modules import Module
 from cdmisfa.core.untrusted import parse_json
+from cdmisfa.modules import Module
 from recorder.mcap.reader import LogReader
 from replay.runs.codec import define_message, parsed
 from replay.runs.folders import run_log
@@ -121,10 +121,9 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
 
 def arrays_of(state: LearnerState) -> dict[str, NDArray[Any]]:
     """All arrays of a state by name: its own, and one for each field of its modules."""
-    fields = dataclasses.fields(Module)
-    return dict(state.arrays) | {
-        _MODULES + field.name: np.array([getattr(m, field.name) for m in state.modules])
-        for field in fields
+    names = [field.name for field in dataclasses.fields(Module) if field.name != "frame_shape"]
+    return dict(state.arrays) | {  # the log's header states the shape of frames
+        _MODULES + name: np.array([getattr(m, name) for m in state.modules]) for name in names
     }
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
-from cdmisfa.core.modules import Module
+from cdmisfa.modules import Module
 from recorder.log.files import atomic_write
 from replay.runs.folders import MODULES_FILE
 from replay.storage.arrays import read_arrays
@@ -31,7 +31,7 @@ _SCALARS = {
 }
 """Fields that are no arrays, and the kind of numpy type that each is stored as."""
 
-_OPTIONAL = ("centres", "counts", "expansion", "scale", "stream")
+_OPTIONAL = ("centres", "counts", "expansion", "scale", "slow", "stream", "frame_shape")
 """Fields that files of earlier versions lack."""
 
 
@@ -79,6 +79,8 @@ def _module(stored: Mapping[str, NDArray[Any]], index: int) -> Module:
         if array.dtype.kind not in kinds:
             raise ValueError(f"{name} is not of type {kinds}")
         values[name] = array.item() if name in _SCALARS else array
+    if "frame_shape" in values:
+        values["frame_shape"] = tuple(map(int, values["frame_shape"].tolist()))
     outputs, size = values["phi"].shape
     shapes = {"mean": size, "band_mean": outputs, "band_sd": outputs, "eta": outputs}
     for name, length in shapes.items():
@@ -158,8 +160,9 @@ class SlowFeatures:
         """Outputs of the module on frames, y = phi (x - mean).
 
         Args:
-            X: (n, I) values, or (n, height, width) pixels, of which uint8 count 1/255 each
-                where it learned from pixels. They are expanded as they were for the learner.
+            X: (n, *frame_shape), the shape of a frame that it learned from, or these as rows
+                (n, I); uint8 count 1/255 each where it learned from pixels. They are expanded as
+                they were for the learner.
 
         Returns:
             (n, J).

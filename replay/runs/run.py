@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import NO_STATE, SIGNALS
+from cdmisfa.modules import Module
 from replay.runs.columns import Blocks, SignalColumns, has_values, whole_signals
 from replay.runs.folders import MODULES_FILE, read_run_json, run_log
 from replay.runs.log import RunHeader, read_columns, read_header
@@ -75,7 +75,11 @@ class Run:
         names = self.streams
         if any(module.stream_index >= len(names) for module in found):
             raise LogDamagedError(f"{self.log.parent} holds modules of streams it does not have")
-        return tuple(replace(module, stream=names[module.stream_index]) for module in found)
+        shape = self.header.spec.frame_shape
+        return tuple(
+            replace(module, stream=names[module.stream_index], frame_shape=shape)
+            for module in found
+        )
 
 
 class _Signals(Mapping[str, "NDArray[Any]"]):

@@ -18,8 +18,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS
+from cdmisfa.modules import Module
 from replay.palette import BRICK, GREY, MIST, Rgb, colour, darker, packed, packed_all, pale, shade
 from replay.runs.columns import Blocks, SignalColumns, has_values
 from replay.runs.log import Batch, RunHeader

@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     summary = page.summary(harness.Results(results).lines)
     if not summary["runs"]:
         parser.error(f"no results in {results}: run campaigns first")
-    if _about()["commit"] != told["commit"]:
+    if chosen.page and _about()["commit"] != told["commit"]:
         parser.error(f"the files changed: they were those of {told['commit']}")
     (chosen.out / "torture.json").write_text(json.dumps(summary, indent=1) + "\n")
     if chosen.page is not None:

@@ -1,6 +1,6 @@
 """A recording that is written, and a run that follows it: one of them killed, or both.
 
-Who follows a recording whose writer is no more ends with a clear line. When both have gone on, the
+Who follows a recording whose writer is no more ends, as its log does. When both have gone on, the
 run is that on the recording of a writer that was never killed.
 """
 
@@ -17,7 +17,7 @@ from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
 from .witness import due, witnessing
 from .works import EASY, files, run
 
-LIMITS = Limits(seconds=120, enough=100, beside=3)
+LIMITS = Limits(seconds=120, enough=100, beside=3, share=1)
 
 FRAMES = 1500
 TIMEOUT = 2
@@ -56,10 +56,11 @@ def case(job: Job) -> Outcome:
             at = rec if name == "writer" else place
             check_disk(at, due(witness, killed, 50.0), group, ran)
     outcomes = [_ended(process.wait(TIMEOUT + 20, group), group) for process in (writer, follower)]
-    _goes_on(job.folder, (*RECORD, "-o", rec), writer.code, rec, group)
+    _goes_on((*RECORD, "-o", rec), rec, group, over=writer.code == 0)
     if files(rec) != job.given["rec"]:
         raise Defect(MIXED, group, "the recording is another")
-    _goes_on(job.folder, words, follower.code, place, group)
+    over = follower.code == 0 and run(place)["ended"] != "log_exhausted"
+    _goes_on(words, place, group, over=over)
     if (found := run(place)) != job.given["run"]:
         raise Defect(MIXED, group, f"the run is another: {found}")
     return worst(outcomes)
@@ -69,10 +70,8 @@ def _ended(ran: Ran, group: str) -> Outcome:
     return judge(ran, group, limit=None) if ran.code >= 0 else Outcome(RIGHT, group)
 
 
-def _goes_on(
-    folder: Path, words: tuple[object, ...], code: int | None, place: Path, group: str
-) -> None:
-    if code == 0:
+def _goes_on(words: tuple[object, ...], place: Path, group: str, *, over: bool) -> None:
+    if over:
         return
     begun = place.exists() and any(place.iterdir())
     ran = here(*words, *(("--resume",) if begun else ()))

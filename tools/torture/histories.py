@@ -41,9 +41,9 @@ from replay.runs.log import read_columns, read_header
 from .calls import Call, watched
 from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
 
-LIMITS = Limits(seconds=120, share=17, enough=10_000)
+LIMITS = Limits(seconds=120, share=20, enough=10_000)
 TAU = 20
-MOST = 400
+MOST = 240
 """Frames of the longest recording."""
 CONFIG = LearnerConfig(tau=TAU, delta=1.0, eta_dot_window=2, min_variance=0.0, warm_up=0)
 PER_CASE = 20

@@ -192,7 +192,7 @@ def play_command(
     """
     if wait is not None and target != "foxglove":
         raise UsageError("--wait is for --to foxglove: a viewer that comes late is shown all")
-    with bar("playing", "s") as shown, stoppable(notice="") as stop:
+    with bar("playing", "s") as shown, stoppable(notice="", opens=True) as stop:
         from replay.playing.feed import Playback
 
         how = Playback(rate, loop, fps, cameras, say_about, warn, stop, shown.update)

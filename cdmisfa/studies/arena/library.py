@@ -26,10 +26,10 @@ from cdmisfa.core.blocks import (
 )
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand
-from cdmisfa.core.modules import Module
 from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
+from cdmisfa.modules import Module
 from cdmisfa.studies.arena.pictures import FITTED, PARTS, Footage, Part
 from cdmisfa.studies.arena.streams import CHANGE, STREAMS, Showing, make_footage, parse
 from recorder.log.files import atomic_write

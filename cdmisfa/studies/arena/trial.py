@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.learning import Learner
-from cdmisfa.core.modules import Module
 from cdmisfa.experiments.loop import ending
 from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.store import StoredTrial
 from cdmisfa.features.sfa import slowness
+from cdmisfa.modules import Module
 from cdmisfa.studies.arena.library import ArenaSource, Library, Reference
 from cdmisfa.studies.arena.pictures import FITTED, FOLLOWING, PARTS, Footage, Part
 from cdmisfa.studies.arena.streams import ArenaSet, parse

@@ -10,8 +10,8 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
-from cdmisfa.core.modules import Module
 from cdmisfa.experiments.results import MeanSd, summary, wilson
+from cdmisfa.modules import Module
 
 Settings = Mapping[str, Any]
 Output = tuple[dict[str, Any], Mapping[str, NDArray[Any]]]

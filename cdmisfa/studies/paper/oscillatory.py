@@ -15,9 +15,9 @@ from cdmisfa.agents.agent import OUTCOME, Frozen, as_struct, new_agent, rules
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.core.modules import Module
 from cdmisfa.experiments.trial import run_trial
 from cdmisfa.kernels import instantaneous_slowness
+from cdmisfa.modules import Module
 from cdmisfa.studies import pages
 from cdmisfa.studies.paper.experiment import (
     Experiment,

@@ -14,8 +14,8 @@ from cdmisfa.agents.blank import signals_of_block
 from cdmisfa.agents.learners import LearnerEntry
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.learning import LearnerState, overwrite
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
+from cdmisfa.modules import Module
 
 
 @dataclass(frozen=True)

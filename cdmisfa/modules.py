@@ -1,0 +1,139 @@
+"""A module: an abstraction that was learned, saved and frozen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import prod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa import kernels
+from cdmisfa.core.blocks import PIXEL, UINT8, as_array
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.expansion import expand, expanded_size
+
+CHUNK = 1024
+"""Frames that are turned into values at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Module:
+    """A frozen abstraction with the policy that led to it.
+
+    Attributes:
+        index: order of learning, from 1.
+        stream: name of the stream that was watched when it was saved; "" where modules.npz is
+            from before that was kept, and no run says.
+        stream_index: that stream, from 0.
+        iteration: iteration at whose end it was saved.
+        phi: (J, I) weights; y = phi (x - mean), x after scaling and expansion.
+        mean: (I,) mean of the input.
+        band_mean: (J,) running mean of eta_inst; centre of the novelty band.
+        band_sd: (J,) running standard deviation of eta_inst.
+        eta: (J,) slowness of each output when saved, cycles per frame.
+        policy: (S,) 0 stay, 1 switch, for each stream.
+        centres: (S, C, tau, J) centres of the clusters; empty but for CD-MISFA 1.0.
+        counts: (S, C) what each centre has seen; empty but for CD-MISFA 1.0.
+        expansion: how its input was expanded; "" where modules.npz is from before that was
+            kept, see `expansion_of`.
+        scale: what one step of a uint8 counts: 1/255, or 1 where it learned from values.
+        frame_shape: of the frames it learned from, (height, width) or (values,); empty where
+            modules.npz is from before that was kept.
+        slow: (J,) 1 where an output is slow on frames that it had not learned from, 0 where it is
+            not; empty but for the progress learner.
+    """
+
+    index: int
+    stream: str
+    stream_index: int
+    iteration: int
+    phi: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    band_mean: NDArray[np.float64]
+    band_sd: NDArray[np.float64]
+    eta: NDArray[np.float64]
+    policy: NDArray[np.int64]
+    centres: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
+    counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    expansion: str = ""
+    scale: float = PIXEL
+    frame_shape: tuple[int, ...] = ()
+    slow: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def transform(
+        self, frames: Any, outputs: int | slice | Sequence[int] | None = None
+    ) -> NDArray[np.float64]:
+        """Outputs on frames, y = phi (x - mean), the same bits on every machine.
+
+        Args:
+            frames: (n, *frame_shape), or these as rows (n, I), uint8 or values; it scales the
+                former and expands both as it learned them.
+            outputs: which of the outputs, from 0, the slowest first: a number of one, a slice, or
+                a list of some; all where it is not given.
+
+        Returns:
+            (n, J), or as many columns as outputs were chosen, to the bit what the run that learned
+            it recorded as y_frozen.
+
+        Raises:
+            UsageError: these are no frames as it learned from, or it has no such outputs.
+        """
+        array = as_array(frames)
+        if array.dtype != UINT8 and array.dtype.kind != "f":
+            raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float values")
+        rows, expansion = self._rows(array)
+        if rows.dtype != UINT8 or self.scale != PIXEL:
+            rows = rows.astype(np.float64)
+        phi = np.ascontiguousarray(self._chosen(outputs), np.float64)
+        offset = kernels.mean_output(phi, np.ascontiguousarray(self.mean, np.float64))
+        y = np.empty((len(rows), len(phi)))
+        for start in range(0, len(rows), CHUNK):
+            x = expand(expansion, rows[start : start + CHUNK])
+            y[start : start + CHUNK] = kernels.outputs(phi, offset, x)
+        return y
+
+    def _chosen(self, outputs: int | slice | Sequence[int] | None) -> NDArray[np.float64]:
+        """The weights of some outputs, see `transform`."""
+        if outputs is None:
+            return self.phi
+        try:
+            return self.phi[outputs if isinstance(outputs, slice) else np.atleast_1d(outputs)]
+        except (IndexError, TypeError) as error:
+            raise UsageError(
+                f"no outputs {outputs!r}: this module has {len(self.phi)}, counted from 0"
+            ) from error
+
+    def _rows(self, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
+        """Frames as rows, and how they are expanded."""
+        shape, size, own = array.shape[1:], prod(array.shape[1:]), self.frame_shape
+        expansion = self.expansion_of(size)
+        right = shape in (own, (prod(own),)) if own else expansion is not None
+        if expansion is not None and right and array.ndim > 1:
+            return array.reshape(len(array), size), expansion
+        wanted = f"give ({', '.join(map(str, ('n', *(own or ('values',)))))})"
+        if array.shape == own or (not own and self.expansion_of(array.size) is not None):
+            raise UsageError(
+                f"a single frame of shape {array.shape} given: {wanted}, as frame[None]"
+            )
+        if array.ndim < 2:
+            raise UsageError(f"frames of shape {array.shape} given: {wanted}")
+        if own:
+            raise UsageError(
+                f"frames of shape {shape} given: this module learned from {own}, {wanted}"
+            )
+        raise UsageError(
+            f"frames of {size} values given: this module has {self.phi.shape[1]} weights an "
+            "output, give frames of the size that it learned from"
+        )
+
+    def expansion_of(self, size: int) -> str | None:
+        """The expansion that makes this module's inputs of frames of so many values, if any.
+
+        A module that does not say how its input was expanded was learned when there were only
+        "none" and "quadratic": then it is the one whose width fits.
+        """
+        kinds = (self.expansion,) if self.expansion else ("none", "quadratic")
+        return next((k for k in kinds if expanded_size(k, size) == self.phi.shape[1]), None)
