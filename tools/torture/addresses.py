@@ -26,7 +26,7 @@ from . import materials
 from .commands import LIMIT, Fork, Process, judge, must, until
 from .outcomes import RIGHT, SKIPPED, WRONG, Defect, Job, Limits, Outcome
 
-LIMITS = Limits(seconds=60, beside=3)
+LIMITS = Limits(seconds=60, beside=3, share=3)
 
 CLONE_NEWNET = 0x40000000
 SIOCSIFFLAGS, IFF_UP = 0x8914, 1

@@ -12,7 +12,7 @@ from bombs import CAMERAS, write_all
 from .commands import here, judge
 from .outcomes import Job, Limits, Outcome
 
-LIMITS = Limits(seconds=60, megabytes=512)
+LIMITS = Limits(seconds=60, megabytes=512, share=1)
 
 RATE = ("--rate", 25, "--size", "16x12")
 LEARN = (*RATE, "--max-iterations", 3, "--set", "learner.tau=10", "--no-rerun")

@@ -18,7 +18,7 @@ from .commands import Process, here
 from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
 from .works import WORKS, Work, files, prepared, run
 
-LIMITS = Limits(seconds=120, enough=64, beside=3)
+LIMITS = Limits(seconds=120, enough=64, beside=3, share=2)
 
 SOURCE = Path(__file__).with_name("clock.c")
 RATE = 30

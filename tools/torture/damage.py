@@ -21,7 +21,7 @@ from .materials import MAKERS, missing
 from .mutations import damage
 from .outcomes import MIXED, WRONG, Defect, Job, Limits, Outcome
 
-LIMITS = Limits(seconds=60, megabytes=512, share=9, enough=10_000)
+LIMITS = Limits(seconds=60, megabytes=512, share=10, enough=10_000)
 
 Words = tuple[object, ...]
 Line = Callable[[Path, Path], Words]

@@ -54,7 +54,7 @@ CLOSED = tuple(
 )
 STREAMS = (*CLOSED, ">/dev/full", "2>/dev/full")
 CASES = tuple(itertools.product(STREAMS, COMMANDS))
-LIMITS = Limits(seconds=180, enough=len(CASES))
+LIMITS = Limits(seconds=180, enough=len(CASES), share=3)
 SAME_BYTES = (".mcap", ".npz", ".csv", ".png")
 
 

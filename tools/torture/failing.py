@@ -27,7 +27,7 @@ from .stories import (
     refuse_unclear,
 )
 
-LIMITS = Limits(share=6)
+LIMITS = Limits(share=8)
 
 
 @dataclass(frozen=True, slots=True)

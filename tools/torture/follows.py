@@ -17,7 +17,7 @@ from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
 from .witness import due, witnessing
 from .works import EASY, files, run
 
-LIMITS = Limits(seconds=120, enough=100, beside=3)
+LIMITS = Limits(seconds=120, enough=100, beside=3, share=1)
 
 FRAMES = 1500
 TIMEOUT = 2

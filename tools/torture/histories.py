@@ -41,7 +41,7 @@ from replay.runs.log import read_columns, read_header
 from .calls import Call, watched
 from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
 
-LIMITS = Limits(seconds=120, share=17, enough=10_000)
+LIMITS = Limits(seconds=120, share=20, enough=10_000)
 TAU = 20
 MOST = 240
 """Frames of the longest recording."""

@@ -90,6 +90,6 @@ class Limits:
 
     seconds: float = 120.0
     megabytes: float | None = None
-    share: float = 2.0
+    share: float = 1.0
     enough: int | None = None
     beside: int = 1

@@ -26,7 +26,7 @@ NAMES, OLD_NAMES = "all names", "synced names"
 LEFT = tuple(itertools.product((WRITTEN, ZEROS, SYNCED), (NAMES, OLD_NAMES)))
 """What is left of the data, and of the names."""
 
-LIMITS = Limits(share=4)
+LIMITS = Limits(share=3)
 
 GONE = 1 << 22
 """The number of no process, as all processes of before are gone when the power is back."""

@@ -26,7 +26,7 @@ from .witness import witnessing
 from .works import EASY, files
 from .works import run as run_result
 
-LIMITS = Limits(seconds=120, enough=300, beside=2)
+LIMITS = Limits(seconds=120, enough=300, beside=2, share=2)
 
 Words = tuple[object, ...]
 Line = Callable[[Path, Path], Words]

@@ -10,7 +10,7 @@ from .outcomes import CLEAR_ERROR, RIGHT, Defect, Job, Limits, Outcome
 from .server_cases import CASES, Given, WrongError, check
 from .server_cases import prepare as made
 
-LIMITS = Limits(seconds=60, megabytes=512, enough=len(CASES), beside=2)
+LIMITS = Limits(seconds=60, megabytes=512, enough=len(CASES), beside=2, share=2)
 
 
 def prepare(folder: Path) -> Given:
