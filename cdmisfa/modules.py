@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import prod
 from typing import Any
@@ -41,6 +42,8 @@ class Module:
         scale: what one step of a uint8 counts: 1/255, or 1 where it learned from values.
         frame_shape: of the frames it learned from, (height, width) or (values,); empty where
             modules.npz is from before that was kept.
+        slow: (J,) 1 where an output is slow on frames that it had not learned from, 0 where it is
+            not; empty but for the progress learner.
     """
 
     index: int
@@ -58,19 +61,25 @@ class Module:
     expansion: str = ""
     scale: float = PIXEL
     frame_shape: tuple[int, ...] = ()
+    slow: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
-    def transform(self, frames: Any) -> NDArray[np.float64]:
+    def transform(
+        self, frames: Any, outputs: int | slice | Sequence[int] | None = None
+    ) -> NDArray[np.float64]:
         """Outputs on frames, y = phi (x - mean), the same bits on every machine.
 
         Args:
             frames: (n, *frame_shape), or these as rows (n, I), uint8 or values; it scales the
                 former and expands both as it learned them.
+            outputs: which of the outputs, from 0, the slowest first: a number of one, a slice, or
+                a list of some; all where it is not given.
 
         Returns:
-            (n, J), to the bit what the run that learned it recorded as y_frozen.
+            (n, J), or as many columns as outputs were chosen, to the bit what the run that learned
+            it recorded as y_frozen.
 
         Raises:
-            UsageError: these are no frames as it learned from.
+            UsageError: these are no frames as it learned from, or it has no such outputs.
         """
         array = as_array(frames)
         if array.dtype != UINT8 and array.dtype.kind != "f":
@@ -78,13 +87,24 @@ class Module:
         rows, expansion = self._rows(array)
         if rows.dtype != UINT8 or self.scale != PIXEL:
             rows = rows.astype(np.float64)
-        phi = np.ascontiguousarray(self.phi, np.float64)
+        phi = np.ascontiguousarray(self._chosen(outputs), np.float64)
         offset = kernels.mean_output(phi, np.ascontiguousarray(self.mean, np.float64))
         y = np.empty((len(rows), len(phi)))
         for start in range(0, len(rows), CHUNK):
             x = expand(expansion, rows[start : start + CHUNK])
             y[start : start + CHUNK] = kernels.outputs(phi, offset, x)
         return y
+
+    def _chosen(self, outputs: int | slice | Sequence[int] | None) -> NDArray[np.float64]:
+        """The weights of some outputs, see `transform`."""
+        if outputs is None:
+            return self.phi
+        try:
+            return self.phi[outputs if isinstance(outputs, slice) else np.atleast_1d(outputs)]
+        except (IndexError, TypeError) as error:
+            raise UsageError(
+                f"no outputs {outputs!r}: this module has {len(self.phi)}, counted from 0"
+            ) from error
 
     def _rows(self, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
         """Frames as rows, and how they are expanded."""

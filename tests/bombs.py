@@ -10,9 +10,11 @@ import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import lz4.frame
 import mcap_files as files
 import numpy as np
 import zstandard
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import CompressionType, IndexType, Writer
 from PIL import Image
 
@@ -44,6 +46,10 @@ CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_
 CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data {data});
 INSERT INTO topics VALUES(1, '/cam', 'sensor_msgs/msg/Image', 'cdr', '');
 """
+
+
+IMAGE = struct.pack("<H", 1) + files.text("foxglove.RawImage") + files.text("protobuf") + bytes(4)
+"""The schema of raw images."""
 
 
 def zeros(mebibytes: int) -> bytes:
@@ -83,7 +89,7 @@ def packed_file(folder: Path) -> Path:
     return folder / "bag"
 
 
-def ros1_chunks(size: int) -> Writing:
+def ros1_chunks(size: int, packing: str = "LZ4") -> Writing:
     """A bag of ROS 1 with a chunk of one message."""
 
     def write(folder: Path) -> Path:
@@ -91,7 +97,7 @@ def ros1_chunks(size: int) -> Writing:
         from rosbags.typesys import Stores, get_typestore
 
         writer = rosbag1.Writer(folder / "a.bag")
-        writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+        writer.set_compression(rosbag1.Writer.CompressionFormat[packing])
         with writer:
             store = get_typestore(Stores.ROS1_NOETIC)
             topic = writer.add_connection("/cam", "sensor_msgs/msg/Image", typestore=store)
@@ -103,14 +109,14 @@ def ros1_chunks(size: int) -> Writing:
 
 def png(side: int) -> bytes:
     """The beginning of a square PNG."""
+    head = png_chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+    data = png_chunk(b"IDAT", zlib.compress(bytes(10**8), 1))
+    return b"\x89PNG\r\n\x1a\n" + head + data + png_chunk(b"IEND", b"")
 
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        crc = zlib.crc32(kind + data)
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
 
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
-    parts = head, chunk(b"IDAT", zlib.compress(bytes(10**8), 1)), chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+def png_chunk(kind: bytes, data: bytes) -> bytes:
+    crc = zlib.crc32(kind + data)
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
 
 
 def picture(folder: Path) -> Path:
@@ -128,11 +134,80 @@ def progressive(folder: Path) -> Path:
     return folder / "pictures"
 
 
+def a_picture(name: str, data: Callable[[], bytes]) -> Writing:
+    """A folder of one picture."""
+
+    def write(folder: Path) -> Path:
+        (folder / "pictures").mkdir()
+        (folder / "pictures" / name).write_bytes(data())
+        return folder / "pictures"
+
+    return write
+
+
+def says_large() -> bytes:
+    """A JPEG that says that it is 65,500x65,500."""
+    raw = bytearray(packed(Image.new("L", (16, 16)), "JPEG"))
+    struct.pack_into(">HH", raw, raw.index(b"\xff\xc0") + 5, 65_500, 65_500)
+    return bytes(raw)
+
+
+def scans() -> bytes:
+    """A JPEG of 94 KB whose pixels are gone over five thousand times."""
+    raw = packed(Image.new("RGB", (2000, 2000)), "JPEG", progressive=True)
+    return raw[:-2] + raw[raw.rindex(b"\xff\xda") : -2] * 5000 + raw[-2:]
+
+
+def profile() -> bytes:
+    """A PNG with a colour profile of 200 MiB of zeros."""
+    raw = packed(Image.new("L", (64, 64)), "PNG")
+    packing = zlib.compressobj()
+    data = b"".join(packing.compress(bytes(PART)) for _ in range(200)) + packing.flush()
+    return raw[:33] + png_chunk(b"iCCP", b"n\0\0" + data) + raw[33:]
+
+
+def packed(image: Image.Image, kind: str, **how: bool) -> bytes:
+    file = io.BytesIO()
+    image.save(file, kind, **how)
+    return file.getvalue()
+
+
+def chunk(compression: str, size: int, stored: bytes) -> Writing:
+    """An MCAP log of a chunk that says how long it is, and may hold more."""
+
+    def write(folder: Path) -> Path:
+        beginning = files.MAGIC + files.header() + files.record(files.SCHEMA, IMAGE)
+        channel = struct.pack("<HH", 1, 1) + files.text("/cam") + files.text("protobuf")
+        beginning += files.record(files.CHANNEL, channel + files.texts({}))
+        body = files.chunk(b"", 5, 5, compression=compression, size=size, stored=stored, crc=False)
+        (folder / "a.mcap").write_bytes(files.finish(beginning + body))
+        return folder / "a.mcap"
+
+    return write
+
+
+def table_of_zeros(folder: Path) -> Path:
+    """A Parquet file of forty million rows of four columns."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    part = pa.table({name: pa.array(np.zeros(10**7)) for name in "abcd"})
+    with pq.ParquetWriter(folder / "a.parquet", part.schema, compression="zstd") as file:
+        for _ in range(4):
+            file.write_table(part)
+    return folder / "a.parquet"
+
+
+def text_of_a_table(folder: Path) -> Path:
+    """A CSV file with a cell of a hundred million digits."""
+    (folder / "a.csv").write_bytes(b"a,b\n1," + b"9" * 100_000_000 + b"\n")
+    return folder / "a.csv"
+
+
 def messages_of_a_chunk(folder: Path) -> Path:
     """An MCAP log of 1,100,000 empty messages in one chunk."""
-    schema = struct.pack("<H", 1) + files.text("foxglove.RawImage") + files.text("protobuf")
     channel = struct.pack("<HH", 1, 1) + files.text("/cam") + files.text("protobuf")
-    body = files.record(files.SCHEMA, schema + bytes(4))
+    body = files.record(files.SCHEMA, IMAGE)
     body += files.record(files.CHANNEL, channel + files.texts({}))
     body += files.record(files.MESSAGE, files.message(1, 0, 5, 5, b"")) * 1_100_000
     log = files.MAGIC + files.header() + files.chunk(body, 5, 5, compression="zstd")
@@ -157,6 +232,11 @@ def log(schema: str, encoding: str, payloads: Iterable[bytes]) -> Writing:
         return folder / "a.mcap"
 
     return write
+
+
+def picture_message(side: int) -> bytes:
+    """A message with a square PNG."""
+    return bytes(CompressedImage(data=png(side), format="png").SerializeToString())
 
 
 def video(folder: Path) -> Path:
@@ -260,7 +340,12 @@ CAMERAS: dict[str, Writing] = {
     "packed message of .db3": packed_message,
     "packed .db3": packed_file,
     "chunk of .bag": ros1_chunks(160_000_000),
+    "packed chunk of .bag": ros1_chunks(160_000_000, "BZ2"),
     "PNG": picture,
+    "PNG in a message": log("foxglove.CompressedImage", "protobuf", [picture_message(60_000)]),
+    "PNG's profile": a_picture("0.png", profile),
+    "JPEG's size": a_picture("0.jpg", says_large),
+    "JPEG's scans": a_picture("0.jpg", scans),
     "progressive JPEG": progressive,
     "video's index": endless_index,
     "video's frames": huge_frames,
@@ -272,6 +357,12 @@ CAMERAS: dict[str, Writing] = {
     "protobuf image": log("foxglove.RawImage", "protobuf", [bytes(140_000_000)]),
     "CDR image": log("sensor_msgs/msg/Image", "cdr", [bytes(140_000_000)]),
     "messages of a chunk": messages_of_a_chunk,
+    "size of a chunk": chunk("zstd", 1 << 40, zeros(1)),
+    "chunk of zstd": chunk("zstd", PART, zeros(300)),
+    "chunk of LZ4": chunk("lz4", PART, lz4.frame.compress(bytes(300 * PART))),
+    "chunk that is not packed": chunk("", 1 << 40, bytes(100)),
+    "Parquet": table_of_zeros,
+    "CSV": text_of_a_table,
 }
 """By what they are bombs of; each is written to a folder."""
 

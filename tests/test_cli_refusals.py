@@ -54,6 +54,18 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn oscillatory --resume": ("-o",),
     "learnn": ("did you mean learn?",),
     "view x --web --save y.rrd": ("--save",),
+    # options that would do nothing, and values that are none
+    "record oscillatory -o x --hold 3": ("oscillatory is no live stream: --hold is for live str",),
+    "learn LOGS --stall 3 --lost end": ("is no live stream: --lost and --stall are for live str",),
+    "learn oscillatory --loop --salvage": ("is a scene: --loop and --salvage are for logs",),
+    "view RUN --topic /a --save v.rrd": ("is a run: --topic is for logs",),
+    "sweep oscillatory -o x --seeds 1,4,0:2": ("--seeds 1,4,0:2: 1 stands there twice",),
+    "learn oscillatory --set learner.beta=foo": ("'foo': it must be a number, or auto",),
+    "learn oscillatory --seed abc": ("'--seed': 'abc' is no whole number",),
+    "learn oscillatory --follow-timeout abc": ("'abc' is no number",),
+    "learn oscillatory --resume -o RUN --algorithm progress": (
+        "was made with learner.algorithm = 2.0, not progress",
+    ),
     # what is written has the name of its kind
     "view RUN --save x.mp4": ("x.mp4: the view is a file of Rerun, name it x.rrd",),
     "view REC --save x.mcap": ("x.mcap: the view is a file of Rerun, name it x.rrd",),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import json
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -144,3 +146,14 @@ def test_demo_replaces_an_earlier_one(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     assert min(first["correlation"], second["correlation"]) > 0.9
     for file in (*report["figures"], Path(report["run"]) / "run.rrd"):
         assert Path(file).stat().st_size > 0
+
+
+def test_a_scheduler_without_an_address_is_one_line_to_the_end_of_the_process(
+    tmp_path: Path,
+) -> None:
+    words = ("sweep", "oscillatory", "-o", tmp_path, "--engine", "dask", "--scheduler", "nope")
+    ended = subprocess.run(
+        [sys.executable, "-m", "cdmisfa", *words], capture_output=True, text=True, check=False
+    )
+    said = "cdmisfa: no dask scheduler answers at nope: missing port number in address 'nope'\n"
+    assert (ended.returncode, ended.stderr) == (1, said)

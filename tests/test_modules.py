@@ -172,3 +172,20 @@ def test_a_write_that_fails_leaves_the_earlier_modules_and_nothing_else(
     with pytest.raises(LogWriteError, match=r"modules\.npz cannot be written: No space left"):
         save_modules(path, [with_width(3)])
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [(path.name, before)]
+
+
+@pytest.mark.parametrize(
+    ("outputs", "columns"),
+    [(None, [0, 1, 2]), (0, [0]), (-1, [2]), (slice(2), [0, 1]), ([2, 0], [2, 0]), ((1,), [1])],
+)
+def test_outputs_are_chosen(outputs: Any, columns: list[int]) -> None:
+    module = replace(with_width(4), phi=np.random.default_rng(0).normal(size=(3, 4)))
+    frames = np.random.default_rng(1).normal(size=(6, 4))
+    y = module.transform(frames)
+    np.testing.assert_allclose(module.transform(frames, outputs=outputs), y[:, columns])
+
+
+@pytest.mark.parametrize("outputs", [3, [0, 5], 0.5, "first"])
+def test_outputs_that_it_lacks_are_refused(outputs: Any) -> None:
+    with pytest.raises(UsageError, match=r"this module has 1, counted from 0"):
+        with_width(4).transform(np.zeros((2, 4)), outputs=outputs)

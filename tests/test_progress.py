@@ -89,19 +89,21 @@ def test_the_same_stream_twice_is_learned_once_and_known() -> None:
     assert rows[0]["slowness"] == pytest.approx(rows[2]["slowness"], rel=0.1)
 
 
-def test_what_changes_is_learned_anew_or_known() -> None:
-    source = MovingPictures("swing>stroll", "noise", seed=3, changes_at=150 * 40)
-    learner = ProgressLearner(ProgressConfig(components=8, watch=10**6), source.spec, 0)
-    learn(source, learner, max_iterations=450)
+@pytest.mark.parametrize("attention", ["progress", "novel"])
+def test_what_changes_is_learned_anew_or_known(attention: str) -> None:
+    config = ProgressConfig(components=8, watch=10**6, attention=attention)
+    source = MovingPictures("swing>stroll", "noise", seed=3, changes_at=250 * 40)
+    learner = ProgressLearner(config, source.spec, 0)
+    learn(source, learner, max_iterations=600)
     assert [m.stream for m in learner.modules] == 2 * ["swing>stroll"]
-    assert learner.modules[0].iteration < 150 < learner.modules[1].iteration
+    assert learner.modules[0].iteration < 250 < learner.modules[1].iteration
     assert learner.summary()["streams"][0]["module"] == 2
     block = source.take(0, 3000)
     y = learner.modules[1].transform(block.frames)[:, 0]
     assert abs(np.corrcoef(y, block.truth[:, 0])[0, 1]) > 0.95
-    source = MovingPictures("swing>stroll", "stroll", seed=3, changes_at=150 * 40)
-    learner = ProgressLearner(ProgressConfig(components=8, watch=10**6), source.spec, 0)
-    learn(source, learner, max_iterations=400)
+    source = MovingPictures("swing>stroll", "stroll", seed=3, changes_at=250 * 40)
+    learner = ProgressLearner(config, source.spec, 0)
+    learn(source, learner, max_iterations=600)
     assert len(learner.modules) == 2
     (changed, other) = learner.summary()["streams"]
     assert (changed["state"], changed["module"]) == ("known", other["module"])
@@ -146,7 +148,7 @@ def test_live_recorded_and_resumed_are_the_same_bit_for_bit(tmp_path: Path) -> N
     frames = MovingPictures(*names).take(1, 5).frames
     for module, row in zip(opened.modules, live.as_json()["modules"], strict=True):
         assert (module.stream, module.stream_index) == (row["stream"], row["stream_index"])
-        assert module.transform(frames).shape == (5, 1)
+        assert module.transform(frames).shape == (5, 8)
     assert opened.signals["state"].shape == (live.iterations, 4)
 
 
@@ -201,7 +203,7 @@ def test_candidates_are_held_for_so_many_streams_only(monkeypatch: pytest.Monkey
 def test_few_values_are_expanded_and_pictures_are_not() -> None:
     few = ProgressLearner(ProgressConfig(), SourceSpec(("a",), (4,), "float64"), 0)
     many = ProgressLearner(ProgressConfig(), SourceSpec(("a",), (48, 64), "uint8"), 0)
-    assert (few.phi.shape, many.phi.shape) == ((1, 14), (1, 3072))
+    assert (few.phi.shape, many.phi.shape) == ((8, 14), (8, 3072))
     with pytest.raises(UsageError, match=r"set learner\.expansion=none or take smaller frames"):
         ProgressLearner(
             ProgressConfig(expansion="quadratic"), SourceSpec(("a",), (48, 64), "uint8"), 0
@@ -406,9 +408,9 @@ def test_peoples_own_logs_are_learned_from_with_it(cdmisfa: Cdmisfa, tmp_path: P
         {"stream", "state", "module", "blocks", "slowness", "why"}
     ]
     assert {row["state"] for row in rows} <= set(STATES)
-    assert [row["stream"] for row in rows] == ["/left", "/right"]
+    assert [row["stream"] for row in rows] == ["left", "right"]
     told = cdmisfa(*words)
-    assert all(f"{name}: " in told.out for name in ("/left", "/right"))
+    assert all(f"{name}: " in told.out for name in ("left", "right"))
     paper = cdmisfa(*words, "--algorithm", "2.0", "--json")
     assert (paper.code, "streams" in paper.json) == (0, False)
     converted = tmp_path / "recording"
@@ -422,3 +424,47 @@ def test_a_loop_is_as_long_as_it_says() -> None:
     first = source.take(0, 5).frames
     source.seek(LENGTH)
     assert (source.take(0, 5).frames == first).all()
+
+
+def test_eight_outputs_are_decided_as_one_and_marked(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    names, told = ("noise", "swing", "stroll"), ProgressConfig(components=8)
+    one = run(MovingPictures(*names), ProgressConfig(components=8, outputs=1), tmp_path / "one")
+    eight = run(MovingPictures(*names), told, tmp_path / "run", rerun=False)
+    assert told.outputs == 8
+    assert [(m.stream, m.iteration) for m in eight.modules] == [
+        (m.stream, m.iteration) for m in one.modules
+    ]
+    frames, signals = MovingPictures("stroll").take(0, 3000).frames, Run(tmp_path / "run").signals
+    document, opened = eight.as_json()["modules"], Run(tmp_path / "run").modules
+    for single, module, row in zip(one.modules, opened, document, strict=True):
+        assert module.eta[0] == pytest.approx(single.eta[0])
+        assert module.slow[0] == 1
+        assert 0 in module.slow
+        assert row["slow"] == [bool(mark) for mark in module.slow]
+        assert row["eta"] == signals["eta"][module.iteration].tolist() == module.eta.tolist()
+        assert (module.eta[module.slow > 0] < 0.15).all()
+    stroll = next(m for m in opened if m.stream == "stroll")
+    assert stroll.slow.tolist() == [1] + 7 * [0]
+    y = stroll.transform(frames)
+    np.testing.assert_allclose(stroll.transform(frames, outputs=0), y[:, :1])
+    said = cdmisfa("info", tmp_path / "run").out
+    assert f"module {stroll.index} of stroll: slowness {stroll.eta[0]:.4f}, (" in said
+    assert "in brackets: not slow on frames that were not learned from" in said
+    found = cdmisfa("info", tmp_path / "run", "--json").json["modules"]
+    assert [one["slow"] for one in found] == [m.slow.tolist() for m in opened]
+
+
+def test_one_world_from_two_sides_is_known_and_another_is_not() -> None:
+    """By three outputs: of a picture that is shifted, and darker, the same place of the spot."""
+
+    class Sides(MovingPictures):
+        def take(self, stream: int, n: int) -> Block:
+            block = super().take(stream, n)
+            if stream:
+                return block
+            frames = (np.roll(block.frames, 1, axis=2) * 0.7).astype(np.uint8)
+            return Block(stream, block.t, freeze(frames), block.truth)
+
+    learner = learned_from(Sides("swing", "swing.2", "stroll"))
+    assert sorted(outcomes(learner).values()) == ["known", "learned", "learned"]
+    assert len(learner.modules) == 2

@@ -65,11 +65,27 @@ def grouped(name: str, common: Sequence[str]) -> Callable[[Callable[..., Any]], 
     return click.command(name, cls=GroupedCommand, common=common)
 
 
+class WholeRange(click.IntRange):
+    """A range of whole numbers."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """See `click.ParamType`."""
+        try:
+            int(value)
+        except ValueError:
+            self.fail(f"{value!r} is no whole number", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 class FiniteRange(click.FloatRange):
     """A range of numbers, of which one that is none is not a part."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """See `click.ParamType`."""
+        try:
+            float(value)
+        except ValueError:
+            self.fail(f"{value!r} is no number", param, ctx)
         found = super().convert(value, param, ctx)
         if not math.isfinite(found):
             self.fail(f"{value} is no finite number", param, ctx)
@@ -90,7 +106,7 @@ def number(
     name: str, about: str, least: float, most: float | None = None, unit: str = "", **how: Any
 ) -> Callable[[Command], Command]:
     """An option that is a number; a whole one where the least that it may be is."""
-    kind = FiniteRange if isinstance(least, float) else click.IntRange
+    kind = FiniteRange if isinstance(least, float) else WholeRange
     shown = how.get("default") is not None
     told: dict[str, Any] = {"metavar": unit or None, "help": about, "show_default": shown, **how}
     return option(name, type=kind(least, most), **told)
@@ -222,7 +238,7 @@ def option_of(
     elif typing.get_origin(kind) is tuple:
         of = {"multiple": True}
     elif kind in (int, float):
-        ranges = {int: click.IntRange, float: FiniteRange}
+        ranges = {int: WholeRange, float: FiniteRange}
         of["type"] = ranges[kind](told["least"], told["most"])
     of |= {"default": field.default, "help": told["about"], "metavar": told["unit"] or None}
     return option(option_name(field), field.name, group=told["group"], **(of | how))

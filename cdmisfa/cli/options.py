@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,7 +21,7 @@ from cdmisfa.cli.making import (
     together,
     word,
 )
-from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError, UsageError, are_for
 from recorder.cameras.options import LiveOptions
 from recorder.images.options import ImageOptions
 from replay.camera_logs.options import CameraOptions
@@ -58,6 +58,17 @@ look_options = options_of(CameraOptions, "cameras", "topics", "fields", "time", 
 
 live_options = options_of(LiveOptions, "live", "hold", "on_loss", "stall")
 """How live streams are put on one clock."""
+
+
+def refuse_live_options(live: LiveOptions, source: Sequence[str]) -> None:
+    """Refuse options of live streams for a source that is none.
+
+    Raises:
+        UsageError: some are given.
+    """
+    if given := live.given():
+        raise UsageError(f"{source[0]} is no live stream: {are_for(given, 'live streams')}")
+
 
 dry_run = flag(
     "--dry-run", "Say what would be read from camera logs, and write nothing.", group="Source"

@@ -189,6 +189,17 @@ def outcome_line(outcome: Mapping[str, Any]) -> str:
     return f"{outcome['stream']}: {came}, after {outcome['blocks']} blocks{because}"
 
 
+BRACKETS = "in brackets: not slow on frames that were not learned from"
+
+
+def slownesses(eta: Sequence[float], slow: Sequence[int]) -> str:
+    """The slowness of each output; in brackets that of those known not to be slow."""
+    marks = slow if len(slow) else [1] * len(eta)
+    return ", ".join(
+        f"{value:.4f}" if mark else f"({value:.4f})" for value, mark in zip(eta, marks, strict=True)
+    )
+
+
 def print_result(result: RunResult, *, as_json: bool) -> None:
     """Print what a run came to."""
     from cdmisfa.core.signals import ACTIONS
@@ -203,7 +214,7 @@ def print_result(result: RunResult, *, as_json: bool) -> None:
             module.stream,
             module.iteration,
             " ".join(ACTIONS[action] for action in module.policy),
-            ", ".join(f"{eta:.4f}" for eta in module.eta),
+            slownesses(module.eta.tolist(), module.slow.tolist()),
         )
         for module in result.modules
     ]
@@ -214,6 +225,8 @@ def print_result(result: RunResult, *, as_json: bool) -> None:
         print_table(("module", "stream", "iteration", "eta"), without)
     else:
         print_line("no module was learned")
+    if any(0 in module.slow for module in result.modules):
+        print_line(BRACKETS)
     if "streams" in result.summary:
         for outcome in result.summary["streams"]:
             print_line(outcome_line(outcome))

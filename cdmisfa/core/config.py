@@ -28,10 +28,8 @@ from cdmisfa.core.registry import did_you_mean
 Section = TypeVar("Section")
 
 LN_2 = 0.6931471805599453
-
 LARGEST = 2**63 - 1
 """Largest whole number a key takes."""
-
 
 MAX_COMPONENTS = 1000
 """More whitening components than this would take minutes a frame."""
@@ -320,7 +318,10 @@ def convert_value(value: Any, hint: Any, key: str) -> Any:
     if origin is types.UnionType or origin is typing.Union:
         if value is None or value == "auto" or (value == "none" and str not in arguments):
             return None
-        return convert_value(value, next(a for a in arguments if a is not types.NoneType), key)
+        try:
+            return convert_value(value, next(a for a in arguments if a is not types.NoneType), key)
+        except UsageError as error:
+            raise UsageError(f"{error}, or auto") from None
     if origin is tuple:
         parts = value.strip("()[] ").split(",") if isinstance(value, str) else value
         if not isinstance(parts, list | tuple):
@@ -361,9 +362,9 @@ def _number(value: Any) -> float:
 
 
 def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError
-    return value
+    if isinstance(value, str):
+        return value
+    raise TypeError
 
 
 _SCALARS: Mapping[Any, tuple[str, Callable[[Any], Any]]] = {

@@ -291,6 +291,8 @@ def _dask_pool(jobs: int, scheduler: str | None) -> _Pool:
     if scheduler is None:
         how = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None}
     try:
+        if scheduler is not None:  # a client of no address ends with a traceback, half a minute on
+            distributed.comm.resolve_address(scheduler)
         client = distributed.Client(**how, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise EngineError(f"no dask scheduler answers at {scheduler}: {one_line(error)}") from error

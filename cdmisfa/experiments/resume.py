@@ -276,7 +276,9 @@ def refuse_difference(
         names = dict(zip(header.spec.streams, spec.streams, strict=True))
         before["spec"]["streams"] = spec.streams
         before["source"] = renamed(source_then, names)
-    for key, old, new in differences(_json(before), _json(now)):
+    found = differences(_json(before), _json(now))
+    # another learner first, for other keys and another arithmetic follow from it
+    for key, old, new in sorted(found, key=lambda one: one[0] != "config.learner.algorithm"):
         if key == "config.learner.portable":
             continue  # begun when it had an effect
         if key.startswith("config.scene.") and streams is not None and streams not in SCENES:

@@ -84,6 +84,7 @@ def module_table(module: Module) -> dict[str, Any]:
         "iteration": module.iteration,
         "policy": module.policy.tolist(),
         "eta": module.eta.tolist(),
+        "slow": [bool(slow) for slow in module.slow],
     }
 
 

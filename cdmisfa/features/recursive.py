@@ -123,9 +123,9 @@ class RecursiveSFA:
             gap: the first frame does not follow the last one learned from.
 
         Returns:
-            (n,): at the last frame of each piece, the change of the outputs: sqrt(2 - 2 |rho|)
-            of their correlation rho with those before, from 0 to sqrt 2; NaN elsewhere, and
-            where there were none before.
+            (n,): at the last frame of each piece, the change of the slowest output:
+            sqrt(2 - 2 |rho|) of its correlation rho with the one before, from 0 to sqrt 2; NaN
+            elsewhere, and where there was none before.
 
         Raises:
             UsageError: these are no frames of I values.

@@ -225,28 +225,20 @@ static void solve_slowest(const recursive *sfa, int64_t rank, double *spare) {
       sfa->weights[o * size + i] = vectors[(k - 1 - o) * k + i] * scale[i];
 }
 
-/* Keep the signs that the outputs had, and say how much they changed: equation P1. They had the
- * weights `before` (J, k) of the new directions; NaN where there were none.
+/* Keep the signs that the outputs had, and say how much the slowest changed: equation P1. They had
+ * the weights `before` (J, k) of the new directions; NaN where there was none.
  */
 static double align_outputs(const recursive *sfa, int64_t k, const double *before, double *spare) {
-  int64_t n = sfa->outputs, size = sfa->size;
-  double *alike = take_zeros(&spare, n * n), *squares = take_zeros(&spare, n * n);
-  double *old = take_zeros(&spare, k);
-  double *values = take_zeros(&spare, n), *vectors = take_zeros(&spare, n * n), total = 0;
-  for (int64_t o = 0; o < n; o++) {
+  double *old = take_zeros(&spare, k), change = NAN;
+  for (int64_t o = 0; o < sfa->outputs; o++) {
+    double *own = sfa->weights + o * sfa->size;
     for (int64_t j = 0; j < k; j++) old[j] = before[o * k + j] * sfa->variance[j];
-    double power = dot(before + o * k, old, k), *own = sfa->weights + o * size;
-    if (power <= 0) return NAN;
-    for (int64_t i = 0; i < n; i++)
-      alike[o * n + i] = dot(old, sfa->weights + i * size, k) / sqrt(power);
-    if (!(alike[o * n + o] < 0)) continue;
-    for (int64_t i = 0; i < size; i++) own[i] = -own[i];
-    for (int64_t i = 0; i < n; i++) alike[i * n + o] = -alike[i * n + o];
+    double power = dot(before + o * k, old, k), shared = dot(old, own, k);
+    if (shared < 0)
+      for (int64_t i = 0; i < sfa->size; i++) own[i] = -own[i];
+    if (o == 0 && !(power <= 0)) change = sqrt(larger(2 - 2 * fabs(shared) / sqrt(power), 0));
   }
-  add_products(n, n, alike, n, alike, n, n, squares, n);
-  eigen(n, squares, values, vectors, spare);
-  for (int64_t o = 0; o < n; o++) total += sqrt(larger(values[o], 0)) / (double)n;
-  return sqrt(larger(2 - 2 * total, 0));
+  return change;
 }
 
 /* Learn from m frames of a block, from the one at `first` on, and return how much the outputs

@@ -30,6 +30,11 @@ _RESTARTS: Final = range(0xD0, 0xD8)
 _ARITHMETIC: Final = b"\xff\xc9"
 """Begins a JPEG of arithmetic coding, whose data may end before its pixels."""
 
+_SCAN: Final = b"\xff\xda"
+_MOST_SCANNED: Final = 720_000_000
+"""Most pixels of all scans of a JPEG: 20 of the largest image; 10 are usual. A scan may have a few
+bytes, and takes as long as any."""
+
 _AHEAD: Final = b"\xff\x00" * 8
 """Bits that stand for nothing; libjpeg reads up to 64 before it needs them."""
 
@@ -87,6 +92,8 @@ def _load_jpeg(image: JpegImageFile, data: bytes) -> None:
     if scans or data.find(_ARITHMETIC, 0, start) >= 0:
         if data.find(b"\xff\xd9", start) < 0:
             raise MalformedImage(_NO_END)
+        if data.count(_SCAN, start) * image.width * image.height > _MOST_SCANNED:
+            raise MalformedImage(f"a JPEG of {data.count(_SCAN)} scans is not read")
         image.load()
         return
     image.fp = scan = _Scan(data, start, _end_of(data, start))

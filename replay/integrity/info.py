@@ -24,6 +24,7 @@ from replay.integrity.state import Crc, State, crc_of, state_of, worst
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
+from replay.runs.modules import load_modules
 from replay.storage.location import Location
 from replay.storage.opening import log_files, open_store
 
@@ -79,6 +80,16 @@ class RecordInfo:
 
 
 @dataclass(frozen=True, slots=True)
+class ModuleInfo:
+    """A module: the slowness of each output, and 1 or 0 where it is known to be slow or not."""
+
+    index: int
+    stream: str
+    slowness: tuple[float, ...]
+    slow: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class LogInfo:
     """What is in a log, or in all logs of a folder.
 
@@ -91,6 +102,7 @@ class LogInfo:
             its own name.
         seed: the one that all files name, if they do.
         ended: why a run ended, where its folder says so.
+        modules: of a run, where they lie in its folder.
         signals: of a run.
         state: the worst of the files.
         notes: what is no problem, and what nothing proves.
@@ -107,6 +119,7 @@ class LogInfo:
     metadata: Mapping[str, Mapping[str, Mapping[str, str]]]
     seed: int | None = None
     ended: str | None = None
+    modules: tuple[ModuleInfo, ...] = ()
     signals: RecordInfo | None = None
     state: State = "whole"
     notes: tuple[str, ...] = ()
@@ -138,6 +151,7 @@ def describe(*words: str | Location) -> LogInfo:
         for f in files
         for name, records in f.metadata.items()
     }
+    folder = named[0] if len(named) == 1 and isinstance(named[0], Path) else None
     records = [values for found in metadata.values() for values in found.values()]
     return LogInfo(
         path=" ".join(map(str, named)),
@@ -149,7 +163,8 @@ def describe(*words: str | Location) -> LogInfo:
         problems=tuple(p for f in files for p in f.problems),
         metadata=metadata,
         seed=_seed(records),
-        ended=_ended(named[0]) if len(named) == 1 and isinstance(named[0], Path) else None,
+        ended=_ended(folder) if folder else None,
+        modules=_modules(folder) if folder else (),
         signals=next((f.signals for f in files if f.signals is not None), None),
         state=worst(f.state for f in files),
         notes=tuple(note for f in files for note in f.notes),
@@ -332,3 +347,15 @@ def _ended(path: Path) -> str | None:
         return None
     result = read_run_json(path if path.is_dir() else path.parent).get("result")
     return str(result["ended"]) if isinstance(result, Mapping) and "ended" in result else None
+
+
+def _modules(path: Path) -> tuple[ModuleInfo, ...]:
+    folder = path if path.is_dir() else path.parent
+    if path.name != RUN_FILE and not (path / RUN_FILE).is_file():
+        return ()
+    with contextlib.suppress(CdmisfaError):
+        return tuple(
+            ModuleInfo(m.index, m.stream, tuple(m.eta.tolist()), tuple(m.slow.tolist()))
+            for m in load_modules(folder)
+        )
+    return ()

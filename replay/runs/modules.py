@@ -31,7 +31,7 @@ _SCALARS = {
 }
 """Fields that are no arrays, and the kind of numpy type that each is stored as."""
 
-_OPTIONAL = ("centres", "counts", "expansion", "scale", "stream", "frame_shape")
+_OPTIONAL = ("centres", "counts", "expansion", "scale", "slow", "stream", "frame_shape")
 """Fields that files of earlier versions lack."""
 
 

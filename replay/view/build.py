@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError, are_for
 from cdmisfa.core.untrusted import check_regular
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.camera_logs.options import CameraOptions
@@ -82,6 +82,8 @@ def build_view(
     if every < 1:
         raise UsageError(f"every {every} frames: it must be at least 1")
     if any(map(holds_run, (path, *beside))):
+        if cameras is not None and (given := cameras.given()):
+            raise UsageError(f"{path} is a run: {are_for(given, 'logs')}")
         if beside:
             raise UsageError(f"{path}: one run is shown at a time; compare --save shows several")
         log = run_log(path)

@@ -44,18 +44,18 @@ class Broadcast:
     """
 
     def __init__(self, kind: str, port: int | None = None) -> None:
-        self.recording = rr.RecordingStream(APPLICATION, recording_id=f"{kind}-{os.getpid()}")
-        if not rr.is_enabled(self.recording):
-            raise CdmisfaError("no live view: Rerun is switched off, unset the variable RERUN")
-        self.recording.set_log_time_enabled(False)
-        self._encoded = rr.binary_stream(self.recording)
         self._pieces = Pieces(MEMORY)
         with contextlib.ExitStack() as serving:
             viewer_port = free_port()
             page = page_of(viewer_port, self._pieces.read)
             self.address = shown_at(serving.enter_context(served(page, port)))
             serving.enter_context(running(page_server(viewer_port)))
+            self.recording = rr.RecordingStream(APPLICATION, recording_id=f"{kind}-{os.getpid()}")
+            if not rr.is_enabled(self.recording):
+                raise CdmisfaError("no live view: Rerun is switched off, unset the variable RERUN")
             self._serving = serving.pop_all()
+        self.recording.set_log_time_enabled(False)
+        self._encoded = rr.binary_stream(self.recording)
 
     def open_window(self) -> None:
         """Open a viewer that shows it; it stays open when we have ended."""

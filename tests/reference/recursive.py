@@ -30,7 +30,7 @@ def eigen(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def learn_piece(state: RecursiveState, x: FloatArray, gap: bool, window: int) -> float:
-    """Take in a piece of a block (m, I) of values; the change of the outputs."""
+    """Take in a piece of a block (m, I) of values; the change of the slowest output."""
     rank, seen, pairs = state.counts.tolist()
     size, (m, _) = len(state.variance), x.shape
     if not seen:
@@ -72,12 +72,12 @@ def solve(state: RecursiveState, rank: int) -> None:
 
 
 def change(weights: FloatArray, before: FloatArray, variance: FloatArray) -> float:
-    """Change of the outputs, from the singular values of their correlations with those before."""
-    power = (before**2 * variance).sum(axis=1)
-    if not power.all():
+    """Change of the slowest output, from its correlation with the one before."""
+    power = float((before[0] ** 2 * variance).sum())
+    if not power:
         return float("nan")
-    alike = (before * variance) @ weights.T / np.sqrt(power)[:, None]
-    return float(np.sqrt(max(0.0, 2 - 2 * np.linalg.svd(alike, compute_uv=False).mean())))
+    rho = abs(float((before[0] * variance) @ weights[0])) / np.sqrt(power)
+    return float(np.sqrt(max(0.0, 2 - 2 * rho)))
 
 
 def update(state: RecursiveState, frames: FloatArray, gap: bool, window: int) -> FloatArray:

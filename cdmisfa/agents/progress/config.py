@@ -31,7 +31,7 @@ class ProgressConfig:
     algorithm: str = "progress"
     tau: int = 40
     components: int = 16
-    outputs: int = 1
+    outputs: int = 8
     expansion: str | None = None
     window: int = 8000
     attention: str = "progress"

@@ -54,11 +54,11 @@ TOO_EVEN = 0.75
 PRESENT = (0.1, 10.0)
 """Variance of a module's output, which had 1, on a stream that shows what it encodes."""
 
-SAME = 0.8
+SAME = 0.85
 """Correlation from which outputs are the same, see `Likeness`."""
 
 TOGETHER = 3
-"""Outputs, the slowest ones, by which a module and a candidate are compared."""
+"""Slow outputs, at most, by which a module and a candidate are compared."""
 
 AS_SLOW = 1.3
 """Slowness of a module over the candidate's, up to which it is as slow."""
@@ -120,6 +120,16 @@ def flatness(candidate: Candidate) -> float:
 def disagreement(candidate: Candidate) -> float:
     """|ln(tested / fitted)|: what the slowness on new frames says of that on old ones."""
     return abs(log_ratio(float(candidate.tested[0]), candidate.fitted))
+
+
+def slow_outputs(candidate: Candidate, config: ProgressConfig) -> NDArray[np.int64]:
+    """(J,) 1 where an output is slow on new frames too, and alive; the slowest was judged so."""
+    low, high = LIVELY
+    tested, fitted = candidate.tested, candidate.sfa.state.spectrum[: len(candidate.variance)]
+    apart = [abs(log_ratio(float(a), float(b))) for a, b in zip(tested, fitted, strict=True)]
+    alive = (low < candidate.variance) & (candidate.variance < high)
+    agrees, below = np.array(apart) < config.agreement, config.slow * candidate.typical
+    return np.asarray(agrees & alive & (tested < below), dtype=np.int64)
 
 
 def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
@@ -186,19 +196,30 @@ def promising(candidate: Candidate, config: ProgressConfig) -> bool:
     )
 
 
-def gives(module: Module, candidate: Candidate, frames: NDArray[Any]) -> Likeness:
-    """What a module gives of what a candidate found, by its slowest outputs together.
+def gives(
+    module: Module, candidate: Candidate, config: ProgressConfig, frames: NDArray[Any]
+) -> Likeness:
+    """What a module gives of what a candidate found, by the outputs that are slow in both.
 
     Args:
         module: frozen.
         candidate: tells by the statistics of its stream.
-        frames: (n, I) the last block of that, see `RecursiveSFA.compare`.
+        config: what is slow.
+        frames: (n, I) the last block of the stream, see `RecursiveSFA.compare`.
     """
-    return candidate.sfa.compare(module.phi[:TOGETHER], frames)
+    marks = np.zeros((2, TOGETHER), np.int64)
+    for row, slow in zip(marks, (module.slow, slow_outputs(candidate, config)), strict=True):
+        row[: len(slow)] = slow[:TOGETHER]
+    both = int(np.minimum.accumulate(marks.min(axis=0)).sum())
+    return candidate.sfa.compare(module.phi[: max(both, 1)], frames)
 
 
 def known_by(
-    candidate: Candidate, modules: list[Module], own: int, frames: NDArray[Any]
+    candidate: Candidate,
+    modules: list[Module],
+    own: int,
+    config: ProgressConfig,
+    frames: NDArray[Any],
 ) -> int | None:
     """Index in `modules` of the one that `gives` what the candidate found, its own first, if any.
 
@@ -206,21 +227,26 @@ def known_by(
         candidate: what was found.
         modules: frozen.
         own: index of the stream's own module, -1 where it has none.
+        config: what is slow.
         frames: (n, I) the last block of the stream.
     """
     low, high = PRESENT
-    found = [gives(module, candidate, frames) for module in modules]
+    found = [gives(module, candidate, config, frames) for module in modules]
     for index in sorted(range(len(modules)), key=lambda index: index != own):
         variance, eta, rho = found[index]
         if low < variance < high and rho > SAME and eta <= AS_SLOW * candidate.fitted:
             return index
-    if own >= 0 and _still_there(candidate, modules[own], found[own]):
+    if own >= 0 and _still_there(candidate, modules[own], frames):
         return own
     return None
 
 
-def _still_there(candidate: Candidate, module: Module, like: Likeness) -> bool:
-    """Whether a stream shows what its own module encodes, at times less and differently."""
+def _still_there(candidate: Candidate, module: Module, frames: NDArray[Any]) -> bool:
+    """Whether a stream shows what its own module encodes, at times less and differently.
+
+    That is told by the slowest output alone: some sum of three shows a little of anything.
+    """
+    like = candidate.sfa.compare(module.phi[:1], frames)
     if like.rho > SAME:
         return like.variance > FAINT
     itself = abs(log_ratio(like.slowness, float(module.eta[0]))) < STRANGE

@@ -38,6 +38,7 @@ from cdmisfa.agents.progress.judging import (
     new_streams,
     outcomes,
     promising,
+    slow_outputs,
     stale,
     take_output,
 )
@@ -292,7 +293,7 @@ class ProgressLearner:
         own = self._streams[stream]
         state, before = int(own["state"]), int(own["module"])
         if index is None:
-            index = known_by(candidate, self.modules, before, frames)
+            index = known_by(candidate, self.modules, before, self.config, frames)
         new = index is None
         if index is None:
             self.modules.append(self._module(stream, candidate))
@@ -303,14 +304,18 @@ class ProgressLearner:
         begin_watching(own, alone.variance, alone.slowness)
         if index == before and state != LEARNING:
             return ()
-        eta = float(candidate.tested[0]) if new else gives(module, candidate, frames).slowness
+        given = gives(module, candidate, self.config, frames)
+        eta = float(candidate.tested[0]) if new else given.slowness
         learned = module.stream_index == stream
         decide(own, LEARNED if learned else KNOWN, index, eta)
         if index == before:
             return self._say(stream, f"still shows what module {index + 1} gives")
         by = "learned by" if learned else f"known by {module.stream}'s"
         what = f"{'has changed and is' if before >= 0 else 'is'} {by} module {index + 1}"
-        return self._say(stream, f"{what} after {own['decided']} blocks, slowness {eta:.4f}")
+        said = f"{what} after {own['decided']} blocks, slowness {eta:.4f}"
+        if new and self._n_outputs > 1:
+            said += f", {int(module.slow.sum())} of {self._n_outputs} outputs slow"
+        return self._say(stream, said)
 
     def _learn_again(self, stream: int, module: int) -> None:
         """Begin a candidate anew for a stream that had been decided."""
@@ -346,6 +351,7 @@ class ProgressLearner:
             policy=self._policy,
             expansion=self._expansion,
             scale=self._scale,
+            slow=slow_outputs(candidate, self.config),
             frame_shape=self.spec.frame_shape,
         )
 

@@ -25,7 +25,7 @@ from cdmisfa.cli.printing import (
     say_counts,
     tell,
 )
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError, are_for
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
@@ -175,8 +175,12 @@ def opened_logs(
         cameras: how images of others become frames.
         live: how live streams do; see `opened_live`.
     """
-    from cdmisfa.experiments.sources import open_source
+    from cdmisfa.experiments.sources import is_scene, open_source
 
+    vain = [f"--{name}" for name in ("loop", "salvage") if told[name]]
+    if vain and is_scene(source):
+        raise UsageError(f"{source[0]} is a scene: {are_for(vain, 'logs')}")
+    options.refuse_live_options(live, source)
     if told["record_to"] is not None:
         raise UsageError("--record is for live streams: leave it out, or see cdmisfa record")
     frames, configuration = open_source(

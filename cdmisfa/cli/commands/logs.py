@@ -12,6 +12,7 @@ import click
 from cdmisfa.cli import options, uploads
 from cdmisfa.cli.making import flag, option
 from cdmisfa.cli.printing import (
+    BRACKETS,
     print_document,
     print_json,
     print_line,
@@ -19,6 +20,7 @@ from cdmisfa.cli.printing import (
     print_text,
     quoted,
     say_about,
+    slownesses,
     tell,
 )
 from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
@@ -64,6 +66,11 @@ def _print_info(found: LogInfo) -> None:
     if found.signals is not None and found.signals.missing:
         version, lacks = found.signals.version, ", ".join(found.signals.missing)
         print_line(f"signals of version {version}: {lacks} are not in it, read as NaN")
+    for module in found.modules:
+        told = slownesses(module.slowness, module.slow)
+        print_line(f"module {module.index} of {module.stream}: slowness {told}")
+    if any(0 in module.slow for module in found.modules):
+        print_line(BRACKETS)
     head: tuple[str, ...] = ("topic", "messages", "encoding", "schema", "from", "to")
     rows: list[tuple[object, ...]] = [
         (c.topic, c.messages, c.encoding, c.schema, _clock(c.start_ns), _clock(c.end_ns))
@@ -205,8 +212,8 @@ def compare_command(
     else:
         print_table(HEAD, [row.cells() for row in rows])
     for explanation in filter(None, (row.explanation() for row in rows)):
-        for line in () if as_json else explanation.splitlines():
-            print_line(line)
+        if not as_json:
+            print_text(explanation)
     if first and second and not as_json:
         print_line(f"signals of iteration {at}:")
         print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.making import number, option, word
+from cdmisfa.cli.making import WholeRange, number, option, word
 from cdmisfa.cli.printing import (
     learning,
     outcome_line,
@@ -104,11 +104,11 @@ def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
 
 @click.command("check")
 @options.path_argument("run")
-@option("--from", "start", type=click.IntRange(0), default=0, metavar="K", help="First iteration.")
+@option("--from", "start", type=WholeRange(0), default=0, metavar="K", help="First iteration.")
 @option(
     "--to",
     "stop",
-    type=click.IntRange(1),
+    type=WholeRange(1),
     metavar="L",
     help="End before this one; else at the end.",
 )

@@ -121,6 +121,7 @@ def record_command(
     start = RecordingStart() if resumed is None else _start(resumed)
     named = "".join(source) or start.scene
     is_scene([named], images)  # which refuses options of cameras
+    options.refuse_live_options(live, [named])
     given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
     asked = named or given_seed or writing["frames"] or writing["split"]
     if resumed is not None and not asked and (files := recorded(resumed)):
@@ -310,6 +311,7 @@ def convert_command(
             )
         record_streams(ctx, source, out, live, cameras, as_json=as_json, **writing)
         return
+    options.refuse_live_options(live, source)
     named = locations(source)
     for place in named:
         refuse_what_is_no_log(place)

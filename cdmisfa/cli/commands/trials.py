@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -138,6 +139,8 @@ def parse_seeds(text: str) -> list[int]:
             seeds.extend(span)
     except ValueError:
         raise click.UsageError(f"--seeds {text}: write it as 0:20 or 1,5,9") from None
+    if twice := [seed for seed, times in Counter(seeds).items() if times > 1]:
+        raise click.UsageError(f"--seeds {text}: {twice[0]} stands there twice")
     return seeds
 
 
