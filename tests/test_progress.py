@@ -408,9 +408,9 @@ def test_peoples_own_logs_are_learned_from_with_it(cdmisfa: Cdmisfa, tmp_path: P
         {"stream", "state", "module", "blocks", "slowness", "why"}
     ]
     assert {row["state"] for row in rows} <= set(STATES)
-    assert [row["stream"] for row in rows] == ["/left", "/right"]
+    assert [row["stream"] for row in rows] == ["left", "right"]
     told = cdmisfa(*words)
-    assert all(f"{name}: " in told.out for name in ("/left", "/right"))
+    assert all(f"{name}: " in told.out for name in ("left", "right"))
     paper = cdmisfa(*words, "--algorithm", "2.0", "--json")
     assert (paper.code, "streams" in paper.json) == (0, False)
     converted = tmp_path / "recording"
