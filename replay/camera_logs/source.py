@@ -198,6 +198,7 @@ class ForeignSource(LoggedSource):
             **self._chosen(),
             "alignment": self.alignment,
             "frames": self._count,
+            **({"held_out": self.held_out} if self.held_out else {}),
             "loop": self._loop,
         }
 
