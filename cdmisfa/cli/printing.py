@@ -106,6 +106,8 @@ def say_about(source: FrameSource) -> None:
     """Say on stderr what the user should know of a source, and how images became frames."""
     for warning in getattr(source, "warnings", ()):
         warn(warning)
+    for note in getattr(source, "notes", ()):
+        tell(note)
     for name, shape in getattr(source, "shapes", {}).items():
         if "," in shape:  # not the image itself
             tell(f"{name}: {shape}")
@@ -165,6 +167,8 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
     if unknown:
         said = "whether images change their size shows when they are read"
         print_line(f"{said}: {' '.join(unknown)}")
+    for note in source.notes:
+        tell(note)
     for warning in warnings:
         warn(warning)
 

@@ -56,7 +56,7 @@ def hold_out(source: FrameSource, share: float | None, *, judged: bool) -> None:
         source.hold_out(count)
     else:
         said = f"{count} of {source.frames} frames are too few to judge on: none are held out"
-        source.warnings = (*source.warnings, f"{said} (--holdout)")
+        source.notes = (*source.notes, f"{said} (--holdout)")
 
 
 def judged(

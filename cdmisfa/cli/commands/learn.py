@@ -140,6 +140,7 @@ def learn_command(
         if dry_run:
             print_plan(frames, as_json=as_json)
             return
+        color = getattr(frames, "color", cameras.color)  # what auto chose stays
         with learning(told["max_iterations"]) as (stop, reporter):
             if hasattr(frames, "stop"):
                 frames.stop = stop  # waiting for frames ends with a signal, too
@@ -148,7 +149,7 @@ def learn_command(
                 configuration.learner,
                 out,
                 sections=configuration.tables(),
-                command=command_of(source, ctx.params, out or Path()),
+                command=command_of(source, {**ctx.params, "color": color}, out or Path()),
                 force=force,
                 resume=resume,
                 rerun=not told["no_rerun"],
