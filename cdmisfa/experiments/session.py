@@ -38,6 +38,7 @@ from cdmisfa.experiments.run_folder import (
     RunResult,
     opened_log,
     versions_used,
+    with_recipes,
     write_results,
 )
 from recorder.log.files import folder_here
@@ -308,8 +309,7 @@ class Session:
         return result
 
     def _result(self, described: Mapping[str, Any], signals_sha256: str, ended: str) -> RunResult:
-        learner = self.learner
-        summary = learner.summary()
+        learner, summary = self.learner, self.learner.summary()
         return RunResult(
             run=str(self.folder) if self.folder is not None else None,
             source=described,
@@ -318,7 +318,7 @@ class Session:
             iterations=learner.iteration,
             frames=learner.iteration * learner.tau,
             signals_sha256=signals_sha256,
-            modules=tuple(learner.modules),
+            modules=with_recipes(learner.modules, self.source, described),
             summary=summary,
             ended=ended,
             undecided=() if learner.over else _undecided(learner, self.source, summary),
