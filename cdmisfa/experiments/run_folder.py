@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from cdmisfa.experiments.documents import machine, versions, write_json
 from cdmisfa.experiments.resume import COMMAND, FORK, SET_ASIDE
 from cdmisfa.modules import Module
 from recorder.cameras.words import PACKAGES
+from recorder.images.recipe import Recipe
 from recorder.log.files import (
     held,
     logs_in,
@@ -27,6 +28,8 @@ from recorder.log.files import (
     refuse_special,
 )
 from recorder.world.scenes import SCENES, scene_of
+from replay.camera_logs.source import ForeignSource
+from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.modules import save_modules
 from replay.runs.run import final_record
@@ -96,12 +99,34 @@ def module_table(module: Module) -> dict[str, Any]:
         "policy": module.policy.tolist(),
         "eta": module.eta.tolist(),
         "slow": [bool(slow) for slow in module.slow],
+        "recipe": None if module.recipe is None else module.recipe.as_json(),
     }
 
 
 def in_words(changed: Mapping[str, Sequence[Any]]) -> list[str]:
     """Values before and now, by name, in words."""
     return [f"{name} is {now}, was {before}" for name, (before, now) in changed.items()]
+
+
+def with_recipes(
+    modules: Iterable[Module], source: FrameSource, described: Mapping[str, Any]
+) -> tuple[Module, ...]:
+    """Modules with what becomes of a raw picture of their streams.
+
+    Args:
+        modules: what was learned.
+        source: from what; of a recording that is what was recorded.
+        described: what it says of itself.
+    """
+    if isinstance(source, RecordedSource):
+        described = source.origin()
+
+    def recipe(stream: int) -> Recipe:
+        own = Recipe.of(described, source.spec.frame_shape, stream)
+        stated = source.pixels(stream) if isinstance(source, ForeignSource) else ""
+        return replace(own, pixels=stated) if stated.startswith("bayer_") else own
+
+    return tuple(replace(module, recipe=recipe(module.stream_index)) for module in modules)
 
 
 class OpenLog(Sink):

@@ -41,6 +41,7 @@ from cdmisfa.experiments.run_folder import (
     opened_log,
     undecided,
     versions_used,
+    with_recipes,
     write_results,
 )
 from recorder.log.files import folder_here
@@ -328,7 +329,7 @@ class Session:
             iterations=learner.iteration,
             frames=learner.iteration * learner.tau,
             signals_sha256=sha256,
-            modules=tuple(learner.modules),
+            modules=with_recipes(learner.modules, self.source, described),
             summary=summary,
             **ending,
             undecided=() if learner.over else undecided(learner, self.source, summary),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.features.outputs import slowness_by_moments
-from cdmisfa.features.recursive import RecursiveSFA
+from cdmisfa.features.recursive import RecursiveFeature
 
 Pieces = Iterable[tuple[NDArray[Any], bool]]
 """Frames (n, I) in their order, and whether some are missing before them."""
@@ -25,7 +25,7 @@ def batch_outputs(
 ) -> tuple[FloatArray, FloatArray]:
     """The slowest outputs of frames that all count the same, in their leading components.
 
-    What `batch_sfa` finds of frames in memory, by `RecursiveSFA` with a window that holds all.
+    What `batch_sfa` finds of frames in memory, by `RecursiveFeature` with a window that holds all.
 
     Args:
         pieces: at least one, uint8 pixels, which count 1/255 each, or float64 values.
@@ -36,9 +36,9 @@ def batch_outputs(
     Returns:
         phi (J, I), their weights of the centred frame, and the mean (I,).
     """
-    sfa: RecursiveSFA | None = None
+    sfa: RecursiveFeature | None = None
     for x, gap in pieces:
-        sfa = sfa or RecursiveSFA(x.shape[1], components, outputs, window=frames)
+        sfa = sfa or RecursiveFeature(x.shape[1], components, outputs, window=frames)
         sfa.update(x, gap)
     assert sfa is not None
     return sfa.phi, sfa.mean

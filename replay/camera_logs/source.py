@@ -17,7 +17,7 @@ from cdmisfa.core.options import option_words
 from recorder.images.fields import rounded
 from recorder.images.framing import framings
 from recorder.images.options import COLOR_RECIPE
-from recorder.images.pixels import Shown, UnknownPixels
+from recorder.images.pixels import DISTANCES, Shown, UnknownPixels
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
@@ -78,7 +78,6 @@ class ForeignSource(LoggedSource):
         changes: for each stream whose images change their size, or whose numbers are held
             rounded, a line that says so; as soon as one was shown.
         color: whether frames show colours; see `shows_hue` of "auto".
-        notes: what was chosen where it was not said.
         warnings: what the user should know: logs that were cut, damage that was left out, images
             that are shown at other times than their own.
     """
@@ -106,7 +105,6 @@ class ForeignSource(LoggedSource):
                 f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in "
                 "seconds after the first image: no image lies between them"
             )
-        self.notes: tuple[str, ...] = ()
         if options.color == "auto":
             how = {"loop": loop, "salvage": salvage, "goal": goal, **chosen, "color": True}
             with contextlib.closing(type(self)(paths, topics, **how)) as shown:
@@ -127,7 +125,11 @@ class ForeignSource(LoggedSource):
                 raise self._of_copies(error) from None
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
             images = firsts[0].ndim > 1
-            if options.depth and images and not any(s.distances() for s in self._streams):
+            if (
+                options.depth
+                and images
+                and not any(s.pixels() in (None, *DISTANCES) for s in self._streams)
+            ):
                 raise UsageError(
                     f"{self._files[0]}: it holds no distances (16UC1, 32FC1): --range is for these"
                 )
@@ -214,6 +216,10 @@ class ForeignSource(LoggedSource):
             "loop": self._loop,
         }
 
+    def pixels(self, stream: int) -> str:
+        """The format of pixels that a stream's messages state, "" where they state none."""
+        return self._streams[stream].pixels() or ""
+
     def plan(self) -> list[dict[str, Any]]:
         """The plan of --dry-run: what would be read of each stream, as JSON values."""
         rows: list[dict[str, Any]] = []
@@ -253,7 +259,7 @@ class ForeignSource(LoggedSource):
         if any(self._gaps):
             chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
-        if any(framing.lossy for framing in self._framings):
+        if options.fit != "crop" or any(framing.lossy for framing in self._framings):
             chosen["fit"] = options.fit
         if options.depth is not None:
             chosen["range_metres" if self._spec.images else "range"] = list(options.depth)

@@ -166,8 +166,9 @@ def robot(model: str, distance: float) -> Maker:
         path = str(Path(pybullet_data.getDataPath(), model))
         with silenced():
             world = bullet_client.BulletClient(pybullet.DIRECT)
-            found = world.loadURDF(path) if model.endswith(".urdf") else world.loadMJCF(path)[0]
-        return _move(world, found, distance, rng, n)
+            found = (world.loadURDF(path),) if model.endswith(".urdf") else world.loadMJCF(path)
+        body = max(found, key=world.getNumJoints)  # others are the ground
+        return _move(world, body, distance, rng, n)
 
     return make_stream
 
@@ -181,7 +182,8 @@ def _move(world: Any, body: int, distance: float, rng: Rng, n: int) -> Footage:
     low, high = (np.array([each[k] for each in turning]) for k in (8, 9))
     middle, reach = (low + high) / 2, np.minimum((high - low) / 2, 1.0)
     place = world.getBasePositionAndOrientation(body)
-    view = world.computeViewMatrixFromYawPitchRoll(place[0], distance, 40, -20, 0, 2)
+    centre = np.mean([world.getLinkState(body, joint)[0] for joint in joints], axis=0).tolist()
+    view = world.computeViewMatrixFromYawPitchRoll(centre, distance, 40, -20, 0, 2)
     lens = world.computeProjectionMatrixFOV(50, WIDTH / HEIGHT, 0.1, 10)
     frames, state = np.empty((n, HEIGHT, WIDTH), np.uint8), np.empty((n, len(joints)))
     for t in range(n):

@@ -58,6 +58,8 @@ IMAGES: Final = ("datasets", "images")
 SAMPLES: Final = ("mpl-data", "sample_data")
 """Where Matplotlib has its own."""
 
+PARCEL: Final = "Minduka_Present_Blue_Pack.png"
+
 STREAMS: Registry[Kind] = Registry(
     "stream",
     {
@@ -79,10 +81,12 @@ STREAMS: Registry[Kind] = Registry(
         "cliff": Kind(grid("CliffWalking-v1", 12)),
         "taxi": Kind(grid("Taxi-v4", 5, 20)),
         "ant": Kind(robot("mjcf/ant.xml", 2.2)),
+        "walker": Kind(robot("mjcf/walker2d.xml", 2.2)),
         "cheetah": Kind(robot("mjcf/half_cheetah.xml", 2.2)),
         "arm": Kind(robot("kuka_iiwa/model.urdf", 2.8)),
         "china": Kind(photograph("sklearn", "scikit-learn", *IMAGES, "china.jpg")),
         "flower": Kind(photograph("sklearn", "scikit-learn", *IMAGES, "flower.jpg")),
+        "parcel": Kind(photograph("matplotlib", "matplotlib", *SAMPLES, PARCEL)),
         "hopper": Kind(photograph("matplotlib", "matplotlib", *SAMPLES, "grace_hopper.jpg")),
         "bikes": Kind(elsewhere.clip("bikes"), loops=True),
         "bigbuckbunny": Kind(elsewhere.clip("bigbuckbunny"), loops=True),
