@@ -47,9 +47,7 @@ def batch_outputs(
 def following_slowness(
     pieces: Pieces, abstractions: Sequence[tuple[FloatArray, FloatArray]]
 ) -> list[FloatArray]:
-    """Slowness of the outputs of several abstractions, in one pass over frames.
-
-    Equation: 2
+    """`slowness` of the outputs of several abstractions, in one pass over frames.
 
     Args:
         pieces: see `batch_outputs`.
