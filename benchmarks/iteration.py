@@ -16,7 +16,7 @@ from cdmisfa import kernels
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig, load_preset
 from cdmisfa.core.signals import SignalsHash
-from cdmisfa.features.incsfa import IncSFA
+from cdmisfa.features.incsfa import IncrementalFeature
 from recorder.log.messages import ImageEncoder
 from recorder.mcap.writer import McapWriter
 from replay.recordings.source import RecordedSource
@@ -27,7 +27,7 @@ CONFIG = LearnerConfig(**load_preset("icub")["learner"])
 
 PARTS: dict[str, tuple[Any, tuple[str, ...]]] = {
     "reading": (RecordedSource, ("take",)),
-    "IncSFA": (IncSFA, ("update",)),
+    "IncSFA": (IncrementalFeature, ("update",)),
     "projecting": (kernels, ("outputs", "mean_output")),
     "gate": (kernels, ("recognise",)),
     "policy": (kernels, ("think",)),

@@ -12,7 +12,7 @@ from benchmarks.kernels import image_frames
 from benchmarks.report import interleaved, middle, ratio, save
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.features.recursive import RecursiveSFA
+from cdmisfa.features.recursive import RecursiveFeature
 
 BLOCK = 40
 """Frames learned at once."""
@@ -86,7 +86,7 @@ def candidates(frames: FloatArray, components: int) -> dict[str, Callable[[], in
     size = frames.shape[1]
     pca = IncrementalPCA(n_components=2 * components)
     found = {
-        "recursive SFA": blocks(RecursiveSFA(size, components).update, frames),
+        "recursive SFA": blocks(RecursiveFeature(size, components).update, frames),
         "plain numpy": blocks(PlainNumpy(size, components).update, frames),
         "IncrementalPCA": blocks(pca.partial_fit, frames),
         "its products alone": products(size, components, frames),

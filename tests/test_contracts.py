@@ -19,7 +19,7 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import SIGNALS, values
-from cdmisfa.features.incsfa import Feature, IncSFA
+from cdmisfa.features.incsfa import Feature, IncrementalFeature
 from cdmisfa.testing import CameraContract, FeatureContract, FormContract, LearnerContract
 from recorder.cameras.readers import Camera
 from recorder.cameras.words import CAMERAS
@@ -45,7 +45,7 @@ class TestProgress(LearnerContract):
 
 class TestIncSFA(FeatureContract):
     def open(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> Feature:
-        return IncSFA(config, n_inputs, rng)
+        return IncrementalFeature(config, n_inputs, rng)
 
 
 class TestVideo(CameraContract):

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from run_data import VECTOR, write_run
@@ -60,11 +61,28 @@ def test_every_number_is_there_and_what_it_is(form, read, run):
             expected = np.asarray(getattr(signals, name))
             if form == "npz":
                 found = found[tuple(slice(size) for size in expected.shape)]
+            else:
+                found = np.asarray(found, signal.dtype)  # null becomes NaN
             np.testing.assert_array_equal(np.reshape(found, expected.shape), expected)
         assert (about[name]["unit"], about[name]["symbol"]) == (signal.unit, signal.symbol)
     if form != "npz":
         assert about["eta"]["dims"] == SIGNALS["eta"].dims
     assert json.loads(manifest)["config"]["learner"]["tau"] == 40
+
+
+@pytest.mark.parametrize("form", ["parquet", "arrow"])
+def test_what_is_missing_is_null_and_nothing_is_nan(form, run):
+    folder, records = run
+    export(folder, folder / f"run.{form}", form)
+    path = folder / f"run.{form}"
+    table = pq.read_table(path) if form == "parquet" else pa.ipc.open_file(path).read_all()
+    for name, signal in SIGNALS.items():
+        column = table.column(name)
+        while pa.types.is_list(column.type):
+            column = pc.list_flatten(column)
+        missing = [np.isnan(getattr(signals, name)).sum() for signals in records]
+        assert column.null_count == sum(missing)
+        assert signal.dtype != "float64" or not pc.any(pc.is_nan(column)).as_py()
 
 
 def test_csv_reads_back_exactly_and_comes_with_what_its_columns_are(run):

@@ -17,7 +17,7 @@ from cdmisfa.core.blocks import Block, SourceSpec, as_frames
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion, expand, quadratic
-from cdmisfa.features.incsfa import IncSFA
+from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.outputs import project
 from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import lib
@@ -28,8 +28,8 @@ CONFIG = LearnerConfig(components=3)
 TYPES = ("float64", "uint8", "float32", "int8", "bool", "int64", "complex128", ">f8", "U3", "O")
 
 
-def abstraction(size: int) -> IncSFA:
-    return IncSFA(CONFIG, size, np.random.default_rng(0))
+def abstraction(size: int) -> IncrementalFeature:
+    return IncrementalFeature(CONFIG, size, np.random.default_rng(0))
 
 
 @st.composite

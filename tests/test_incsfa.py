@@ -12,9 +12,9 @@ from cdmisfa.core.blocks import PIXEL, freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.features.incsfa import IncSFA, IncSFAState, new_state
+from cdmisfa.features.incsfa import IncrementalFeature, IncSFAState, new_state
 from cdmisfa.features.outputs import project
-from cdmisfa.features.recursive import RecursiveSFA
+from cdmisfa.features.recursive import RecursiveFeature
 from cdmisfa.features.sfa import batch_sfa, slowness
 from recorder.world.oscillatory import OscillatorySource, one_period
 
@@ -72,7 +72,7 @@ def assert_states_close(a: IncSFAState, b: IncSFAState, rtol: float) -> None:
 @pytest.mark.parametrize("stream", [0, 1, 2])
 def test_each_oscillatory_stream_alone_gives_the_slow_feature_of_batch_sfa(stream):
     config = LearnerConfig()
-    sfa = IncSFA(config, 5, np.random.default_rng(stream))
+    sfa = IncrementalFeature(config, 5, np.random.default_rng(stream))
     source = OscillatorySource()
     for _ in range(300):
         sfa.update(quadratic(source.take(stream, 100).frames))
@@ -239,7 +239,7 @@ def test_same_blocks_give_the_same_bits_and_inputs_stay(size):
     frames = latent_frames(200, size)
     results = []
     for _ in range(2):
-        sfa = IncSFA(config, size, np.random.default_rng(0))
+        sfa = IncrementalFeature(config, size, np.random.default_rng(0))
         xi = np.concatenate([sfa.update(frames[k : k + 40], k == 80) for k in range(0, 200, 40)])
         results.append((xi.tobytes(), *(a.tobytes() for a in sfa.state)))
     assert results[0] == results[1]
@@ -336,7 +336,7 @@ def test_any_numbers_are_learned_within_the_arrays_alike_by_both_modules(
 
 @pytest.mark.parametrize("what", [0, 2])
 def test_a_state_that_no_kernel_left_is_refused(what):
-    sfa = IncSFA(config_of(4, 1), 300, np.random.default_rng(0))
+    sfa = IncrementalFeature(config_of(4, 1), 300, np.random.default_rng(0))
     sfa.state.counts[what] = -1
     with pytest.raises(UsageError, match="not a state"):
         sfa.update(np.zeros((3, 300)))
@@ -352,8 +352,8 @@ def test_arrays_of_another_shape_or_order_are_refused():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: IncSFA(config_of(3, 1), 6, np.random.default_rng(0)),
-        lambda: RecursiveSFA(6, components=3),
+        lambda: IncrementalFeature(config_of(3, 1), 6, np.random.default_rng(0)),
+        lambda: RecursiveFeature(6, components=3),
     ],
 )
 def test_a_state_that_is_set_is_learned_from(make):

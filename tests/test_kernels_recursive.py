@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa import kernels
 from cdmisfa.core.errors import UsageError
-from cdmisfa.features.recursive import RecursiveSFA, RecursiveState
+from cdmisfa.features.recursive import RecursiveFeature, RecursiveState
 from cdmisfa.kernels import _plain
 from tests.reference import recursive as reference
 
@@ -21,7 +21,7 @@ GUARD = 8
 
 
 @st.composite
-def streams(draw: st.DrawFn) -> tuple[RecursiveSFA, list[NDArray[Any]], list[bool]]:
+def streams(draw: st.DrawFn) -> tuple[RecursiveFeature, list[NDArray[Any]], list[bool]]:
     """An SFA, blocks for it, and which of them follow a gap."""
     inputs = draw(st.one_of(st.integers(1, 40), st.integers(250, 530)))
     components = draw(st.integers(1, 20))
@@ -38,7 +38,7 @@ def streams(draw: st.DrawFn) -> tuple[RecursiveSFA, list[NDArray[Any]], list[boo
     if draw(st.booleans()):
         blocks[draw(st.integers(0, len(blocks) - 1))][:] = x[0]
     gaps = [draw(st.booleans()) for _ in blocks]
-    return RecursiveSFA(inputs, components, outputs, draw(st.integers(1, 400))), blocks, gaps
+    return RecursiveFeature(inputs, components, outputs, draw(st.integers(1, 400))), blocks, gaps
 
 
 def copied(state: RecursiveState) -> RecursiveState:
@@ -58,7 +58,7 @@ def turned(own: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.f
 @given(stream=streams())
 @settings(max_examples=60)
 def test_equals_the_reference(
-    stream: tuple[RecursiveSFA, list[NDArray[Any]], list[bool]],
+    stream: tuple[RecursiveFeature, list[NDArray[Any]], list[bool]],
 ) -> None:
     sfa, blocks, gaps = stream
     for frames, gap in zip(blocks, gaps, strict=True):
@@ -91,7 +91,7 @@ def test_equals_the_reference(
 def test_outputs_keep_their_signs() -> None:
     rng = np.random.default_rng(4)
     frames = np.cumsum(rng.normal(size=(600, 20)), axis=0)
-    sfa = RecursiveSFA(20, 6, 3)
+    sfa = RecursiveFeature(20, 6, 3)
     sfa.update(frames[:20])
     for start in range(20, 600, 20):
         before = sfa.phi
@@ -103,7 +103,7 @@ def test_outputs_keep_their_signs() -> None:
 def test_the_last_bit_of_large_values_is_no_direction() -> None:
     frames = np.full((50, 20), 1e6 / 3)
     frames[::2] = np.nextafter(frames[::2], 0.0)
-    sfa = RecursiveSFA(20, 4)
+    sfa = RecursiveFeature(20, 4)
     sfa.update(frames)
     assert sfa.state.counts.tolist() == [0, 50, 49]
 
@@ -125,7 +125,7 @@ def guarded(state: RecursiveState) -> tuple[RecursiveState, list[NDArray[Any]]]:
 )
 @settings(max_examples=60)
 def test_whatever_frames_hold_nothing_else_is_written(
-    stream: tuple[RecursiveSFA, list[NDArray[Any]], list[bool]],
+    stream: tuple[RecursiveFeature, list[NDArray[Any]], list[bool]],
     value: float,
     seed: int,
     share: float,
@@ -150,7 +150,9 @@ def test_whatever_frames_hold_nothing_else_is_written(
         assert (own[-GUARD:] == 7).all()
 
 
-def learned(module: Any, sfa: RecursiveSFA, blocks: list[NDArray[Any]], gaps: list[bool]) -> Any:
+def learned(
+    module: Any, sfa: RecursiveFeature, blocks: list[NDArray[Any]], gaps: list[bool]
+) -> Any:
     """All that a kernel module makes of a stream."""
     sfa.state, _ = guarded(RecursiveState(*(np.zeros_like(array) for array in sfa.state)))
     vars(sfa).pop("_record", None)
@@ -166,7 +168,7 @@ def learned(module: Any, sfa: RecursiveSFA, blocks: list[NDArray[Any]], gaps: li
 @given(stream=streams())
 @settings(max_examples=40)
 def test_both_modules_give_the_same_bits(
-    stream: tuple[RecursiveSFA, list[NDArray[Any]], list[bool]],
+    stream: tuple[RecursiveFeature, list[NDArray[Any]], list[bool]],
 ) -> None:
     from cdmisfa.kernels import _wide
 
@@ -176,7 +178,7 @@ def test_both_modules_give_the_same_bits(
 
 @pytest.mark.parametrize("counts", [(9, 5, 4), (-1, 5, 4), (2**62, 5, 4), (3, -1, 4), (3, 5, -1)])
 def test_a_state_that_points_nowhere_is_refused(counts: tuple[int, ...]) -> None:
-    sfa = RecursiveSFA(20, 4)
+    sfa = RecursiveFeature(20, 4)
     frames = np.random.default_rng(0).normal(size=(30, 20))
     sfa.update(frames)
     sfa.state.counts[:] = counts
@@ -188,7 +190,7 @@ def test_a_state_that_points_nowhere_is_refused(counts: tuple[int, ...]) -> None
 
 
 def test_a_window_that_shrank_is_no_broken_state() -> None:
-    sfa = RecursiveSFA(20, 4, window=10)
+    sfa = RecursiveFeature(20, 4, window=10)
     frames = np.random.default_rng(0).normal(size=(30, 20))
     sfa.update(frames)
     sfa.state.counts[1:] = 2**63 - 1
@@ -197,7 +199,7 @@ def test_a_window_that_shrank_is_no_broken_state() -> None:
 
 
 def test_arrays_of_other_shapes_are_refused() -> None:
-    sfa = RecursiveSFA(20, 4)
+    sfa = RecursiveFeature(20, 4)
     sfa.state = sfa.state._replace(weights=np.zeros((1, 7)))
     with pytest.raises(UsageError, match="weights is float64"):
         sfa.update(np.zeros((3, 20)))

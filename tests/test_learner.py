@@ -22,7 +22,7 @@ from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import overwrite
 from cdmisfa.core.signals import BlockSignals, SignalsHash, values
-from cdmisfa.features.incsfa import IncSFA
+from cdmisfa.features.incsfa import IncrementalFeature
 from recorder.world.oscillatory import OscillatorySource, one_period
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
@@ -296,7 +296,7 @@ def test_a_constant_block_carries_nothing() -> None:
         assert not learner.phi.any()
 
 
-class InPython(IncSFA):
+class InPython(IncrementalFeature):
     """The same abstraction as a feature of somebody else; it notes when it is told of a gap."""
 
     def __init__(self, *args: Any) -> None:
@@ -347,7 +347,7 @@ def test_a_switch_of_stream_is_a_gap() -> None:
 def test_a_feature_that_learns_in_python_gives_the_same_bits(algorithm: str) -> None:
     config = dataclasses.replace(CONFIG, algorithm=algorithm, delta=0.01, roc_error=0.3)
     hashes = []
-    for feature in (IncSFA, InPython):
+    for feature in (IncrementalFeature, InPython):
         source, digest = OscillatorySource(), SignalsHash()
         learner = CuriousLearner(config, source.spec, 3, feature=feature)
         for _ in range(600):
@@ -361,8 +361,10 @@ def test_a_feature_that_learns_in_python_gives_the_same_bits(algorithm: str) -> 
 
 
 def test_a_feature_of_another_shape_is_refused() -> None:
-    def feature(config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> IncSFA:
-        return IncSFA(config, n_inputs - 1, rng)
+    def feature(
+        config: LearnerConfig, n_inputs: int, rng: np.random.Generator
+    ) -> IncrementalFeature:
+        return IncrementalFeature(config, n_inputs - 1, rng)
 
     with pytest.raises(UsageError, match=r"phi of \(1, 4\): it must be \(1, 5\)"):
         CuriousLearner(CONFIG, SPEC, 0, feature=feature)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.features.incsfa import Feature
-from cdmisfa.features.recursive import PIECE, RecursiveSFA
+from cdmisfa.features.recursive import PIECE, RecursiveFeature
 from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import ffi, lib
 
@@ -38,8 +38,8 @@ def mixture(seed: int, n: int, sources: int, inputs: int) -> NDArray[np.float64]
     return waves @ rng.normal(size=(sources, inputs)) + rng.normal(size=inputs)
 
 
-def learned(frames: NDArray[Any], cuts: list[int], **options: Any) -> RecursiveSFA:
-    sfa = RecursiveSFA(frames.shape[1], window=FOREVER, **options)
+def learned(frames: NDArray[Any], cuts: list[int], **options: Any) -> RecursiveFeature:
+    sfa = RecursiveFeature(frames.shape[1], window=FOREVER, **options)
     for i, piece in enumerate(np.split(frames, cuts)):
         sfa.update(piece, gap=i == 0)
     return sfa
@@ -87,7 +87,7 @@ def test_it_does_not_matter_how_frames_of_few_directions_are_cut(
 
 def test_a_long_call_is_its_pieces() -> None:
     frames = np.random.default_rng(2).integers(0, 256, (3 * PIECE + 5, 50), dtype=np.uint8)
-    a, b = RecursiveSFA(50, 8), RecursiveSFA(50, 8)
+    a, b = RecursiveFeature(50, 8), RecursiveFeature(50, 8)
     changes = a.update(frames)
     each = [b.update(frames[i : i + PIECE]) for i in range(0, len(frames), PIECE)]
     np.testing.assert_array_equal(changes, np.concatenate(each))
@@ -96,7 +96,7 @@ def test_a_long_call_is_its_pieces() -> None:
 
 def test_differences_over_a_gap_do_not_count() -> None:
     a, b = mixture(3, 700, 3, 10), mixture(3, 700, 3, 10)[::-1] + 5.0
-    sfa = RecursiveSFA(10, 5, window=FOREVER)
+    sfa = RecursiveFeature(10, 5, window=FOREVER)
     sfa.update(a)
     sfa.update(b, gap=True)
     steps = np.concatenate([np.diff(a, axis=0), np.diff(b, axis=0)])
@@ -110,7 +110,7 @@ def test_differences_over_a_gap_do_not_count() -> None:
 @pytest.mark.parametrize("value", [0, 93])
 @pytest.mark.parametrize("dtype", [np.uint8, np.float64])
 def test_a_stream_that_shows_nothing_has_no_slow_feature(value: int, dtype: Any) -> None:
-    sfa = RecursiveSFA(40, 5)
+    sfa = RecursiveFeature(40, 5)
     for _ in range(4):
         change = sfa.update(np.full((30, 40), value, dtype))
         assert np.isnan(change).all()
@@ -124,7 +124,7 @@ def test_a_stream_that_shows_nothing_has_no_slow_feature(value: int, dtype: Any)
 @settings(max_examples=40)
 def test_any_rank_and_any_block_length(rank: int, n: int, seed: int) -> None:
     frames = mixture(seed, 4 * n + 12, rank, 9)
-    sfa = RecursiveSFA(9, 16, outputs=3)
+    sfa = RecursiveFeature(9, 16, outputs=3)
     for start in range(0, len(frames), n):
         sfa.update(frames[start : start + n])
     kept = sfa.state.counts[0]
@@ -181,7 +181,7 @@ def test_what_lies_outside_of_the_directions_kept_counts_as_its_last_frames_show
 
 def test_change_is_free_of_scale_and_falls() -> None:
     frames = mixture(7, 4000, 4, 15)
-    a, b = RecursiveSFA(15, 6), RecursiveSFA(15, 6)
+    a, b = RecursiveFeature(15, 6), RecursiveFeature(15, 6)
     first = [a.update(frames[i : i + 40])[-1] for i in range(0, 4000, 40)]
     second = [b.update(1e-3 * frames[i : i + 40])[-1] for i in range(0, 4000, 40)]
     assert np.isnan(first[0])
@@ -192,7 +192,7 @@ def test_change_is_free_of_scale_and_falls() -> None:
 
 def test_goes_on_from_its_state_with_the_same_bits() -> None:
     frames = np.random.default_rng(3).integers(0, 256, (400, 60), dtype=np.uint8)
-    straight, restored = RecursiveSFA(60, 8, 2), RecursiveSFA(60, 8, 2)
+    straight, restored = RecursiveFeature(60, 8, 2), RecursiveFeature(60, 8, 2)
     straight.update(frames[:200])
     for own, saved in zip(restored.state, straight.state, strict=True):
         own[...] = saved
@@ -203,7 +203,7 @@ def test_goes_on_from_its_state_with_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda sfa: pickle.loads(pickle.dumps(sfa))])
-def test_a_copy_learns_on_its_own(copied: Callable[[RecursiveSFA], RecursiveSFA]) -> None:
+def test_a_copy_learns_on_its_own(copied: Callable[[RecursiveFeature], RecursiveFeature]) -> None:
     frames = np.random.default_rng(3).integers(0, 256, (400, 60), dtype=np.uint8)
     sfa = learned(frames[:200], [], components=8)
     other, phi = copied(sfa), sfa.phi
@@ -215,7 +215,7 @@ def test_a_copy_learns_on_its_own(copied: Callable[[RecursiveSFA], RecursiveSFA]
 
 def test_frames_are_neither_changed_nor_kept() -> None:
     frames = mixture(8, 100, 3, 10)
-    before, sfa = frames.copy(), RecursiveSFA(10, 4)
+    before, sfa = frames.copy(), RecursiveFeature(10, 4)
     sfa.update(frames)
     phi = sfa.phi
     np.testing.assert_array_equal(frames, before)
@@ -228,31 +228,31 @@ def test_frames_are_neither_changed_nor_kept() -> None:
 )
 def test_what_are_no_frames_is_refused(frames: NDArray[Any]) -> None:
     with pytest.raises(UsageError, match="frames of"):
-        RecursiveSFA(10, 4).update(frames)
+        RecursiveFeature(10, 4).update(frames)
 
 
 @pytest.mark.parametrize("options", [(0, 4), (10, 0), (10, 4, 5), (10, 4, 1, 0)])
 def test_sizes_that_make_no_sense_are_refused(options: tuple[int, ...]) -> None:
     with pytest.raises(UsageError, match="at least 1"):
-        RecursiveSFA(*options)
+        RecursiveFeature(*options)
 
 
 def test_no_frames_change_nothing() -> None:
-    sfa = RecursiveSFA(10, 4)
+    sfa = RecursiveFeature(10, 4)
     assert sfa.update(np.zeros((0, 10))).shape == (0,)
     assert not sfa.state.counts.any()
 
 
 def test_it_is_a_feature() -> None:
-    assert isinstance(RecursiveSFA(10, 4), Feature)
+    assert isinstance(RecursiveFeature(10, 4), Feature)
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:
     code = (
         "import hashlib, numpy as np;"
-        "from cdmisfa.features.recursive import RecursiveSFA;"
+        "from cdmisfa.features.recursive import RecursiveFeature;"
         "f = np.random.default_rng(0).integers(0, 256, (300, 3000), dtype=np.uint8);"
-        "s = RecursiveSFA(3000, 16, 3); [s.update(f[i:i + 40]) for i in range(0, 300, 40)];"
+        "s = RecursiveFeature(3000, 16, 3); [s.update(f[i:i + 40]) for i in range(0, 300, 40)];"
         "print(hashlib.sha256(s.phi.tobytes() + repr(s.compare(s.phi)).encode()).hexdigest())"
     )
     hashes = set()

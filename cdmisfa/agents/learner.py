@@ -32,7 +32,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.signals import NO_STATE, BlockSignals
-from cdmisfa.features.incsfa import Feature, IncSFA, MakeFeature
+from cdmisfa.features.incsfa import Feature, IncrementalFeature, MakeFeature
 from cdmisfa.modules import Module
 
 POLICY_KEY, WEIGHTS_KEY = 1, 2
@@ -77,7 +77,7 @@ class CuriousLearner:
         spec: SourceSpec,
         seed: int,
         *,
-        feature: MakeFeature = IncSFA,
+        feature: MakeFeature = IncrementalFeature,
     ) -> None:
         self.config = config
         self.spec = spec

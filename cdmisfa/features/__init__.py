@@ -5,9 +5,9 @@ from cdmisfa.core.exports import exports
 __getattr__, __dir__, __all__ = exports(
     __name__,
     {
-        "cdmisfa.features.incsfa": "Feature IncSFA",
+        "cdmisfa.features.incsfa": "Feature IncrementalFeature",
         "cdmisfa.features.outputs": "project",
-        "cdmisfa.features.recursive": "RecursiveSFA",
+        "cdmisfa.features.recursive": "RecursiveFeature",
         "cdmisfa.features.sfa": "batch_sfa",
     },
 )

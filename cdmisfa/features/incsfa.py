@@ -1,4 +1,4 @@
-"""Adaptive abstractions: what a learner learns with, and `IncSFA`, the paper's.
+"""Adaptive abstractions: what a learner learns with, and `IncrementalFeature`, the paper's.
 
 Sources: candid covariance-free incremental PCA (CCIPCA): Weng, Zhang and Hwang 2003;
 minor component analysis (MCA) by sequential addition: Peng and Yi 2006; the two joined
@@ -23,7 +23,8 @@ from cdmisfa.core.config import LearnerConfig
 class Feature(Protocol):
     """Slow features that are learned frame by frame: y = phi (x - mean).
 
-    One that also has `kernel`, a record of its arrays as `IncSFA` has it, is learned with in C.
+    One that also has `kernel`, a record of its arrays as `IncrementalFeature` has it, is learned
+    with in C.
     """
 
     def update(self, frames: NDArray[Any], gap: bool = False) -> FloatArray:
@@ -106,11 +107,11 @@ def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) ->
     )
 
 
-class IncSFA:
+class IncrementalFeature:
     """Incremental slow feature analysis, frame by frame.
 
     Example:
-        >>> sfa = IncSFA(LearnerConfig(), 5, np.random.default_rng(0))
+        >>> sfa = IncrementalFeature(LearnerConfig(), 5, np.random.default_rng(0))
         >>> sfa.update(np.random.default_rng(1).random((100, 5))).shape
         (100,)
     """

@@ -1,4 +1,4 @@
-"""`RecursiveSFA`: the slowest outputs of all frames so far, exactly and without a learning rate.
+"""`RecursiveFeature`: the slowest outputs of all frames so far, exactly, without a learning rate.
 
 Kept are the largest principal components of the frames and the covariance of the differences
 of consecutive frames along them, each over an exponential window. The slow features are the
@@ -71,7 +71,7 @@ class Likeness(NamedTuple):
     rho: float
 
 
-class RecursiveSFA:
+class RecursiveFeature:
     """Slow feature analysis of all frames so far, in blocks.
 
     Where the frames have no more directions than are kept (twice `components`), nothing is
@@ -85,7 +85,7 @@ class RecursiveSFA:
 
     Example:
         >>> t = np.arange(2000.0)
-        >>> sfa = RecursiveSFA(2, components=2)
+        >>> sfa = RecursiveFeature(2, components=2)
         >>> change = sfa.update(np.stack([np.sin(t / 50) + np.sin(t), np.sin(t)], axis=1))
         >>> round(float(sfa.slowness * 2 * np.pi * 50), 2)
         1.0

@@ -223,7 +223,7 @@ def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
 
 
 def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update") -> FloatArray:
-    """Learn from consecutive frames; see `IncSFA.update`.
+    """Learn from consecutive frames; see `IncrementalFeature.update`.
 
     What is faster is chosen by the number of inputs; `by` is "by_frame" or "by_gram" to say which.
     """
@@ -371,7 +371,7 @@ def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
 
 
 def recursive_update(state: Struct, frames: Any, gap: bool) -> FloatArray:
-    """Learn from consecutive frames; see `RecursiveSFA.update`."""
+    """Learn from consecutive frames; see `RecursiveFeature.update`."""
     x = frames_of(frames, state.pointer.inputs)
     change = np.empty(x.pointer.n)
     code = lib.recursive_update(state.pointer, x.pointer, bool(gap), _buffer("double[]", change))

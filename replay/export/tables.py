@@ -1,6 +1,7 @@
 """A run's signals as a table that other tools read: a row an iteration, a column a signal.
 
-Every table is made from the one table of signals. Parquet and Arrow carry each signal's
+Every table is made from the one table of signals. What is missing is null in Parquet and Arrow,
+and NaN in npz and CSV. Parquet and Arrow carry each signal's
 symbol, equation, unit and dimensions as the column's metadata, and the run's configuration as
 the table's; npz has both as JSON in the arrays `_signals` and `_run`, CSV in a file beside it as
 the W3C's "CSV on the Web" has it.
@@ -11,6 +12,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -61,14 +63,27 @@ def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> i
         return rows
 
 
-def _arrow_schema(header: RunHeader) -> pa.Schema:
+def signals_table(run: Path, names: Sequence[str] = tuple(SIGNALS)) -> pa.Table:
+    """Some signals of a run as an Arrow table, a row an iteration; what is missing is null.
+
+    Raises:
+        UsageError: no such run.
+        LogDamagedError: the run cannot be read.
+    """
+    header = read_header(run)
+    schema = _arrow_schema(header, names)
+    return pa.Table.from_batches(_batches(run, header, schema), schema)
+
+
+def _arrow_schema(header: RunHeader, names: Sequence[str] = tuple(SIGNALS)) -> pa.Schema:
     """The table's columns, nested one list a dimension, with what each signal is."""
     fields = []
-    for signal in SIGNALS.values():
+    for signal in map(SIGNALS.__getitem__, names):
         kind = _ARROW[signal.dtype]
         for _ in signal.dims:
             kind = pa.list_(kind)
-        fields.append(pa.field(signal.name, kind, nullable=False, metadata=_about(signal)))
+        missing = signal.dtype == "float64" and not signal.dims
+        fields.append(pa.field(signal.name, kind, nullable=missing, metadata=_about(signal)))
     about = {f"cdmisfa.{name}": value for name, value in _run(header).items()}
     return pa.schema(fields, metadata=about)
 
@@ -86,13 +101,19 @@ def _run(header: RunHeader) -> dict[str, str]:
 
 
 def _nested(values: NDArray[Any]) -> pa.Array:
-    """(n, ...) values as n rows of nested lists."""
-    array: pa.Array = pa.array(values.reshape(-1))
+    """(n, ...) values as n rows of nested lists, NaN as null."""
+    array: pa.Array = pa.array(values.reshape(-1), from_pandas=True)
     for dim in range(values.ndim - 1, 0, -1):
         lists = math.prod(values.shape[:dim])
         offsets = np.arange(lists + 1, dtype=np.int32) * values.shape[dim]
         array = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), array)
     return array
+
+
+def _batches(run: Path, header: RunHeader, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
+    for piece in read_columns(run, header):
+        arrays = [_nested(piece[name]) for name in schema.names]
+        yield pa.RecordBatch.from_arrays(arrays, schema=schema)
 
 
 def _write_batches(run: Path, header: RunHeader, out: Path, form: str) -> int:
@@ -102,10 +123,9 @@ def _write_batches(run: Path, header: RunHeader, out: Path, form: str) -> int:
     else:
         writer = pa.ipc.new_file(str(out), schema)
     with writer:
-        for piece in read_columns(run, header):
-            arrays = [_nested(piece[name]) for name in SIGNALS]
-            writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
-            rows += len(piece)
+        for batch in _batches(run, header, schema):
+            writer.write_batch(batch)
+            rows += len(batch)
     return rows
 
 

@@ -81,7 +81,7 @@ def change(weights: FloatArray, before: FloatArray, variance: FloatArray) -> flo
 
 
 def update(state: RecursiveState, frames: FloatArray, gap: bool, window: int) -> FloatArray:
-    """Learn from consecutive frames of values; what `RecursiveSFA.update` returns."""
+    """Learn from consecutive frames of values; what `RecursiveFeature.update` returns."""
     out = np.full(len(frames), np.nan)
     for start in range(0, len(frames), PIECE):
         piece = frames[start : start + PIECE]

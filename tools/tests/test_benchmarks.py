@@ -178,7 +178,7 @@ def test_recursive() -> None:
     mixing = np.random.default_rng(0).standard_normal((5, 300))
     frames = np.sin(np.arange(120)[:, None] * np.array([0.05, 0.21, 0.5, 0.9, 1.4])) @ mixing
     frames.flags.writeable = False
-    ours, plain = recursive.RecursiveSFA(300, 5), recursive.PlainNumpy(300, 5)
+    ours, plain = recursive.RecursiveFeature(300, 5), recursive.PlainNumpy(300, 5)
     for start in range(0, 120, 40):
         ours.update(frames[start : start + 40])
         slow = plain.update(frames[start : start + 40])

@@ -155,10 +155,18 @@ def prepare(folder: Path) -> dict[str, Any]:
                     if ran.code not in (0, 3 if "begun" in name else 0):
                         raise Defect(WRONG, "setup", f"{ran.line}: {ran.told()}")
                     if line is kind.learn:
-                        signals[name] = ran.json["signals_sha256"]
+                        signals[name] = {ran.json["signals_sha256"], *_shorter(line, place, out)}
                     shutil.rmtree(place)
                     shutil.rmtree(out, ignore_errors=True)
     return {"folder": folder, "signals": signals}
+
+
+def _shorter(line: Line, place: Path, out: Path) -> list[str]:
+    """The signals of fewer iterations: a log that was cut short has no more, and that is said."""
+    words = line(place, out)
+    if "--resume" in words:
+        return []
+    return [here(*words, "--max-iterations", n).json["signals_sha256"] for n in (1, 2)]
 
 
 def case(job: Job) -> Outcome:
@@ -179,9 +187,9 @@ def case(job: Job) -> Outcome:
     line = job.rng.choice((*kind.lines, *([kind.learn] * 2 if kind.learn else ())))
     ran = here(*line(place, out))
     outcomes.append(judge(ran, name))
-    learned = ran.json["signals_sha256"] if line is kind.learn and ran.code == 0 else None
     exchanged = "replaced" in done and name in UNNAMED
-    if not exchanged and learned not in (None, job.given["signals"].get(name)):
+    learned = line is kind.learn and ran.code == 0 and not exchanged
+    if learned and ran.json["signals_sha256"] not in job.given["signals"][name]:
         raise Defect(MIXED, name, f"{done}: {ran.line}: other signals, no error")
     return worst(outcomes)
 

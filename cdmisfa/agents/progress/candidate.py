@@ -13,7 +13,7 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.learning import overwrite
 from cdmisfa.features.outputs import slowness_by_moments, window_rate
-from cdmisfa.features.recursive import RecursiveSFA, RecursiveState
+from cdmisfa.features.recursive import RecursiveFeature, RecursiveState
 
 WHITE_NOISE = math.sqrt(2.0) / (2.0 * math.pi)
 """Slowness of white noise."""
@@ -69,7 +69,7 @@ class Candidate:
         y: (n, J) outputs on the last block, before any of it was learned from; NaN without.
         blocks: blocks learned from.
         tests: blocks tested before they were learned from.
-        change: mean change of the outputs with a block, see `RecursiveSFA.update`.
+        change: mean change of the outputs with a block, see `RecursiveFeature.update`.
         regret: log of the slowness that the outputs of some time ago have now, over that of
             today's: 0 where nothing was gained since.
         errors: (ERRORS,) learning error of the last blocks, the newest last; NaN before.
@@ -78,7 +78,7 @@ class Candidate:
     def __init__(
         self, n_inputs: int, components: int, outputs: int, window: int, test_window: int
     ) -> None:
-        self.sfa = RecursiveSFA(n_inputs, components, outputs, window)
+        self.sfa = RecursiveFeature(n_inputs, components, outputs, window)
         n_outputs = len(self.sfa.state.weights)
         self.test_window = test_window
         self.blocks = self.tests = self._reference_age = 0

@@ -205,7 +205,7 @@ def gives(
         module: frozen.
         candidate: tells by the statistics of its stream.
         config: what is slow.
-        frames: (n, I) the last block of the stream, see `RecursiveSFA.compare`.
+        frames: (n, I) the last block of the stream, see `RecursiveFeature.compare`.
     """
     marks = np.zeros((2, TOGETHER), np.int64)
     for row, slow in zip(marks, (module.slow, slow_outputs(candidate, config)), strict=True):

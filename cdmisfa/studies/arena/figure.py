@@ -35,11 +35,21 @@ def draw_figure(document: Mapping[str, Any], folder: Path) -> list[Path]:
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(2, 2, 4.4, 3.3)
         curves, slowness, told, order = axes.ravel()
-        _draw_curves(curves, plain)
+        shared = _shared(plain)
+        _draw_curves(curves, shared)
         _draw_slowness(slowness, mine)
         _draw_blocks(told, _told(mine), "blocks until noise is told")
-        _draw_blocks(order, _spent(plain), "share of blocks on what cannot be learned")
+        _draw_blocks(order, _spent(shared), "share of blocks on what cannot be learned")
         return save_figure(figure, folder, "arena")
+
+
+def _shared(entries: Sequence[Entry]) -> list[Entry]:
+    """Results on the sets that every learner was on, or all where there is no such set."""
+    sets: dict[str, set[str]] = {}
+    for entry in entries:
+        sets.setdefault(entry["point"]["learner"], set()).add(entry["point"]["set"])
+    common = set.intersection(*sets.values())
+    return [entry for entry in entries if entry["point"]["set"] in common] or list(entries)
 
 
 def conditions(entry: Entry) -> str:
@@ -48,28 +58,27 @@ def conditions(entry: Entry) -> str:
     return ", ".join(f"{k}={v}" for k, v in more.items())
 
 
-def colour(learner: str) -> Any:
-    """Of a learner: black of the first, and then one after the other."""
-    names = list(CONTESTANTS)
-    place = names.index(learner) if learner in names else 0
-    return tuple(part / 255 for part in CYCLE[(place - 1) % len(CYCLE)]) if place else "black"
+DASHES: Final = ("-", "--", ":", "-.")
+"""Of lines, by how often their colour was there before."""
 
 
 def _draw_curves(panel: Any, entries: Sequence[Entry]) -> None:
     """The share learned by frames seen, a line a learner: mean over the sets it was run on."""
     last = max((e["curve"]["frames"][-1] for e in entries if e["curve"]["frames"]), default=1e4)
     at = np.geomspace(1000, last, POINTS)
-    for learner in dict.fromkeys(entry["point"]["learner"] for entry in entries):
+    learners = dict.fromkeys(entry["point"]["learner"] for entry in entries)
+    for place, learner in enumerate(learners):
         curves = [e["curve"] for e in entries if e["point"]["learner"] == learner]
         found = [np.interp(at, c["frames"], c["mean"]) for c in curves if c["frames"]]
         if found:
-            line = "-" if learner == DEFAULT else "--"
-            label = f"{learner} ({len(found)} sets)"
-            panel.plot(at, np.mean(found, axis=0), line, color=colour(learner), label=label)
+            again, which = divmod(place, len(CYCLE))
+            rgb = tuple(part / 255 for part in CYCLE[which])
+            dash = DASHES[again % len(DASHES)]
+            panel.plot(at, np.mean(found, axis=0), dash, color=rgb, label=learner)
     panel.set_xscale("log")
     panel.set_ylim(-0.03, 1.03)
     panel.set_xlabel("frames seen")
-    panel.set_ylabel("share learned")
+    panel.set_ylabel(f"share learned, {len({e['point']['set'] for e in entries})} sets")
     if panel.get_lines():
         panel.legend(fontsize=6)
 
@@ -94,7 +103,7 @@ def _told(entries: Sequence[Entry]) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for entry in entries:
         for stream, blocks in entry["told"].items():
-            found.setdefault(stream, []).extend(blocks)
+            found.setdefault(stream.partition("#")[0], []).extend(blocks)
     return found
 
 

@@ -17,7 +17,7 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.results import correlation, stays_above
-from cdmisfa.features.incsfa import IncSFA
+from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
 from cdmisfa.studies import pages
 from cdmisfa.studies.paper import icub
@@ -100,7 +100,7 @@ class Difficulty(Experiment):
         """Frames until IncSFA's slowest output stays in the direction of batch SFA's."""
         task = _task(settings["scene"], settings["stream"], settings["recording"])
         rng = np.random.default_rng(np.random.SeedSequence(settings["seed"]))
-        sfa = IncSFA(task.config, task.frames.shape[1], rng)
+        sfa = IncrementalFeature(task.config, task.frames.shape[1], rng)
         cosines = []
         for start in range(0, len(task.frames) - STEP + 1, STEP):
             sfa.update(task.frames[start : start + STEP])
