@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from cdmisfa.modules import Module as Module
     from recorder.cameras.stepped import ArraySource as ArraySource
     from recorder.cameras.stepped import GymSource as GymSource
+    from recorder.images.recipe import Recipe as Recipe
+    from recorder.images.recipe import make_frame as make_frame
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
 
     __version__: str
@@ -50,6 +52,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.estimators.batches": "IncSFA RecursiveSFA",
         "cdmisfa.experiments.loop": "learn",
         "recorder.cameras.stepped": "ArraySource GymSource",
+        "recorder.images.recipe": "Recipe make_frame",
         "recorder.world.oscillatory": "OscillatorySource",
         "cdmisfa.experiments.recompute": "Run",
     },
