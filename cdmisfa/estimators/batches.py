@@ -34,8 +34,10 @@ except ImportError:
             )
 else:
 
-    class _Estimator(  # type: ignore[no-redef, misc]
-        ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
+    class _Estimator(  # type: ignore[no-redef]
+        ClassNamePrefixFeaturesOutMixin,  # type: ignore[misc]
+        TransformerMixin,  # type: ignore[misc]
+        BaseEstimator,  # type: ignore[misc]
     ):
         pass
 
@@ -50,6 +52,7 @@ class _SlowFeatures(_Estimator):
     n_components: int
     n_whitened: int
     window: int
+    _feature: Any
 
     def fit(self, X: Any, y: Any = None) -> Self:
         """Learn from one sequence, and forget what was learned before.
@@ -100,12 +103,12 @@ class _SlowFeatures(_Estimator):
     @property
     def components_(self) -> FloatArray:
         """(n_components, I) weights of the centred sample; 0 where too few samples were seen."""
-        return self._feature.phi.copy()
+        return np.array(self._feature.phi)
 
     @property
     def mean_(self) -> FloatArray:
         """(I,) mean of the samples, over the window."""
-        return self._feature.mean.copy()
+        return np.array(self._feature.mean)
 
     def __sklearn_is_fitted__(self) -> bool:
         return "_feature" in vars(self)
@@ -128,7 +131,7 @@ class _SlowFeatures(_Estimator):
             raise ValueError(f"X holds {largest:g}, more than {LARGEST_VALUE:g}: scale it")
         if first:
             self._check(X.shape[1])
-            self._feature: Any = self._begin(X.shape[1])
+            self._feature = self._begin(X.shape[1])
             self.n_samples_seen_ = 0
         for x in _chunks(X):
             self._feature.update(x, gap)
@@ -187,7 +190,7 @@ class RecursiveSFA(_SlowFeatures):
     @property
     def slowness_(self) -> FloatArray:
         """(n_components,) in cycles a sample, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN: no such yet."""
-        return self._feature.state.spectrum[: self._n_features_out].copy()
+        return np.array(self._feature.state.spectrum[: self._n_features_out])
 
     def inverse_transform(self, Y: Any) -> FloatArray:
         """The samples that outputs tell of, with the least mean square error over those learned.
@@ -206,7 +209,8 @@ class RecursiveSFA(_SlowFeatures):
         Y, state = np.asarray(Y, np.float64), self._feature.state
         if Y.ndim != 2 or Y.shape[1] != self._n_features_out:
             raise ValueError(f"Y of shape {Y.shape} given: give (n, {self._n_features_out})")
-        return multiply(multiply(Y, state.weights * state.variance), state.basis) + state.mean
+        patterns = multiply(state.weights * state.variance, state.basis)
+        return np.asarray(multiply(np.ascontiguousarray(Y), patterns) + self.mean_)
 
     def _begin(self, n_features: int) -> Feature:
         whitened = min(self.n_whitened, n_features)
@@ -257,6 +261,10 @@ class IncSFA(_SlowFeatures):
         self.nu = nu
         self.window = window
         self.random_state = random_state
+
+    _moments: FloatArray
+    _measured: int
+    _last: FloatArray
 
     @property
     def slowness_(self) -> FloatArray:

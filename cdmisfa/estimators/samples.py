@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import isfinite, nan
-from numbers import Real
+from math import nan
 from typing import Any, Self
 
 import numpy as np
@@ -96,4 +95,5 @@ class OnlineSFA(Transformer):  # type: ignore[misc]
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and isfinite(value) and abs(value) <= LARGEST_VALUE
+    real = isinstance(value, int | float | np.number | np.bool_)
+    return real and bool(abs(value) <= LARGEST_VALUE)  # a NaN is not
