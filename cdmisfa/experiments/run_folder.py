@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ class RunResult:
         source: what it learned from, described.
         modules: what was learned, in order.
         summary: what else the learner says of itself.
+        held_out: how slow it is on frames that were held out; see `judged`.
         ended: why, a key of `ENDINGS`.
         undecided: streams of which the learner had not come to a result when it ended.
     """
@@ -58,6 +59,7 @@ class RunResult:
     signals_sha256: str
     modules: tuple[Module, ...]
     summary: Mapping[str, Any]
+    held_out: Mapping[str, Any] | None
     ended: str
     undecided: tuple[str, ...]
 
@@ -73,9 +75,18 @@ class RunResult:
             "signals_sha256": self.signals_sha256,
             "modules": [module_table(module) for module in self.modules],
             **self.summary,
+            **({"held_out": dict(self.held_out)} if self.held_out else {}),
             "ended": self.ended,
             "undecided": list(self.undecided),
         }
+
+
+def undecided(learner: Learner, source: FrameSource, summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """The streams that are still being learned, or, where a learner says none, without a module."""
+    if "streams" in summary:
+        return tuple(one["stream"] for one in summary["streams"] if one["state"] == "learning")
+    learned = {module.stream_index for module in learner.modules}
+    return tuple(name for s, name in enumerate(source.spec.streams) if s not in learned)
 
 
 def module_table(module: Module) -> dict[str, Any]:
@@ -90,6 +101,11 @@ def module_table(module: Module) -> dict[str, Any]:
         "slow": [bool(slow) for slow in module.slow],
         "recipe": None if module.recipe is None else module.recipe.as_json(),
     }
+
+
+def in_words(changed: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Values before and now, by name, in words."""
+    return [f"{name} is {now}, was {before}" for name, (before, now) in changed.items()]
 
 
 def with_recipes(
