@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.mcap.reader import LogReader
+from recorder.mcap.records import no_log
 from replay.camera_logs.opening import (
     ALL,
     WHOLE_FILES,
@@ -198,7 +199,7 @@ def refuse_what_is_no_log(path: Location) -> None:
     elif only_foreign(path) or ".mcap" in path.suffixes:  # the latter is a damaged log
         run = False
     else:
-        raise UsageError(f"{path} is no MCAP file: name a recording, or logs of cameras")
+        raise no_log(path)
     if run:
         raise _a_run(path)
 
