@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from cdmisfa.public.run import Run as Run
     from recorder.cameras.stepped import ArraySource as ArraySource
     from recorder.cameras.stepped import GymSource as GymSource
+    from recorder.images.recipe import Recipe as Recipe
+    from recorder.images.recipe import make_frame as make_frame
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
 
     __version__: str
@@ -47,6 +49,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.public.recording": "Recording",
         "cdmisfa.public.run": "Run",
         "recorder.cameras.stepped": "GymSource",
+        "recorder.images.recipe": "Recipe make_frame",
     },
     beside={
         "cdmisfa.agents.learner": "CuriousLearner",

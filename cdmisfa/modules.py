@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from cdmisfa import kernels
 from cdmisfa.core.blocks import PIXEL, UINT8, as_array
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, expanded_size
+
+if TYPE_CHECKING:  # the mind knows no images: who saves a module adds how they became frames
+    from recorder.images.recipe import Recipe
 
 CHUNK = 1024
 """Frames that are turned into values at once."""
@@ -44,6 +47,8 @@ class Module:
             modules.npz is from before that was kept.
         slow: (J,) 1 where an output is slow on frames that it had not learned from, 0 where it is
             not; empty but for the progress learner.
+        recipe: what became of a raw picture before; None where nobody said it: of a learner in
+            memory, and in modules.npz from before that was kept, where a run still says it.
     """
 
     index: int
@@ -62,15 +67,17 @@ class Module:
     scale: float = PIXEL
     frame_shape: tuple[int, ...] = ()
     slow: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    recipe: Recipe | None = None
 
     def transform(
         self, frames: Any, outputs: int | slice | Sequence[int] | None = None
     ) -> NDArray[np.float64]:
-        """Outputs on frames, y = phi (x - mean), the same bits on every machine.
+        """Outputs on frames or raw pictures, y = phi (x - mean), the same bits on every machine.
 
         Args:
             frames: (n, *frame_shape), or these as rows (n, I), uint8 or values; it scales the
-                former and expands both as it learned them.
+                former and expands both as it learned them. Where it has a recipe, pictures of any
+                size as the source gave them, too; see `make_frame`.
             outputs: which of the outputs, from 0, the slowest first: a number of one, a slice, or
                 a list of some; all where it is not given.
 
@@ -79,12 +86,19 @@ class Module:
             it recorded as y_frozen.
 
         Raises:
-            UsageError: these are no frames as it learned from, or it has no such outputs.
+            UsageError: these are no frames as it learned from, a value is no finite number, or it
+                has no such outputs.
         """
-        array = as_array(frames)
+        array = self._frames(frames)
         if array.dtype != UINT8 and array.dtype.kind != "f":
             raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float values")
         rows, expansion = self._rows(array)
+        if rows.dtype != UINT8 and not np.isfinite(rows).all():
+            row, place = (int(found[0]) for found in np.nonzero(~np.isfinite(rows)))
+            raise UsageError(
+                f"frame {row} holds {rows[row, place]} at place {place}, which is no finite "
+                "number: leave it out, or fill it in"
+            )
         if rows.dtype != UINT8 or self.scale != PIXEL:
             rows = rows.astype(np.float64)
         phi = np.ascontiguousarray(self._chosen(outputs), np.float64)
@@ -94,6 +108,21 @@ class Module:
             x = expand(expansion, rows[start : start + CHUNK])
             y[start : start + CHUNK] = kernels.outputs(phi, offset, x)
         return y
+
+    def _frames(self, given: Any) -> NDArray[Any]:
+        """Frames as they were given, or made of raw pictures."""
+        if self.recipe is None:
+            return as_array(given)
+        own = self.frame_shape
+        try:
+            array = np.asarray(given)
+        except ValueError:  # of several sizes
+            return self.recipe.frames(given)
+        shaped = array.shape[1:] in (own, (prod(own),)) or array.shape == own
+        bounded = self.recipe.size is None and self.recipe.range is not None
+        if shaped and (array.dtype == UINT8 or array.dtype.kind == "f") and not bounded:
+            return array
+        return self.recipe.frames(array if array.dtype.kind in "biuf" else given)
 
     def _chosen(self, outputs: int | slice | Sequence[int] | None) -> NDArray[np.float64]:
         """The weights of some outputs, see `transform`."""

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.mcap.reader import LogReader
-from replay.camera_logs.arrays import ENDINGS, ArrayLog, are_arrays, open_arrays
+from replay.arrays import ENDINGS, ArrayLog, are_arrays, open_arrays
 from replay.camera_logs.opening import (
     ALL,
     WHOLE_FILES,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 from cdmisfa.core.blocks import Block, ClockedSource, check_request
-from cdmisfa.core.errors import LogExhaustedError
+from cdmisfa.core.errors import LogExhaustedError, UsageError
 
 Span = tuple[int, int]
 """The frames [start, stop)."""
@@ -19,9 +20,11 @@ class StoredSource(ClockedSource):
     A class that derives from it sets `_spec`, `gaps` and, with gaps, `_held`, and has `describe`.
 
     Attributes:
+        held_out: frames at the end that `take` does not give; see `hold_out`.
         more: what else than to begin again can be done where there are too few frames, in words.
     """
 
+    held_out: int = 0
     more: ClassVar[str] = ""
     _loop: bool
     _first: int = 0
@@ -38,6 +41,34 @@ class StoredSource(ClockedSource):
     def first_frame(self) -> int:
         """Number of the first frame."""
         return self._first
+
+    @property
+    def end(self) -> int:
+        """The frame after the last that `take` gives, of the first lap."""
+        return self._first + self._count - self.held_out
+
+    def hold_out(self, count: int) -> None:
+        """Keep the last frames from `take`: what is learned is judged on them, see `pieces`.
+
+        Raises:
+            UsageError: it loops, or no frame would be left.
+        """
+        if self._loop or not 0 <= count < self._count:
+            raise UsageError(f"{self._name()}: no {count} frames of {self._count} can be held out")
+        self.held_out = count
+        self._spec = replace(self._spec, length=self._count - count)
+
+    def pieces(self, stream: int, start: int, stop: int, n: int) -> Iterator[Block]:
+        """What a stream shows of the frames [start, stop), in blocks of n or fewer.
+
+        Those held out are among them; the clock stays.
+
+        Raises:
+            LogDamagedError: what is kept is damaged.
+        """
+        for low, high in self.spans(stream, start, stop):
+            for t in range(low, high, n):
+                yield self._block(stream, t, min(n, high - t))
 
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a stream shows at t .. t+n-1; moves t by n.
@@ -64,7 +95,7 @@ class StoredSource(ClockedSource):
         """
         check_request(self._spec, 0, n)
         stop = self._t + n
-        if not self._loop and stop > self._first + self._count:
+        if not self._loop and stop > self.end:
             raise self._exhausted(n)
         blocks = tuple(
             self._block(stream, low, high - low)
@@ -89,7 +120,7 @@ class StoredSource(ClockedSource):
         """
         if t < self._first:
             raise ValueError(f"frame {t} lies before the first, {self._first}")
-        end = self._first + self._count
+        end = self.end
         if not self._loop and t > end:
             raise LogExhaustedError(
                 f"{self._name()}: it ends at frame {end}, before frame {t}; begin again at its end "
@@ -108,18 +139,19 @@ class StoredSource(ClockedSource):
     def _unbroken(self, stream: int, n: int) -> int:
         """Where the next n frames of a stream begin that follow one another."""
         # Looping, a stretch that holds them is in the rest of this lap or in the next two.
-        end = self._t + 3 * self._count + n if self._loop else self._first + self._count
+        end = self._t + 3 * self._count + n if self._loop else self.end
         for low, high in self.spans(stream, self._t, end):
             if high - low >= n:
                 return low
         raise self._exhausted(n)
 
     def _exhausted(self, n: int) -> LogExhaustedError:
-        left = max(self._first + self._count - self._t, 0)
+        left = max(self.end - self._t, 0)
         unbroken = " without a gap" if self.gaps else ""
+        held = f", before {self.held_out} held out" if self.held_out else ""
         return LogExhaustedError(
-            f"{self._name()}: {left} frames are left at frame {self._t}, {n} are needed{unbroken}; "
-            f"{self.more}begin again at its end with --loop"
+            f"{self._name()}: {left} frames are left at frame {self._t}{held}, {n} are needed"
+            f"{unbroken}; {self.more}begin again at its end with --loop"
         )
 
 

@@ -21,7 +21,7 @@ from cdmisfa import Recording, Run, learn
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.recompute import check_run
 from cdmisfa.testing.sources import SourceContract
-from replay.camera_logs.arrays import ArrayLog
+from replay.arrays import ArrayLog
 from replay.camera_logs.options import CameraOptions
 
 ROOT = Path(__file__).parents[1]
@@ -255,3 +255,21 @@ def test_the_page_s_python_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert abs(np.corrcoef(found["slowest"][:, 0], found["frames"][:, 0])[0, 1]) > 0.9
     assert len(found["rewards"]) == 50
     assert found["left"].shape == (100, 48, 128)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
+def test_modules_take_the_pictures_that_they_learned_from(kind: Any) -> None:
+    t = np.arange(3000)
+    drift = 128 + 100 * np.sin(t / 60)[:, None, None] * np.linspace(0, 1, 40)[None, :, None]
+    shown = (drift + np.zeros((1, 1, 60))).astype(np.uint8)
+    given = {
+        np.uint8: shown,
+        np.uint16: shown.astype(np.uint16) << 8,
+        np.float64: shown / 255,
+    }[kind]
+    recording = Recording(given, size=(20, 30))
+    run = learn(recording)
+    (module, *_) = run.modules
+    frames = recording.frames()
+    assert frames.shape == (3000, 20, 30)
+    assert np.array_equal(module.transform(given[:90]), module.transform(frames[:90]))

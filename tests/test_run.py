@@ -135,6 +135,7 @@ def test_the_json_of_a_result_and_the_manifest(tmp_path: Path) -> None:
     assert document["frames"] == 100 * document["iterations"]
     (module,) = document["modules"]
     assert len(module.pop("eta")) == 1
+    assert (module.pop("recipe")["shape"], module.pop("slow")) == ([2], [])
     assert module == {
         "index": 1,
         "stream": "x1",

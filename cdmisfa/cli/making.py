@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar, cast
 import click
 
 from cdmisfa.core.options import RANGE, SIZE, TIME, option_name
+from recorder.images.options import Color
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -40,6 +41,17 @@ class GroupedCommand(click.Command):
     def __init__(self, *args: Any, common: Sequence[str], **how: Any) -> None:
         super().__init__(*args, **how)
         self._common = common
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """See `click.Command`; what follows a `Switch` and is none of its words is an argument."""
+        for param in self.params:
+            if isinstance(kind := param.type, Switch):
+                pairs = zip(args, [*args[1:], ""], strict=True)
+                args = [
+                    f"{word}=on" if word in param.opts and after not in kind.choices else word
+                    for word, after in pairs
+                ]
+        return super().parse_args(ctx, args)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """See `click.Command`."""
@@ -75,6 +87,17 @@ class WholeRange(click.IntRange):
         except ValueError:
             self.fail(f"{value!r} is no whole number", param, ctx)
         return super().convert(value, param, ctx)
+
+
+class Switch(click.Choice[str]):
+    """On, off, or what else there is; an option of it that stands alone is on."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """See `click.ParamType`."""
+        if isinstance(value, bool):
+            return value
+        found = super().convert(value, param, ctx)
+        return {"on": True, "off": False}.get(found, found)
 
 
 class FiniteRange(click.FloatRange):
@@ -235,6 +258,8 @@ def option_of(
         of["type"] = click.Choice(typing.get_args(kind))
     elif kind is bool:
         of = {"is_flag": True}
+    elif kind == Color:
+        of = {"type": Switch(["on", "off", "auto"]), "is_flag": False, "flag_value": "on"}
     elif typing.get_origin(kind) is tuple:
         of = {"multiple": True}
     elif kind in (int, float):

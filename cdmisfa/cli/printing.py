@@ -106,6 +106,8 @@ def say_about(source: FrameSource) -> None:
     """Say on stderr what the user should know of a source, and how images became frames."""
     for warning in getattr(source, "warnings", ()):
         warn(warning)
+    for note in getattr(source, "notes", ()):
+        tell(note)
     for name, shape in getattr(source, "shapes", {}).items():
         if "," in shape:  # not the image itself
             tell(f"{name}: {shape}")
@@ -165,6 +167,8 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
     if unknown:
         said = "whether images change their size shows when they are read"
         print_line(f"{said}: {' '.join(unknown)}")
+    for note in source.notes:
+        tell(note)
     for warning in warnings:
         warn(warning)
 
@@ -200,6 +204,15 @@ def slownesses(eta: Sequence[float], slow: Sequence[int]) -> str:
     )
 
 
+def print_held_out(found: Mapping[str, Any]) -> None:
+    """Print how slow modules are on frames that were held out, beside batch SFA."""
+    start, stop = found["frames"]
+    print_line(f"slowness on the frames {start} to {stop - 1}, which were held out:")
+    for one in found["modules"]:
+        own, batch = (slownesses(one[key], ()) for key in ("slowness", "of_batch"))
+        print_line(f"module {one['module']} of {one['stream']}: {own}; batch SFA: {batch}")
+
+
 def print_result(result: RunResult, *, as_json: bool) -> None:
     """Print what a run came to."""
     from cdmisfa.core.signals import ACTIONS
@@ -232,6 +245,8 @@ def print_result(result: RunResult, *, as_json: bool) -> None:
             print_line(outcome_line(outcome))
     elif result.undecided:
         print_line(f"not decided: {', '.join(result.undecided)}")
+    if result.held_out and result.modules:
+        print_held_out(result.held_out)
     print_line(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
     print_line(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:

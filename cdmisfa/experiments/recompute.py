@@ -36,6 +36,7 @@ from replay.runs.folders import run_log
 from replay.runs.keyframes import arrays_of, read_keyframe, read_keyframes
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.run import other_files, stated_source
+from replay.stored import StoredSource
 
 SAME = ("frame_shape", "dtype", "fps", "start_ns")
 """What besides its streams a source must have in common with the one that a run learned from."""
@@ -311,6 +312,9 @@ class Recomputation:
                 f"{' '.join(self._words) or 'its source'} shows other streams than {self.log} was "
                 "learned from: name its source with --source"
             )
+        held_out = self.header.manifest["source"].get("held_out", 0)
+        if held_out and isinstance(source, StoredSource):
+            source.hold_out(held_out)
         return source
 
 

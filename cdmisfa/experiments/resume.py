@@ -44,6 +44,7 @@ OPTIONS = (
     "loop",
     "salvage",
     "follow",
+    "holdout",
     *CAMERAS,
     "max_iterations",
     "max_modules",
@@ -92,6 +93,7 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
         for name, value in kept.items()
         if name in OPTIONS
     }
+    options.setdefault("holdout", 0.0)  # begun when nothing was held out
     preset = options.get("preset")
     if preset is not None and str(preset).endswith(".toml"):
         options["preset"] = found_path(str(preset), run)

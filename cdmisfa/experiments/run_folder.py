@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from cdmisfa.experiments.documents import machine, versions, write_json
 from cdmisfa.experiments.resume import COMMAND, FORK, SET_ASIDE
 from cdmisfa.modules import Module
 from recorder.cameras.words import PACKAGES
+from recorder.images.recipe import Recipe
 from recorder.log.files import (
     held,
     logs_in,
@@ -27,6 +28,8 @@ from recorder.log.files import (
     refuse_special,
 )
 from recorder.world.scenes import SCENES, scene_of
+from replay.camera_logs.source import ForeignSource
+from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.modules import save_modules
 from replay.runs.run import final_record
@@ -42,6 +45,7 @@ class RunResult:
         source: what it learned from, described.
         modules: what was learned, in order.
         summary: what else the learner says of itself.
+        held_out: how slow it is on frames that were held out; see `judged`.
         ended: why, a key of `ENDINGS`.
         undecided: streams of which the learner had not come to a result when it ended.
     """
@@ -55,6 +59,7 @@ class RunResult:
     signals_sha256: str
     modules: tuple[Module, ...]
     summary: Mapping[str, Any]
+    held_out: Mapping[str, Any] | None
     ended: str
     undecided: tuple[str, ...]
 
@@ -70,9 +75,18 @@ class RunResult:
             "signals_sha256": self.signals_sha256,
             "modules": [module_table(module) for module in self.modules],
             **self.summary,
+            **({"held_out": dict(self.held_out)} if self.held_out else {}),
             "ended": self.ended,
             "undecided": list(self.undecided),
         }
+
+
+def undecided(learner: Learner, source: FrameSource, summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """The streams that are still being learned, or, where a learner says none, without a module."""
+    if "streams" in summary:
+        return tuple(one["stream"] for one in summary["streams"] if one["state"] == "learning")
+    learned = {module.stream_index for module in learner.modules}
+    return tuple(name for s, name in enumerate(source.spec.streams) if s not in learned)
 
 
 def module_table(module: Module) -> dict[str, Any]:
@@ -85,7 +99,34 @@ def module_table(module: Module) -> dict[str, Any]:
         "policy": module.policy.tolist(),
         "eta": module.eta.tolist(),
         "slow": [bool(slow) for slow in module.slow],
+        "recipe": None if module.recipe is None else module.recipe.as_json(),
     }
+
+
+def in_words(changed: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Values before and now, by name, in words."""
+    return [f"{name} is {now}, was {before}" for name, (before, now) in changed.items()]
+
+
+def with_recipes(
+    modules: Iterable[Module], source: FrameSource, described: Mapping[str, Any]
+) -> tuple[Module, ...]:
+    """Modules with what becomes of a raw picture of their streams.
+
+    Args:
+        modules: what was learned.
+        source: from what; of a recording that is what was recorded.
+        described: what it says of itself.
+    """
+    if isinstance(source, RecordedSource):
+        described = source.origin()
+
+    def recipe(stream: int) -> Recipe:
+        own = Recipe.of(described, source.spec.frame_shape, stream)
+        stated = source.pixels(stream) if isinstance(source, ForeignSource) else ""
+        return replace(own, pixels=stated) if stated.startswith("bayer_") else own
+
+    return tuple(replace(module, recipe=recipe(module.stream_index)) for module in modules)
 
 
 class OpenLog(Sink):

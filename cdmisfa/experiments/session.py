@@ -17,6 +17,7 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
+from cdmisfa.experiments.holdout import judged
 from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn_blocks
 from cdmisfa.experiments.names import placed
 from cdmisfa.experiments.recompute import Recomputation, check_run
@@ -36,8 +37,11 @@ from cdmisfa.experiments.resume import (
 from cdmisfa.experiments.run_folder import (
     OpenLog,
     RunResult,
+    in_words,
     opened_log,
+    undecided,
     versions_used,
+    with_recipes,
     write_results,
 )
 from recorder.log.files import folder_here
@@ -300,17 +304,24 @@ class Session:
                     view.earlier(log.path.parent)
             told += sinks
             ended = learn_blocks(self.source, self.learner, told, stop=stop, **self._limits)
+            ended, held_out = self._judged(ended, stop)
             stopped = ended == INTERRUPTED  # then nothing is done that takes as long as the log
             described = description(self.source, at_once=stopped, told=hashing)
-            result = self._result(described, digest.hexdigest(), ended)
+            result = self._result(described, digest.hexdigest(), ended=ended, held_out=held_out)
             if log is not None:
                 stated = {**self.manifest, "versions": self._versions}
                 write_results(log, result, stated, view=rerun and not stopped)
         return result
 
-    def _result(self, described: Mapping[str, Any], signals_sha256: str, ended: str) -> RunResult:
-        learner = self.learner
-        summary = learner.summary()
+    def _judged(self, ended: str, stop: Callable[[], bool]) -> tuple[str, Mapping[str, Any] | None]:
+        if ended == INTERRUPTED:
+            return ended, None
+        config = self.manifest["config"]["learner"]
+        found = judged(self.source, self.learner.modules, config.get("components", 1), stop)
+        return INTERRUPTED if found is None else ended, found
+
+    def _result(self, described: Mapping[str, Any], sha256: str, **ending: Any) -> RunResult:
+        learner, summary = self.learner, self.learner.summary()
         return RunResult(
             run=str(self.folder) if self.folder is not None else None,
             source=described,
@@ -318,11 +329,11 @@ class Session:
             seed=self.manifest["seed"],
             iterations=learner.iteration,
             frames=learner.iteration * learner.tau,
-            signals_sha256=signals_sha256,
-            modules=tuple(learner.modules),
+            signals_sha256=sha256,
+            modules=with_recipes(learner.modules, self.source, described),
             summary=summary,
-            ended=ended,
-            undecided=() if learner.over else _undecided(learner, self.source, summary),
+            **ending,
+            undecided=() if learner.over else undecided(learner, self.source, summary),
         )
 
     def _copy_log(self, log: RunWriter, digest: Digest) -> None:
@@ -339,10 +350,10 @@ class Session:
                 changed = {k: (then.get(k), v) for k, v in now.items() if then.get(k) != v}
                 log.event(t, max(at - 1, 0), f"resumed at iteration {at}")
                 if changed:
-                    log.event(t, max(at - 1, 0), "; ".join(_changes(changed)), "WARNING")
+                    log.event(t, max(at - 1, 0), "; ".join(in_words(changed)), "WARNING")
             else:
                 text = f"fork of {fork['parent']} after {at} iterations"
-                log.event(t, max(at - 1, 0), "; ".join([text, *_changes(fork["changed"])]))
+                log.event(t, max(at - 1, 0), "; ".join([text, *in_words(fork["changed"])]))
                 log.keyframe(keyframe, again=True)
         log.sync()
         if self._resumed:
@@ -350,21 +361,6 @@ class Session:
                 before.unlink()
             except OSError as error:
                 raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
-
-
-def _undecided(
-    learner: Learner, source: FrameSource, summary: Mapping[str, Any]
-) -> tuple[str, ...]:
-    """The streams that are still being learned, or, where a learner says none, without a module."""
-    if "streams" in summary:
-        return tuple(one["stream"] for one in summary["streams"] if one["state"] == "learning")
-    learned = {module.stream_index for module in learner.modules}
-    return tuple(name for s, name in enumerate(source.spec.streams) if s not in learned)
-
-
-def _changes(changed: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Values before and now, by name, in words."""
-    return [f"{name} is {now}, was {before}" for name, (before, now) in changed.items()]
 
 
 def run(

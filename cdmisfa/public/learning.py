@@ -15,9 +15,11 @@ import numpy as np
 from cdmisfa.core.blocks import FrameSource, description
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
+from cdmisfa.experiments.holdout import hold_out
 from cdmisfa.experiments.resume import command_of
 from cdmisfa.experiments.session import run as run_to_its_end
 from cdmisfa.experiments.sources import (
+    OF_CAMERAS,
     Configuration,
     configure_for,
     is_scene,
@@ -30,7 +32,7 @@ from cdmisfa.public.run import Run
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live
 from recorder.images.options import ImageOptions
-from replay.camera_logs.arrays import ArrayLog
+from replay.arrays import ArrayLog
 
 
 def learn(
@@ -42,6 +44,7 @@ def learn(
     max_iterations: int | None = None,
     max_modules: int | None = None,
     preset: str | None = None,
+    holdout: float | None = None,
     loop: bool = False,
     force: bool = False,
     view: bool = False,
@@ -67,6 +70,8 @@ def learn(
         max_modules: end after so many; by default the learner ends by itself, and any learner
             where the source ends.
         preset: settings by name or from a .toml file.
+        holdout: the share of a camera log, at its end, that is kept from the progress learner, to
+            judge on it what was learned; by default a tenth.
         loop: begin logs or arrays again at their end.
         force: replace an existing run.
         view: also write the view, run.rrd.
@@ -86,8 +91,11 @@ def learn(
     if algorithm is not None:
         words.append(f"learner.algorithm={algorithm}")
     how: dict[str, Any] = {"preset": preset, "settings": words, "seed": seed}
-    limits = {"max_iterations": max_iterations, "max_modules": max_modules}
+    limits: dict[str, Any] = {"max_iterations": max_iterations, "max_modules": max_modules}
     with _opened(source, loop, how) as (frames, configuration, told), _folder(out) as folder:
+        by_progress = configuration.learner.algorithm == OF_CAMERAS
+        hold_out(frames, holdout, judged=by_progress)
+        limits["holdout"] = holdout
         run_to_its_end(
             frames,
             configuration.learner,

@@ -15,7 +15,7 @@ from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.resume import CAMERAS
 from cdmisfa.experiments.sources import open_logs
 from cdmisfa.public.shown import Shown, beside, curves, view
-from replay.camera_logs.arrays import ArrayLog
+from replay.arrays import ArrayLog
 from replay.camera_logs.options import CameraOptions
 
 Given: TypeAlias = Any

@@ -126,7 +126,7 @@ def open_live(
         about[PACKAGES] = packages
     if options.depth is not None:
         about["range_metres"] = list(options.depth)
-    frames = CameraFrames(names, options.size, options.fit, color=options.color, say=say)
+    frames = CameraFrames(names, options.size, options.fit, color=bool(options.color), say=say)
     readers = Readers(cameras, frames.frame, on_loss=options.on_loss, stall=options.stall, say=say)
     source = LiveSource(readers, names, about, rate=options.rate, hold=options.hold)
     may_show = [
@@ -143,6 +143,8 @@ def _refuse_inapplicable(
     words: Sequence[str], takes: Sequence[Sequence[str]], options: LiveOptions
 ) -> None:
     """Refuse options that do not apply to the named streams, given what each takes."""
+    if options.color == "auto":
+        raise UsageError(f"{words[0]} is a live stream: --color auto is for logs, give on or off")
     for word, taken in zip(words, takes, strict=True):
         if options.fields and "fields" not in taken:
             raise UsageError(f"{word} {_NO_FIELDS}")
@@ -168,7 +170,7 @@ def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions)
         fit=options.fit,
         fps=options.rate,
         seed=options.seed,
-        color=options.color,
+        color=bool(options.color),
     )
 
 

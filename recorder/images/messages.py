@@ -102,10 +102,13 @@ def image_decoder(
     return None if packet is None else VideoPackets(packet, color=color)
 
 
-def holds_distances(schema: str, encoding: str, data: bytes | memoryview) -> bool:
-    """Whether a message of such a kind holds distances; raises MalformedImage."""
+def pixel_format(schema: str, encoding: str, data: bytes | memoryview) -> str:
+    """The format of pixels that a message of such a kind states, "" of none; raises MalformedImage.
+
+    Of what is compressed it is that of the pixels before.
+    """
     opened = _IMAGES.get((schema, encoding))
-    return opened is not None and opened(data).encoding in DISTANCES
+    return "" if opened is None else opened(data).encoding
 
 
 def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.options import RANGE, SIZE, check_settings, given, option_name, setting
 
 RECIPE: Final = (
@@ -35,6 +36,9 @@ Size = tuple[int, int]
 
 Depth = tuple[float, float]
 """Distances in metres that are shown black and white, or the range that numbers are kept in."""
+
+Color = bool | Literal["auto"]
+"""Whether frames show colours; "auto" looks at a log's first frames."""
 
 Fit = Literal["crop", "pad", "stretch"]
 """How an image of another ratio of the sides becomes a frame: see `fitted`."""
@@ -76,9 +80,10 @@ class ImageOptions:
         name="field",
         group="Images",
     )
-    color: bool = setting(
+    color: Color = setting(
         False,
-        "Show red, green and blue beside one another, as a frame of three times the width.",
+        "Show red, green and blue beside one another, as a frame of three times the width; auto "
+        "does where hue varies in the first frames of a log and brightness does not.",
         group="Images",
     )
     depth: Depth | None = setting(
@@ -92,6 +97,8 @@ class ImageOptions:
 
     def __post_init__(self) -> None:
         check_settings(self)
+        if self.color not in (False, True, "auto"):
+            raise UsageError(f"--color is {self.color}: give on, off or auto")
 
     def given(self) -> tuple[str, ...]:
         """The options of the command line that say other than the defaults."""

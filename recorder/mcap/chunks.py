@@ -265,8 +265,6 @@ def _from_zstd(stored: ByteArray, size: int, cut: bool) -> ByteArray:
             there += n
         if there == size and not cut:
             there += reader.readinto(out[size:].data)
-    if cut and not there:
-        raise ValueError("nothing can be decompressed")
     return out[:there]
 
 

@@ -52,4 +52,4 @@ class CameraOptions(ImageOptions):
     @property
     def reading(self) -> Reading:
         """What is taken of messages and files."""
-        return Reading(self.depth, tuple(self.fields), self.time, self.stamp, self.color)
+        return Reading(self.depth, tuple(self.fields), self.time, self.stamp, self.color is True)

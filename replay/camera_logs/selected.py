@@ -16,7 +16,7 @@ from cdmisfa.core.blocks import stream_name, stream_names
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import VIDEO_RECIPE, Size
-from recorder.images.pixels import Shown
+from recorder.images.pixels import DISTANCES, Shown
 from recorder.images.videos import VideoPackets
 from recorder.images.whole import MalformedImage
 from recorder.mcap.records import MalformedRecord
@@ -88,8 +88,9 @@ class Selected(ImageStream):
         stream, own = self._at(row)
         return stream.where(own)
 
-    def distances(self) -> bool:
-        return any(stream.distances() for stream in self._streams)
+    def pixels(self) -> str | None:
+        stated = [stream.pixels() for stream in self._streams]
+        return next((one for one in stated if one in DISTANCES), stated[0])
 
     def close(self) -> None:
         for stream in self._streams:
@@ -239,8 +240,8 @@ class VideoMessages(Selected):
         self._next = row + 1
         return shown
 
-    def distances(self) -> bool:
-        return False  # known without a message, which may be broken
+    def pixels(self) -> str:
+        return ""  # known without a message, which may be broken
 
     def _begins(self, row: int) -> bool:
         try:
@@ -286,11 +287,11 @@ class WholeImages(Selected):
                 self.broken[near] = error
         raise self.broken[row]
 
-    def distances(self) -> bool:
+    def pixels(self) -> str | None:
         try:
-            return super().distances()
+            return super().pixels()
         except BROKEN:
-            return True  # the image that would tell is broken
+            return None  # the image that would tell is broken
 
     def said(self) -> str | None:
         """A line that counts the broken images met so far; None if there were none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +17,7 @@ from cdmisfa.core.options import option_words
 from recorder.images.fields import rounded
 from recorder.images.framing import framings
 from recorder.images.options import COLOR_RECIPE
-from recorder.images.pixels import Shown, UnknownPixels
+from recorder.images.pixels import DISTANCES, Shown, UnknownPixels
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
@@ -35,6 +36,7 @@ from replay.camera_logs.alignment import (
     unlike,
 )
 from replay.camera_logs.copies import copies
+from replay.camera_logs.hue import CHOSEN, shows_hue
 from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
 from replay.camera_logs.options import Align, CameraOptions
 from replay.camera_logs.selected import (
@@ -75,6 +77,7 @@ class ForeignSource(LoggedSource):
         shapes: for each stream how an image becomes a frame, in words.
         changes: for each stream whose images change their size, or whose numbers are held
             rounded, a line that says so; as soon as one was shown.
+        color: whether frames show colours; see `shows_hue` of "auto".
         warnings: what the user should know: logs that were cut, damage that was left out, images
             that are shown at other times than their own.
     """
@@ -102,6 +105,13 @@ class ForeignSource(LoggedSource):
                 f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in "
                 "seconds after the first image: no image lies between them"
             )
+        if options.color == "auto":
+            how = {"loop": loop, "salvage": salvage, "goal": goal, **chosen, "color": True}
+            with contextlib.closing(type(self)(paths, topics, **how)) as shown:
+                color = shows_hue(shown)
+            self._options = options = replace(options, color=color)
+            self.notes = (CHOSEN[color],)
+        self.color = bool(options.color)
         self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
         self._streams: list[ImageStream] = []
@@ -115,11 +125,15 @@ class ForeignSource(LoggedSource):
                 raise self._of_copies(error) from None
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
             images = firsts[0].ndim > 1
-            if options.depth and images and not any(s.distances() for s in self._streams):
+            if (
+                options.depth
+                and images
+                and not any(s.pixels() in (None, *DISTANCES) for s in self._streams)
+            ):
                 raise UsageError(
                     f"{self._files[0]}: it holds no distances (16UC1, 32FC1): --range is for these"
                 )
-            self._framings = framings(firsts, options.size, options.fit, color=options.color)
+            self._framings = framings(firsts, options.size, options.fit, color=self.color)
             for stream, rows in enumerate(self._rows):  # refused before anything is written
                 self._frame(stream, int(rows[0]))
         except BaseException:
@@ -192,14 +206,19 @@ class ForeignSource(LoggedSource):
             "files": list(logs),
             "topics": [s.topic for s in self._streams],
             "size": list(self._spec.frame_shape),
-            "recipe": COLOR_RECIPE if self._options.color else "; ".join(recipes),
+            "recipe": COLOR_RECIPE if self.color else "; ".join(recipes),
             "align": self._options.align,
             "rate": self._fps,
             **self._chosen(),
             "alignment": self.alignment,
             "frames": self._count,
+            **({"held_out": self.held_out} if self.held_out else {}),
             "loop": self._loop,
         }
+
+    def pixels(self, stream: int) -> str:
+        """The format of pixels that a stream's messages state, "" where they state none."""
+        return self._streams[stream].pixels() or ""
 
     def plan(self) -> list[dict[str, Any]]:
         """The plan of --dry-run: what would be read of each stream, as JSON values."""
@@ -240,7 +259,7 @@ class ForeignSource(LoggedSource):
         if any(self._gaps):
             chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
-        if any(framing.lossy for framing in self._framings):
+        if options.fit != "crop" or any(framing.lossy for framing in self._framings):
             chosen["fit"] = options.fit
         if options.depth is not None:
             chosen["range_metres" if self._spec.images else "range"] = list(options.depth)
@@ -250,7 +269,7 @@ class ForeignSource(LoggedSource):
             chosen["time"] = options.time
         if options.stamp != "log":
             chosen["stamp"] = options.stamp
-        if options.color:
+        if self.color:
             chosen["color"] = "red, green and blue beside one another"
         return chosen
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
-from recorder.images.messages import SCHEMAS, Decoder, holds_distances
+from recorder.images.messages import SCHEMAS, Decoder, pixel_format
 from recorder.images.options import RECIPE, Reading, Size
 from recorder.images.pixels import Shown
 from recorder.log.messages import VECTOR_SCHEMA
@@ -117,9 +117,12 @@ class ImageStream(ABC):
         """
         raise UsageError(f"{self.path}: {self.topic} is no topic of messages: leave out --stamp")
 
-    def distances(self) -> bool:
-        """Whether its first image holds distances; raises as `image`."""
-        return False
+    def pixels(self) -> str | None:
+        """The format of pixels that the message of its first image states, "" of none.
+
+        None where that message is broken; raises as `image`.
+        """
+        return ""
 
     def stated_size(self, row: int) -> Size | None:
         """The size of an image where that is known without decoding it; of numbers, None."""
@@ -149,8 +152,8 @@ class MessageImages(ImageStream):
     def image(self, row: int) -> Shown:
         return self.taken(row, self.decode)
 
-    def distances(self) -> bool:
-        return self.taken(0, partial(holds_distances, self.kind.schema, self.kind.encoding))
+    def pixels(self) -> str | None:
+        return self.taken(0, partial(pixel_format, self.kind.schema, self.kind.encoding))
 
     def stamp(self, row: int) -> int:
         if self._stamp is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -103,6 +104,7 @@ class LogInfo:
         seed: the one that all files name, if they do.
         ended: why a run ended, where its folder says so.
         modules: of a run, where they lie in its folder.
+        held_out: how slow they are on frames that were held out, where its folder says so.
         signals: of a run.
         state: the worst of the files.
         notes: what is no problem, and what nothing proves.
@@ -120,6 +122,7 @@ class LogInfo:
     seed: int | None = None
     ended: str | None = None
     modules: tuple[ModuleInfo, ...] = ()
+    held_out: Mapping[str, Any] | None = None
     signals: RecordInfo | None = None
     state: State = "whole"
     notes: tuple[str, ...] = ()
@@ -164,6 +167,7 @@ def describe(*words: str | Location) -> LogInfo:
         metadata=metadata,
         seed=_seed(records),
         ended=_ended(folder) if folder else None,
+        held_out=_held_out(folder) if folder else None,
         modules=_modules(folder) if folder else (),
         signals=next((f.signals for f in files if f.signals is not None), None),
         state=worst(f.state for f in files),
@@ -343,10 +347,31 @@ def _seed(records: Sequence[Mapping[str, str]]) -> int | None:
 
 
 def _ended(path: Path) -> str | None:
+    ended = _result(path).get("ended")
+    return None if ended is None else str(ended)
+
+
+def _held_out(path: Path) -> Mapping[str, Any] | None:
+    with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):
+        found = _result(path)["held_out"]
+        numbers = ("slowness", "of_batch")
+        return {
+            **{key: [int(t) for t in found[key]][:2] for key in ("frames", "fitted")},
+            "modules": [
+                {"module": int(one["module"]), "stream": str(one["stream"])}
+                | {key: [math.nan if v is None else float(v) for v in one[key]] for key in numbers}
+                for one in found["modules"]
+            ],
+        }
+    return None
+
+
+def _result(path: Path) -> Mapping[str, Any]:
+    """What run.json says that a run came to; nothing where it is no run, or does not say."""
     if path.name != RUN_FILE and not (path / RUN_FILE).is_file():
-        return None
+        return {}
     result = read_run_json(path if path.is_dir() else path.parent).get("result")
-    return str(result["ended"]) if isinstance(result, Mapping) and "ended" in result else None
+    return result if isinstance(result, Mapping) else {}
 
 
 def _modules(path: Path) -> tuple[ModuleInfo, ...]:

@@ -19,7 +19,9 @@ from google.protobuf import message
 
 from cdmisfa.core.blocks import Block, HeadPose, freeze
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.untrusted import parse_json
 from recorder.log.messages import POSE_TOPIC, RECORDING_METADATA
+from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import PARTIAL
 from replay.recordings.view_file import ViewFile, intersection
@@ -197,6 +199,18 @@ class RecordedSource(LoggedSource):
         """What was recorded: the scene, its seed and the checksum of its configuration."""
         facts = self._views[0][0].facts
         return {name: getattr(facts, name) for name in _SCENE if name in facts.values}
+
+    def origin(self) -> Mapping[str, Any]:
+        """What the source of which this was recorded said of itself; empty of scenes."""
+        reader = self._views[0][0].reader
+        own = next((one for one in reader.attachments if one.name == CONFIG_NAME), None)
+        if own is None:
+            return {}
+        try:
+            stated = parse_json(bytes(reader.attachment_data(own)))["source"]
+        except (ValueError, LookupError, TypeError):
+            return {}
+        return stated if isinstance(stated, dict) else {}
 
     def close(self) -> None:
         for view in self._all():

@@ -34,6 +34,8 @@ KEYFRAME_VERSION = 1
 
 _ABOUT_FACTS = "JSON: name, type and shape of each array, and more"
 _MODULES = "modules."
+_OF_SOURCE = ("frame_shape", "recipe")
+"""What of a module follows from the source, which the log's header states."""
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _KEYFRAME, KEYFRAME_DEFINITION = define_message(
     KEYFRAME_SCHEMA,
@@ -121,8 +123,8 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
 
 def arrays_of(state: LearnerState) -> dict[str, NDArray[Any]]:
     """All arrays of a state by name: its own, and one for each field of its modules."""
-    names = [field.name for field in dataclasses.fields(Module) if field.name != "frame_shape"]
-    return dict(state.arrays) | {  # the log's header states the shape of frames
+    names = [field.name for field in dataclasses.fields(Module) if field.name not in _OF_SOURCE]
+    return dict(state.arrays) | {
         _MODULES + name: np.array([getattr(m, name) for m in state.modules]) for name in names
     }
 

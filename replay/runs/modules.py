@@ -6,6 +6,7 @@ Neither the learner nor scikit-learn is needed to use what was learned.
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.modules import Module
+from recorder.images.recipe import Recipe
 from recorder.log.files import atomic_write
 from replay.runs.folders import MODULES_FILE
 from replay.storage.arrays import read_arrays
@@ -27,11 +29,12 @@ _SCALARS = {
     **dict.fromkeys(("index", "stream_index", "iteration"), "iu"),
     "stream": "U",
     "expansion": "U",
+    "recipe": "U",
     "scale": "f",
 }
 """Fields that are no arrays, and the kind of numpy type that each is stored as."""
 
-_OPTIONAL = ("centres", "counts", "expansion", "scale", "slow", "stream", "frame_shape")
+_OPTIONAL = ("centres", "counts", "expansion", "scale", "slow", "stream", "frame_shape", "recipe")
 """Fields that files of earlier versions lack."""
 
 
@@ -45,6 +48,8 @@ def save_modules(path: Path, modules: Iterable[Module]) -> None:
     for module in modules:
         for name in _FIELDS:
             arrays[_key(module.index, name)] = getattr(module, name)
+        recipe = "" if module.recipe is None else json.dumps(module.recipe.as_json())
+        arrays[_key(module.index, "recipe")] = recipe
     with atomic_write(Path(path)) as partial, open(partial, "wb") as file:
         np.savez(file, **arrays)
 
@@ -81,6 +86,8 @@ def _module(stored: Mapping[str, NDArray[Any]], index: int) -> Module:
         values[name] = array.item() if name in _SCALARS else array
     if "frame_shape" in values:
         values["frame_shape"] = tuple(map(int, values["frame_shape"].tolist()))
+    if "recipe" in values:
+        values["recipe"] = Recipe.from_json(values["recipe"]) if values["recipe"] else None
     outputs, size = values["phi"].shape
     shapes = {"mean": size, "band_mean": outputs, "band_sd": outputs, "eta": outputs}
     for name, length in shapes.items():

@@ -17,6 +17,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from cdmisfa.modules import Module
+from recorder.images.recipe import Recipe
 from replay.runs.columns import Blocks, SignalColumns, has_values, whole_signals
 from replay.runs.folders import MODULES_FILE, read_run_json, run_log
 from replay.runs.log import RunHeader, read_columns, read_header
@@ -77,9 +78,20 @@ class Run:
             raise LogDamagedError(f"{self.log.parent} holds modules of streams it does not have")
         shape = self.header.spec.frame_shape
         return tuple(
-            replace(module, stream=names[module.stream_index], frame_shape=shape)
+            replace(
+                module,
+                stream=names[module.stream_index],
+                frame_shape=shape,
+                recipe=module.recipe or self.recipe(module.stream_index),
+            )
             for module in found
         )
+
+    def recipe(self, stream: int = 0) -> Recipe:
+        """What became of the raw pictures of a stream."""
+        stated = self.header.manifest.get("source")
+        shape = self.header.spec.frame_shape
+        return Recipe.of(stated if isinstance(stated, Mapping) else {}, shape, stream)
 
 
 class _Signals(Mapping[str, "NDArray[Any]"]):

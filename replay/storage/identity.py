@@ -220,10 +220,12 @@ class LoggedSource(StoredSource):
     Attributes:
         left_out: a line for each log that could not be read, and is no part of it.
         copies: a line for each stream that shows the same as one of another log.
+        notes: a line for each thing that was chosen where it was not said.
     """
 
     left_out: tuple[str, ...] = ()
     copies: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     _identities: Sequence[Identity] | None = None
 
     @abstractmethod

@@ -71,6 +71,13 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
     default=60.0,
     group="Source",
 )
+@number(
+    "--holdout",
+    "Keep the last part of a camera log from the progress learner, and say how slow what it "
+    "learned is there; by default 0.1, a tenth. 0 learns from all.",
+    *(0.0, 0.9, "SHARE"),
+    group="Source",
+)
 @option(
     "--record",
     "record_to",
@@ -133,6 +140,7 @@ def learn_command(
         if dry_run:
             print_plan(frames, as_json=as_json)
             return
+        color = getattr(frames, "color", cameras.color)  # what auto chose stays
         with learning(told["max_iterations"]) as (stop, reporter):
             if hasattr(frames, "stop"):
                 frames.stop = stop  # waiting for frames ends with a signal, too
@@ -141,7 +149,7 @@ def learn_command(
                 configuration.learner,
                 out,
                 sections=configuration.tables(),
-                command=command_of(source, ctx.params, out or Path()),
+                command=command_of(source, {**ctx.params, "color": color}, out or Path()),
                 force=force,
                 resume=resume,
                 rerun=not told["no_rerun"],
@@ -175,9 +183,10 @@ def opened_logs(
         cameras: how images of others become frames.
         live: how live streams do; see `opened_live`.
     """
-    from cdmisfa.experiments.sources import is_scene, open_source
+    from cdmisfa.experiments.holdout import hold_out
+    from cdmisfa.experiments.sources import OF_CAMERAS, is_scene, open_source
 
-    vain = [f"--{name}" for name in ("loop", "salvage") if told[name]]
+    vain = [f"--{name}" for name in ("loop", "salvage", "holdout") if told[name]]
     if vain and is_scene(source):
         raise UsageError(f"{source[0]} is a scene: {are_for(vain, 'logs')}")
     options.refuse_live_options(live, source)
@@ -192,6 +201,8 @@ def opened_logs(
         **{name: told[name] for name in ("preset", "seed", "loop", "salvage")},
     )
     with contextlib.closing(frames):
+        progress = configuration.learner.algorithm == OF_CAMERAS
+        hold_out(frames, told["holdout"], judged=progress)
         refuse_copies(frames, strict=told["strict"])
         if told["dry_run"]:
             yield frames, configuration
@@ -212,10 +223,11 @@ def opened_live(
     from recorder.live import RecordedWhileWatched
     from recorder.log.files import refuse_existing
 
-    if any(told[name] for name in ("resume", "loop", "salvage", "follow", "dry_run")):
+    refused = ("resume", "loop", "salvage", "follow", "dry_run", "holdout")
+    if any(told[name] for name in refused):
         raise UsageError(
-            "live streams cannot go back: leave out --resume, --loop, --salvage, --follow "
-            "and --dry-run, or learn from a recording of them"
+            "live streams cannot go back: leave out --resume, --loop, --salvage, --follow, "
+            "--dry-run and --holdout, or learn from a recording of them"
         )
     out, record_to, force = told["out"], told["record_to"], told["force"]
     for folder in (out, record_to):

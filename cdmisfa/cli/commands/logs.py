@@ -14,6 +14,7 @@ from cdmisfa.cli.making import flag, option
 from cdmisfa.cli.printing import (
     BRACKETS,
     print_document,
+    print_held_out,
     print_json,
     print_line,
     print_table,
@@ -71,6 +72,8 @@ def _print_info(found: LogInfo) -> None:
         print_line(f"module {module.index} of {module.stream}: slowness {told}")
     if any(0 in module.slow for module in found.modules):
         print_line(BRACKETS)
+    if found.held_out is not None:
+        print_held_out(found.held_out)
     head: tuple[str, ...] = ("topic", "messages", "encoding", "schema", "from", "to")
     rows: list[tuple[object, ...]] = [
         (c.topic, c.messages, c.encoding, c.schema, _clock(c.start_ns), _clock(c.end_ns))

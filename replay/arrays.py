@@ -17,6 +17,7 @@ from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, are_for
 from recorder.images.framing import Framing, framings
 from recorder.images.pixels import Shown, raw_image
+from recorder.images.recipe import pixels_of
 from replay.camera_logs.opening import fits_topic
 from replay.camera_logs.options import CameraOptions
 from replay.storage.arrays import load_numbers
@@ -76,13 +77,13 @@ class ArrayLog(LoggedSource):
         shown = list(self._arrays.values())
         firsts = [_pixels(array[:1])[0] for array in shown]
         _refuse_unlike(dict(zip(self._arrays, firsts, strict=True)))
-        self._framings = framings(firsts, options.size, options.fit, color=options.color)
-        self._color = options.color
+        self._color = options.color is True
+        self._framings = framings(firsts, options.size, options.fit, color=self._color)
         self._count = min(map(len, shown))
         self._about = {
             "size": list(self._framings[0].shape),
             "fit": options.fit,
-            "color": options.color,
+            **({"color": "red, green and blue beside one another"} if self._color else {}),
             "recipe": RECIPE,
         }
         self.shapes = dict(zip(self._arrays, map(str, self._framings), strict=True))
@@ -255,11 +256,7 @@ def _pixels(rows: NDArray[Any]) -> NDArray[Any]:
     """Rows as the streams of logs show them: pictures of uint8, or numbers."""
     if rows.ndim == 2:
         return rows.astype(np.float64)
-    if rows.dtype == np.bool_:
-        return np.where(rows, 255, 0).astype(np.uint8)
     if rows.dtype == np.uint16:
         return (rows >> 8).astype(np.uint8)
-    if rows.dtype.kind == "f":
-        return np.asarray(np.rint(rows * rows.dtype.type(255)), np.uint8)
-    pixels: NDArray[Any] = rows.astype(np.uint8, copy=False)
+    pixels: NDArray[Any] = pixels_of(rows).astype(np.uint8, copy=False)
     return pixels

@@ -1,0 +1,89 @@
+"""Whether the first frames of a log show in their colours what they do not show in grey."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.stored import StoredSource
+
+LOOKED: Final = 2000
+"""Frames at the beginning that are looked at."""
+
+STEP: Final = 5
+"""One frame in so many is: what lasts is the same in two of them, and noise is not."""
+
+_CELLS = 8
+"""Parts of a picture's height, and of its width, whose mean colours are compared."""
+
+_FEWEST = 20
+
+_SHARE = 0.1
+"""Hue is worth three times the pixels from this share of the variance of brightness on."""
+
+_LASTING = 0.3
+"""Share of its variance that must last from one frame looked at to the next."""
+
+_LEAST = 0.25
+"""Variance, in steps of a pixel squared, below which hue is the rounding of pictures."""
+
+
+CHOSEN: Final = {
+    True: "--color auto: hue varies where brightness does not, frames show red, green and blue",
+    False: "--color auto: hue tells no more than brightness, frames are grey",
+}
+"""What was chosen, in words."""
+
+
+def shows_hue(source: StoredSource) -> bool:
+    """Whether frames of a source, which shows colours, are worth it on one of its streams."""
+    for stream in range(len(source.spec.streams)):
+        times = range(0, min(source.frames, LOOKED), STEP)
+        looked = [block.frames for t in times for block in source.pieces(stream, t, t + 1, 1)]
+        if looked and hue_varies(np.concatenate(looked)):
+            return True
+    return False
+
+
+def hue_varies(frames: NDArray[Any]) -> bool:
+    """Whether hue varies where brightness does not, and lasts, as noise does not.
+
+    In each of 8 x 8 cells hue is red and blue less brightness, without what brightness in the same
+    cell tells of it. Of that, as of brightness, the covariance of frames that follow one another
+    is taken, summed over the cells.
+
+    Args:
+        frames: (n, height, 3 width) uint8, each in red, green and blue beside one another.
+    """
+    if len(frames) < _FEWEST:
+        return False
+    cells = np.stack([_in_cells(plane) for plane in np.split(frames, 3, axis=2)])
+    cells -= cells.mean(axis=1, keepdims=True)
+    grey = cells.mean(axis=0)
+    hue = cells[[0, 2]] - grey
+    along = (hue * grey).sum(axis=1) / np.maximum((grey * grey).sum(axis=0), 1e-9)
+    hue -= along[:, None] * grey
+    lasting = _lasting(hue) / len(grey.T)
+    varies = max(
+        _SHARE * _lasting(grey) / len(grey.T),
+        _LASTING * (hue * hue).mean(axis=1).sum() / len(grey.T),
+    )
+    return bool(lasting >= max(varies, _LEAST))
+
+
+def _lasting(x: NDArray[np.float64]) -> float:
+    """Covariance of frames (..., n, cells) with the next, summed."""
+    return float((x[..., 1:, :] * x[..., :-1, :]).sum() / (x.shape[-2] - 1))
+
+
+def _in_cells(plane: NDArray[Any]) -> NDArray[np.float64]:
+    """The mean of each cell of pictures (n, height, width), (n, cells)."""
+    for axis in (1, 2):
+        size = plane.shape[axis]
+        starts = np.unique(np.arange(_CELLS) * size // _CELLS)
+        widths = np.diff(np.append(starts, size))
+        shape = [-1 if i == axis else 1 for i in range(3)]
+        plane = np.add.reduceat(plane, starts, axis=axis, dtype=np.float64) / widths.reshape(shape)
+    return np.asarray(plane.reshape(len(plane), -1))

@@ -1,0 +1,162 @@
+"""The last frames of a camera log, which nothing learns from and what was learned is judged on."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from message_files import write_table
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray
+from cdmisfa.features.following import batch_outputs, following_slowness
+from cdmisfa.features.sfa import batch_sfa, slowness
+from replay.runs.modules import load_modules
+
+FRAMES = 6000
+LEARN = ("--time", "t", "--set", "learner.expansion=none", "--set", "learner.outputs=2", "--json")
+
+
+def values(frames: int = FRAMES) -> NDArray[Any]:
+    """(frames, 6): two slow courses under jumps of which each column has its own mixture."""
+    rng, t = np.random.default_rng(5), np.arange(frames)
+    slow = np.stack([np.sin(t / 40), np.sin(t / 13), *rng.normal(0, 1, (4, frames))])
+    return np.asarray(slow.T @ rng.normal(0, 1, (6, 6)))
+
+
+def table(path: Path, rows: NDArray[Any]) -> Path:
+    columns = {f"c{i}": rows[:, i] for i in range(rows.shape[1])}
+    return write_table(path, {"t": np.arange(len(rows)) / 100, **columns})
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return table(tmp_path_factory.mktemp("holdout") / "log.csv", values())
+
+
+def in_pieces(frames: NDArray[Any], size: int) -> Iterator[tuple[NDArray[Any], bool]]:
+    return ((frames[at : at + size], False) for at in range(0, len(frames), size))
+
+
+def test_frames_held_out_are_not_learned_from_and_judged_as_batch_sfa_is(
+    cdmisfa: Cdmisfa, log: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    found = cdmisfa("learn", log, *LEARN, "-o", run, "--no-rerun").json
+    changed = values()
+    changed[5400:] = changed[5400:][::-1, ::-1]
+    other = cdmisfa("learn", table(tmp_path / "other.csv", changed), *LEARN).json
+    assert found["signals_sha256"] == other["signals_sha256"]
+    assert found["held_out"]["modules"] != other["held_out"]["modules"]
+    assert found["held_out"]["frames"] == [5400, 6000]
+    assert found["held_out"]["fitted"] == [0, found["frames"]]
+    (module,), (told,) = load_modules(run), found["held_out"]["modules"]
+    x = values()
+    weights = batch_sfa(x[: found["frames"]], 2)
+    batch = slowness((x[5400:] - x[: found["frames"]].mean(axis=0)) @ weights.T)
+    np.testing.assert_allclose(told["slowness"], slowness(module.transform(x[5400:])), rtol=1e-9)
+    np.testing.assert_allclose(told["of_batch"], batch, rtol=1e-6)
+    assert cdmisfa("info", run, "--json").json["held_out"] == found["held_out"]
+    lines = cdmisfa("info", run).out.splitlines()
+    own, theirs = (", ".join(f"{v:.4f}" for v in told[k]) for k in ("slowness", "of_batch"))
+    at = lines.index("slowness on the frames 5400 to 5999, which were held out:")
+    assert lines[at + 1] == f"module 1 of log: {own}; batch SFA: {theirs}"
+
+
+@pytest.mark.parametrize(
+    ("options", "held"),
+    [
+        ((), 600),
+        (("--holdout", "0.25"), 1500),
+        (("--from", "10", "--to", "50"), 400),
+        (("--holdout", "0"), 0),
+        (("--to", "15"), 0),  # too few
+        (("--loop",), 0),
+        (("--algorithm", "2.0"), 0),
+    ],
+)
+def test_a_share_of_what_is_learned_from_once_is_held_out(
+    cdmisfa: Cdmisfa, log: Path, options: tuple[str, ...], held: int
+) -> None:
+    said = LEARN[:2] if "2.0" in options else LEARN[:-1]
+    done = cdmisfa("learn", log, *said, "--json", "--max-iterations", "3", *options)
+    assert done.json["source"].get("held_out", 0) == held
+    assert ("held_out" in done.json) == (held > 0)
+    few = "150 of 1500 frames are too few to judge on: none are held out (--holdout)"
+    assert (few in done.err) == ("15" in options)
+
+
+def test_what_never_is_held_out_is_refused_where_it_is_asked_for(
+    cdmisfa: Cdmisfa, log: Path, oscillatory_recording: Path
+) -> None:
+    share = ("--holdout", "0.2")
+    for words in (
+        ("oscillatory",),
+        (oscillatory_recording,),
+        (oscillatory_recording, "--algorithm", "progress"),
+        (log, "--time", "t", "--loop"),
+        (log, "--time", "t", "--algorithm", "2.0"),
+        ("av:lavfi:testsrc",),
+    ):
+        refused = cdmisfa("learn", *words, *share)
+        assert refused.code == 2
+        assert "--holdout" in refused.err
+    assert cdmisfa("learn", log, "--holdout", "0.95").code == 2
+    recorded = cdmisfa("learn", oscillatory_recording, "--algorithm", "progress", "--json")
+    assert "held_out" not in recorded.json
+
+
+def test_going_on_keeps_to_what_the_run_learns_from(
+    cdmisfa: Cdmisfa, log: Path, tmp_path: Path
+) -> None:
+    once, resumed, fork = (tmp_path / name for name in ("once", "resumed", "fork"))
+    how = (*LEARN[:-1], "--no-rerun")
+    whole = cdmisfa("learn", log, *how, "-o", once, "--json").json
+    cdmisfa("learn", log, *how, "-o", resumed, "--max-iterations", "20")
+    assert cdmisfa("learn", log, *how, "-o", resumed, "--resume", "--holdout", "0.2").code == 2
+    more = ("--max-iterations", "1000", "--no-rerun", "--json")
+    assert cdmisfa("learn", "--resume", "-o", resumed, *more).json["held_out"] == whole["held_out"]
+    assert cdmisfa("check", once).code == 0
+    endless = ("--set", "learner.watch=1000", "--json", "--no-rerun")
+    forked = cdmisfa("fork", once, "--at", "20", "-o", fork, *endless).json
+    assert forked["frames"] == forked["held_out"]["frames"][0] == 5400
+
+
+def test_a_run_that_states_something_else_is_described_without(
+    cdmisfa: Cdmisfa, log: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    cdmisfa("learn", log, *LEARN, "-o", run, "--no-rerun", "--max-iterations", "3")
+    document = json.loads((run / "run.json").read_text())
+    for odd in (7, {}, {"frames": None}, {"frames": [0, 1], "fitted": [0, 1], "modules": [3]}):
+        document["result"]["held_out"] = odd
+        (run / "run.json").write_text(json.dumps(document))
+        assert cdmisfa("info", run, "--json").json["held_out"] is None
+
+
+@pytest.mark.parametrize("size", [7, 100, 5000])
+def test_slowness_in_pieces_is_that_of_all_frames(size: int) -> None:
+    x = values(3000)
+    phi, mean = batch_outputs(in_pieces(x, size), len(x), components=6, outputs=2)
+    exact = slowness((x - x.mean(axis=0)) @ batch_sfa(x, 2).T)
+    np.testing.assert_allclose(mean, x.mean(axis=0), rtol=1e-9, atol=1e-12)
+    (found,) = following_slowness(in_pieces(x, size), [(phi, mean)])
+    np.testing.assert_allclose(found, exact, rtol=1e-6)
+
+
+def test_no_step_leads_across_what_is_missing() -> None:
+    y: FloatArray = np.array([0.0, 1.0, 2.0, 10.0, 11.0])[:, None]
+    one = (np.ones((1, 1)), np.zeros(1))
+    (slow,) = following_slowness([(y[:3], False), (y[3:], True)], [one])
+    assert slow[0] == pytest.approx(math.sqrt(1 / y.var()) / (2 * math.pi))
+    (still,), (none,) = (
+        following_slowness(pieces, [one])[0] for pieces in ([(np.ones((4, 1)), False)], [])
+    )
+    assert still == math.inf
+    assert math.isnan(none)

@@ -1,0 +1,135 @@
+"""`--color auto`: colours are learned from where hue varies and brightness does not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from numpy.typing import NDArray
+from PIL import Image
+
+from cdmisfa.core.errors import UsageError
+from recorder.images.options import ImageOptions
+from replay.camera_logs.hue import hue_varies
+
+N, H, W = 120, 24, 32
+ONE = np.ones((N, H, W))
+WAVE = np.sin(np.arange(N) / 10)[:, None, None] * ONE
+Y, X = np.mgrid[:H, :W]
+BALL = (X - 16 - 10 * WAVE[:, :1, :1]) ** 2 + (Y - 12) ** 2 < 25
+LAMP = (X < 5) & (Y < 5)
+
+
+def seen(
+    red: NDArray[np.float64], green: NDArray[np.float64], blue: NDArray[np.float64], sd: float = 3
+) -> NDArray[np.uint8]:
+    """Frames in colours through a sensor of this noise."""
+    noise = np.random.default_rng(3).normal(0, sd, (N, H, 3 * W))
+    frames = np.concatenate([red, green, blue], axis=2) + noise
+    return np.rint(frames.clip(0, 255)).astype(np.uint8)
+
+
+def ball(inside: tuple[int, int, int], outside: tuple[int, int, int]) -> NDArray[np.uint8]:
+    red, green, blue = (np.where(BALL, *c) for c in zip(inside, outside, strict=True))
+    return seen(red, green, blue)
+
+
+NOISE = np.random.default_rng(4).integers(0, 256, (N, H // 8, 3 * W // 8), dtype=np.uint8)
+MIXED = 120 + 30 * WAVE * np.random.default_rng(5).normal(0, 1, (1, H, W))
+
+COLOR = {
+    "hue alone": seen(120 + 20 * WAVE, 120 * ONE, 120 - 20 * WAVE),
+    "under noise": seen(120 + 20 * WAVE, 120 * ONE, 120 - 20 * WAVE, sd=20),
+    "a ball as bright as what is behind": ball((170, 85, 60), (60, 130, 125)),
+    "a lamp": seen(120 + 60 * WAVE * LAMP, 120 * ONE, 120 - 60 * WAVE * LAMP),
+}
+GREY = {
+    "grey": seen(MIXED, MIXED, MIXED, sd=0),
+    "coloured noise on grey": seen(MIXED, MIXED, MIXED, sd=30),
+    "coloured noise alone": seen(120 * ONE, 120 * ONE, 120 * ONE, sd=60),
+    "coarse noise": np.kron(NOISE, np.ones((1, 8, 8), np.uint8)),
+    "tinted light": seen(120 + 40 * WAVE, 100 + 30 * WAVE, 60 + 15 * WAVE),
+    "a red ball on black": ball((200, 40, 40), (30, 30, 30)),
+    "nothing moves": seen(200 * ONE, 10 * ONE, 60 * ONE, sd=0),
+    "few frames": seen(120 + 20 * WAVE, 120 * ONE, 120 - 20 * WAVE)[:19],
+}
+
+
+@pytest.mark.parametrize("case", COLOR)
+def test_hue_that_brightness_does_not_tell_is_chosen(case: str) -> None:
+    assert hue_varies(COLOR[case])
+    assert hue_varies(COLOR[case][:, :, ::-1])  # blue, green, red, from right to left
+
+
+@pytest.mark.parametrize("case", GREY)
+def test_grey_noise_and_what_brightness_tells_are_not(case: str) -> None:
+    assert not hue_varies(GREY[case])
+
+
+def pictures(folder: Path, frames: NDArray[np.uint8]) -> Path:
+    """A folder of five pictures of each frame."""
+    folder.mkdir()
+    for i, frame in enumerate(np.repeat(frames, 5, axis=0)):
+        rgb = np.stack(np.split(frame, 3, axis=1), axis=2)
+        Image.fromarray(rgb).save(folder / f"{i:04}.png", compress_level=1)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("frames", "said", "word", "width"),
+    [
+        (COLOR["hue alone"], "frames show red, green and blue", "on", 3 * W),
+        (GREY["coloured noise on grey"], "frames are grey", "off", W),
+    ],
+)
+def test_the_choice_is_said_and_the_run_goes_on_with_it(
+    cdmisfa: Cdmisfa, tmp_path: Path, frames: NDArray[np.uint8], said: str, word: str, width: int
+) -> None:
+    log, runs = pictures(tmp_path / "log", frames), [tmp_path / name for name in ("auto", "said")]
+    how = ("--rate", "20", "--no-rerun", "--max-iterations")
+    auto = cdmisfa("learn", log, *how, "4", "--color", "auto", "-o", runs[0])
+    assert said in auto.err
+    cdmisfa("learn", log, *how, "8", "--color", word, "-o", runs[1])
+    assert json.loads((runs[0] / "run.json").read_text())["command"]["color"] is (word == "on")
+    resumed = cdmisfa("learn", "--resume", "-o", runs[0], *how[2:], "8")
+    assert "--color auto" not in resumed.err
+    assert cdmisfa("check", runs[0]).code == 0
+    one, other = (json.loads((run / "run.json").read_text()) for run in runs)
+    assert one["source"]["size"] == [H, width]
+    assert one["result"]["signals_sha256"] == other["result"]["signals_sha256"]
+    assert said in cdmisfa("learn", log, "--rate", "20", "--color", "auto", "--dry-run").err
+    rec = tmp_path / "rec"
+    assert said in cdmisfa("convert", log, "--rate", "20", "--color=auto", "-o", rec).err
+
+
+def test_color_alone_is_on_wherever_it_stands(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log = pictures(tmp_path / "log", GREY["grey"][:2])
+    plan = ("--rate", "20", "--dry-run", "--json")
+    for words, width in (
+        (("--color", log, *plan), 3 * W),
+        ((log, *plan, "--color"), 3 * W),
+        (("--color", "on", log, *plan), 3 * W),
+        (("--color", "off", log, *plan), W),
+        ((log, *plan), W),
+    ):
+        assert cdmisfa("learn", *words).json["size"] == [H, width]
+
+
+def test_what_has_no_first_frames_or_colours_to_look_at_is_refused(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    (tmp_path / "t.csv").write_text("a\n" + "1\n" * 100)
+    for words, remedy in (
+        (("av:lavfi:testsrc",), "give on or off"),
+        (("gym:CartPole-v1",), "give on or off"),
+        (("oscillatory",), "--color is for cameras"),
+        ((tmp_path / "t.csv", "--rate", "5"), "--color is for images"),
+    ):
+        refused = cdmisfa("learn", *words, "--color", "auto")
+        assert refused.code == 2
+        assert remedy in refused.err
+    with pytest.raises(UsageError, match="give on, off or auto"):
+        ImageOptions(color="red")  # type: ignore[arg-type]

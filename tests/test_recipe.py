@@ -1,0 +1,182 @@
+"""A module knows what becomes of a raw picture: pictures are taken as the source gave them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_files import RAW, encoded, raw
+from conftest import Cdmisfa
+from mcap.writer import Writer
+from PIL import Image
+
+from cdmisfa import Module, Recipe, Run, make_frame
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.options import Depth, Fit
+from replay.camera_logs.source import ForeignSource
+from replay.runs.modules import load_modules, save_modules
+
+RNG = np.random.default_rng(5)
+
+
+def of_type(dtype: str, *shape: int) -> Any:
+    if dtype == "f4":
+        return RNG.uniform(0.1, 6, (9, *shape)).astype("<f4")
+    return RNG.integers(0, np.iinfo(dtype).max, (9, *shape), dtype)
+
+
+def logged(path: Path, pictures: Any, encoding: str) -> Path:
+    """A log of pictures, 25 a second."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel(
+            "/cam", RAW.encoding, writer.register_schema(RAW.schema, RAW.encoding, b"")
+        )
+        for i, picture in enumerate(pictures):
+            at = (1 + i) * 40_000_000
+            writer.add_message(channel, at, raw(picture, encoding), at)
+        writer.finish()
+    return path
+
+
+def module_of(recipe: Recipe | None, shape: tuple[int, ...]) -> Module:
+    size = int(np.prod(shape))
+    phi, mean, zero = np.random.default_rng(1).normal(size=(2, size)), np.zeros(size), np.zeros(2)
+    scale = 1.0 if len(shape) == 1 else 1 / 255
+    about: Any = {"expansion": "none", "scale": scale, "frame_shape": shape, "recipe": recipe}
+    return Module(1, "a", 0, 9, phi, mean, zero, zero, zero, np.zeros(1, int), **about)
+
+
+KINDS: dict[str, tuple[str, tuple[int, ...], bool, Depth | None]] = {
+    "mono8": ("u1", (30, 41), False, None),
+    "mono16": ("u2", (30, 41), False, None),
+    "rgb8": ("u1", (30, 41, 3), False, None),
+    "rgba8": ("u1", (30, 41, 4), True, None),
+    "bayer_rggb8": ("u1", (60, 82), False, None),
+    "bayer_gbrg16": ("u2", (60, 82), True, None),
+    "16UC1": ("u2", (30, 41), False, (0.3, 5.0)),
+    "32FC1": ("f4", (30, 41), False, (0.3, 5.0)),
+}
+
+
+@pytest.mark.parametrize("encoding", KINDS)
+@pytest.mark.parametrize("fit", ["crop", "pad", "stretch"])
+def test_a_raw_picture_becomes_the_frame_that_the_log_shows(
+    encoding: str, fit: Fit, tmp_path: Path
+) -> None:
+    dtype, shape, color, depth = KINDS[encoding]
+    pictures = of_type(dtype, *shape)
+    log = logged(tmp_path / "a.mcap", pictures, encoding)
+    source = ForeignSource(log, size=(8, 16), fit=fit, color=color, depth=depth)
+    frames = source.take(0, len(pictures)).frames
+    recipe = Recipe.of(source.describe(), frames.shape[1:])
+    assert (recipe.fit, recipe.color, recipe.range) == (fit, color, depth)
+    if encoding.startswith("bayer"):
+        recipe = Recipe(recipe.shape, fit, color, pixels=source.pixels(0))
+    module = module_of(recipe, frames.shape[1:])
+    for given in (pictures, list(pictures)):
+        np.testing.assert_array_equal(module.transform(given), module.transform(frames))
+    np.testing.assert_array_equal(make_frame(pictures[0], recipe), frames[0])
+
+
+def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    textures = RNG.uniform(-30, 30, (6, 12, 16, 3))
+    waves = np.sin(np.arange(1000)[:, None] / (60 / np.arange(1, 7) ** 2))
+    pictures = (128 + np.tensordot(waves, textures, 1)).clip(0, 255).astype(np.uint8)
+    log, out = logged(tmp_path / "a.mcap", pictures, "bgr8"), tmp_path / "run"
+    easy = ("delta=1", "eta_dot_window=3", "min_variance=0", "warm_up=0", "tau=20", "novel_share=0")
+    settings = [word for key in easy for word in ("--set", f"learner.{key}")]
+    options = ("--size", "8x8", "--fit", "stretch", "--algorithm", "2.0", "--max-modules", "1")
+    done = cdmisfa("learn", log, "-o", out, *options, *settings, "--no-rerun", "--json")
+    assert done.code == 0, done.err
+    said = {"shape": [8, 8], "fit": "stretch", "color": False, "range": None, "fields": []}
+    stated = json.loads((out / "run.json").read_text())["result"]["modules"]
+    assert [module["recipe"] for module in stated] == [{**said, "pixels": ""}] * len(stated)
+    module = Run(out).modules[0]
+    assert module.recipe == load_modules(out)[0].recipe == Recipe((8, 8), "stretch")
+    frames = ForeignSource(log, size=(8, 8), fit="stretch").take(0, 50).frames
+    y = module.transform(pictures[:50, :, :, ::-1])  # red first
+    np.testing.assert_array_equal(y, module.transform(frames))
+    larger = pictures[:5].repeat(2, 1).repeat(2, 2)
+    assert module.transform([*pictures[:5], *larger]).shape == (10, len(y[0]))
+    arrays = dict(np.load(out / "modules.npz"))
+    np.savez(out / "modules.npz", **{k: v for k, v in arrays.items() if "recipe" not in k})
+    assert load_modules(out)[0].recipe is None
+    assert Run(out).modules[0].recipe == module.recipe
+
+
+def test_a_recording_of_a_log_keeps_its_recipe(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    pictures = np.repeat(of_type("u1", 12, 16, 3), 60, 0)
+    log = logged(tmp_path / "a.mcap", pictures, "rgb8")
+    cdmisfa("convert", log, "--color", "--size", "8x8", "--fit", "pad", "-o", tmp_path / "rec")
+    learned = (*("learn", tmp_path / "rec", "-o", tmp_path / "run"), "--no-rerun")
+    assert cdmisfa(*learned, "--set", "learner.tau=40", "--max-iterations", 12).code == 0
+    module = Run(tmp_path / "run").modules
+    recipe = Recipe((8, 24), "pad", color=True)
+    assert {one.recipe for one in module} <= {recipe}
+
+
+def test_a_jpeg_is_turned_as_its_exif_says(tmp_path: Path) -> None:
+    picture = of_type("u1", 20, 30)[0]
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(picture).save(tmp_path / "a.png", exif=exif)
+    recipe = Recipe((30, 20))
+    turned = make_frame((tmp_path / "a.png").read_bytes(), recipe)
+    np.testing.assert_array_equal(turned, np.rot90(picture, -1))
+    np.testing.assert_array_equal(make_frame(encoded(turned), recipe), turned)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "given", "why"),
+    [
+        (Recipe((8, 16)), np.zeros((4, 7, 20), np.uint8), "20x7 is smaller than the .* 16x8"),
+        (Recipe((8, 16)), np.full((4, 20, 40), 1.5), "pictures of float64 .*: give .n, height"),
+        (Recipe((8, 16)), np.zeros((4, 20, 40, 2), np.uint8), r"uint8 \(20, 40, 2\) given"),
+        (Recipe((8, 16)), np.zeros((20, 40), np.uint8), r"pictures of uint8 \(40,\) given"),
+        (Recipe((8, 16)), [b"nothing"], "a picture cannot be taken: .* broken"),
+        (Recipe((8, 16)), "abc", "given"),
+        (Recipe((8, 16)), None, "one picture or none given"),
+        (Recipe((8, 16)), b"abc", "one picture or none given"),
+        (
+            Recipe((3,), fields=("a", "b")),
+            np.zeros((4, 2)),
+            r"float64 of shape \(4, 2\) .* give \(n, 3\).*a, b",
+        ),
+        (Recipe((3,)), [["a", "b", "c"]], r"given: give \(n, 3\)"),
+        (Recipe((3,)), [[1.0, np.nan, 2.0]], "frame 0 holds nan at place 1, .* no finite number"),
+        (Recipe((3,)), np.full((2, 3), np.inf), "frame 0 holds inf"),
+    ],
+)
+def test_what_a_module_cannot_take_is_refused_in_a_line(
+    recipe: Recipe, given: Any, why: str
+) -> None:
+    with pytest.raises(UsageError, match=why) as refused:
+        module_of(recipe, recipe.shape).transform(given)
+    assert "\n" not in str(refused.value)
+
+
+def test_numbers_of_any_type_are_taken_and_kept_in_their_range() -> None:
+    module = module_of(Recipe((2,), range=(-1.0, 1.0)), (2,))
+    given = [[3, -5], [1, 0]]
+    np.testing.assert_array_equal(module.transform(np.array(given, float)), module.transform(given))
+    np.testing.assert_array_equal(module.transform(given), module.transform([[1.0, -1.0], [1, 0]]))
+    assert module.transform(np.zeros((0, 2), int)).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["x", "[]", "{}", '{"shape": 3}', '{"shape": [2], "fit": "no"}', '{"shape": ["a"]}',
+     '{"shape": [2], "range": [1]}', '{"shape": [2], "range": 3}', '{"shape": [2], "fields": 3}'],
+)  # fmt: skip
+def test_a_recipe_that_is_none_is_damage(text: str, tmp_path: Path) -> None:
+    save_modules(tmp_path / "modules.npz", [module_of(Recipe((2,)), (2,))])
+    assert load_modules(tmp_path)[0].recipe == Recipe((2,))
+    arrays = dict(np.load(tmp_path / "modules.npz"))
+    np.savez(tmp_path / "modules.npz", **{**arrays, "module1_recipe": np.array(text)})
+    with pytest.raises(LogDamagedError, match="holds no modules"):
+        load_modules(tmp_path)
