@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Sink as Sink
     from cdmisfa.core.signals import SIGNALS as SIGNALS
     from cdmisfa.core.signals import BlockSignals as BlockSignals
+    from cdmisfa.estimators.batches import IncSFA as IncSFA
+    from cdmisfa.estimators.batches import RecursiveSFA as RecursiveSFA
     from cdmisfa.modules import Module as Module
     from cdmisfa.public.learning import learn as learn
     from cdmisfa.public.recording import Recording as Recording
@@ -44,6 +46,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.core.errors": "CdmisfaError",
         "cdmisfa.core.learning": "Sink",
         "cdmisfa.core.signals": "SIGNALS",
+        "cdmisfa.estimators.batches": "IncSFA RecursiveSFA",
         "cdmisfa.modules": "Module",
         "cdmisfa.public.learning": "learn",
         "cdmisfa.public.recording": "Recording",

@@ -89,6 +89,16 @@ class Module:
             UsageError: these are no frames as it learned from, a value is no finite number, or it
                 has no such outputs.
         """
+        rows, expansion = self._inputs(frames)
+        phi = np.ascontiguousarray(self._chosen(outputs), np.float64)
+        return _projected(rows, expansion, phi, kernels.mean_output(phi, self._mean))
+
+    @property
+    def _mean(self) -> NDArray[np.float64]:
+        return np.ascontiguousarray(self.mean, np.float64)
+
+    def _inputs(self, frames: Any) -> tuple[NDArray[Any], str]:
+        """Frames or raw pictures as scaled rows, and how they are expanded; see `transform`."""
         array = self._frames(frames)
         if array.dtype != UINT8 and array.dtype.kind != "f":
             raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float values")
@@ -101,13 +111,7 @@ class Module:
             )
         if rows.dtype != UINT8 or self.scale != PIXEL:
             rows = rows.astype(np.float64)
-        phi = np.ascontiguousarray(self._chosen(outputs), np.float64)
-        offset = kernels.mean_output(phi, np.ascontiguousarray(self.mean, np.float64))
-        y = np.empty((len(rows), len(phi)))
-        for start in range(0, len(rows), CHUNK):
-            x = expand(expansion, rows[start : start + CHUNK])
-            y[start : start + CHUNK] = kernels.outputs(phi, offset, x)
-        return y
+        return rows, expansion
 
     def _frames(self, given: Any) -> NDArray[Any]:
         """Frames as they were given, or made of raw pictures."""
@@ -166,3 +170,40 @@ class Module:
         """
         kinds = (self.expansion,) if self.expansion else ("none", "quadratic")
         return next((k for k in kinds if expanded_size(k, size) == self.phi.shape[1]), None)
+
+
+class Stack:
+    """Several modules of one run side by side, whose outputs are computed in one pass.
+
+    Args:
+        modules: at least one.
+
+    Attributes:
+        modules: the same.
+    """
+
+    def __init__(self, modules: Sequence[Module]) -> None:
+        self.modules = tuple(modules)
+        self._phi = np.ascontiguousarray(np.concatenate([m.phi for m in modules]), np.float64)
+        each = [np.ascontiguousarray(m.phi, np.float64) for m in modules]
+        means = [kernels.mean_output(p, m._mean) for p, m in zip(each, modules, strict=True)]
+        self._offset = np.concatenate(means)
+
+    def transform(self, frames: Any) -> NDArray[np.float64]:
+        """Outputs of each module, one beside the other, (n, R), to the bit those that it gives.
+
+        Args:
+            frames: see `Module.transform`, as for what it raises.
+        """
+        rows, expansion = self.modules[0]._inputs(frames)
+        return _projected(rows, expansion, self._phi, self._offset)
+
+
+def _projected(
+    rows: NDArray[Any], expansion: str, phi: NDArray[np.float64], offset: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    y = np.empty((len(rows), len(phi)))
+    for start in range(0, len(rows), CHUNK):
+        x = expand(expansion, rows[start : start + CHUNK])
+        y[start : start + CHUNK] = kernels.outputs(phi, offset, x)
+    return y

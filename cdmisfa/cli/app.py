@@ -27,6 +27,7 @@ from cdmisfa.core.untrusted import printable
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
     "learn": ("learn", "Learn slow feature modules from a scene, a recording, logs or cameras."),
+    "apply": ("apply", "Apply the modules of a run to other logs."),
     "view": ("view", "Open a run or a recording in the Rerun viewer, or save, serve or draw it."),
     "play": ("view", "Show a recording as it was seen, in real time."),
     "info": ("logs", "Say what is in a recording, a run, any MCAP file, or a camera log."),

@@ -193,7 +193,7 @@ def _range(parts: Sequence[str | None]) -> tuple[float, float] | None:
 
 _NUMBER = r"(-?\d{1,9}(?:\.\d{1,9})?)"
 
-_WRITTEN = {
+WRITTEN = {
     SIZE: Written("size", "WIDTHxHEIGHT, as 128x48", r"([1-9]\d{0,3})x([1-9]\d{0,3})", _size),
     TIME: Written(
         "time",
@@ -252,8 +252,8 @@ def option_of(
     if types.NoneType in typing.get_args(kind):
         kind = next(each for each in typing.get_args(kind) if each is not types.NoneType)
     of: dict[str, Any] = {"type": kind, "show_default": field.default is not None}
-    if told["unit"] in _WRITTEN:
-        of = {"type": _WRITTEN[told["unit"]]}
+    if told["unit"] in WRITTEN:
+        of = {"type": WRITTEN[told["unit"]]}
     elif typing.get_origin(kind) is Literal:
         of["type"] = click.Choice(typing.get_args(kind))
     elif kind is bool:

@@ -56,7 +56,7 @@ class SteppedSource(ForwardSource):
     def take_all(self, n: int) -> tuple[Block, ...]:
         """See `FrameSource`."""
         check_request(self._spec, 0, n)
-        self._ahead += islice(self._steps, n - len(self._ahead))
+        self._ahead += islice(self._steps, max(n - len(self._ahead), 0))
         if len(self._ahead) < n:
             raise LogExhaustedError(
                 f"{len(self._ahead)} frames are left at frame {self._t}, {n} are needed"

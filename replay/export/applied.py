@@ -1,0 +1,301 @@
+"""What frozen modules give on the frames of a log, written for other programs as it comes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+from google.protobuf import descriptor_pb2
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.clock import times_of
+from cdmisfa.modules import Module
+from recorder.log.logfile import LogFile
+from recorder.log.messages import ENCODING, ImageEncoder, VectorEncoder, varint, view_topic
+from replay.runs.codec import define_message
+
+ROWS: Final = 8192
+"""Rows of a table that are written at once."""
+
+_FIELD = descriptor_pb2.FieldDescriptorProto
+OUTPUT_SCHEMA: Final = "cdmisfa.ModuleOutput"
+_, OUTPUT_DEFINITION = define_message(
+    OUTPUT_SCHEMA,
+    "module_output",
+    [
+        ("y", 1, _FIELD.TYPE_DOUBLE, True, "Outputs on the frame, the slowest first"),
+        ("slowness", 2, _FIELD.TYPE_DOUBLE, True, "Of each within the block, 1/frame"),
+        ("alive", 3, _FIELD.TYPE_BOOL, False, "Whether the first varies as where it was learned"),
+        ("novelty", 4, _FIELD.TYPE_DOUBLE, False, "Of the block, 1 and above where it is another"),
+        ("frame", 5, _FIELD.TYPE_SFIXED64, False, "Number of the frame"),
+    ],
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """What M modules with R outputs together give on frames that follow one another.
+
+    Attributes:
+        block: of one stream, no longer than a block of the run that learned the modules.
+        y: (n, R) outputs of all modules, one beside the other.
+        slowness: (R,) of each output within the block, 1/frame; infinite where it stands still.
+        alive: (M,) whether the module's first output varies there as where it was learned.
+        novelty: (M,) how much else than there it gives, 1 at the bound from which it does not
+            know the block.
+    """
+
+    block: Block
+    y: FloatArray
+    slowness: FloatArray
+    alive: NDArray[np.bool_]
+    novelty: FloatArray
+
+
+class AppliedSink(Protocol):
+    """Takes what modules give, block by block."""
+
+    def add(self, applied: Applied) -> None:
+        """Take a block in."""
+
+    def close(self) -> None:
+        """Let go; what was taken in is written."""
+
+
+def columns_of(modules: Sequence[Module]) -> Iterator[tuple[Module, slice]]:
+    """Each module with its columns among the outputs of all."""
+    ends = accumulate((len(module.phi) for module in modules), initial=0)
+    for module, (low, high) in zip(modules, pairwise(ends), strict=True):
+        yield module, slice(low, high)
+
+
+class TableSink:
+    """A table with a row a frame of a stream, Parquet or CSV by the name of the file.
+
+    What has no value is null, or nothing between two commas.
+    """
+
+    def __init__(self, path: Path, form: str, spec: SourceSpec, modules: Sequence[Module]) -> None:
+        import pyarrow as pa
+        import pyarrow.csv as pacsv
+        import pyarrow.parquet as pq
+
+        self._pa, self._spec = pa, spec
+        self._modules = list(columns_of(modules))
+        fields = [("log_time", pa.int64()), ("t", pa.int64()), ("stream", pa.string())]
+        plain = ["log_time", "t"]
+        for module, own in self._modules:
+            name, outputs = f"module{module.index}", range(own.stop - own.start)
+            fields += [(f"{name}_y{j}", pa.float64()) for j in outputs]
+            plain += [f"{name}_y{j}" for j in outputs]
+            fields += [(f"{name}_slowness{j}", pa.float64()) for j in outputs]
+            fields += [(f"{name}_alive", pa.bool_()), (f"{name}_novelty", pa.float64())]
+        self._schema = pa.schema(fields)
+        self._writer: Any
+        if form == "parquet":
+            of_blocks = [name for name, _ in fields if name not in plain]
+            self._writer = pq.ParquetWriter(
+                path, self._schema, compression="zstd", use_dictionary=of_blocks
+            )
+        else:
+            self._writer = pacsv.CSVWriter(path, self._schema)
+        self._waiting: list[Applied] = []
+        self._count = 0
+
+    def add(self, applied: Applied) -> None:
+        """See `AppliedSink`."""
+        self._waiting.append(applied)
+        self._count += len(applied.block)
+        if self._count >= ROWS:
+            self._write()
+
+    def close(self) -> None:
+        """See `AppliedSink`."""
+        self._write()
+        self._writer.close()
+
+    def _write(self) -> None:
+        if not self._waiting:
+            return
+        pa, waiting, spec = self._pa, self._waiting, self._spec
+        lengths = [len(one.block) for one in waiting]
+        t = np.concatenate(
+            [np.arange(one.block.t, one.block.t + len(one.block)) for one in waiting]
+        )
+        names = np.array(spec.streams, object)[[one.block.stream for one in waiting]]
+
+        def of_block(values: Any) -> Any:
+            each = np.repeat(np.stack(values), lengths, axis=0)
+            return each if each.dtype == bool else np.where(np.isfinite(each), each, np.nan)
+
+        y = np.concatenate([one.y for one in waiting])
+        slowness = of_block([one.slowness for one in waiting])
+        alive = of_block([one.alive for one in waiting])
+        novelty = of_block([one.novelty for one in waiting])
+        columns: list[Any] = [pa.array(times_of(t, spec.fps, spec.start_ns)), pa.array(t)]
+        columns.append(pa.array(np.repeat(names, lengths), pa.string()))
+        for i, (_, own) in enumerate(self._modules):
+            columns += [pa.array(y[:, j]) for j in range(own.start, own.stop)]
+            columns += [
+                pa.array(slowness[:, j], from_pandas=True) for j in range(own.start, own.stop)
+            ]
+            columns.append(pa.array(alive[:, i]))
+            columns.append(pa.array(novelty[:, i], from_pandas=True))
+        self._writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=self._schema))
+        self._waiting, self._count = [], 0
+
+
+@dataclass(frozen=True, slots=True)
+class OutputTopic:
+    """A topic on which messages are told: of the frames of a stream, or of a module on it."""
+
+    name: str
+    schema: str
+    definition: bytes
+
+
+class Messages:
+    """What modules give as messages: the frames of each stream, and a topic a module and stream.
+
+    Args:
+        spec: of the frames.
+        modules: in their order.
+
+    Attributes:
+        topics: all that there are.
+    """
+
+    def __init__(self, spec: SourceSpec, modules: Sequence[Module]) -> None:
+        self._spec, self._modules = spec, list(columns_of(modules))
+        self._frames: list[Any] = [VectorEncoder() for _ in spec.streams]
+        if spec.images:
+            height, width = spec.frame_shape
+            self._frames = [ImageEncoder(height, width, name) for name in spec.streams]
+        self._views = [
+            OutputTopic(view_topic(name), encoder.schema, encoder.schema_data())
+            for name, encoder in zip(spec.streams, self._frames, strict=True)
+        ]
+        self._outputs = [
+            [
+                OutputTopic(f"/module{module.index}/{name}", OUTPUT_SCHEMA, OUTPUT_DEFINITION)
+                for module, _ in self._modules
+            ]
+            for name in spec.streams
+        ]
+        self.topics = [*self._views, *(topic for own in self._outputs for topic in own)]
+
+    def of(self, applied: Applied) -> Iterator[tuple[OutputTopic, int, bytes]]:
+        """The messages of a block: topic, log time in nanoseconds, and data."""
+        block = applied.block
+        times = self._spec.times(block.t, block.t + len(block)).tolist()
+        encode, view = self._frames[block.stream], self._views[block.stream]
+        for at, frame in zip(times, block.frames, strict=True):
+            yield view, at, encode(at, frame)
+        for i, (_, own) in enumerate(self._modules):
+            topic = self._outputs[block.stream][i]
+            rows = _encoded(applied, i, own)
+            for at, row in zip(times, rows, strict=True):
+                yield topic, at, row.tobytes()
+
+
+def _encoded(applied: Applied, module: int, own: slice) -> NDArray[np.void]:
+    """The messages `cdmisfa.ModuleOutput` of a module on a block, all laid out alike."""
+    count = own.stop - own.start
+    head = varint(8 * count)
+    values = {
+        "y": (b"\x0a" + head, f"({count},)<f8", applied.y[:, own]),
+        "slowness": (b"\x12" + head, f"({count},)<f8", applied.slowness[own]),
+        "alive": (b"\x18", "u1", applied.alive[module]),
+        "novelty": (b"\x21", "<f8", applied.novelty[module]),
+        "frame": (b"\x29", "<i8", applied.block.t + np.arange(len(applied.block))),
+    }
+    kinds = []
+    for name, (tag, kind, _) in values.items():
+        kinds += [(f"{name}_tag", f"V{len(tag)}"), (name, kind)]
+    rows = np.zeros(len(applied.block), np.dtype(kinds))
+    for name, (tag, _, given) in values.items():
+        rows[f"{name}_tag"] = np.void(tag)
+        rows[name] = given
+    return rows
+
+
+class LogSink:
+    """An MCAP file: a topic a module and stream, beside the frames; readable while written."""
+
+    def __init__(
+        self, path: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool = False
+    ) -> None:
+        self._messages = Messages(spec, modules)
+        self._log = LogFile(path, force=force, compression="lz4", aside=True)
+        self._channels = {
+            topic: self._log.add_channel(
+                topic.name, self._log.add_schema(topic.schema, ENCODING, topic.definition)
+            )
+            for topic in self._messages.topics
+        }
+
+    def add(self, applied: Applied) -> None:
+        """See `AppliedSink`."""
+        found = self._messages.of(applied)
+        self._log.write_all([(self._channels[c], at, data, at, 0) for c, at, data in found])
+
+    def close(self) -> None:
+        """See `AppliedSink`."""
+        self._log.finish()
+
+    def abandon(self) -> None:
+        """Leave a readable NAME.partial."""
+        self._log.abandon()
+
+
+def as_json(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> Mapping[str, Any]:
+    """A block as JSON values; what is no finite number is null."""
+    block = applied.block
+    return {
+        "log_time": spec.time_ns(block.t),
+        "t": block.t,
+        "frames": len(block),
+        "stream": spec.streams[block.stream],
+        "modules": [
+            {
+                "module": module.index,
+                "y": applied.y[:, own].tolist(),
+                "slowness": [_number(value) for value in applied.slowness[own].tolist()],
+                "alive": bool(applied.alive[i]),
+                "novelty": _number(float(applied.novelty[i])),
+            }
+            for i, (module, own) in enumerate(columns_of(modules))
+        ],
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+class LinesSink:
+    """JSON lines, one a block, each handed on at once.
+
+    Args:
+        write: takes a line, without its end.
+        spec: of the frames.
+        modules: in their order.
+    """
+
+    def __init__(self, write: Any, spec: SourceSpec, modules: Sequence[Module]) -> None:
+        self._write, self._spec, self._modules = write, spec, modules
+
+    def add(self, applied: Applied) -> None:
+        """See `AppliedSink`."""
+        self._write(json.dumps(as_json(applied, self._spec, self._modules), allow_nan=False))
+
+    def close(self) -> None:
+        """See `AppliedSink`."""

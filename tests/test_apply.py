@@ -1,0 +1,207 @@
+"""Frozen modules are applied to other logs, with the bits that they give themselves."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+from camera_files import pictures, write_images
+from conftest import Cdmisfa
+from mcap.reader import make_reader
+from message_files import write_table
+from run_data import module_of
+
+from cdmisfa import Recipe, Run
+from cdmisfa.experiments.apply import Application
+from cdmisfa.modules import Module
+from recorder.cameras.stepped import ArraySource
+from recorder.recording import record
+from replay.camera_logs.source import ForeignSource
+from replay.runs.modules import save_modules
+
+TAU = 20
+SIZE = (6, 8)
+
+
+@pytest.fixture
+def run(cdmisfa: Cdmisfa, tmp_path: Path) -> Path:
+    """A run of one stream with two modules of three outputs, of frames 8x6."""
+    out = tmp_path / "run"
+    log = camera(tmp_path / "learned.mcap", 100, 9)
+    quick = ("--set", f"learner.tau={TAU}", "--max-iterations", 3, "--no-rerun", "-o", out)
+    done = cdmisfa("learn", log, "--size", "8x6", *quick)
+    assert done.code == 0, done.err
+    save_modules(out / "modules.npz", [learned(i) for i in (1, 2)])
+    return out
+
+
+def learned(index: int, shape: tuple[int, ...] = SIZE) -> Module:
+    phi = np.random.default_rng(index).normal(size=(3, int(np.prod(shape))))
+    made = module_of(index, index, phi)
+    about: Any = {"eta": np.full(3, 0.02), "band_sd": np.full(3, np.nan)}
+    about |= {"band_mean": about["eta"]}
+    recipe = Recipe(shape)
+    return replace(made, **about, recipe=recipe, frame_shape=shape, expansion="none", scale=1 / 255)
+
+
+def camera(path: Path, count: int, seed: int = 0, gap: int = 0) -> Path:
+    """A log of pictures 16x12, 50 a second; `gap` seconds are missing in its middle."""
+    late = [1000 * gap * (i >= count // 2) for i in range(count)]
+    images = [(1000 + 20 * i + late[i], image) for i, image in enumerate(pictures(count, seed))]
+    return write_images(path, {"/cam": images})
+
+
+def outputs(table: Any, module: int) -> np.ndarray:
+    return np.stack([table[f"module{module}_y{j}"].to_numpy() for j in range(3)], axis=1)
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv"])
+@pytest.mark.parametrize(("count", "gap"), [(90, 0), (2000, 0), (90, 3), (21, 0)])
+def test_a_table_has_the_bits_of_transform(
+    form: str, count: int, gap: int, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log, out = camera(tmp_path / "a.mcap", count, gap=gap), tmp_path / f"o.{form}"
+    done = cdmisfa("apply", run, log, "-o", out, "--json")
+    assert done.code == 0, done.err
+    table = pq.read_table(out) if form == "parquet" else pacsv.read_csv(out)
+    assert done.json["logs"][0]["frames"] == len(table) == count
+    shown = np.stack(list(pictures(count)))
+    for module in Run(run).modules:
+        np.testing.assert_array_equal(outputs(table, module.index), module.transform(shown))
+    assert np.unique(table["log_time"].to_numpy()).size == count
+    for name in ("module1_novelty", "module2_slowness0"):
+        each = np.array(table[name].to_pylist(), float)
+        starts = [0, *(np.flatnonzero(np.diff(table["t"].to_numpy() // TAU)) + 1)]
+        assert all(len(set(part[:5])) == 1 for part in np.split(each, starts[1:]))
+    assert table["module1_novelty"].null_count == (count == 21)  # a block of one frame
+
+
+def test_an_mcap_has_a_topic_a_module_beside_the_frames(
+    run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log, out = camera(tmp_path / "a.mcap", 50), tmp_path / "o.mcap"
+    assert cdmisfa("apply", run, log, "-o", out).code == 0
+    from replay.camera_logs.options import CameraOptions
+    from replay.inputs import open_log
+
+    frames = ForeignSource(log, size=SIZE).take(0, 50).frames
+    again = ForeignSource(out, ["/view/cam"]).take(0, 50).frames
+    np.testing.assert_array_equal(again, frames)
+    for module in Run(run).modules:
+        options = CameraOptions(topics=(f"/module{module.index}/cam",), fields=("y",))
+        y = open_log([out], options).take(0, 50).frames
+        np.testing.assert_array_equal(y, module.transform(frames))
+    with out.open("rb") as file:
+        times = [m.log_time for _, c, m in make_reader(file).iter_messages() if "1/cam" in c.topic]
+    assert times == [(1000 + 20 * i) * 10**6 for i in range(50)]
+    assert cdmisfa("verify", out).code == 0
+
+
+def test_several_logs_are_a_file_each_and_a_bad_one_does_not_end_the_rest(
+    run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    logs = [camera(tmp_path / f"{name}.mcap", 60, seed) for seed, name in enumerate("abcd")]
+    logs[1].write_bytes(b"nothing")
+    table = write_table(tmp_path / "t.csv", {"x": [1.0, 2.0, 3.0]})
+    done = cdmisfa("apply", run, *logs, table, "-o", tmp_path / "out", "--json")
+    assert done.code == 3, done.err
+    said = done.json["logs"]
+    assert [one["frames"] for one in said] == [60, 0, 60, 60, 0]
+    assert [one["error"] is None for one in said] == [True, False, True, True, False]
+    found = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert found == ["a.parquet", "c.parquet", "d.parquet"]
+    refused = cdmisfa("apply", run, *logs, "-o", tmp_path / "out.csv")
+    assert (refused.code, "a file each" in refused.err) == (2, True)
+
+
+def test_what_came_before_damage_is_kept(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log, out = camera(tmp_path / "a.mcap", 3000), tmp_path / "o.parquet"
+    data = bytearray(log.read_bytes())
+    half = len(data) // 2
+    data[half : half + 40] = bytes(40)
+    log.write_bytes(data)
+    done = cdmisfa("apply", run, log, "-o", out)
+    assert done.code == 3, done.err
+    assert "what came before was applied, and is kept" in done.err
+    table = pq.read_table(out)
+    assert 1000 < len(table) < 2000
+    shown = np.stack(list(pictures(len(table))))
+    module = Run(run).modules[1]
+    np.testing.assert_array_equal(outputs(table, 2), module.transform(shown))
+    assert cdmisfa("apply", run, log, "-o", tmp_path / "w.csv", "--salvage").code == 0
+
+
+def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
+    run: Path, tmp_path: Path
+) -> None:
+    """From an array that ends within a block, its recording, and that as another's log."""
+    shown = np.stack(list(pictures(150)))[:, ::2, ::2].copy()
+    record(ArraySource({"cam": shown}), tmp_path / "rec", frames=150)
+    application = Application(run)
+    sources = [
+        ArraySource({"cam": iter(shown)}),
+        application.open([str(tmp_path / "rec")]),
+        ForeignSource(tmp_path / "rec" / "cam.mcap", ["/view/cam"]),
+    ]
+    found = [list(application.to(source)) for source in sources]
+    assert [len(one.block) for one in found[0]] == [TAU] * 7 + [10]
+    for each in zip(*found, strict=True):
+        for one in each[1:]:
+            for name in ("y", "slowness", "alive", "novelty"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(each[0], name))
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "why"),
+    [
+        ("apply RUN oscillatory", 2, r"frames of \(2,\), and the modules learned from \(6, 8\)"),
+        ("apply RUN small.mcap", 2, "smaller than 8x6"),
+        ("apply RUN t.csv", 2, "t.csv"),
+        ("apply RUN none.mcap", 2, "none.mcap: no such file"),
+        ("apply RUN empty.mcap", 3, "empty.mcap"),
+        ("apply a.mcap a.mcap", 2, "a.mcap"),
+        ("apply EMPTY a.mcap", 2, "has no modules: learn longer"),
+        ("apply RUN a.mcap --to csv", 2, "name it with -o"),
+        ("apply RUN a.mcap --to tea", 2, "--to tea: name parquet, csv, mcap"),
+        ("apply RUN a.mcap -o o.csv --to mcap", 2, "name it o.mcap"),
+        ("apply RUN a.mcap -o there.csv", 2, "there.csv exists"),
+        ("apply RUN a.mcap --from 5 --to 3", 2, "--from 5 is no earlier than --to 3"),
+        ("apply RUN RUN", 2, "is a run, not a recording"),
+    ],
+)
+def test_what_cannot_be_applied_is_refused_in_a_line(
+    words: str, code: int, why: str, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    camera(tmp_path / "a.mcap", 30)
+    tiny = [(20 * i, image[:4, :4]) for i, image in enumerate(pictures(30))]
+    write_images(tmp_path / "small.mcap", {"/cam": tiny})
+    write_table(tmp_path / "t.csv", {"x": [1.0, float("nan"), 3.0]})
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    (tmp_path / "there.csv").write_text("mine")
+    if "EMPTY" in words:
+        save_modules(run / "modules.npz", [])
+    named = {"RUN": run, "EMPTY": run}
+    args = [named.get(word, tmp_path / word if "." in word else word) for word in words.split()[1:]]
+    done = cdmisfa("apply", *args)
+    assert done.code == code, done.err
+    assert re.search(why, done.err), done.err
+    assert len(done.err.splitlines()) == 1
+    assert (tmp_path / "there.csv").read_text() == "mine"
+
+
+def test_a_part_and_a_loop_are_applied(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log = camera(tmp_path / "a.mcap", 100)
+    part = cdmisfa("apply", run, log, "--from", 0.2, "--to", 1, "--json").json
+    assert part["logs"][0]["frames"] == 40
+    out = tmp_path / "o.csv"
+    done = cdmisfa("apply", run, log, "--loop", "--frames", 250, "--to", "csv", "-o", out, "--json")
+    assert json.loads(done.out)["logs"][0]["frames"] == 250
+    y = outputs(pacsv.read_csv(out), 1)
+    np.testing.assert_array_equal(y[:100], y[100:200])
