@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Sink as Sink
     from cdmisfa.core.signals import SIGNALS as SIGNALS
     from cdmisfa.core.signals import BlockSignals as BlockSignals
+    from cdmisfa.estimators.batches import IncSFA as IncSFA
+    from cdmisfa.estimators.batches import RecursiveSFA as RecursiveSFA
     from cdmisfa.experiments.loop import learn as learn
     from cdmisfa.experiments.recompute import Run as Run
     from cdmisfa.modules import Module as Module
@@ -47,6 +49,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.core.learning": "Learner Sink",
         "cdmisfa.modules": "Module",
         "cdmisfa.core.signals": "SIGNALS BlockSignals",
+        "cdmisfa.estimators.batches": "IncSFA RecursiveSFA",
         "cdmisfa.experiments.loop": "learn",
         "recorder.cameras.stepped": "ArraySource GymSource",
         "recorder.images.recipe": "Recipe make_frame",

@@ -38,6 +38,7 @@ FORBIDDEN = {
     "cdmisfa.cli": ("rerun", "mcap", "pybullet"),
     "cdmisfa.cli.commands": ("rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
+    "cdmisfa.estimators": ("cdmisfa.experiments.session", "replay.palette", "recorder.config"),
     "cdmisfa.experiments": ("cdmisfa.studies.paper.reproduce", "cdmisfa.cli.app"),
     "cdmisfa.agents.progress": ("cdmisfa.experiments.session", "replay.palette", "rerun"),
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),

@@ -28,7 +28,8 @@ EXTRAS = {
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs; -o s3://"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "arena": (("ale_py", "av", "gymnasium", "skvideo", "sklearn"), "streams of the arena"),
-    "sklearn": (("sklearn",), "the transformer for scikit-learn"),
+    "sklearn": (("sklearn",), "RecursiveSFA and IncSFA, estimators of scikit-learn"),
+    "river": (("river",), "OnlineSFA, a transformer of river"),
     "testing": (("pytest",), "the contract tests of cdmisfa.testing"),
     "dask": (("distributed",), "sweep and reproduce --engine dask"),
 }

@@ -1,0 +1,307 @@
+"""Slow feature analysis as estimators of scikit-learn, which learn on from batch to batch.
+
+The rows of X are samples that follow one another in time. Where a batch does not follow the one
+before, `gap=True` says so, and no difference is taken across it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from numbers import Integral, Real
+from typing import Any, Self
+
+import numpy as np
+
+from cdmisfa.agents.inputs import LARGEST_VALUE
+from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.config import MAX_COMPONENTS, LearnerConfig
+from cdmisfa.core.errors import UsageError
+from cdmisfa.features.incsfa import Feature, IncrementalFeature
+from cdmisfa.features.outputs import project
+from cdmisfa.features.recursive import PIECE, RecursiveFeature
+from cdmisfa.kernels import mean_output, multiply
+
+try:
+    from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, TransformerMixin
+    from sklearn.utils.validation import check_is_fitted, check_random_state, validate_data
+except ImportError:
+
+    class _Estimator:
+        def __new__(cls, *_: Any, **__: Any) -> Self:
+            raise UsageError(
+                f"{cls.__name__} needs scikit-learn, which is missing: "
+                "pip install 'cdmisfa[sklearn]'"
+            )
+else:
+
+    class _Estimator(  # type: ignore[no-redef]
+        ClassNamePrefixFeaturesOutMixin,  # type: ignore[misc]
+        TransformerMixin,  # type: ignore[misc]
+        BaseEstimator,  # type: ignore[misc]
+    ):
+        pass
+
+
+CHUNK = 16 * PIECE
+"""Samples that are made float64 at once: whole pieces, so that it does not matter."""
+
+
+class _SlowFeatures(_Estimator):
+    """What both estimators share; a class that derives from it has `_begin`."""
+
+    n_components: int
+    n_whitened: int
+    window: int
+    _feature: Any
+
+    def fit(self, X: Any, y: Any = None) -> Self:
+        """Learn from one sequence, and forget what was learned before.
+
+        Args:
+            X: (n, I) samples that follow one another in time.
+            y: not used.
+
+        Raises:
+            ValueError: X or a parameter cannot be used.
+        """
+        vars(self).pop("_feature", None)
+        return self._learn(X, False, fewest=2)
+
+    def partial_fit(self, X: Any, y: Any = None, *, gap: bool = False) -> Self:
+        """Learn on from samples that follow those before, or from others after a gap.
+
+        Args:
+            X: (n, I) samples that follow one another in time.
+            y: not used.
+            gap: the first of them does not follow the last one learned from: it is another
+                sequence, or samples are missing.
+
+        Raises:
+            ValueError: X or a parameter cannot be used.
+        """
+        return self._learn(X, gap, fewest=1)
+
+    def transform(self, X: Any) -> FloatArray:
+        """Outputs (X - mean_) @ components_.T, the same bits on every machine.
+
+        Args:
+            X: (n, I) samples, in any order.
+
+        Returns:
+            (n, n_components), the slowest first.
+
+        Raises:
+            NotFittedError: nothing was learned yet.
+            ValueError: X cannot be used.
+        """
+        check_is_fitted(self)
+        X = validate_data(self, X, reset=False, dtype="numeric")
+        weights, mean = np.ascontiguousarray(self.components_), self.mean_
+        offset = mean_output(weights, mean)
+        return np.concatenate([project(weights, offset, x) for x in _chunks(X)])
+
+    @property
+    def components_(self) -> FloatArray:
+        """(n_components, I) weights of the centred sample; 0 where too few samples were seen."""
+        return np.array(self._feature.phi)
+
+    @property
+    def mean_(self) -> FloatArray:
+        """(I,) mean of the samples, over the window."""
+        return np.array(self._feature.mean)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return "_feature" in vars(self)
+
+    @property
+    def _n_features_out(self) -> int:
+        return len(self._feature.phi)
+
+    def _begin(self, n_features: int) -> Feature:
+        raise NotImplementedError
+
+    def _follow(self, x: FloatArray, gap: bool) -> None:
+        """Samples were learned from."""
+
+    def _learn(self, X: Any, gap: bool, fewest: int) -> Self:
+        first = not self.__sklearn_is_fitted__()
+        X = validate_data(self, X, reset=first, dtype="numeric", ensure_min_samples=fewest)
+        largest = max(abs(float(X.max())), abs(float(X.min())))
+        if largest > LARGEST_VALUE:
+            raise ValueError(f"X holds {largest:g}, more than {LARGEST_VALUE:g}: scale it")
+        if first:
+            self._check(X.shape[1])
+            self._feature = self._begin(X.shape[1])
+            self.n_samples_seen_ = 0
+        for x in _chunks(X):
+            self._feature.update(x, gap)
+            self._follow(x, gap)
+            self.n_samples_seen_ += len(x)
+            gap = False
+        return self
+
+    def _check(self, n_features: int) -> None:
+        sizes = {"n_components": self.n_components, "n_whitened": self.n_whitened}
+        for name, value in {**sizes, "window": self.window}.items():
+            if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"{name}={value!r} given: it is a whole number from 1")
+        most = min(self.n_whitened, n_features, MAX_COMPONENTS)
+        if self.n_components > most:
+            raise ValueError(
+                f"n_components={self.n_components} given: with n_whitened={self.n_whitened} and "
+                f"n_features={n_features} it is at most {most}"
+            )
+
+
+class RecursiveSFA(_SlowFeatures):
+    """The slowest features of all samples so far, without a learning rate.
+
+    It keeps the largest principal components and the covariance of the differences along them, and
+    solves for the slowest directions with every batch. Where X has at most `n_whitened` features,
+    and up to as many samples as the window has, that is batch SFA but for rounding, however they
+    are cut into batches.
+
+    Args:
+        n_components: features to find.
+        n_whitened: principal components that they are found among, at most the features of X.
+        window: samples of the exponential window; the first so many all count the same.
+
+    Attributes:
+        components_: (n_components, n_features_in_) weights of the centred sample.
+        mean_: (n_features_in_,) mean of the samples.
+        slowness_: (n_components,) of each feature.
+        n_samples_seen_: samples learned from.
+        n_features_in_: features of X.
+        feature_names_in_: their names, where X has names.
+
+    Example:
+        >>> t = np.arange(2000.0)
+        >>> X = np.stack([np.sin(t / 50) + np.sin(t), np.sin(t)], axis=1)
+        >>> sfa = RecursiveSFA().fit(X[:1000]).partial_fit(X[1000:])
+        >>> round(float(sfa.slowness_[0] * 2 * np.pi * 50), 2)
+        1.0
+    """
+
+    def __init__(self, n_components: int = 1, *, n_whitened: int = 16, window: int = 8000) -> None:
+        self.n_components = n_components
+        self.n_whitened = n_whitened
+        self.window = window
+
+    @property
+    def slowness_(self) -> FloatArray:
+        """(n_components,) in cycles a sample, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN: no such yet."""
+        return np.array(self._feature.state.spectrum[: self._n_features_out])
+
+    def inverse_transform(self, Y: Any) -> FloatArray:
+        """The samples that outputs tell of, with the least mean square error over those learned.
+
+        Args:
+            Y: (n, n_components) outputs.
+
+        Returns:
+            (n, I).
+
+        Raises:
+            NotFittedError: nothing was learned yet.
+            ValueError: these are not so many outputs.
+        """
+        check_is_fitted(self)
+        Y, state = np.asarray(Y, np.float64), self._feature.state
+        if Y.ndim != 2 or Y.shape[1] != self._n_features_out:
+            raise ValueError(f"Y of shape {Y.shape} given: give (n, {self._n_features_out})")
+        patterns = multiply(state.weights * state.variance, state.basis)
+        return np.asarray(multiply(np.ascontiguousarray(Y), patterns) + self.mean_)
+
+    def _begin(self, n_features: int) -> Feature:
+        whitened = min(self.n_whitened, n_features)
+        return RecursiveFeature(n_features, whitened, self.n_components, self.window)
+
+
+class IncSFA(_SlowFeatures):
+    """Incremental slow feature analysis, sample by sample, with a learning rate.
+
+    That is what the paper's learner learns with: candid covariance-free PCA, and minor component
+    analysis of the whitened differences (Kompella, Luciw and Schmidhuber 2012). It follows a stream
+    that changes, and needs thousands of samples to converge; `RecursiveSFA` needs fewer.
+
+    Args:
+        n_components: features to find.
+        n_whitened: principal components that they are found among, at most the features of X.
+        nu: learning rate, from 0 to 1.
+        window: samples of the running mean, and of the slowness.
+        random_state: where the first weights are drawn from.
+
+    Attributes:
+        components_: (n_components, n_features_in_) weights of the centred sample.
+        mean_: (n_features_in_,) mean of the samples, over the window.
+        slowness_: (n_components,) of each feature over the window.
+        n_samples_seen_: samples learned from.
+        n_features_in_: features of X.
+        feature_names_in_: their names, where X has names.
+
+    Example:
+        >>> t = np.arange(20000.0)
+        >>> X = np.stack([np.sin(t / 50) + np.sin(t), np.sin(t)], axis=1)
+        >>> y = IncSFA(n_whitened=2).fit(X).transform(X)
+        >>> round(abs(float(np.corrcoef(y[:, 0], np.sin(t / 50))[0, 1])), 1)
+        1.0
+    """
+
+    def __init__(
+        self,
+        n_components: int = 1,
+        *,
+        n_whitened: int = 16,
+        nu: float = 0.05,
+        window: int = 1000,
+        random_state: Any = 0,
+    ) -> None:
+        self.n_components = n_components
+        self.n_whitened = n_whitened
+        self.nu = nu
+        self.window = window
+        self.random_state = random_state
+
+    _moments: FloatArray
+    _measured: int
+    _last: FloatArray
+
+    @property
+    def slowness_(self) -> FloatArray:
+        """(n_components,) in cycles a sample, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN: no such yet."""
+        mean, square, moves = self._moments
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(np.sqrt(moves / (square - mean * mean)) / (2 * np.pi))
+
+    def _begin(self, n_features: int) -> Feature:
+        if not isinstance(self.nu, Real) or not 0 <= self.nu <= 1:
+            raise ValueError(f"nu={self.nu!r} given: it is a learning rate, from 0 to 1")
+        config = LearnerConfig(
+            outputs=self.n_components,
+            components=min(self.n_whitened, n_features),
+            nu=self.nu,
+            mean_window=self.window,
+        )
+        seed = check_random_state(self.random_state).randint(2**31 - 1)
+        self._moments, self._measured = np.zeros((3, self.n_components)), 0
+        return IncrementalFeature(config, n_features, np.random.default_rng(seed))
+
+    def _follow(self, x: FloatArray, gap: bool) -> None:
+        """Measure the outputs of the samples that follow others; see `slowness_`."""
+        weights = self._feature.phi
+        before = x[:0] if gap or not self.n_samples_seen_ else self._last
+        self._last = x[-1:].copy()
+        y = project(weights, mean_output(weights, self._feature.mean), np.concatenate([before, x]))
+        if len(y) < 2:
+            return
+        now, moves = y[1:], np.diff(y, axis=0)
+        self._measured = min(self._measured + len(now), self.window)
+        share = min(len(now) / self._measured, 1.0)
+        new = np.stack([now, now**2, moves**2]).mean(axis=1)
+        self._moments = (1 - share) * self._moments + share * new
+
+
+def _chunks(X: Any) -> Iterator[FloatArray]:
+    """Rows as float64, some at a time."""
+    for start in range(0, len(X), CHUNK):
+        yield np.ascontiguousarray(X[start : start + CHUNK], np.float64)

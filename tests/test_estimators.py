@@ -1,0 +1,226 @@
+"""Slow feature analysis in scikit-learn and river: their own checks, and more."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from river import checks
+from sklearn.base import clone
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from sklearn.utils.estimator_checks import check_estimator
+
+from cdmisfa.core.errors import UsageError
+from cdmisfa.estimators import IncSFA, OnlineSFA, RecursiveSFA
+from cdmisfa.features.sfa import batch_sfa, slowness
+
+Make = Callable[[], Any]
+BOTH = pytest.mark.parametrize("make", [RecursiveSFA, IncSFA])
+
+
+def waves(n: int = 3000, size: int = 6) -> NDArray[np.float64]:
+    """(n, size) mixed sines, from slow to quick."""
+    t = np.arange(float(n))[:, None]
+    mixing = np.linalg.qr(np.random.default_rng(3).standard_normal((size, size)))[0]
+    return np.asarray(np.sin(t / (100.0 / 2.0 ** np.arange(size))) @ mixing + 5.0)
+
+
+def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return abs(float(np.corrcoef(a, b)[0, 1]))
+
+
+@BOTH
+def test_scikit_learns_own_checks_pass(make: Make) -> None:
+    results = check_estimator(make(), on_skip=None, on_fail=None)
+    wrong = {r["check_name"]: r["exception"] for r in results if r["status"] == "failed"}
+    assert wrong == {}
+    assert sum(r["status"] == "passed" for r in results) >= 40
+
+
+@pytest.mark.parametrize("check", list(checks.yield_checks(OnlineSFA())), ids=lambda c: c.__name__)
+def test_rivers_own_checks_pass(check: Callable[[Any], None]) -> None:
+    check(OnlineSFA())
+
+
+@pytest.mark.parametrize("cut", [1, 7, 1024, 3000])
+def test_however_the_samples_are_cut_it_is_batch_sfa(cut: int) -> None:
+    X, sfa = waves(), RecursiveSFA(3)
+    for start in range(0, len(X), cut):
+        sfa.partial_fit(X[start : start + cut])
+    y, expected = sfa.transform(X), (X - X.mean(axis=0)) @ batch_sfa(X, 3).T
+    assert [correlation(y[:, i], expected[:, i]) for i in range(3)] == pytest.approx([1.0] * 3)
+    np.testing.assert_allclose(y.var(axis=0), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(sfa.slowness_, slowness(y), rtol=1e-3)
+    assert sfa.n_samples_seen_ == len(X)
+
+
+@BOTH
+def test_nothing_is_learned_across_a_gap(make: Make) -> None:
+    X = waves()
+    a, b = np.array_split(X, 2)
+    told, untold = make().fit(a), make().fit(a)
+    for _ in range(20):
+        told.partial_fit(b[:50] + 30.0, gap=True)
+        untold.partial_fit(b[:50] + 30.0)
+        told.partial_fit(a[:50], gap=True)
+        untold.partial_fit(a[:50])
+    assert told.slowness_[0] < untold.slowness_[0] / 2
+
+
+@BOTH
+@pytest.mark.parametrize("dtype", ["uint8", "int64", "float32", "bool", ">f8", "object"])
+def test_numbers_of_any_type_count_as_they_are(make: Make, dtype: str) -> None:
+    X = (waves(400) > 5.0) if dtype == "bool" else np.round(waves(400) * 4.0 + 60.0)
+    own, plain = make().fit(X.astype(dtype)), make().fit(X.astype(float))
+    np.testing.assert_array_equal(own.transform(X.astype(dtype)), plain.transform(X.astype(float)))
+    np.testing.assert_array_equal(own.mean_, plain.mean_)
+
+
+@BOTH
+def test_an_array_that_is_not_float64_is_never_copied_whole(make: Make) -> None:
+    X = np.random.default_rng(0).integers(0, 256, (60_000, 64), dtype=np.uint8)
+    sfa = make().fit(X[:2000])
+    tracemalloc.start()
+    sfa.partial_fit(X)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < X.nbytes  # of float64 it would be eight times as much
+
+
+@BOTH
+def test_it_learns_on_after_pickling_with_the_same_bits(make: Make) -> None:
+    X = waves()
+    straight = make().fit(X[:1000])
+    copied = pickle.loads(pickle.dumps(straight))
+    for sfa in (straight, copied):
+        sfa.partial_fit(X[1000:])
+    np.testing.assert_array_equal(straight.transform(X), copied.transform(X))
+    again = clone(straight).fit(X[:1000]).partial_fit(X[1000:])
+    np.testing.assert_array_equal(again.transform(X), straight.transform(X))
+    np.testing.assert_array_equal(straight.fit(X[:500]).mean_, make().fit(X[:500]).mean_)
+
+
+def test_a_pipeline_finds_what_is_slow_in_products() -> None:
+    t = np.linspace(0, 2 * np.pi, 4000)  # Wiskott and Sejnowski 2002
+    X = np.stack([np.sin(t) + np.cos(11 * t) ** 2, np.cos(11 * t)], axis=1)
+    whole = make_pipeline(StandardScaler(), PolynomialFeatures(include_bias=False), RecursiveSFA())
+    y = whole.set_output(transform="default").fit_transform(X)
+    assert correlation(y[:, 0], np.sin(t)) > 0.999
+    assert whole.get_feature_names_out().tolist() == ["recursivesfa0"]
+
+
+def test_inverse_transform_is_the_best_that_outputs_tell() -> None:
+    X = waves()
+    for n in (2, 6):
+        sfa = RecursiveSFA(n).fit(X)
+        y = sfa.transform(X)
+        best = np.linalg.lstsq(y, X - X.mean(axis=0), rcond=None)[0]
+        expected = y @ best + X.mean(axis=0)
+        np.testing.assert_allclose(sfa.inverse_transform(y), expected, atol=1e-6)
+    np.testing.assert_allclose(expected, X, atol=1e-6)
+
+
+def test_incsfa_follows_what_is_slow() -> None:
+    t = np.arange(30_000.0)
+    slow, quick = np.sin(t / 50), np.sin(t)
+    sfa = IncSFA(2, n_whitened=2).fit(np.stack([slow + quick, quick], axis=1)[:20_000])
+    y = sfa.transform(np.stack([slow + quick, quick], axis=1)[20_000:])
+    assert correlation(y[:, 0], slow[20_000:]) > 0.99
+    np.testing.assert_allclose(sfa.slowness_, slowness(y), rtol=0.1)
+
+
+@BOTH
+def test_too_few_samples_give_no_feature_yet(make: Make) -> None:
+    sfa = make().partial_fit([[1.0, 2.0]])
+    assert np.isnan(sfa.slowness_).all()
+    assert sfa.transform([[1.0, 2.0]]).shape == (1, 1)
+    constant = make().fit(np.ones((50, 3)))
+    assert np.isnan(constant.slowness_).all()
+    np.testing.assert_array_equal(constant.transform(np.ones((2, 3))), 0.0)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("parameters", "X", "message"),
+    [
+        ({"n_components": 3}, np.ones((9, 2)), "n_components=3 .* at most 2"),
+        ({"n_components": 5, "n_whitened": 4}, np.ones((9, 9)), "at most 4"),
+        ({"n_components": 0}, np.ones((9, 2)), "n_components=0 given: it is a whole number"),
+        ({"n_whitened": 2.5}, np.ones((9, 2)), "n_whitened=2.5 given"),
+        ({"window": None}, np.ones((9, 2)), "window=None given"),
+        ({}, np.full((9, 2), 1e200), "holds 1e[+]200, more than 1e[+]100: scale it"),
+        ({}, np.full((9, 2), np.nan), "contains NaN"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused(
+    make: Callable[..., Any], parameters: dict[str, Any], X: Any, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(**parameters).fit(X)
+
+
+@pytest.mark.parametrize("nu", [-1.0, 2.0, "quick"])
+def test_a_learning_rate_is_from_0_to_1(nu: Any) -> None:
+    with pytest.raises(ValueError, match=f"nu={nu!r} given: it is"):
+        IncSFA(nu=nu).fit(np.ones((9, 2)))
+
+
+def samples(X: NDArray[np.float64]) -> list[dict[str, float]]:
+    return [dict(zip("abcdef", row, strict=True)) for row in X.tolist()]
+
+
+def test_a_sample_at_a_time_gives_the_same_bits() -> None:
+    X, online, sfa = waves(300), OnlineSFA(2), RecursiveSFA(2)
+    for row, x in zip(X, samples(X), strict=True):
+        online.learn_one(x)
+        sfa.partial_fit(row[None])
+    y = sfa.transform(X[-1:])[0]
+    assert list(online.transform_one(samples(X)[-1]).values()) == y.tolist()
+    assert online.slowness == sfa.slowness_[0]
+
+
+@pytest.mark.parametrize("lost", [None, float("nan"), float("inf"), 1e200, "word"])
+def test_a_sample_that_lacks_something_is_a_gap(lost: Any) -> None:
+    X, online, sfa = waves(300), OnlineSFA(), RecursiveSFA()
+    incomplete = samples(X)[0] | {"a": lost} if lost else {"b": 1.0}
+    for x in [*samples(X[:200]), incomplete, *samples(X[250:])]:
+        online.learn_one(x)
+    for i, row in enumerate(X):
+        if not 200 <= i < 250:
+            sfa.partial_fit(row[None], gap=i == 250)
+    assert online.slowness == sfa.slowness_[0]
+    centre = dict(zip("abcdef", sfa.mean_.tolist(), strict=True))
+    assert online.transform_one({}) == online.transform_one(centre)
+
+
+def test_more_features_than_there_are_is_refused_of_a_sample() -> None:
+    with pytest.raises(UsageError, match="20 outputs"):
+        OnlineSFA(20).learn_one({"a": 1.0})
+    assert OnlineSFA(3).transform_one({"a": 1.0}) == dict.fromkeys(
+        ("onlinesfa0", "onlinesfa1", "onlinesfa2"), 0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"),
+    [("RecursiveSFA", "sklearn", "sklearn"), ("OnlineSFA", "river", "river")],
+)
+def test_without_its_package_it_says_what_to_install(name: str, package: str, extra: str) -> None:
+    code = (
+        f"import sys; sys.modules[{package!r}] = None\n"
+        f"import cdmisfa.estimators as e\nhelp(e.{name})\n"
+        f"try: e.{name}(2, n_whitened=4)\nexcept Exception as error: print(repr(error))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert "window: " in done.stdout
+    assert f"which is missing: pip install 'cdmisfa[{extra}]'" in done.stdout.splitlines()[-1]
