@@ -26,7 +26,6 @@ from cdmisfa.cli.printing import (
 )
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.options import TIME
-from recorder.cameras.words import is_live
 from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
@@ -95,6 +94,7 @@ def apply_command(
     """
     from cdmisfa.experiments.apply import Application
     from cdmisfa.experiments.applying import places
+    from recorder.cameras.words import is_live
 
     target, logs = targets(ctx, to, port), logs_of(source)
     if target.way == STDOUT and as_json:
@@ -220,6 +220,7 @@ def targets(ctx: click.Context, words: Sequence[str], port: int | None) -> Targe
 
 def logs_of(source: Sequence[str]) -> list[list[str]]:
     """The words of each log, of a pattern those that match it; live streams are together."""
+    from recorder.cameras.words import is_live
     from recorder.world.scenes import SCENES
     from replay.inputs import locations
     from replay.storage.location import Url
