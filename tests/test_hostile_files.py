@@ -27,6 +27,7 @@ from recorder.log.logfile import LogFile
 from recorder.log.resume import frames_held
 from recorder.mcap.records import KINDS
 from recorder.recording import record_scene
+from replay.arrays import ENDINGS
 from replay.camera_logs import pictures
 from replay.camera_logs.opening import WHOLE_FILES, open_images
 from replay.integrity.info import describe
@@ -335,7 +336,7 @@ def test_a_file_that_was_never_written_is_said_to_be(
         assert "it begins with zeros, as a file that was never written" in done.err + done.out
 
 
-@pytest.mark.parametrize("ending", ["flv", "ts", "gif", "webp", "npy", "tiff", "bmp"])
+@pytest.mark.parametrize("ending", ["flv", "ts", "gif", "webp", "tiff", "bmp"])
 def test_of_what_is_no_log_it_is_said_which_kinds_are(
     cdmisfa: Cdmisfa, tmp_path: Path, ending: str
 ) -> None:
@@ -351,7 +352,7 @@ def test_of_what_is_no_log_it_is_said_which_kinds_are(
             assert KINDS in done.err
 
 
-@pytest.mark.parametrize("ending", [*WHOLE_FILES, ".mcap"])
+@pytest.mark.parametrize("ending", [*WHOLE_FILES, *ENDINGS, ".mcap"])
 def test_every_kind_that_is_read_is_named(ending: str) -> None:
     assert re.search(rf"{re.escape(ending.replace('.jpeg', '.jpg'))}\b", KINDS)
 

@@ -54,7 +54,8 @@ class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with 
 
 KINDS: Final = (
     "logs are .mcap, .bag and .db3 files, videos (.mp4, .m4v, .mov, .mkv, .webm, .avi, .wmv, .mpg, "
-    ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, and LeRobot datasets"
+    ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, and LeRobot datasets "
+    "(.npy and .npz are for learn and sweep)"
 )
 """What is read, for errors; docs/logs.md says more."""
 
