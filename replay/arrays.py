@@ -215,6 +215,7 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
             f"{name}: its values are of type {array.dtype}, no numbers: {_WANTED}; of a table "
             "choose the columns of numbers"
         )
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.ndim == 1:
         array = array[:, None]
     if array.ndim == 4 and array.shape[3] in (1, 3, 4):
