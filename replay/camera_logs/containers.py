@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.untrusted import begun, opened_regular
 
 
