@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from cdmisfa.experiments.loop import learn as learn
     from cdmisfa.experiments.recompute import Run as Run
     from cdmisfa.modules import Module as Module
+    from cdmisfa.watching import WatchEnv as WatchEnv
     from recorder.cameras.stepped import ArraySource as ArraySource
     from recorder.cameras.stepped import GymSource as GymSource
     from recorder.images.recipe import Recipe as Recipe
@@ -48,6 +49,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.core.errors": "CdmisfaError",
         "cdmisfa.core.learning": "Learner Sink",
         "cdmisfa.modules": "Module",
+        "cdmisfa.watching": "WatchEnv",
         "cdmisfa.core.signals": "SIGNALS BlockSignals",
         "cdmisfa.estimators.batches": "IncSFA RecursiveSFA",
         "cdmisfa.experiments.loop": "learn",
