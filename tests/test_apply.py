@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,14 @@ from conftest import Cdmisfa
 from mcap.reader import make_reader
 from message_files import write_table
 from run_data import module_of
+from waiting import started
 
 from cdmisfa import Recipe, Run
 from cdmisfa.experiments.apply import Application
 from cdmisfa.modules import Module
+from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
+from recorder.images.options import Reading
 from recorder.recording import record
 from replay.camera_logs.source import ForeignSource
 from replay.runs.modules import save_modules
@@ -205,3 +209,87 @@ def test_a_part_and_a_loop_are_applied(run: Path, cdmisfa: Cdmisfa, tmp_path: Pa
     assert json.loads(done.out)["logs"][0]["frames"] == 250
     y = outputs(pacsv.read_csv(out), 1)
     np.testing.assert_array_equal(y[:100], y[100:200])
+
+
+LIVE = "av:lavfi:testsrc=size=160x120:rate=30"
+
+
+def test_lines_come_block_by_block_and_are_those_of_what_was_recorded(
+    run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    out = tmp_path / "o.mcap"
+    done = cdmisfa("apply", run, LIVE, "--frames", 50, "--to", "stdout", "-o", out)
+    assert done.code == 0, done.err
+    lines = [json.loads(line) for line in done.out.splitlines()]
+    assert [(line["t"], line["frames"]) for line in lines] == [(0, 20), (20, 20), (40, 10)]
+    source = ForeignSource(out, ["/view/lavfi_testsrc"])
+    assert source.spec.frame_shape == SIZE
+    recorded = list(Application(run).to(source))
+    for line, applied in zip(lines, recorded, strict=True):
+        assert line["log_time"] == source.spec.time_ns(applied.block.t)
+        y = np.concatenate([module["y"] for module in line["modules"]], axis=1)
+        np.testing.assert_array_equal(y, applied.y)
+        slowness = np.concatenate([module["slowness"] for module in line["modules"]])
+        np.testing.assert_array_equal(slowness, applied.slowness)
+        assert [module["novelty"] for module in line["modules"]] == applied.novelty.tolist()
+        assert [module["alive"] for module in line["modules"]] == applied.alive.tolist()
+
+
+def test_lines_of_a_log_are_its_table(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log = camera(tmp_path / "a.mcap", 70)
+    lines = cdmisfa("apply", run, log, "--to", "stdout").out.splitlines()
+    y = np.concatenate([json.loads(line)["modules"][0]["y"] for line in lines])
+    frames = ForeignSource(log, size=SIZE).take(0, 70).frames
+    np.testing.assert_array_equal(y, Run(run).modules[0].transform(frames))
+
+
+def test_others_see_what_is_applied_as_a_robot(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "o.mcap"
+    served = ("--frames", 160, "--to", "foxglove", "--port", 0, "-o", out)
+    with started("apply", run, LIVE, *served) as command:
+        assert command.stderr is not None
+        address = next(line.split()[-1] for line in command.stderr if "applying at" in line)
+        topic = f"foxglove://{address.removeprefix('ws://')}/module1/lavfi_testsrc"
+        reading = Reading(fields=("y", "frame"))
+        viewer = FoxgloveCamera(topic, "m", timeout=10, reading=reading).pictures()
+        seen = [next(viewer)[1] for _ in range(TAU)]
+        command.communicate(timeout=60)
+    assert command.returncode == 0
+    frames = ForeignSource(out, ["/view/lavfi_testsrc"]).take(0, 160).frames
+    y = Run(run).modules[0].transform(frames)
+    for *values, frame in seen:
+        assert values == y[int(frame)].tolist()
+
+
+def test_a_reader_that_goes_away_ends_it(run: Path) -> None:
+    with started("apply", run, LIVE, "--to", "stdout") as command:
+        assert command.stdout is not None
+        assert command.stderr is not None
+        assert json.loads(command.stdout.readline())["frames"] == TAU
+        command.stdout.close()
+        assert command.wait(30) == 1
+        assert "Traceback" not in command.stderr.read()
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ((LIVE, "a.mcap"), "a.mcap is no live stream, as the others are"),
+        ((LIVE, "--from", "3"), "is a live stream: --from is for logs"),
+        ((LIVE, "--loop"), "live streams cannot go back: leave out --loop"),
+        (("a.mcap", "--to", "foxglove"), "--to foxglove is for live streams: write -o OUT.mcap"),
+        (("a.mcap", "--port", "80"), "--port goes with --to foxglove"),
+        (("a.mcap", "--to", "stdout", "--json"), "use one of them"),
+        (("a.mcap", "--hold", "1"), "is no live stream: --hold"),
+        ((LIVE, "--to", "foxglove", "--port", "TAKEN"), "choose another with --port"),
+    ],
+)
+def test_what_is_not_for_live_streams_is_refused(
+    words: tuple[str, ...], why: str, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    camera(tmp_path / "a.mcap", 30)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        named = {"a.mcap": tmp_path / "a.mcap", "TAKEN": taken.getsockname()[1]}
+        done = cdmisfa("apply", run, *(named.get(word, word) for word in words))
+    assert done.code in (1, 2), done.err
+    assert why in done.err.splitlines()[-1]

@@ -94,7 +94,7 @@ CASES: dict[str, tuple[str, ...]] = {
     ),
     "sweep REC --grid scene.seed=9,10 -o sweep": ("scene.seed " + VAIN.format("REC"),),
     # a file of another kind is a wrong word and no damage
-    **{f"{command} numbers.npz": (NO_MCAP,) for command in ("info", "verify", "learn", "play")},
+    **{f"{command} numbers.npz": (NO_MCAP,) for command in ("info", "verify", "play")},
     **{f"{command} numbers.npz": (NO_MCAP,) for command in ("check", "plot")},
     "recover -o out.mcap numbers.npz": (NO_MCAP,),
     "convert -o out numbers.npz": (NO_MCAP,),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,18 @@ import pytest
 from conftest import Cdmisfa
 from message_files import write_table
 from numpy.typing import NDArray
+from PIL import Image
 
 from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.blocks import description
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError
+from cdmisfa.experiments.holdout import hold_out, judged
+from cdmisfa.experiments.session import Session
+from cdmisfa.experiments.sources import configure_for, log_settings
 from cdmisfa.features.following import batch_outputs, following_slowness
-from cdmisfa.features.sfa import batch_sfa, slowness
+from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
+from cdmisfa.modules import Module
+from replay.camera_logs.source import ForeignSource
 from replay.runs.modules import load_modules
 
 FRAMES = 6000
@@ -160,3 +170,53 @@ def test_no_step_leads_across_what_is_missing() -> None:
     )
     assert still == math.inf
     assert math.isnan(none)
+
+
+def test_judging_is_stopped_at_once_and_done_when_the_run_is_resumed(
+    cdmisfa: Cdmisfa, log: Path, tmp_path: Path
+) -> None:
+    whole = cdmisfa("learn", log, *LEARN).json
+    settings = ("learner.expansion=none", "learner.outputs=2")
+    with contextlib.closing(ForeignSource(log, time="t")) as source:
+        hold_out(source, None, judged=True)
+        about = description(source)
+        learner = configure_for(source.spec, about, words=log_settings(settings, log)).learner
+        session = Session(source, learner, tmp_path / "run")
+        stopped = session.learn(stop=lambda: bool(session.learner.over), rerun=False)
+        assert (stopped.ended, stopped.held_out) == ("interrupted", None)
+        resumed = Session.resume(source, learner, tmp_path / "run").learn(rerun=False)
+    assert resumed.held_out == whole["held_out"]
+
+
+def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -> None:
+    x = np.rint(128 + 12 * values(120)).clip(0, 255).astype(np.uint8)
+    for i, frame in enumerate(x):
+        Image.fromarray(frame.reshape(2, 3)).save(tmp_path / f"{i:03}.png")
+    (tmp_path / "110.png").write_bytes((tmp_path / "110.png").read_bytes()[:50])
+    none, policy = np.zeros(1), np.zeros(0, np.int64)
+    learned = Module(1, "log", 0, 0, np.eye(6)[:1], np.zeros(6), none, none, none, policy)
+    for salvage in (False, True):
+        with contextlib.closing(ForeignSource(tmp_path, rate=5, salvage=salvage)) as source:
+            source.hold_out(20)
+            source.take(0, 100)
+            with pytest.raises(LogExhaustedError, match="before 20 held out"):
+                source.take(0, 1)
+            if salvage:
+                found = judged(source, [replace(learned, expansion="none")], components=2)
+                assert found is not None
+                assert found["frames"] == [100, 120]
+            else:
+                with pytest.raises(LogDamagedError, match=r"110\.png.*--salvage"):
+                    judged(source, [replace(learned, expansion="none")], components=2)
+
+
+def test_the_leading_components_of_many_directions_are_those_of_frames_in_memory() -> None:
+    rng, t = np.random.default_rng(8), np.arange(3000)
+    strong = np.stack([np.sin(t / period) for period in (90, 31, 12, 5)], axis=1) * (4, 5, 6, 7)
+    x = strong @ rng.normal(0, 1, (4, 200)) + rng.normal(0, 1, (3000, 200))
+    centred = x - x.mean(axis=0)
+    within = leading_directions(centred, 4)
+    exact = slowness(centred @ within @ batch_sfa(centred @ within, 2).T)
+    phi, mean = batch_outputs(in_pieces(x, 256), len(x), components=4, outputs=2)
+    (found,) = following_slowness(in_pieces(x, 256), [(phi, mean)])
+    np.testing.assert_allclose(found, exact, rtol=1e-3)

@@ -25,7 +25,7 @@ SIGNALS: Mapping[str, str] = {
     "2.0": "4c7950b36d5160b6a19710d78431d7feb9b2788e1ffbdedac060e43b432090a1",
     "2.0 of images": "3ffed8c9e884247400ba723b3703a716d6093dcd98fe918b4a70e84bea92518d",
     "1.0": "a7a505b233e7585546ab580d7f3f84df9824a6c4d141a35d39f8b0d4d63360da",
-    "progress": "908c72a75dd5344e2b0d210fe4646d4529caaf9c903edb017c64cc3873f34b51",
+    "progress": "7a797d075470f7bd373a15af1a1044e0b36a2bca9f2707cf1259430d1fea5d2e",
     "progress of images": "bbef8d869ad135f322ca7d006802fbf343acf758c8d71584da60507854ea59ec",
 }
 """Of 20 iterations on the oscillatory streams, and of 2 on images, with seed 3."""

@@ -18,7 +18,8 @@ from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.signals import SignalsHash
-from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.loop import Digest, learn_blocks
+from cdmisfa.public.recording import Recording
 from cdmisfa.watching import WatchEnv
 from recorder.cameras.stepped import ArraySource
 from recorder.world.oscillatory import OscillatorySource
@@ -66,7 +67,7 @@ def test_gymnasiums_own_checks_pass(what: str, observe: Any, algorithm: str) -> 
 def test_our_policy_gives_the_signals_of_a_run(algorithm: str) -> None:
     digest, source = Digest(), OscillatorySource()
     learner = open_learner(LEARNED[algorithm], source.spec, 7)
-    ended = learn(source, learner, [digest], max_iterations=400)
+    ended = learn_blocks(source, learner, [digest], max_iterations=400)
     env = WatchEnv(OscillatorySource(), algorithm, max_iterations=400, **SETTINGS[algorithm])
     for _ in range(2):  # an episode begins anew
         told, over = SignalsHash(), False
@@ -128,6 +129,13 @@ def test_where_the_source_ends_it_is_truncated() -> None:
     env.reset(seed=0)
     with pytest.raises(LogExhaustedError, match="20 frames are left"):
         env.step(0)
+
+
+def test_episodes_of_arrays_begin_anew() -> None:
+    with WatchEnv(Recording(pictures()).source(), tau=20) as env:
+        for _ in range(2):
+            env.reset(seed=0)
+            np.testing.assert_array_equal(env.step(1)[0], pictures()["right"][:20])
 
 
 def test_without_a_seed_episodes_differ_and_follow_from_the_first() -> None:

@@ -118,6 +118,9 @@ class Application:
         return {**numbers, "depth": options.depth or recipe.range}
 
     def _live(self, words: Sequence[str], cameras: CameraOptions, live: LiveOptions) -> LiveOptions:
+        stored = [word for word in words if not is_live(word)]
+        if stored:
+            raise UsageError(f"{stored[0]} is no live stream, as the others are: name them apart")
         of_images = {field.name for field in fields(ImageOptions)}
         of_logs = [
             option_name(field)

@@ -67,14 +67,14 @@ class Tally:
 
 def follow(
     applied: Iterable[Applied],
-    sink: AppliedSink | None,
+    sinks: Sequence[AppliedSink],
     tally: Tally,
     told: Callable[[], None] = lambda: None,
 ) -> None:
-    """Hand every block to a sink and a tally; damage of the log ends it and is noted."""
+    """Hand every block to sinks and a tally; damage of the log ends it and is noted."""
     try:
         for one in applied:
-            if sink is not None:
+            for sink in sinks:
                 sink.add(one)
             tally.add(one)
             told()

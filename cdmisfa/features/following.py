@@ -19,13 +19,20 @@ from cdmisfa.features.recursive import RecursiveFeature
 Pieces = Iterable[tuple[NDArray[Any], bool]]
 """Frames (n, I) in their order, and whether some are missing before them."""
 
+KEPT = 8
+"""Directions that are kept while frames are taken in, for each that is wanted of all of them."""
+
+NOTHING = 1e-10
+"""Share of the largest variance below which a direction holds rounding noise."""
+
 
 def batch_outputs(
     pieces: Pieces, frames: int, components: int, outputs: int
 ) -> tuple[FloatArray, FloatArray]:
     """The slowest outputs of frames that all count the same, in their leading components.
 
-    What `batch_sfa` finds of frames in memory, by `RecursiveFeature` with a window that holds all.
+    That is what `batch_sfa` finds of frames in memory within their `leading_directions`, up to how
+    far the directions that are kept meanwhile, `KEPT` times as many, hold the leading ones.
 
     Args:
         pieces: at least one, uint8 pixels, which count 1/255 each, or float64 values.
@@ -34,14 +41,20 @@ def batch_outputs(
         outputs: J.
 
     Returns:
-        phi (J, I), their weights of the centred frame, and the mean (I,).
+        phi (J, I), their weights of the centred frame, and the mean (I,); fewer outputs where the
+        frames vary in fewer directions.
     """
     sfa: RecursiveFeature | None = None
     for x, gap in pieces:
-        sfa = sfa or RecursiveFeature(x.shape[1], components, outputs, window=frames)
+        sfa = sfa or RecursiveFeature(x.shape[1], KEPT * components // 2, window=frames)
         sfa.update(x, gap)
     assert sfa is not None
-    return sfa.phi, sfa.mean
+    state = sfa.state
+    variance = state.variance[: min(components, int(state.counts[0]))]
+    variance = variance[variance > NOTHING * variance.max(initial=0.0)]
+    size, scale = len(variance), 1 / np.sqrt(variance)
+    _, rotation = np.linalg.eigh(state.differences[:size, :size] * scale * scale[:, None])
+    return (rotation[:, :outputs].T * scale) @ state.basis[:size], state.mean
 
 
 def following_slowness(

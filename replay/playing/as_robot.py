@@ -7,7 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from cdmisfa.modules import Module
+from recorder.log.messages import ENCODING
+from replay.export.applied import Applied, Messages
 from replay.playing.feed import SLICE, Playback, Played, Topic, opened_messages, paced
 
 HOST: Final = "127.0.0.1"
@@ -48,7 +52,7 @@ def play_as_robot(
         CdmisfaError: the port is taken.
     """
     played = Played()
-    with opened_messages(paths, how) as feed, _Robot(feed.topics, port) as robot:
+    with opened_messages(paths, how) as feed, Robot(feed.topics, port) as robot:
         say(f"playing at ws://{HOST}:{robot.port}{', once watched' if wait else ''}")
         while robot.watched < wait and not how.stop():
             time.sleep(SLICE / 10)
@@ -58,16 +62,26 @@ def play_as_robot(
     return played
 
 
-class _Robot:
-    """The server, with a channel for each topic."""
+class Robot:
+    """A Foxglove WebSocket server of this machine, with a channel for each topic.
 
-    def __init__(self, topics: Sequence[Topic], port: int) -> None:
+    Args:
+        topics: that clients may subscribe to.
+        port: to listen at; 0 for a free one.
+        name: that clients are told.
+
+    Raises:
+        UsageError: foxglove-sdk is missing.
+        CdmisfaError: the port is taken.
+    """
+
+    def __init__(self, topics: Sequence[Topic], port: int, name: str = "cdmisfa play") -> None:
         try:
             import foxglove
             from foxglove.websocket import ServerListener
         except ImportError:
             raise UsageError(
-                "to play as a robot needs foxglove-sdk: pip install 'cdmisfa[foxglove]'"
+                "to serve as a robot needs foxglove-sdk: pip install 'cdmisfa[foxglove]'"
             ) from None
         # Else a line of its own about each client that leaves without a word.
         foxglove.set_log_level("CRITICAL")
@@ -95,7 +109,7 @@ class _Robot:
             )
         try:
             self._server = foxglove.start_server(
-                name="cdmisfa play",
+                name=name,
                 host=HOST,
                 port=port,
                 server_listener=Listener(),
@@ -121,10 +135,42 @@ class _Robot:
         """Tell a message to who has subscribed to its topic."""
         self._channels[topic].log(data, log_time=time_ns)
 
-    def __enter__(self) -> _Robot:
+    def __enter__(self) -> Robot:
         return self
 
     def __exit__(self, *error: object) -> None:
         if self._subscribed and not any(error):
             time.sleep(LAST_SECONDS)
         self._server.stop()
+
+
+class RobotSink:
+    """Serves what modules give, and the frames, as a running robot; see `Messages`.
+
+    Args:
+        port: to listen at; 0 for a free one.
+        spec: of the frames.
+        modules: in their order.
+    """
+
+    def __init__(self, port: int, spec: SourceSpec, modules: Sequence[Module]) -> None:
+        self._messages = Messages(spec, modules)
+        self._topics = {
+            topic: Topic(topic.name, ENCODING, topic.schema, ENCODING, topic.definition)
+            for topic in self._messages.topics
+        }
+        self._robot = Robot(tuple(self._topics.values()), port, "cdmisfa apply")
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return self._robot.port
+
+    def add(self, applied: Applied) -> None:
+        """See `AppliedSink`."""
+        for topic, at, data in self._messages.of(applied):
+            self._robot.publish(self._topics[topic], data, at)
+
+    def close(self) -> None:
+        """See `AppliedSink`."""
+        self._robot.__exit__()

@@ -34,7 +34,7 @@ class ProgressConfig:
     outputs: int = 8
     expansion: str | None = None
     window: int = 8000
-    attention: str = "progress"
+    attention: str = "novel"
     visit: int = 5
     explore: float = 0.1
     test_frames: int = 2000

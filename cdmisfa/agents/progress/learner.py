@@ -2,8 +2,8 @@
 
 A candidate is tested on each block before it learns from it. What is slow on frames not yet
 learned from, and settled, becomes a module; what a module gives already is known; what is no
-slower than anything else in its stream is given up. The learner looks where the learning error
-falls fastest, and it is over when no stream is being learned.
+slower than anything else in its stream is given up. The learner stays with a stream until that is
+decided, and it is over when no stream is being learned.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle
 
 
 class ProgressLearner:
-    """One candidate a stream, attention by learning progress, and an end of its own.
+    """One candidate a stream, attention to what is not decided yet, and an end of its own.
 
     Args:
         config: what it is told.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from cdmisfa.cli.printing import (
     print_table,
     say_about,
     say_changes,
+    say_counts,
     tell,
     warn,
 )
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from recorder.cameras.options import LiveOptions
 
 OF_FILES = ("parquet", "csv", "mcap")
+STDOUT, FOXGLOVE = AS_THEY_COME = ("stdout", "foxglove")
 
 log_options = options_of(
     CameraOptions,
@@ -52,8 +54,10 @@ log_options = options_of(
     "--to",
     multiple=True,
     metavar="FORM|TIME",
-    help=f"What is written, {', '.join(OF_FILES)}; or leave out images of logs from this TIME on.",
+    help=f"What is written, {', '.join(OF_FILES)}; or where blocks go as they come: {STDOUT}, as "
+    f"JSON lines, {FOXGLOVE}, of live streams as a robot; or leave out images from this TIME on.",
 )
+@number("--port", "Where --to foxglove is served, on this machine.", 0, 65535)
 @number("--frames", "End after so many frames of each stream.", 1)
 @options.loop
 @options.salvage
@@ -70,6 +74,7 @@ def apply_command(
     source: tuple[str, ...],
     out: Path | None,
     to: tuple[str, ...],
+    port: int | None,
     frames: int | None,
     loop: bool,
     salvage: bool,
@@ -80,36 +85,40 @@ def apply_command(
 ) -> None:
     """Apply the modules of a run to other logs.
 
-    SOURCE is what cdmisfa learn takes: a recording, logs of others, a scene. Each is a log by
-    itself; pictures of any size become frames as those of the run did. A row a frame has the
-    outputs of each module, their slowness within the block, whether the module is alive there,
-    and how novel the block is: from 1 on the module does not know it.
+    SOURCE is what cdmisfa learn takes: recordings, logs of others, a scene, live streams. Each log
+    is by itself, live streams are on one clock; pictures of any size become frames as those of the
+    run did. A row a frame has the outputs of each module, their slowness within the block, whether
+    the module is alive there, and how novel the block is: from 1 on the module does not know it.
 
     A log that cannot be read does not end the rest; the exit code is then 3, or 2.
     """
     from cdmisfa.experiments.apply import Application
     from cdmisfa.experiments.applying import places
+    from recorder.cameras.words import is_live
 
-    form, until = targets(ctx, to)
-    logs = logs_of(source)
-    outs = places(out, form, logs, force=force)
+    target, logs = targets(ctx, to, port), logs_of(source)
+    if target.way == STDOUT and as_json:
+        raise UsageError("--to stdout prints JSON lines, --json one document: use one of them")
+    if not any(map(is_live, source)):
+        options.refuse_live_options(live, source)
+    elif loop or salvage:
+        raise UsageError("live streams cannot go back: leave out --loop and --salvage")
+    if target.way == FOXGLOVE and not any(map(is_live, source)):
+        raise UsageError(
+            "--to foxglove is for live streams: write -o OUT.mcap, and cdmisfa play it so"
+        )
+    outs = places(out, target.form, [words[0] for words in logs], force=force)
     application = Application(run)
-    told: dict[str, Any] = {
-        "cameras": replace(cameras, stop=until),
-        "live": live,
-        "loop": loop,
-        "salvage": salvage,
-    }
+    told: dict[str, Any] = {"cameras": replace(cameras, stop=target.until), "live": live}
+    told |= {"loop": loop, "salvage": salvage, "say": tell}
     rows: list[dict[str, Any]] = []
     failed: list[CdmisfaError] = []
     with stoppable() as stop:
-        for log, place in zip(logs, outs, strict=True):
-            row: dict[str, Any] = {"log": log, "out": None if place is None else str(place)}
+        for words, place in zip(logs, outs, strict=True):
+            row: dict[str, Any] = {"log": " ".join(words), "out": place and str(place)}
             try:
-                with contextlib.closing(application.open([log], say=tell, **told)) as opened:
-                    say_about(opened)
-                    tally = applied(application, opened, place, frames, stop, force=force)
-                    say_changes(opened)
+                with contextlib.closing(application.open(words, **told)) as opened:
+                    tally = applied(application, opened, place, target, frames, stop, force=force)
             except CdmisfaError as error:
                 if len(logs) == 1:
                     raise
@@ -124,7 +133,8 @@ def apply_command(
                 rows[-1]["error"] = str(tally.damaged)
             if stop.number:
                 break
-    print_applied(str(run), rows, as_json=as_json)
+    if target.way != STDOUT:
+        print_applied(str(run), rows, as_json=as_json)
     if stop.number:
         ctx.exit(stop.exit_code)
     if failed:
@@ -135,56 +145,95 @@ def applied(
     application: Application,
     source: FrameSource,
     place: Path | None,
+    target: Target,
     frames: int | None,
     stop: Stop,
     *,
     force: bool,
 ) -> Tally:
-    """Apply modules to an open source, into its file."""
+    """Apply modules to an open source, into its file and to where blocks go as they come."""
     from cdmisfa.experiments.applying import Tally, follow, written
+    from replay.export.applied import LinesSink
 
+    live = hasattr(source, "stop")
     if hasattr(source, "stop"):
-        source.stop = stop
+        source.stop = stop  # waiting for frames ends with a signal, too
+    else:
+        say_about(source)
     modules, spec = application.modules, source.spec
-    tally = Tally(spec, modules)
+    tally, sinks = Tally(spec, modules), []
     with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
-        sink = None
         if place is not None:
-            sink = stack.enter_context(written(place, spec, modules, force=force))
+            sinks.append(stack.enter_context(written(place, spec, modules, force=force)))
+        if target.way == STDOUT:
+            sinks.append(LinesSink(print_line, spec, modules))
+        if target.way == FOXGLOVE:
+            from replay.playing.as_robot import HOST, PORT, RobotSink
+
+            robot = RobotSink(PORT if target.port is None else target.port, spec, modules)
+            sinks.append(stack.enter_context(contextlib.closing(robot)))
+            tell(f"applying at ws://{HOST}:{robot.port}")
         blocks = application.to(source, frames, stop)
         total = None if spec.length is None else spec.length * len(spec.streams)
-        follow(blocks, sink, tally, lambda: shown.update(tally.frames, total))
+        follow(blocks, sinks, tally, lambda: shown.update(tally.frames, total))
+    if live:
+        say_counts(source)
+    else:
+        say_changes(source)
     return tally
 
 
-def targets(ctx: click.Context, words: Sequence[str]) -> tuple[str | None, float | None]:
-    """The form and the time that --to names, each at most once."""
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What --to and --port say.
+
+    Attributes:
+        form: of files; None where none is named.
+        way: where blocks go as they come, one of `AS_THEY_COME` or "".
+        until: time of a log from which on images are left out.
+        port: of the server.
+    """
+
     form: str | None = None
+    way: str = ""
     until: float | None = None
+    port: int | None = None
+
+
+def targets(ctx: click.Context, words: Sequence[str], port: int | None) -> Target:
+    """Read what --to says, each kind of it once."""
+    found = Target(port=port)
     for word in words:
         if word in OF_FILES:
-            form = word
+            found = replace(found, form=word)
+        elif word in AS_THEY_COME:
+            found = replace(found, way=word)
         elif word[:1].isdigit():
-            until = WRITTEN[TIME].convert(word, None, ctx)
+            found = replace(found, until=WRITTEN[TIME].convert(word, None, ctx))
         else:
-            raise UsageError(f"--to {word}: name {', '.join(OF_FILES)}, or a time, as 1:30")
-    return form, until
+            names = ", ".join((*OF_FILES, *AS_THEY_COME))
+            raise UsageError(f"--to {word}: name {names}, or a time, as 1:30")
+    if port is not None and found.way != FOXGLOVE:
+        raise UsageError("--port goes with --to foxglove")
+    return found
 
 
-def logs_of(source: Sequence[str]) -> list[str]:
-    """The logs that words name, a pattern as what matches it."""
+def logs_of(source: Sequence[str]) -> list[list[str]]:
+    """The words of each log, of a pattern those that match it; live streams are together."""
     from recorder.cameras.words import is_live
     from recorder.world.scenes import SCENES
     from replay.inputs import locations
     from replay.storage.location import Url
 
-    found: list[str] = []
+    if any(map(is_live, source)):
+        return [list(source)]
+    found: list[list[str]] = []
     for word in source:
-        if is_live(word) or word in SCENES:
-            found.append(word)
+        if word in SCENES:
+            found.append([word])
         else:
             places = locations([word])
-            found += [place.address if isinstance(place, Url) else str(place) for place in places]
+            found += [[p.address if isinstance(p, Url) else str(p)] for p in places]
     return found
 
 

@@ -46,10 +46,11 @@ CONTESTANTS: Registry[tuple[str, ...]] = Registry(
         "progress": ("learner.algorithm=progress",),
         "2.0": ("learner.algorithm=2.0",),
         "1.0": ("learner.algorithm=1.0",),
+        "learning-progress": ("learner.algorithm=progress", "learner.attention=progress"),
         **{
             name: ("learner.algorithm=progress", f"learner.attention={name}")
             for name in ATTENTIONS
-            if name != "progress"
+            if name not in ("progress", "novel")  # novel is the default
         },
     },
 )
