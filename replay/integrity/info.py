@@ -180,7 +180,7 @@ def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
             else:
                 yield _describe_file(log)
         except CdmisfaError as error:
-            if alone and len(logs) == 1:
+            if alone and (len(logs) == 1 or not isinstance(error, LogDamagedError)):
                 raise
             yield _unread(log, error)
 
