@@ -56,6 +56,9 @@ class ArrayLog(LoggedSource):
         loop: begin again at the end.
         files: where they are from.
 
+    Attributes:
+        arrays: of each stream by its name, what it shows as it was given, frames first.
+
     Raises:
         UsageError: they are no such arrays, or hold what is no finite number.
     """
@@ -73,10 +76,10 @@ class ArrayLog(LoggedSource):
         if not streams:
             raise UsageError("no array given: name one at least")
         self._loop, self._files = loop, tuple(files)
-        self._arrays = {str(name): _checked(str(name), given) for name, given in streams.items()}
-        shown = list(self._arrays.values())
+        self.arrays = {str(name): _checked(str(name), given) for name, given in streams.items()}
+        shown = list(self.arrays.values())
         firsts = [_pixels(array[:1])[0] for array in shown]
-        _refuse_unlike(dict(zip(self._arrays, firsts, strict=True)))
+        _refuse_unlike(dict(zip(self.arrays, firsts, strict=True)))
         self._color = options.color is True
         self._framings = framings(firsts, options.size, options.fit, color=self._color)
         self._count = min(map(len, shown))
@@ -86,11 +89,11 @@ class ArrayLog(LoggedSource):
             **({"color": "red, green and blue beside one another"} if self._color else {}),
             "recipe": RECIPE,
         }
-        self.shapes = dict(zip(self._arrays, map(str, self._framings), strict=True))
+        self.shapes = dict(zip(self.arrays, map(str, self._framings), strict=True))
         kind = "uint8" if isinstance(self._framings[0], Framing) else "float64"
         length, fps = None if loop else self._count, options.rate or FPS
         shape = self._framings[0].shape
-        self._spec = SourceSpec(tuple(self._arrays), shape, kind, (), fps, START_NS, length)
+        self._spec = SourceSpec(tuple(self.arrays), shape, kind, (), fps, START_NS, length)
         for stream in range(len(shown)):  # refused before anything is written
             self._block(stream, 0, 1)
 
@@ -102,7 +105,7 @@ class ArrayLog(LoggedSource):
         return {
             "kind": "arrays",
             "files": list(logs),
-            "streams": list(self._arrays) if self._files else self._hashes,
+            "streams": list(self.arrays) if self._files else self._hashes,
             **self._about,
             "rate": self._spec.fps,
             "frames": self._count,
@@ -112,7 +115,7 @@ class ArrayLog(LoggedSource):
     @cached_property
     def _hashes(self) -> list[dict[str, Any]]:
         found = []
-        for name, array in self._arrays.items():
+        for name, array in self.arrays.items():
             digest = hashlib.sha256()
             for start in range(0, len(array), 1024):
                 digest.update(np.ascontiguousarray(array[start : start + 1024]).data)
@@ -121,7 +124,7 @@ class ArrayLog(LoggedSource):
         return found
 
     def _block(self, stream: int, t: int, n: int) -> Block:
-        array, framing = list(self._arrays.values())[stream], self._framings[stream]
+        array, framing = list(self.arrays.values())[stream], self._framings[stream]
         rows = array[(t + np.arange(n)) % self._count]
         if isinstance(framing, Framing):
             frames = np.stack([framing.frame(self._image(picture)) for picture in _pixels(rows)])
@@ -137,7 +140,7 @@ class ArrayLog(LoggedSource):
         return raw_image(data, picture.shape[0], picture.shape[1], "rgb8")
 
     def _name(self) -> str:
-        return str(self._files[0]) if self._files else f"the array {next(iter(self._arrays))}"
+        return str(self._files[0]) if self._files else f"the array {next(iter(self.arrays))}"
 
 
 def are_arrays(paths: Sequence[Location]) -> bool:
@@ -212,6 +215,7 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
             f"{name}: its values are of type {array.dtype}, no numbers: {_WANTED}; of a table "
             "choose the columns of numbers"
         )
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.ndim == 1:
         array = array[:, None]
     if array.ndim == 4 and array.shape[3] in (1, 3, 4):

@@ -88,7 +88,13 @@ def test_arrays_of_any_type_are_learned_from(given: Any, shape: Any, dtype: str)
 
 def test_pictures_of_any_type_are_the_same_frames() -> None:
     gray = pictures(6, 8)
-    for same in (gray / 255, gray.astype(int), gray.astype(np.uint16) << 8, gray[..., None]):
+    for same in (
+        gray.astype(">u2") << 8,
+        gray / 255,
+        gray.astype(int),
+        gray.astype(np.uint16) << 8,
+        gray[..., None],
+    ):
         assert np.array_equal(Recording(same).frames(), gray)
     assert np.array_equal(Recording(np.stack([gray] * 3, axis=3)).frames(), gray)
 
@@ -128,6 +134,7 @@ def test_what_cannot_be_learned_from_is_one_line(
         ({"algoritm": "2.0"}, "did you mean learner.algorithm"),
         ({"algorithm": "3.0"}, "no learner.algorithm"),
         ({"tau": "many"}, "learner.tau is 'many'"),
+        ({"size": (8, 8)}, r"learn\(Recording\(source, size=...\)\)"),
         ({"seed": "x"}, "seed is 'x'"),
     ],
 )

@@ -16,7 +16,7 @@ from cdmisfa.core.blocks import FrameSource, description
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 from cdmisfa.experiments.holdout import hold_out
-from cdmisfa.experiments.resume import command_of
+from cdmisfa.experiments.resume import CAMERAS, command_of
 from cdmisfa.experiments.session import run as run_to_its_end
 from cdmisfa.experiments.sources import (
     OF_CAMERAS,
@@ -86,6 +86,9 @@ def learn(
     """
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise UsageError(f"seed is {seed!r}: give a whole number from 0 on")
+    if misplaced := [name for name in settings if name in CAMERAS]:
+        name = misplaced[0]
+        raise UsageError(f"{name} is of a recording: learn(Recording(source, {name}=...))")
     seed = int(seed)
     words = [f"learner.{name}={value}" for name, value in settings.items()]
     if algorithm is not None:

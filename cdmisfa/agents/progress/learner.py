@@ -108,6 +108,12 @@ class ProgressLearner:
         """Stream the learner wants to watch next."""
         return int(self._counts["stream"][0])
 
+    def watch(self, stream: int) -> None:
+        """Have it watch another stream next than it chose."""
+        counts = self._counts[0]
+        if stream != counts["stream"]:
+            counts["stream"], counts["stay"] = stream, 0
+
     @property
     def arithmetic(self) -> int:
         """Version of how it computes; see `arithmetic_of`."""
