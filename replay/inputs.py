@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.mcap.reader import LogReader
+from recorder.mcap.records import no_log
 from replay.arrays import ENDINGS, ArrayLog, are_arrays, open_arrays
 from replay.camera_logs.opening import (
     ALL,
@@ -201,7 +202,7 @@ def refuse_what_is_no_log(path: Location) -> None:
     elif only_foreign(path) or ".mcap" in path.suffixes or path.suffix.lower() in ENDINGS:
         run = False
     else:
-        raise UsageError(f"{path} is no MCAP file: name a recording, or logs of cameras")
+        raise no_log(path)
     if run:
         raise _a_run(path)
 
