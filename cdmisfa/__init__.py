@@ -1,13 +1,13 @@
-"""Curiosity-driven modular incremental slow feature analysis (CD-MISFA 2.0).
+"""Slow features of streams, learned by curiosity.
 
-A learner learns from a source, and sinks are told of it:
+From arrays, logs, scenes or cameras to a run, its signals as a table, and what was learned at work:
 
-    source = OscillatorySource()
-    learner = CuriousLearner(LearnerConfig(), source.spec, seed=0)
-    learn(source, learner)
+    run = learn("oscillatory", max_modules=1)
+    table = run.signals.to_arrow()
+    outputs = run.modules[0].transform(run.frames())
 
-What follows is the vocabulary; `cdmisfa.experiments` does whole runs and sweeps, `recorder`
-records sources, `replay` reads and shows what was logged.
+docs/python.md shows more. `cdmisfa.experiments` has the loop of every run, `recorder` records
+sources, `replay` reads and shows what was logged.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -28,9 +28,13 @@ if TYPE_CHECKING:
     from cdmisfa.core.signals import BlockSignals as BlockSignals
     from cdmisfa.estimators.batches import IncSFA as IncSFA
     from cdmisfa.estimators.batches import RecursiveSFA as RecursiveSFA
-    from cdmisfa.experiments.loop import learn as learn
-    from cdmisfa.experiments.recompute import Run as Run
     from cdmisfa.modules import Module as Module
+    from cdmisfa.public.learning import learn as learn
+    from cdmisfa.public.recording import Recording as Recording
+    from cdmisfa.public.run import Run as Run
+    from cdmisfa.public.sweeps import Sweep as Sweep
+    from cdmisfa.public.sweeps import sweep as sweep
+    from cdmisfa.watching import WatchEnv as WatchEnv
     from recorder.cameras.stepped import ArraySource as ArraySource
     from recorder.cameras.stepped import GymSource as GymSource
     from recorder.images.recipe import Recipe as Recipe
@@ -42,19 +46,27 @@ if TYPE_CHECKING:
 _load, __dir__, __all__ = exports(
     __name__,
     {
+        "cdmisfa.core.errors": "CdmisfaError",
+        "cdmisfa.core.learning": "Sink",
+        "cdmisfa.core.signals": "SIGNALS",
+        "cdmisfa.estimators.batches": "IncSFA RecursiveSFA",
+        "cdmisfa.modules": "Module",
+        "cdmisfa.public.learning": "learn",
+        "cdmisfa.public.recording": "Recording",
+        "cdmisfa.public.run": "Run",
+        "cdmisfa.watching": "WatchEnv",
+        "cdmisfa.public.sweeps": "Sweep sweep",
+        "recorder.cameras.stepped": "GymSource",
+        "recorder.images.recipe": "Recipe make_frame",
+    },
+    beside={
         "cdmisfa.agents.learner": "CuriousLearner",
         "cdmisfa.core.blocks": "Block FrameSource SeekableSource SourceSpec",
         "cdmisfa.core.config": "LearnerConfig",
-        "cdmisfa.core.errors": "CdmisfaError",
-        "cdmisfa.core.learning": "Learner Sink",
-        "cdmisfa.modules": "Module",
-        "cdmisfa.core.signals": "SIGNALS BlockSignals",
-        "cdmisfa.estimators.batches": "IncSFA RecursiveSFA",
-        "cdmisfa.experiments.loop": "learn",
-        "recorder.cameras.stepped": "ArraySource GymSource",
-        "recorder.images.recipe": "Recipe make_frame",
+        "cdmisfa.core.learning": "Learner",
+        "cdmisfa.core.signals": "BlockSignals",
+        "recorder.cameras.stepped": "ArraySource",
         "recorder.world.oscillatory": "OscillatorySource",
-        "cdmisfa.experiments.recompute": "Run",
     },
 )
 

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.mcap.reader import LogReader
+from recorder.mcap.records import no_log
+from replay.arrays import ENDINGS, ArrayLog, are_arrays, open_arrays
 from replay.camera_logs.opening import (
     ALL,
     WHOLE_FILES,
@@ -44,11 +46,11 @@ def open_log(
     loop: bool = False,
     salvage: bool = False,
     goal: tuple[str, str] = ("learn", "RUN"),
-) -> Logged:
-    """Open one of our recordings, or camera logs of others.
+) -> Logged | ArrayLog:
+    """Open one of our recordings, camera logs of others, or files of NumPy's arrays.
 
     Args:
-        paths: the folder of a recording or its views' files, or camera logs of others.
+        paths: the folder of a recording or its views' files, or logs of others.
         cameras: how images of others become frames; given, the paths are taken as such logs.
         loop: start again at the end.
         salvage: pass over what is damaged.
@@ -61,6 +63,8 @@ def open_log(
     cameras = cameras or CameraOptions()
     for path in paths:
         refuse_what_is_no_log(path)
+    if are_arrays(paths):
+        return open_arrays([path for path in paths if isinstance(path, Path)], cameras, loop=loop)
     left_out: list[str] = []
     if salvage:
         paths, cameras, left_out = _readable(paths, cameras)
@@ -195,10 +199,10 @@ def refuse_what_is_no_log(path: Location) -> None:
         raise UsageError(f"{path}: no such file or folder")
     elif starts_as_log(path):
         run = path.name.startswith(RUN_FILE) and is_run(path)
-    elif only_foreign(path) or ".mcap" in path.suffixes:  # the latter is a damaged log
+    elif only_foreign(path) or ".mcap" in path.suffixes or path.suffix.lower() in ENDINGS:
         run = False
     else:
-        raise UsageError(f"{path} is no MCAP file: name a recording, or logs of cameras")
+        raise no_log(path)
     if run:
         raise _a_run(path)
 

@@ -13,7 +13,7 @@ from test_cli import assert_one_line
 LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
 
 A_RUN = "is a run, not a recording: look at it with cdmisfa view"
-NO_MCAP = "numbers.npz is no MCAP file: name a recording"
+NO_MCAP = "numbers.npz is no log that is read: logs are .mcap, .bag and .db3 files"
 URLS = ("gs://bucket/there", "https://there.org/x")
 ONE = "is a scene, of which only one can be named"
 VAIN = "is for live scenes, and {} is none: leave it out"
@@ -94,7 +94,7 @@ CASES: dict[str, tuple[str, ...]] = {
     ),
     "sweep REC --grid scene.seed=9,10 -o sweep": ("scene.seed " + VAIN.format("REC"),),
     # a file of another kind is a wrong word and no damage
-    **{f"{command} numbers.npz": (NO_MCAP,) for command in ("info", "verify", "learn", "play")},
+    **{f"{command} numbers.npz": (NO_MCAP,) for command in ("info", "verify", "play")},
     **{f"{command} numbers.npz": (NO_MCAP,) for command in ("check", "plot")},
     "recover -o out.mcap numbers.npz": (NO_MCAP,),
     "convert -o out numbers.npz": (NO_MCAP,),

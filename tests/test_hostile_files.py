@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import zipfile
 from collections.abc import Callable
@@ -24,9 +25,11 @@ from cdmisfa.experiments.store import DONE, ROWS, read_rows
 from recorder.config import RecordConfig
 from recorder.log.logfile import LogFile
 from recorder.log.resume import frames_held
+from recorder.mcap.records import KINDS
 from recorder.recording import record_scene
+from replay.arrays import ENDINGS
 from replay.camera_logs import pictures
-from replay.camera_logs.opening import open_images
+from replay.camera_logs.opening import WHOLE_FILES, open_images
 from replay.integrity.info import describe
 from replay.runs.folders import REQUEST, RUN_METADATA, read_run_json, runs_in
 from replay.runs.keyframes import decode_keyframe, encode_keyframe
@@ -305,6 +308,53 @@ def test_what_is_no_file_is_refused_by_every_command(
         command, *options = way.split()
         done = cdmisfa(command, name, *options)
         assert (done.code, done.err.count("\n"), name in done.err) == (2, 1, True), (way, done.err)
+
+
+@pytest.mark.parametrize("words", ["check {}", "at {} 3", "fork {} --at 3 -o x", "compare {} {}"])
+def test_what_stands_where_a_run_would_be_is_said(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run").mkdir()
+    for name, named in (("a.mcap", "a.mcap"), ("run/run.mcap", "run")):
+        os.mkfifo(name)
+        done = cdmisfa(*words.replace("{}", named).split())
+        said = f"cdmisfa: {name}: no regular file but a pipe, remove it or name another\n"
+        assert (done.code, done.err) == (2, said)
+
+
+@pytest.mark.parametrize("size", [99, 1 << 40])
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.bag", "a.db3"])
+def test_a_file_that_was_never_written_is_said_to_be(
+    cdmisfa: Cdmisfa, tmp_path: Path, name: str, size: int
+) -> None:
+    with (tmp_path / name).open("xb") as file:
+        file.truncate(size)
+    for command in ("info", "verify", "learn"):
+        done = cdmisfa(command, tmp_path / name)
+        assert done.code == 3
+        assert "it begins with zeros, as a file that was never written" in done.err + done.out
+
+
+@pytest.mark.parametrize("ending", ["flv", "ts", "gif", "webp", "tiff", "bmp"])
+def test_of_what_is_no_log_it_is_said_which_kinds_are(
+    cdmisfa: Cdmisfa, tmp_path: Path, ending: str
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / f"a.{ending}").write_bytes(b"GIF89a" * 99)
+    for path, what in ((folder / f"a.{ending}", "no log that is read"), (folder, "no log in this")):
+        for command in ("info", "verify", "learn"):
+            done = cdmisfa(command, path)
+            assert (done.code, done.err.count("\n")) == (2, 1)
+            assert f"{path}" in done.err
+            assert what in done.err
+            assert KINDS in done.err
+
+
+@pytest.mark.parametrize("ending", [*WHOLE_FILES, *ENDINGS, ".mcap"])
+def test_every_kind_that_is_read_is_named(ending: str) -> None:
+    assert re.search(rf"{re.escape(ending.replace('.jpeg', '.jpg'))}\b", KINDS)
 
 
 @pytest.mark.parametrize("kind", ["fifo", "socket"])

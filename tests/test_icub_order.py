@@ -12,7 +12,7 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
-from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.studies.paper import icub
 from cdmisfa.studies.paper.oscillatory import paper_config
 from replay.recordings.source import RecordedSource
@@ -30,7 +30,7 @@ def config(components: int) -> LearnerConfig:
 def test_object_1_then_object_3(components: int) -> None:
     with contextlib.closing(RecordedSource(SAMPLE, loop=True)) as source:
         learner = open_learner(config(components), source.spec, 2)
-        learn(source, learner, max_iterations=icub.ITERATIONS, max_modules=2)
+        learn_blocks(source, learner, max_iterations=icub.ITERATIONS, max_modules=2)
     found = [(m.stream_index, "".join(map(str, m.policy))) for m in learner.modules]
     assert found == list(icub.OPTIMAL)
     fastest = [float(m.eta.max()) for m in learner.modules]
@@ -54,5 +54,5 @@ def after_ten(source: FrameSource) -> str:
     digest = Digest()
     with contextlib.closing(source):
         learner: Learner = open_learner(config(10), source.spec, 4)
-        learn(source, learner, (digest,), max_iterations=10)
+        learn_blocks(source, learner, (digest,), max_iterations=10)
     return digest.hexdigest()

@@ -14,7 +14,7 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn
+from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn_blocks
 from cdmisfa.studies.demo import ProgressSink
 from cdmisfa.testing.learners import CONFIG, SinkContract
 from recorder.world.oscillatory import OscillatorySource
@@ -100,7 +100,7 @@ def learner_for(source: OscillatorySource) -> CuriousLearner:
 
 def test_every_sink_is_told_everything_in_order() -> None:
     source, one, two = OscillatorySource(), Notes(), Notes()
-    assert learn(source, learner_for(source), (one, two), max_modules=1) == "max_modules"
+    assert learn_blocks(source, learner_for(source), (one, two), max_modules=1) == "max_modules"
     saved, ended, finished = one.told[-3:]
     assert one.told[:-3] == list(range(9))
     assert saved == (320, 8, "module 1 saved on stream x2, policy [1, 1, 1]", "INFO")
@@ -110,7 +110,7 @@ def test_every_sink_is_told_everything_in_order() -> None:
 
 def test_the_end_of_a_recording_ends_the_run_and_is_told() -> None:
     source, notes = OscillatorySource(length=130), Notes()
-    assert learn(source, learner_for(source), (notes,)) == "log_exhausted"
+    assert learn_blocks(source, learner_for(source), (notes,)) == "log_exhausted"
     (t, iteration, why, level), *last = notes.told[3:]
     assert (notes.told[:3], t, iteration, level) == ([0, 1, 2], 120, 2, "WARNING")
     assert "the streams end after 130 frames" in why
@@ -120,7 +120,7 @@ def test_the_end_of_a_recording_ends_the_run_and_is_told() -> None:
 def test_less_than_a_block_is_not_enough() -> None:
     source, notes = OscillatorySource(length=39), Notes()
     with pytest.raises(LogExhaustedError, match="the streams end after 39 frames"):
-        learn(source, learner_for(source), (notes,))
+        learn_blocks(source, learner_for(source), (notes,))
     assert notes.told == []
 
 
@@ -128,13 +128,13 @@ def test_what_is_no_source_and_no_learner_is_refused() -> None:
     source = OscillatorySource()
     given: Any
     for given in ((learner_for(source), source), ("icub", learner_for(source)), (source, CONFIG)):
-        with pytest.raises(UsageError, match="learn takes a source that is open, then a learner"):
-            learn(*given)
+        with pytest.raises(UsageError, match="takes a source that is open, then a learner"):
+            learn_blocks(*given)
 
 
 def test_asked_to_stop_while_it_waits_for_frames_it_is_interrupted() -> None:
     source, asked = OscillatorySource(length=50), iter([False, False, True, True])
-    assert learn(source, learner_for(source), stop=lambda: next(asked)) == "interrupted"
+    assert learn_blocks(source, learner_for(source), stop=lambda: next(asked)) == "interrupted"
 
 
 def test_a_sink_that_fails_ends_the_run_and_finishes_nothing() -> None:
@@ -144,7 +144,7 @@ def test_a_sink_that_fails_ends_the_run_and_finishes_nothing() -> None:
 
     source, notes = OscillatorySource(), Notes()
     with pytest.raises(OSError, match="the disk is full"):
-        learn(source, learner_for(source), (notes, Full()))
+        learn_blocks(source, learner_for(source), (notes, Full()))
     assert notes.told == [0]
 
 
@@ -152,7 +152,7 @@ def test_a_learner_learns_on_from_where_it_is(tmp_path: Path) -> None:
     source = OscillatorySource()
     learner, digest = learner_for(source), Digest()
     for iterations in (3, 11):
-        learn(source, learner, (digest,), max_iterations=iterations, max_modules=9)
+        learn_blocks(source, learner, (digest,), max_iterations=iterations, max_modules=9)
     whole, straight = OscillatorySource(), Digest()
-    learn(whole, learner_for(whole), (straight,), max_iterations=11, max_modules=9)
+    learn_blocks(whole, learner_for(whole), (straight,), max_iterations=11, max_modules=9)
     assert digest.hexdigest() == straight.hexdigest()

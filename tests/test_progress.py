@@ -32,7 +32,7 @@ from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import STATES, canonical_bytes
-from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure
 from recorder.recording import record
@@ -44,7 +44,7 @@ NO_TRUTH = np.zeros((40, 0))
 
 def learned_from(source: MovingPictures, seed: int = 0, **settings: Any) -> ProgressLearner:
     learner = ProgressLearner(ProgressConfig(components=8, **settings), source.spec, seed)
-    learn(source, learner, max_iterations=3000)
+    learn_blocks(source, learner, max_iterations=3000)
     return learner
 
 
@@ -94,7 +94,7 @@ def test_what_changes_is_learned_anew_or_known(attention: str) -> None:
     config = ProgressConfig(components=8, watch=10**6, attention=attention)
     source = MovingPictures("swing>stroll", "noise", seed=3, changes_at=250 * 40)
     learner = ProgressLearner(config, source.spec, 0)
-    learn(source, learner, max_iterations=600)
+    learn_blocks(source, learner, max_iterations=600)
     assert [m.stream for m in learner.modules] == 2 * ["swing>stroll"]
     assert learner.modules[0].iteration < 250 < learner.modules[1].iteration
     assert learner.summary()["streams"][0]["module"] == 2
@@ -103,7 +103,7 @@ def test_what_changes_is_learned_anew_or_known(attention: str) -> None:
     assert abs(np.corrcoef(y, block.truth[:, 0])[0, 1]) > 0.95
     source = MovingPictures("swing>stroll", "stroll", seed=3, changes_at=250 * 40)
     learner = ProgressLearner(config, source.spec, 0)
-    learn(source, learner, max_iterations=600)
+    learn_blocks(source, learner, max_iterations=600)
     assert len(learner.modules) == 2
     (changed, other) = learner.summary()["streams"]
     assert (changed["state"], changed["module"]) == ("known", other["module"])
@@ -113,7 +113,7 @@ def test_what_only_drifts_does_not_hold_a_run_up() -> None:
     """Its slow output is nowhere seen again, so that it is begun anew; but not for ever."""
     source = MovingPictures("dawn", "swing")
     learner = ProgressLearner(ProgressConfig(components=8), source.spec, 0)
-    assert learn(source, learner, max_iterations=1500) == "all_decided"
+    assert learn_blocks(source, learner, max_iterations=1500) == "all_decided"
     assert "swing" in [m.stream for m in learner.modules]
 
 
@@ -128,7 +128,7 @@ def test_what_is_too_slow_to_be_tested_says_so() -> None:
 def test_what_does_not_change_is_not_learned_twice() -> None:
     source = MovingPictures("swing", "stroll", "noise", seed=3)
     learner = ProgressLearner(ProgressConfig(components=8, watch=10**6), source.spec, 0)
-    learn(source, learner, max_iterations=1500)
+    learn_blocks(source, learner, max_iterations=1500)
     assert len(learner.modules) == 2
     assert sorted(outcomes(learner).values()) == ["given_up", "learned", "learned"]
 

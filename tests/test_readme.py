@@ -60,10 +60,14 @@ def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
 def test_python_example_works(elsewhere: Path) -> None:
     (example,) = blocks("python")
     done = subprocess.run(
-        [sys.executable, "-c", example + "\nprint(learner.modules[0].stream)"],
+        [
+            sys.executable,
+            "-c",
+            example + "\nprint(run.modules[0].stream, len(outputs) == 100 * len(table))",
+        ],
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
     )
-    assert (done.returncode, done.stdout.strip()) == (0, "x1"), done.stderr
+    assert (done.returncode, done.stdout.strip()) == (0, "x1 True"), done.stderr

@@ -135,7 +135,7 @@ def test_a_jpeg_is_turned_as_its_exif_says(tmp_path: Path) -> None:
     ("recipe", "given", "why"),
     [
         (Recipe((8, 16)), np.zeros((4, 7, 20), np.uint8), "20x7 is smaller than the .* 16x8"),
-        (Recipe((8, 16)), np.zeros((4, 20, 40)), "pictures of float64 .*: give .n, height"),
+        (Recipe((8, 16)), np.full((4, 20, 40), 1.5), "pictures of float64 .*: give .n, height"),
         (Recipe((8, 16)), np.zeros((4, 20, 40, 2), np.uint8), r"uint8 \(20, 40, 2\) given"),
         (Recipe((8, 16)), np.zeros((20, 40), np.uint8), r"pictures of uint8 \(40,\) given"),
         (Recipe((8, 16)), [b"nothing"], "a picture cannot be taken: .* broken"),

@@ -506,7 +506,7 @@ def test_the_page_s_python_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with contextlib.redirect_stdout(words):
         exec("\n".join(examples), {})
     first, *points, claim = words.getvalue().splitlines()
-    assert first == "4 computed, 0 were there, 0 failed"
+    assert first == "4 trials, which differ in {'learner.nu': [0.04, 0.05]}"
     assert len(points) == 2
     assert "'holds': True" in claim
 

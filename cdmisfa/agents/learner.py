@@ -127,6 +127,13 @@ class CuriousLearner:
         """Stream the learner wants to watch next."""
         return int(self.agent.memory["stream"][0])
 
+    def watch(self, stream: int) -> None:
+        """Have it watch another stream next than it chose."""
+        memory = self.agent.memory[0]
+        if stream != memory["stream"]:
+            memory["stream"] = stream
+            memory["last_action"] = stream != memory["last_stream"]
+
     @property
     def iteration(self) -> int:
         """Iterations so far."""

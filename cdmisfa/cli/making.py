@@ -46,7 +46,7 @@ class GroupedCommand(click.Command):
         """See `click.Command`; what follows a `Switch` and is none of its words is an argument."""
         for param in self.params:
             if isinstance(kind := param.type, Switch):
-                pairs = zip(args, [*args[1:], ""], strict=True)
+                pairs = zip(args, [*args[1:], ""], strict=False)
                 args = [
                     f"{word}=on" if word in param.opts and after not in kind.choices else word
                     for word, after in pairs

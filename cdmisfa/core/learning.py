@@ -1,7 +1,7 @@
 """The interfaces of learners and of sinks, which take what a run computes.
 
-`cdmisfa.experiments.loop.learn` brings a source, a learner and sinks together, and knows no more
-of them than is said here.
+`cdmisfa.experiments.loop.learn_blocks` brings a source, a learner and sinks together, and
+knows no more of them than is said here.
 """
 
 from __future__ import annotations

@@ -40,6 +40,8 @@ _SPARSE: Final = 4 * 1024**3
 _EMPTY: Final = 1000
 """Files above `_SPARSE` bytes of which so small a part is on the disk are holes: what reads them to
 their end would never come there. A file system that compresses makes nothing so small."""
+_HEAD: Final = 16
+"""Bytes that `begun` gives, which no format has as zeros."""
 _LOCK: Final = threading.Lock()
 _THREAD: Final = threading.local()
 _threads = 0
@@ -178,6 +180,24 @@ def opened_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
         raise LogDamagedError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
+def begun(path: Path) -> bytes:
+    """The first bytes of a file; raises as `read_regular` does, and where it was never written.
+
+    Raises:
+        LogDamagedError: it is empty, or begins with zeros, as no format does.
+    """
+    with opened_regular(path) as file:
+        head = file.read(_HEAD)
+    if not head:
+        raise LogDamagedError(f"{path}: it is empty")
+    if not any(head):
+        raise LogDamagedError(
+            f"{path}: it begins with zeros, as a file that was never written: copy it again from "
+            "where it was recorded"
+        )
+    return head
+
+
 def open_regular(path: Path, limit: int | None = None) -> int:
     """Open a regular file to be read, by its number; nothing else is opened or waited for.
 
@@ -214,9 +234,19 @@ def read_json(path: Path, remedy: str, *, most: int = MAX_JSON) -> Any:
         raise LogDamagedError(f"{path} is damaged: {remedy}") from error
 
 
+_KINDS: Final = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFDIR: "a folder",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
 def _check(path: Path, found: os.stat_result, limit: int | None) -> None:
     if not stat.S_ISREG(found.st_mode):
-        raise UsageError(f"{path}: no regular file, remove it or name another")
+        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
+        raise UsageError(f"{path}: no regular file but {kind}, remove it or name another")
     if limit is not None and found.st_size > limit:
         raise UsageError(f"{path}: {found.st_size} bytes, above the limit of {limit}")
     on_disk = getattr(found, "st_blocks", 0) * _BLOCK  # 0 where a file system does not tell

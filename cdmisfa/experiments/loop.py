@@ -36,7 +36,7 @@ SHARE = 5
 """A keyframe waits until the log has grown by so many times the size of the one before."""
 
 
-def learn(
+def learn_blocks(
     source: FrameSource,
     learner: Learner,
     sinks: Sequence[Sink] = (),
@@ -64,7 +64,7 @@ def learn(
     """
     if not hasattr(source, "take") or not hasattr(learner, "step"):
         given = f"{type(source).__name__} and {type(learner).__name__}"
-        raise UsageError(f"{given} given: learn takes a source that is open, then a learner")
+        raise UsageError(f"{given} given: learn_blocks takes a source that is open, then a learner")
     modules = learner.max_modules if max_modules is None else max_modules
     while True:
         ended = ending(learner, modules, max_iterations) or (INTERRUPTED if stop() else "")

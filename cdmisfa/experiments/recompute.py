@@ -41,6 +41,9 @@ from replay.stored import StoredSource
 SAME = ("frame_shape", "dtype", "fps", "start_ns")
 """What besides its streams a source must have in common with the one that a run learned from."""
 
+Words = Sequence[str]
+"""What names a source on the command line."""
+
 ROUNDING = 1e-6
 """Share of a signal's largest number up to which another arithmetic explains a difference."""
 
@@ -111,7 +114,7 @@ class Recomputation:
     Args:
         run: the run's folder, or its log.
         iteration: iterations done.
-        source: words that name its source, where it is not what the run says.
+        source: words that name its source, where it is not what the run says, or it, open.
 
     Attributes:
         log: of the run.
@@ -124,10 +127,11 @@ class Recomputation:
         LogDamagedError: it cannot be read.
     """
 
-    def __init__(self, run: Path, iteration: int, source: Sequence[str] = ()) -> None:
+    def __init__(self, run: Path, iteration: int, source: Words | SeekableSource = ()) -> None:
         self.log = run_log(Path(run))
         self.header: RunHeader = read_header(self.log)
-        self._words = tuple(source)
+        self._given = source if isinstance(source, SeekableSource) else None
+        self._words = tuple(source) if not isinstance(source, SeekableSource) else ()
         self._source: SeekableSource | None = None
         spans = config_history(self.log, self.header.manifest)
         keyframe = read_keyframe(self.log, iteration)
@@ -141,7 +145,7 @@ class Recomputation:
             self.t = keyframe.t
 
     @classmethod
-    def after(cls, run: Path, iterations: int, source: Sequence[str] = ()) -> Self:
+    def after(cls, run: Path, iterations: int, source: Words | SeekableSource = ()) -> Self:
         """A run's learner after so many iterations, bit for bit; to be closed.
 
         What is computed again to get there is compared with the log.
@@ -294,7 +298,7 @@ class Recomputation:
 
     def _open(self) -> SeekableSource:
         try:
-            source = source_of(self.log.parent, self._words)
+            source = self._given or source_of(self.log.parent, self._words)
         except UsageError as error:
             raise UsageError(
                 f"{error} (what it learned from is needed after {self.learner.iteration} "
@@ -325,12 +329,13 @@ class Run(replay.runs.run.Run):
         LogDamagedError: its log cannot be read, here or in any later access.
     """
 
-    def at(self, iterations: int, source: Sequence[str] = ()) -> Learner:
+    def at(self, iterations: int, source: Words | SeekableSource = ()) -> Learner:
         """Its learner as it was after so many iterations, bit for bit.
 
         Args:
             iterations: done before; 0 is the beginning.
-            source: words that name what it learned from, where it is not what the run says.
+            source: words that name what it learned from, where it is not what the run says, or
+                it, open.
 
         Raises:
             UsageError: it has not so many, or its source is not there; what stands in its log, a

@@ -278,9 +278,21 @@ def _point(point: Mapping[str, Any], rows: Sequence[Mapping[str, Any] | None]) -
     )
 
 
+def differing(points: Sequence[PointResult]) -> dict[str, list[Any]]:
+    """The settings that differ between points, and their values in order, each once."""
+    found: dict[str, list[Any]] = {}
+    for point in points:
+        for key, value in point.point.items():
+            values = found.setdefault(key, [])
+            if value not in values:
+                values.append(value)
+    return {key: values for key, values in found.items() if len(values) > 1}
+
+
 def as_json(points: Sequence[PointResult]) -> dict[str, Any]:
     """The results as one JSON document."""
-    return {"schema": SCHEMA, "points": [asdict(point) for point in points]}
+    found = [asdict(point) for point in points]
+    return {"schema": SCHEMA, "differ": differing(points), "points": found}
 
 
 def measure_names(points: Sequence[PointResult]) -> list[str]:

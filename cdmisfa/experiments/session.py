@@ -18,7 +18,7 @@ from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.experiments.holdout import judged
-from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn
+from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn_blocks
 from cdmisfa.experiments.names import placed
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
@@ -302,7 +302,8 @@ class Session:
                 self._copy_log(log, digest)
                 if live:
                     view.earlier(log.path.parent)
-            ended = learn(self.source, self.learner, (*told, *sinks), stop=stop, **self._limits)
+            told += sinks
+            ended = learn_blocks(self.source, self.learner, told, stop=stop, **self._limits)
             ended, held_out = self._judged(ended, stop)
             stopped = ended == INTERRUPTED  # then nothing is done that takes as long as the log
             described = description(self.source, at_once=stopped, told=hashing)

@@ -30,7 +30,7 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.signals import SignalsHash
-from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.features.incsfa import Feature
 from recorder.world.oscillatory import OscillatorySource
 
@@ -204,10 +204,10 @@ class SinkContract:
     def test_it_changes_nothing_of_a_run(self, opened: Opened) -> None:
         source, learner, sink = opened
         digest, alone = Digest(), Digest()
-        learn(source, learner, (sink, digest), max_iterations=20, max_modules=9)
+        learn_blocks(source, learner, (sink, digest), max_iterations=20, max_modules=9)
         assert len(learner.modules) == 1
         other = CuriousLearner(CONFIG, source.spec, seed=3)
-        learn(OscillatorySource(), other, (alone,), max_iterations=20, max_modules=9)
+        learn_blocks(OscillatorySource(), other, (alone,), max_iterations=20, max_modules=9)
         assert digest.hexdigest() == alone.hexdigest()
         state, expected = learner.state, other.state
         assert state.policy_rng == expected.policy_rng
@@ -217,7 +217,7 @@ class SinkContract:
     def test_it_takes_a_run_without_blocks(self, opened: Opened) -> None:
         source, learner, sink = opened
         assert isinstance(sink, Sink)
-        assert learn(source, learner, (sink,), max_iterations=0) == "max_iterations"
+        assert learn_blocks(source, learner, (sink,), max_iterations=0) == "max_iterations"
 
     def test_it_takes_events_of_every_level(self, opened: Opened) -> None:
         source, learner, sink = opened

@@ -23,8 +23,8 @@ _FORMATS = {("u1", 0): "mono8", ("u2", 0): "mono16", ("u1", 3): "rgb8", ("u1", 4
 _DISTANCES = {"u2": "16UC1", "f4": "32FC1", "f8": "32FC1"}
 
 _PICTURES = (
-    "give (n, height, width) of uint8 or uint16, (n, height, width, 3) or 4 of uint8, or a list of "
-    "such pictures, or of the bytes of JPEG or PNG files"
+    "give (n, height, width) of uint8 or uint16, (n, height, width, 3) or 4 of uint8, or these of "
+    "bool or floats of 0 to 1, or a list of such pictures, or of the bytes of JPEG or PNG files"
 )
 
 
@@ -171,8 +171,22 @@ def make_frame(picture: Any, recipe: Recipe) -> Shown:
     return Framing(size, recipe.size, recipe.fit, recipe.color).frame(image)
 
 
+def pixels_of(pictures: NDArray[Any]) -> NDArray[Any]:
+    """Pictures as uint8 or uint16: truth as 0 and 255, floats of 0 to 1 as round(255 x).
+
+    Others stay as they are.
+    """
+    if pictures.dtype == np.bool_:
+        return np.where(pictures, np.uint8(255), np.uint8(0))
+    if pictures.dtype.kind == "f" and pictures.size and 0 <= pictures.min() <= pictures.max() <= 1:
+        return np.asarray(np.rint(pictures * pictures.dtype.type(255)), np.uint8)
+    return pictures
+
+
 def _image(array: NDArray[Any], recipe: Recipe) -> Shown:
     """A picture, gray (height, width), or (height, width, 3) in colours."""
+    if recipe.range is None:
+        array = pixels_of(array)
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
     kind, channels = array.dtype.str[1:], array.shape[2] if array.ndim == 3 else 0

@@ -52,11 +52,19 @@ class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with 
     """Bytes that are not what MCAP says they are; the reader adds file and place."""
 
 
+KINDS: Final = (
+    "logs are .mcap, .bag and .db3 files, videos (.mp4, .m4v, .mov, .mkv, .webm, .avi, .wmv, .mpg, "
+    ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, and LeRobot datasets "
+    "(.npy and .npz are for learn and sweep)"
+)
+"""What is read, for errors; docs/logs.md says more."""
+
+
 def no_log(path: Place) -> CdmisfaError:
     """What is wrong with a file that begins otherwise: damage, where its name is that of a log."""
     if ".mcap" in path.name:
         return LogDamagedError(f"{path}: not an MCAP file (its first bytes are not MCAP's)")
-    return UsageError(f"{path} is no MCAP file: name a recording, a run, or logs of cameras")
+    return UsageError(f"{path} is no log that is read: {KINDS}")
 
 
 @dataclass(frozen=True, slots=True)

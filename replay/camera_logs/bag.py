@@ -21,7 +21,7 @@ import numpy as np
 import zstandard
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
+from cdmisfa.core.untrusted import begun, check_regular, opened_regular, read_regular
 from recorder.images.decoding import MessageKind, decoder_of
 from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
 from recorder.mcap.records import MAX_CHUNK
@@ -35,7 +35,10 @@ from replay.camera_logs.stream import (
 
 Found = TypeVar("Found")
 
-BAGS: Final = (".bag", ".db3")
+_HEADS: Final = {".bag": b"#ROSBAG V", ".db3": b"SQLite format 3\0"}
+"""What each kind begins with."""
+
+BAGS: Final = tuple(_HEADS)
 
 METADATA: Final = "metadata.yaml"
 MAX_METADATA: Final = 1024 * 1024
@@ -250,10 +253,11 @@ def _unpacked_bag(path: Path) -> Iterator[tuple[Path, bool]]:
 
     Raises:
         UsageError: a file of it is no regular one.
-        LogDamagedError: it is no rosbag2, or unpacks to far more than it is.
+        LogDamagedError: it is no bag, or unpacks to far more than it is.
     """
     if not path.is_dir():
-        check_regular(path)
+        if not begun(path).startswith(_HEADS[path.suffix]):
+            raise LogDamagedError(f"{path}: it is no ROS bag, by its first bytes")
         yield path, False
         return
     from ruamel.yaml import YAML

@@ -12,8 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.untrusted import opened_regular
+from cdmisfa.core.untrusted import begun, opened_regular
 
 
 class Extent(NamedTuple):
@@ -33,15 +32,16 @@ def extent_of(path: Path) -> Extent:
 
     Raises:
         UsageError: it is no regular file, or may not be read.
-        LogDamagedError: it is empty, or the disk does not give it.
+        LogDamagedError: it was never written, or the disk does not give it.
     """
+    head = begun(path)
     with opened_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        head = file.read(16)
-        if not size or not head:
-            raise LogDamagedError(f"{path}: it is empty")
         if head[4:8] in _FIRST_BOXES:
-            return _boxes(file, size)
+            kinds, extent = _boxes(file, size)
+            if kinds & {b"moov", b"moof"}:
+                return extent
+            return extent._replace(missing="; ".join(filter(None, (extent.missing, _NO_INDEX))))
         if head.startswith(_EBML):
             return _elements(file, size)
         if head.startswith(b"RIFF"):
@@ -68,22 +68,31 @@ def _at(file: BinaryIO, place: int, count: int) -> bytes:
 _FIRST_BOXES: Final = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp")
 
 
-def _boxes(file: BinaryIO, size: int) -> Extent:
-    """In one piece a file ends with its last box; in fragments, moof, their index mfra ends it."""
+_NO_INDEX: Final = (
+    "its index (moov), which is written last, is not all there, and no frame is read without: "
+    "tools like untrunc make one by that of a whole video of the same camera"
+)
+
+
+def _boxes(file: BinaryIO, size: int) -> tuple[set[bytes], Extent]:
+    """The kinds of its boxes that are all there, and how far it goes.
+
+    In one piece a file ends with its last box; in fragments, moof, their index mfra ends it.
+    """
     kinds: set[bytes] = set()
     at = 0
     while at < size:
         length, kind, long = struct.unpack(">I4sQ", _at(file, at, 16))
         if kind == bytes(4):  # behind the last box of a file in one piece it is room for others
-            return _zeros(at) if b"moof" in kinds else Extent()
-        kinds.add(kind)
+            return kinds, _zeros(at) if b"moof" in kinds else Extent()
         if length == 0:  # to the end, wherever that is
-            return Extent(stated=False)
+            return kinds, Extent(stated=False)
         stop = at + max(long if length == 1 else length, 8)
         if stop > size:
-            return _ended(f"its {kind.decode('latin-1')!r}", stop, size)
+            return kinds, _ended(f"its {kind.decode('latin-1')!r}", stop, size)
+        kinds.add(kind)
         at = stop
-    return Extent(stated=b"moof" not in kinds or b"mfra" in kinds)
+    return kinds, Extent(stated=b"moof" not in kinds or b"mfra" in kinds)
 
 
 # Matroska, WebM: RFC 8794 and RFC 9559

@@ -24,7 +24,7 @@ from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
 from recorder.images.videos import frame_colors, frame_gray, pyav
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.containers import extent_of
-from replay.camera_logs.stream import ImageStream, explained, sorted_times
+from replay.camera_logs.stream import ImageStream, UnreadableError, explained, sorted_times
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
 
@@ -115,6 +115,11 @@ class VideoImages(ImageStream):
                 self._container = self._av.open(str(path))
                 self._open()
             self._held = data_bytes() - before
+        except UnreadableError:
+            self.close()
+            if not self.missing:
+                raise
+            raise LogDamagedError(f"{path}: cut short: {self.missing}") from None
         except BaseException:
             self.close()
             raise
@@ -212,7 +217,8 @@ class VideoImages(ImageStream):
         if self.missing and stamps:
             self._cut = stamps.pop()
         if not stamps:
-            raise LogDamagedError(f"{self.path}: there is no frame in it")
+            why = f", cut short: {self.missing}" if self.missing else ""
+            raise LogDamagedError(f"{self.path}: there is no frame in it{why}")
         self._stamps = np.sort(np.array(stamps, np.int64))
         if (np.diff(self._stamps) == 0).any():
             raise LogDamagedError(f"{self.path}: two of its frames have the same time")

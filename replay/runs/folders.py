@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.untrusted import MAX_LIST, read_json
+from cdmisfa.core.untrusted import MAX_LIST, check_regular, read_json
 from recorder.log.files import partial_path
 from recorder.mcap.reader import LogReader
 
@@ -37,12 +37,13 @@ def run_log(path: Path) -> Path:
     """The log of a run, given its folder or the log itself; a partial one where it was cut short.
 
     Raises:
-        UsageError: there is none.
+        UsageError: there is none, or what is there is no file.
     """
     path = Path(path)
     whole = path / RUN_FILE if path.is_dir() else path
     for candidate in (whole, partial_path(whole)):
-        if candidate.is_file():
+        if candidate.exists() and not candidate.is_dir():
+            check_regular(candidate)
             return candidate
     if path.is_dir():
         if any((path / name).is_file() for name in (RUN_JSON, MODULES_FILE)):

@@ -17,8 +17,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import one_line
-from cdmisfa.core.untrusted import open_regular
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_line
+from cdmisfa.core.untrusted import BUDGET, check_regular, open_regular
 
 MAX_BYTES: Final = 192 * 1024 * 1024
 """Largest file of arrays that is read."""
@@ -60,6 +60,35 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise ValueError("not all of it are arrays")
     for array in arrays.values():
         _check_text(array)
+    return arrays
+
+
+def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a user's file, by name: of .npy the one, mapped and called as the file.
+
+    Raises:
+        UsageError: there is no such file, or it is too large.
+        LogDamagedError: it holds something else.
+    """
+    check_regular(path)
+    try:
+        if path.suffix.lower() == ".npy":
+            return {path.stem: np.lib.format.open_memmap(path, mode="r")}
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as found:
+            if sum(member.file_size for member in found.zip.infolist()) > BUDGET:
+                raise UsageError(
+                    f"{path}: its arrays have more than {BUDGET >> 20} MiB: save each as .npy, "
+                    "which is not read whole"
+                )
+            arrays = {name: found[name] for name in found.files}
+    except CdmisfaError:
+        raise
+    except (*_IMPOSSIBLE, *_DAMAGED) as error:
+        pickled = "pickle" in str(error)
+        why = "it holds Python objects, or something else" if pickled else one_line(error)
+        raise LogDamagedError(f"{path} is no file of NumPy's arrays ({why})") from error
+    if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
+        raise LogDamagedError(f"{path} is no file of NumPy's arrays: it holds none")
     return arrays
 
 

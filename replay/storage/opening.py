@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.untrusted import opened_regular
-from recorder.mcap.records import MAGIC
+from recorder.mcap.records import KINDS, MAGIC
 from recorder.mcap.store import PARTIAL, FileStore, Store
 from replay.storage.location import Location, Url, location
 
@@ -36,8 +36,8 @@ def log_files(paths: str | Location | Iterable[str | Location]) -> list[Location
             found = whole + [p for p in cut if p.with_suffix("") not in whole]
             if not found:
                 raise UsageError(
-                    f"{path}: no .mcap file in this folder; record or learn first, or name each "
-                    "video, bag or folder of pictures in it"
+                    f"{path}: no log in this folder; {KINDS}; record or learn first, or name each "
+                    "video, bag, table or folder of pictures in it"
                 )
             files += found
         elif path.exists():

@@ -23,7 +23,8 @@ PACKAGES = ("numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplo
 
 EXTRAS = {
     "video": (("av",), "videos and cameras: learn, record, convert; export --to mp4"),
-    "gym": (("gymnasium",), "gym: streams of simulated tasks"),
+    "gym": (("gymnasium",), "gym: streams of simulated tasks; WatchEnv"),
+    "rl": (("gymnasium", "stable_baselines3"), "examples/ppo.py"),
     "foxglove": (("foxglove", "websockets"), "foxglove:// streams of robots; play as a robot"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs; -o s3://"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),

@@ -17,7 +17,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.documents import plain, write_json
-from cdmisfa.experiments.loop import learn
+from cdmisfa.experiments.loop import learn_blocks
 from cdmisfa.experiments.results import correlation
 from cdmisfa.studies import pages
 from cdmisfa.studies.paper.experiment import (
@@ -199,7 +199,7 @@ def learn_curves(source: FrameSource, config: LearnerConfig, seed: int, iteratio
     """Learn from a source: a trial's row, and the curves and each module's last outputs."""
     learner = open_learner(config, source.spec, seed)
     curves = Curves(learner.tau, source.spec.truth)
-    learn(source, learner, (curves,), max_iterations=iterations, max_modules=iterations)
+    learn_blocks(source, learner, (curves,), max_iterations=iterations, max_modules=iterations)
     encoded, done = curves.encoded, learner.iteration
     row = {**module_row(learner.modules), "correlation": encoded, "iterations": done}
     return row, curves.arrays

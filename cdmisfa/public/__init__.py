@@ -1,0 +1,1 @@
+"""What a program or a notebook holds in hand: runs, recordings, and `learn`."""

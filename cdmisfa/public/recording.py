@@ -1,0 +1,168 @@
+"""What can be learned from, in hand: recordings, logs of others, and arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.shown import Shown
+from cdmisfa.experiments.resume import CAMERAS
+from cdmisfa.experiments.sources import open_logs
+from cdmisfa.public.shown import beside, curves, view
+from replay.arrays import ArrayLog
+from replay.camera_logs.options import CameraOptions
+
+Given: TypeAlias = Any
+"""What `learn` takes: arrays, tables, mappings of these by streams' names, paths and URLs of logs,
+names of scenes, words of live streams, or an open source."""
+
+MOST = 200
+"""Frames of numbers that a picture shows."""
+
+
+class Recording(Shown):
+    """A recording, logs of others, or arrays, to be looked at and learned from.
+
+    Args:
+        given: paths, URLs or patterns: a recording's folder, MCAP files, ROS bags, videos, folders
+            of pictures, tables, LeRobot datasets, .npy and .npz files; or one array, table, or
+            mapping of them by the streams' names. Arrays hold numbers, (n,) or (n, values), or
+            pictures, (n, height, width) or (n, height, width, 3), the i-th of all at once.
+        loop: begin again at the end.
+        salvage: leave out what is damaged.
+        options: which streams, and how they become frames, as those of `cdmisfa learn`: `topics`,
+            `size`, `fit`, `rate`, `color`, `fields`, `time`, `align`, `start`, `stop`, `gaps`,
+            `depth` (--range), `stamp`.
+
+    Attributes:
+        spec: names of the streams, shape, type, rate and number of frames.
+
+    Raises:
+        UsageError: there is no such log, or arrays hold no numbers.
+        LogDamagedError: a log is damaged.
+    """
+
+    def __init__(
+        self, *given: Given, loop: bool = False, salvage: bool = False, **options: Any
+    ) -> None:
+        unknown = [name for name in options if name not in CAMERAS]
+        if unknown:
+            raise UsageError(f"no option {unknown[0]}: {did_you_mean(unknown[0], CAMERAS)}")
+        if not given:
+            raise UsageError("nothing given: name a log, or give an array")
+        lists = {k: tuple(v) for k, v in options.items() if isinstance(v, list)}
+        self._options = CameraOptions(**{**options, **lists})
+        self._given = given
+        self.loop, self.salvage = loop, salvage
+        words = all(isinstance(one, str | Path) for one in given)
+        self.words: tuple[str, ...] = tuple(map(str, given)) if words else ()
+        if not words and len(given) > 1:
+            raise UsageError("several arrays given: name each, as {'left': one, 'right': two}")
+        with self.source() as source:
+            self.spec: SourceSpec = source.spec
+
+    @classmethod
+    def of(cls, given: Given) -> Self:
+        """A recording as it is, or of paths in a list, of one path or of arrays."""
+        if isinstance(given, cls):
+            return given
+        paths = isinstance(given, list | tuple) and all(isinstance(w, str | Path) for w in given)
+        return cls(*given) if paths and given else cls(given)
+
+    @property
+    def options(self) -> Mapping[str, Any]:
+        """Options that say other than the defaults, by name."""
+        plain = CameraOptions()
+        found = {name: getattr(self._options, name) for name in CAMERAS}
+        return {k: value for k, value in found.items() if value != getattr(plain, k)}
+
+    def source(self, *, loop: bool = False) -> Any:
+        """Its streams, open to be read, for `with`: a `SeekableSource`.
+
+        Args:
+            loop: begin again at the end, also where that was not said before.
+        """
+        loop = loop or self.loop
+        if self.words:
+            return open_logs(self.words, loop=loop, salvage=self.salvage, cameras=self._options)
+        (given,) = self._given
+        streams = given if isinstance(given, Mapping) else {"stream": given}
+        return ArrayLog(streams, self._options, loop=loop)
+
+    def arrays(self) -> Mapping[str, NDArray[Any]]:
+        """The arrays that were given, by the streams' names; none of logs."""
+        with self.source() as source:
+            return dict(source.arrays) if isinstance(source, ArrayLog) else {}
+
+    def frames(
+        self, stream: str | int = 0, start: int = 0, stop: int | None = None
+    ) -> NDArray[Any]:
+        """The frames [start, stop) of a stream, without those of gaps, (n, *frame_shape).
+
+        Args:
+            stream: its name, or its number from 0.
+            start: counted from the first frame.
+            stop: by default the end; needed where it begins again at its end.
+
+        Raises:
+            UsageError: there is no such stream, or no such frames.
+        """
+        names, length = self.spec.streams, self.spec.length
+        index = names.index(stream) if stream in names else stream
+        if not isinstance(index, int) or not 0 <= index < len(names):
+            raise UsageError(f"no stream {stream!r}: there are {', '.join(names)}")
+        stop = length if stop is None else stop
+        if stop is None or not 0 <= start <= stop or (length is not None and stop > length):
+            raise UsageError(f"no frames [{start}, {stop}): there are [0, {length or '...'})")
+        found = [np.empty((0, *self.spec.frame_shape), self.spec.dtype)]
+        with self.source() as source:
+            first = getattr(source, "first_frame", 0)
+            held = source.spans(index, first + start, first + stop) if stop > start else []
+            for low, high in held:
+                source.seek(low)
+                found.append(source.take(index, high - low).frames)
+        return np.concatenate(found)
+
+    def view(self, save: str | Path | None = None, *, tab: str | None = None) -> None:
+        """Show it in the Rerun viewer, until its window is closed.
+
+        Args:
+            save: write the view to this file, *.rrd, instead.
+            tab: the name of the tab that is open.
+
+        Raises:
+            UsageError: it is of arrays, or of several paths.
+            CdmisfaError: there is no display, or the file cannot be written.
+        """
+        if len(self.words) != 1:
+            raise UsageError("one recording or log is shown: of arrays, view the run")
+        view(Path(self.words[0]), save, tab=tab)
+
+    def _facts(self) -> Mapping[str, Any]:
+        spec, what = self.spec, ", ".join(self.words) or "arrays"
+        shape = "x".join(map(str, spec.frame_shape))
+        count = "without end" if spec.length is None else spec.length
+        streams = ", ".join(spec.streams)
+        return {
+            "recording": what,
+            "streams": streams,
+            "frames": count,
+            "shape": shape,
+            "rate": f"{spec.fps:g} Hz",
+        }
+
+    def _picture(self) -> NDArray[np.uint8] | None:
+        count = min(self.spec.length or MOST, MOST)
+        if self.spec.images:
+            first = [self.frames(stream, 0, count)[:1] for stream in self.spec.streams[:6]]
+            shown = [frames[0] for frames in first if len(frames)]
+            return beside(shown) if shown else None
+        values = self.frames(0, 0, count)
+        return curves(values[:, :8]) if len(values) else None

@@ -1,0 +1,177 @@
+"""Learning as an environment of Gymnasium: actions are streams to watch, rewards are curiosity."""
+
+from __future__ import annotations
+
+from math import isnan
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.agents.learners import LEARNERS, open_learner
+from cdmisfa.core.blocks import FrameSource, SeekableSource
+from cdmisfa.core.config import build, load_preset
+from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.learning import Learner
+from cdmisfa.core.signals import BlockSignals
+
+try:
+    from gymnasium import Env
+    from gymnasium.spaces import Box, Discrete
+except ImportError:
+
+    class Env:  # type: ignore[no-redef]
+        def __new__(cls, *_: Any, **__: Any) -> Self:
+            raise UsageError(
+                f"{cls.__name__} needs Gymnasium, which is missing: pip install 'cdmisfa[gym]'"
+            )
+
+
+class WatchEnv(Env):
+    """What a learner does while others choose what it watches.
+
+    A step is an iteration: the learner learns from a block of the stream that the action names. The
+    reward is the learner's own: the fall of the learning error with that block of the progress
+    learner, the paper's of 2.0 and 1.0; 0 where there is none. An episode is a run. It is
+    terminated when the learner ends by itself, and truncated after `max_iterations` or where the
+    source ends.
+
+    `info["stream"]` is what the learner itself would watch next. Actions that always follow it give
+    the signals of a run of the same learner, source and seed, to the bit.
+
+    Args:
+        source: an open source of frames; `close` closes it. Each episode begins where it is now,
+            or, with one that cannot go back, where the one before ended.
+        algorithm: the learner's name, "progress", "2.0" or "1.0".
+        observe: "block": the frames watched; "outputs": those of what is being learned there,
+            NaN as 0. Zeros before the first step.
+        max_iterations: steps of an episode at most.
+        settings: keys of the learner, `tau=20`; see docs/configuration.md.
+
+    Attributes:
+        action_space: the streams' indices.
+        observation_space: (tau, *frame_shape), or (tau, outputs).
+        learner: the episode's; None before the first.
+        signals: of the last step, see docs/signals.md; None before the first of an episode.
+
+    Raises:
+        UsageError: Gymnasium is missing, or there is no such learner, setting or observation.
+
+    Example:
+        >>> from recorder.world.oscillatory import OscillatorySource
+        >>> env = WatchEnv(OscillatorySource(), max_iterations=100)
+        >>> seen, info = env.reset(seed=0)
+        >>> seen, reward, terminated, truncated, info = env.step(info["stream"])
+        >>> seen.shape
+        (40, 1)
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it
+
+    def __init__(
+        self,
+        source: FrameSource,
+        algorithm: str = "progress",
+        *,
+        observe: Literal["block", "outputs"] = "block",
+        max_iterations: int | None = None,
+        **settings: Any,
+    ) -> None:
+        if not isinstance(source, FrameSource):
+            raise UsageError(f"{type(source).__name__} given: WatchEnv takes an open source")
+        if observe not in ("block", "outputs"):
+            raise UsageError(f'observe={observe!r} given: it is "block" or "outputs"')
+        if max_iterations is not None and not (
+            isinstance(max_iterations, int) and max_iterations >= 1
+        ):
+            raise UsageError(
+                f"max_iterations={max_iterations!r} given: it is a number from 1, or None"
+            )
+        entry = LEARNERS[algorithm]
+        base = load_preset(entry.preset)["learner"] if entry.preset else {}
+        told = ({"algorithm": algorithm}, settings)
+        self._config = build(entry.configuration, "learner", base, *told)
+        self._source, self._start, self._observe = source, source.t, observe
+        self._most = max_iterations
+        spec = source.spec
+        first = open_learner(self._config, spec, 0)
+        if not hasattr(first, "watch"):
+            raise UsageError(
+                f"the learner {algorithm} cannot be told what to watch: it has no watch"
+            )
+        shape: tuple[int, ...] = (first.tau, len(first.phi))
+        if observe == "block":
+            shape = (first.tau, *spec.frame_shape)
+        if observe == "block" and spec.dtype == "uint8":
+            self.observation_space = Box(0, 255, shape, np.uint8)
+        else:
+            self.observation_space = Box(-np.inf, np.inf, shape, np.float64)
+        self._nothing: NDArray[Any] = np.zeros(shape, self.observation_space.dtype)
+        self.action_space = Discrete(len(spec.streams))
+        self.learner: Learner | None = None
+        self.signals: BlockSignals | None = None
+        self._seen = self._nothing
+        self._ended = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Begin an episode with a learner that has learned nothing.
+
+        Args:
+            seed: of the learner's random choices; by default drawn.
+            options: none.
+
+        Returns:
+            Zeros, and `info`.
+        """
+        super().reset(seed=seed)
+        own = int(self.np_random.integers(2**31)) if seed is None else seed
+        if isinstance(self._source, SeekableSource):
+            self._source.seek(self._start)
+        self.learner = open_learner(self._config, self._source.spec, own)
+        self.signals, self._seen, self._ended = None, self._nothing, False
+        return self._seen.copy(), {"stream": self.learner.stream}
+
+    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
+        """Watch a stream for a block, and learn from it.
+
+        Args:
+            action: the stream's index.
+
+        Returns:
+            What was seen, the reward, whether the learner has ended, whether it was stopped, and
+            `info`.
+
+        Raises:
+            UsageError: there is no such stream, or no episode.
+            LogExhaustedError: the source has not enough for a single block.
+        """
+        learner: Any = self.learner
+        if self._ended:
+            raise UsageError("there is no episode, or it is over: call reset()")
+        if not self.action_space.contains(action):
+            streams = len(self._source.spec.streams)
+            raise UsageError(f"no stream {action!r}: the actions are 0 to {streams - 1}")
+        reward, terminated = 0.0, False
+        learner.watch(int(action))
+        try:
+            block = self._source.take(learner.stream, learner.tau)
+        except LogExhaustedError:
+            if not learner.iteration:
+                raise
+            truncated = True
+        else:
+            self.signals = signals = learner.step(block)
+            shown = block.frames if self._observe == "block" else np.nan_to_num(signals.y)
+            self._seen = np.asarray(shown)
+            reward = 0.0 if isnan(signals.reward) else float(signals.reward)
+            most = learner.max_modules
+            terminated = bool(learner.over) or (most is not None and len(learner.modules) >= most)
+            truncated = self._most is not None and learner.iteration >= self._most
+        self._ended = terminated or truncated
+        return self._seen.copy(), reward, terminated, truncated, {"stream": learner.stream}
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()

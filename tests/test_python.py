@@ -1,0 +1,290 @@
+"""What a program or a notebook does: `learn` from anything, and what it holds then."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from conftest import Cdmisfa
+from PIL import Image
+
+import cdmisfa
+from cdmisfa import Recording, Run, learn
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.experiments.recompute import check_run
+from cdmisfa.testing.sources import SourceContract
+from replay.arrays import ArrayLog
+from replay.camera_logs.options import CameraOptions
+
+ROOT = Path(__file__).parents[1]
+FEW: dict[str, Any] = {"max_iterations": 12, "tau": 20}
+
+
+def numbers(rows: int = 400) -> Any:
+    t = np.arange(rows) / 20
+    return np.stack([np.sin(t), np.cos(3 * t), np.sin(7 * t)], axis=1)
+
+
+def pictures(*shape: int) -> Any:
+    return np.random.default_rng(0).integers(0, 255, (400, *shape), np.uint8)
+
+
+class Table:
+    """What stands for a DataFrame."""
+
+    def to_numpy(self) -> Any:
+        return numbers().astype(np.float32)
+
+
+class TestArrays(SourceContract):
+    ends = True
+
+    def open(self) -> ArrayLog:
+        rows = pictures(8, 12, 3)[:100]
+        return ArrayLog({"left": rows, "right": 255 - rows}, CameraOptions(size=(4, 6), rate=10))
+
+
+class TestNumbers(SourceContract):
+    ends = True
+
+    def open(self) -> ArrayLog:
+        return ArrayLog({"all": numbers(60)})
+
+
+@pytest.mark.parametrize(
+    ("given", "shape", "dtype"),
+    [
+        (numbers()[:, 0], (1,), "float64"),
+        (list(range(400)), (1,), "float64"),
+        ((100 * numbers()).astype(np.int16), (3,), "float64"),
+        (numbers() > 0, (3,), "float64"),
+        (Table(), (3,), "float64"),
+        (pa.table({"a": numbers()[:, 0], "b": range(400)}), (2,), "float64"),
+        (pictures(6, 8), (6, 8), "uint8"),
+        (pictures(6, 8, 3), (6, 8), "uint8"),
+        (pictures(6, 8, 4), (6, 8), "uint8"),
+        (pictures(6, 8).astype(np.uint16) << 8, (6, 8), "uint8"),
+        (pictures(6, 8) / 255, (6, 8), "uint8"),
+        (pictures(6, 8) > 99, (6, 8), "uint8"),
+        ({"a": numbers(), "b": numbers()[::-1]}, (3,), "float64"),
+        ({"made": (row for row in numbers())}, (3,), "float64"),
+    ],
+)
+def test_arrays_of_any_type_are_learned_from(given: Any, shape: Any, dtype: str) -> None:
+    run = learn(given, **FEW)
+    spec = run.header.spec
+    assert (spec.frame_shape, spec.dtype) == (shape, dtype)
+    assert run.frames().shape == (240 if dtype == "float64" else 24, *shape)
+    assert run.signals.to_arrow().num_rows == 12
+
+
+def test_pictures_of_any_type_are_the_same_frames() -> None:
+    gray = pictures(6, 8)
+    for same in (
+        gray.astype(">u2") << 8,
+        gray / 255,
+        gray.astype(int),
+        gray.astype(np.uint16) << 8,
+        gray[..., None],
+    ):
+        assert np.array_equal(Recording(same).frames(), gray)
+    assert np.array_equal(Recording(np.stack([gray] * 3, axis=3)).frames(), gray)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ([[1.0, 2.0], [3.0, np.nan]], "stream: row 1, counted from 0, holds what is no finite"),
+        ({"cam": np.zeros((9, 3, 20, 30))}, r"cam: .*move its colours last, np.moveaxis"),
+        (1000 * numbers().reshape(-1, 4, 5), "scale them to 0 to 1"),
+        (["one", 2], "no numbers"),
+        ([[1, 2], [3]], "unequal length"),
+        (np.zeros((0, 3)), "it is empty"),
+        (5, r"it has shape \(\)"),
+        ({}, "no array given"),
+        ({"a": numbers(), "b": pictures(4, 5)}, "a rows of 3 and b pictures"),
+        (np.ma.masked_less(numbers(), 0), "masked"),
+        ("nowhere.npz", "no such file"),
+        (["nowhere.npz", "x.mcap"], "no such file"),
+        ("gym:Nothing-v0", "cannot be made"),
+        (numbers()[:10], "10 frames are left at frame 0, 40 are needed"),
+    ],
+)
+def test_what_cannot_be_learned_from_is_one_line(
+    given: Any, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(CdmisfaError, match=said) as found:
+        learn(given)
+    assert "\n" not in str(found.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"algoritm": "2.0"}, "did you mean learner.algorithm"),
+        ({"algorithm": "3.0"}, "no learner.algorithm"),
+        ({"tau": "many"}, "learner.tau is 'many'"),
+        ({"size": (8, 8)}, r"learn\(Recording\(source, size=...\)\)"),
+        ({"seed": "x"}, "seed is 'x'"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(how: dict[str, Any], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        learn(numbers(), **how)
+
+
+def test_files_of_arrays_are_logs_that_runs_find_again(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    arrays = {"a": numbers(), "b": numbers()[::-1]}
+    np.savez_compressed(tmp_path / "x.npz", **arrays)
+    np.save(tmp_path / "y.npy", arrays["a"])
+    held, run = learn(arrays, **FEW), learn(str(tmp_path / "x.npz"), tmp_path / "run", **FEW)
+    assert dict(run.result or {})["signals_sha256"] == dict(held.result or {})["signals_sha256"]
+    assert check_run(run.path).holds
+    assert run.at(7).iteration == held.at(7).iteration == 7
+    other = cdmisfa("learn", tmp_path / "y.npy", "-o", tmp_path / "other", "--max-iterations", "3")
+    assert other.code == 0, other.err
+    assert Run(tmp_path / "other").streams == ("y",)
+    np.savez(tmp_path / "x.npz", **(arrays | {"a": arrays["b"]}))
+    assert check_run(run.path).other_files == ("x.npz",)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"PK\x03\x04" + bytes(90), b"\x93NUMPY\x01\x00", b"x" * 99]
+)
+@pytest.mark.parametrize("name", ["x.npz", "x.npy"])
+def test_a_damaged_file_of_arrays_is_one_line(
+    cdmisfa: Cdmisfa, name: str, content: bytes, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    found = cdmisfa("learn", tmp_path / name)
+    assert (found.code, found.err.count("\n")) == (3, 1), found.err
+    assert f"{name} is no file of NumPy's arrays" in found.err
+
+
+def test_a_temporary_run_goes_with_what_holds_it() -> None:
+    run = learn(numbers(), **FEW)
+    path = run.path
+    assert path.is_dir()
+    del run
+    assert not path.exists()
+
+
+def test_a_run_gives_what_its_log_holds(tmp_path: Path) -> None:
+    rewards: list[float] = []
+
+    class Rewards(cdmisfa.Sink):
+        def block(self, block: Any, signals: Any, learner: Any) -> None:
+            rewards.append(signals.reward)
+
+    learn("oscillatory", tmp_path / "run", max_modules=1, sinks=[Rewards()])
+    again = Run(tmp_path / "run")
+    assert again.signals["reward"].tolist() == pytest.approx(rewards, nan_ok=True)
+    table = again.signals.to_arrow("iteration", "reward", "eta")
+    assert table.num_rows == len(rewards)
+    assert table["reward"].null_count == np.isnan(rewards).sum()
+    assert again.config["learner"]["tau"] == again.signals["y"].shape[1]
+    assert again.events[-1].text.startswith("ended: ")
+    (module,) = again.modules
+    shown = module.transform(again.frames(0, 3))
+    assert np.array_equal(again.features[0].transform(again.frames(0, 3)), shown)
+    assert "1 module learned" in again.report()
+    for part in ((3, 3), (-1, 2), (0, 10**6)):
+        with pytest.raises(UsageError, match="has no iterations"):
+            again.frames(*part)
+    again.view(tmp_path / "view.rrd")
+    assert (tmp_path / "view.rrd").stat().st_size > 0
+
+
+def test_a_recording_gives_the_frames_of_its_streams() -> None:
+    recording = Recording(ROOT / "sample_logs" / "icub", topics=["/view/left", "/view/right"])
+    assert recording.spec.streams == ("left", "right")
+    left = recording.frames("left", 5, 25)
+    with recording.source() as source:
+        source.seek(5)
+        assert np.array_equal(source.take(0, 20).frames, left)
+    assert learn(recording, max_iterations=2).header.spec.streams == ("left", "right")
+    with pytest.raises(UsageError, match="no stream 'up': there are left, right"):
+        recording.frames("up")
+    with pytest.raises(UsageError, match="no frames"):
+        recording.frames("left", 5, 10**9)
+    with pytest.raises(UsageError, match="did you mean topics"):
+        Recording("x.mcap", topic=["/a"])
+
+
+@pytest.mark.parametrize("given", [numbers(), pictures(6, 8), {"<b>": numbers()}])
+def test_what_is_shown_is_short_with_a_small_picture(given: Any) -> None:
+    for held in (Recording(given), learn(given, **FEW)):
+        text, page = repr(held), held._repr_html_()
+        assert len(text) < 200
+        assert "\n" not in text
+        assert "<b>" not in page
+        png = re.search(r'src="data:image/png;base64,([^"]+)"', page)
+        assert png is not None
+        with Image.open(io.BytesIO(base64.b64decode(png[1]))) as picture:
+            assert max(picture.size) <= 960
+    assert len(repr(learn(given, **FEW).signals)) < 500
+
+
+def test_a_module_shows_its_weights() -> None:
+    run = learn("oscillatory", max_modules=1)
+    (module,) = run.modules
+    assert repr(module).startswith("<Module 1, of x1, saved at iteration ")
+    assert len(repr(run.features[0])) < 200
+    assert "data:image/png" in module._repr_html_()
+
+
+def test_the_library_lists_what_a_user_needs_and_explains_each() -> None:
+    names = [name for name in dir(cdmisfa) if not name.startswith("_")]
+    assert "CuriousLearner" not in names
+    assert cdmisfa.CuriousLearner
+    for name in names:
+        assert getattr(cdmisfa, name).__doc__, name
+    for name in ("learn", "Run", "Recording"):
+        done = subprocess.run(
+            [sys.executable, "-c", f"import cdmisfa; help(cdmisfa.{name})"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert "Raises:" in done.stdout
+
+
+def test_the_page_s_python_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("gymnasium")
+    page = (ROOT / "docs" / "python.md").read_text("utf-8")
+    examples = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
+    found: dict[str, Any] = {}
+    exec("\n".join(examples), found)
+    assert abs(np.corrcoef(found["slowest"][:, 0], found["frames"][:, 0])[0, 1]) > 0.9
+    assert len(found["rewards"]) == 50
+    assert found["left"].shape == (100, 48, 128)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
+def test_modules_take_the_pictures_that_they_learned_from(kind: Any) -> None:
+    t = np.arange(3000)
+    drift = 128 + 100 * np.sin(t / 60)[:, None, None] * np.linspace(0, 1, 40)[None, :, None]
+    shown = (drift + np.zeros((1, 1, 60))).astype(np.uint8)
+    given = {
+        np.uint8: shown,
+        np.uint16: shown.astype(np.uint16) << 8,
+        np.float64: shown / 255,
+    }[kind]
+    recording = Recording(given, size=(20, 30))
+    run = learn(recording)
+    (module, *_) = run.modules
+    frames = recording.frames()
+    assert frames.shape == (3000, 20, 30)
+    assert np.array_equal(module.transform(given[:90]), module.transform(frames[:90]))

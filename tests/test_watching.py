@@ -1,0 +1,213 @@
+"""Learning as an environment of Gymnasium."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from cdmisfa.agents.learners import open_learner
+from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.signals import SignalsHash
+from cdmisfa.experiments.loop import Digest, learn_blocks
+from cdmisfa.public.recording import Recording
+from cdmisfa.watching import WatchEnv
+from recorder.cameras.stepped import ArraySource
+from recorder.world.oscillatory import OscillatorySource
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "progress": {},
+    "2.0": {"delta": 0.01, "warm_up": 5},
+    "1.0": {"delta": 0.01, "warm_up": 5},
+}
+LEARNED = {
+    "progress": ProgressConfig(),
+    "2.0": LearnerConfig(**SETTINGS["2.0"]),
+    "1.0": LearnerConfig(algorithm="1.0", **SETTINGS["1.0"]),
+}
+
+
+def pictures(n: int = 400) -> dict[str, Any]:
+    rng = np.random.default_rng(1)
+    return {name: rng.integers(0, 256, (n, 6, 8), dtype=np.uint8) for name in ("left", "right")}
+
+
+def environment(what: str, **options: Any) -> WatchEnv:
+    source = ArraySource(pictures(2000)) if what == "pictures" else OscillatorySource()
+    return WatchEnv(source, **options)
+
+
+@pytest.mark.parametrize("what", ["numbers", "pictures"])
+@pytest.mark.parametrize("observe", ["block", "outputs"])
+@pytest.mark.parametrize("algorithm", LEARNED)
+def test_gymnasiums_own_checks_pass(what: str, observe: Any, algorithm: str) -> None:
+    if what == "pictures":  # they go on where they are, so that no two episodes are the same
+        with environment(what, algorithm=algorithm, observe=observe, expansion="none") as env:
+            seen, _ = env.reset(seed=1)
+            assert env.observation_space.contains(seen)
+            assert env.observation_space.contains(env.step(0)[0])
+        return
+    with warnings.catch_warnings(), environment(what, algorithm=algorithm, observe=observe) as env:
+        warnings.filterwarnings("ignore", ".*alternative render modes|.*infinity")
+        check_env(env)
+
+
+@pytest.mark.parametrize("algorithm", LEARNED)
+def test_our_policy_gives_the_signals_of_a_run(algorithm: str) -> None:
+    digest, source = Digest(), OscillatorySource()
+    learner = open_learner(LEARNED[algorithm], source.spec, 7)
+    ended = learn_blocks(source, learner, [digest], max_iterations=400)
+    env = WatchEnv(OscillatorySource(), algorithm, max_iterations=400, **SETTINGS[algorithm])
+    for _ in range(2):  # an episode begins anew
+        told, over = SignalsHash(), False
+        _, info = env.reset(seed=7)
+        while not over:
+            _, reward, terminated, truncated, info = env.step(info["stream"])
+            signals: Any = env.signals
+            assert reward == np.nan_to_num(signals.reward)
+            told.add(signals)
+            over = terminated or truncated
+        assert told.hexdigest() == digest.hexdigest()
+        assert truncated == (ended == "max_iterations")
+
+
+@pytest.mark.parametrize("algorithm", LEARNED)
+def test_what_others_choose_is_watched(algorithm: str) -> None:
+    env = WatchEnv(OscillatorySource(), algorithm, **SETTINGS[algorithm])
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    rewards = []
+    for _ in range(200):
+        action = int(rng.integers(3))
+        _, reward, over, _, _ = env.step(action)
+        signals: Any = env.signals
+        assert signals.stream == action
+        rewards.append(reward)
+        if over:
+            break
+    assert np.any(rewards)
+    assert np.isfinite(rewards).all()
+
+
+def test_observations_are_what_was_watched() -> None:
+    arrays, env = pictures(), WatchEnv(ArraySource(pictures()), tau=20)
+    seen, _ = env.reset(seed=0)
+    assert not seen.any()
+    np.testing.assert_array_equal(env.step(1)[0], arrays["right"][:20])
+    seen = env.step(0)[0]
+    np.testing.assert_array_equal(seen, arrays["left"][20:40])
+    seen[:] = 0  # is the caller's
+    outputs = WatchEnv(OscillatorySource(), observe="outputs")
+    outputs.reset(seed=0)
+    for _ in range(5):
+        seen = outputs.step(0)[0]
+    signals: Any = outputs.signals
+    np.testing.assert_array_equal(seen, np.nan_to_num(signals.y))
+    assert seen.any()
+
+
+def test_where_the_source_ends_it_is_truncated() -> None:
+    env = WatchEnv(ArraySource(pictures(100)), tau=40)
+    env.reset(seed=0)
+    steps = [env.step(0) for _ in range(3)]
+    assert [truncated for _, _, _, truncated, _ in steps] == [False, False, True]
+    assert steps[2][1] == 0.0
+    np.testing.assert_array_equal(steps[2][0], steps[1][0])
+    with pytest.raises(UsageError, match="call reset"):
+        env.step(0)
+    env.reset(seed=0)
+    with pytest.raises(LogExhaustedError, match="20 frames are left"):
+        env.step(0)
+
+
+def test_episodes_of_arrays_begin_anew() -> None:
+    with WatchEnv(Recording(pictures()).source(), tau=20) as env:
+        for _ in range(2):
+            env.reset(seed=0)
+            np.testing.assert_array_equal(env.step(1)[0], pictures()["right"][:20])
+
+
+def test_without_a_seed_episodes_differ_and_follow_from_the_first() -> None:
+    def chosen() -> list[int]:
+        env, found = WatchEnv(OscillatorySource(), "2.0"), []
+        for seed in (3, None, None):
+            _, info = env.reset(seed=seed)
+            for _ in range(20):
+                *_, info = env.step(info["stream"])
+                found.append(info["stream"])
+        return found
+
+    assert chosen() == chosen()
+    assert chosen()[:20] != chosen()[20:40]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: WatchEnv(np.zeros((9, 2))), "ndarray given: WatchEnv takes an open source"),
+        (lambda: WatchEnv(OscillatorySource(), "progres"), "progres"),
+        (lambda: WatchEnv(OscillatorySource(), observe="frame"), '"block" or "outputs"'),
+        (lambda: WatchEnv(OscillatorySource(), max_iterations=0), "max_iterations=0 given"),
+        (lambda: WatchEnv(OscillatorySource(), max_iterations="9"), "max_iterations='9' given"),
+        (lambda: WatchEnv(OscillatorySource(), taus=3), "unknown key learner.taus"),
+        (lambda: WatchEnv(OscillatorySource()).step(0), r"call reset\(\)"),
+    ],
+)
+def test_what_it_cannot_take_is_refused(make: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("action", [-1, 3, 0.5, "left", None])
+def test_what_is_no_stream_is_refused(action: Any) -> None:
+    env = WatchEnv(OscillatorySource())
+    env.reset(seed=0)
+    with pytest.raises(UsageError, match="the actions are 0 to 2"):
+        env.step(action)
+
+
+def test_without_gymnasium_it_says_what_to_install() -> None:
+    code = (
+        "import sys; sys.modules['gymnasium'] = None\n"
+        "import cdmisfa\nhelp(cdmisfa.WatchEnv)\n"
+        "try: cdmisfa.WatchEnv(None)\nexcept Exception as error: print(repr(error))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert "max_iterations: " in done.stdout
+    assert "is missing: pip install 'cdmisfa[gym]'" in done.stdout.splitlines()[-1]
+
+
+def test_the_example_of_ppo_runs(tmp_path: Path) -> None:
+    """With a stand-in that chooses at random, for stable-baselines3 brings gigabytes."""
+    (tmp_path / "stable_baselines3.py").write_text(
+        "class PPO:\n"
+        "    def __init__(self, policy, env, *, n_steps, batch_size, seed, verbose):\n"
+        "        self.env = env\n"
+        "    def learn(self, steps):\n"
+        "        self.env.action_space.seed(0)\n"
+        "    def predict(self, seen):\n"
+        "        assert self.env.observation_space.contains(seen)\n"
+        "        return self.env.action_space.sample(), None\n"
+    )
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "ppo.py"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(EXAMPLES.parent)])},
+    )
+    assert [line.partition(":")[0] for line in done.stdout.splitlines()] == ["PPO", "the learner"]
