@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from cdmisfa import kernels
 from cdmisfa.core.blocks import PIXEL, UINT8, as_array
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, expanded_size
+from cdmisfa.core.shown import Shown, weights
 
 if TYPE_CHECKING:  # the mind knows no images: who saves a module adds how they became frames
     from recorder.images.recipe import Recipe
@@ -22,8 +23,8 @@ CHUNK = 1024
 """Frames that are turned into values at once."""
 
 
-@dataclass(frozen=True, slots=True)
-class Module:
+@dataclass(frozen=True, slots=True, repr=False)
+class Module(Shown):
     """A frozen abstraction with the policy that led to it.
 
     Attributes:
@@ -112,6 +113,23 @@ class Module:
         if rows.dtype != UINT8 or self.scale != PIXEL:
             rows = rows.astype(np.float64)
         return rows, expansion
+
+    def _facts(self) -> Mapping[str, Any]:
+        shape = "x".join(map(str, self.frame_shape)) or f"{self.phi.shape[1]} values"
+        eta = ", ".join(f"{value:.3g}" for value in self.eta)
+        return {
+            "module": self.index,
+            "of": self.stream,
+            "saved at iteration": self.iteration,
+            "frames": shape,
+            "slowness": eta,
+        }
+
+    def _picture(self) -> NDArray[np.uint8] | None:
+        """The weights of the slowest output."""
+        own = self.frame_shape
+        plain = len(own) == 2 and prod(own) == self.phi.shape[1]
+        return weights(self.phi[0].reshape(own if plain else (1, -1)))
 
     def _frames(self, given: Any) -> NDArray[Any]:
         """Frames as they were given, or made of raw pictures."""

@@ -81,6 +81,12 @@ class WatchEnv(Env):
             raise UsageError(f"{type(source).__name__} given: WatchEnv takes an open source")
         if observe not in ("block", "outputs"):
             raise UsageError(f'observe={observe!r} given: it is "block" or "outputs"')
+        if max_iterations is not None and not (
+            isinstance(max_iterations, int) and max_iterations >= 1
+        ):
+            raise UsageError(
+                f"max_iterations={max_iterations!r} given: it is a number from 1, or None"
+            )
         entry = LEARNERS[algorithm]
         base = load_preset(entry.preset)["learner"] if entry.preset else {}
         told = ({"algorithm": algorithm}, settings)

@@ -235,6 +235,14 @@ def test_what_is_shown_is_short_with_a_small_picture(given: Any) -> None:
     assert len(repr(learn(given, **FEW).signals)) < 500
 
 
+def test_a_module_shows_its_weights() -> None:
+    run = learn("oscillatory", max_modules=1)
+    (module,) = run.modules
+    assert repr(module).startswith("<Module 1, of x1, saved at iteration ")
+    assert len(repr(run.features[0])) < 200
+    assert "data:image/png" in module._repr_html_()
+
+
 def test_the_library_lists_what_a_user_needs_and_explains_each() -> None:
     names = [name for name in dir(cdmisfa) if not name.startswith("_")]
     assert "CuriousLearner" not in names

@@ -158,6 +158,8 @@ def test_without_a_seed_episodes_differ_and_follow_from_the_first() -> None:
         (lambda: WatchEnv(np.zeros((9, 2))), "ndarray given: WatchEnv takes an open source"),
         (lambda: WatchEnv(OscillatorySource(), "progres"), "progres"),
         (lambda: WatchEnv(OscillatorySource(), observe="frame"), '"block" or "outputs"'),
+        (lambda: WatchEnv(OscillatorySource(), max_iterations=0), "max_iterations=0 given"),
+        (lambda: WatchEnv(OscillatorySource(), max_iterations="9"), "max_iterations='9' given"),
         (lambda: WatchEnv(OscillatorySource(), taus=3), "unknown key learner.taus"),
         (lambda: WatchEnv(OscillatorySource()).step(0), r"call reset\(\)"),
     ],

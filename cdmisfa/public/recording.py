@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.shown import Shown
 from cdmisfa.experiments.resume import CAMERAS
 from cdmisfa.experiments.sources import open_logs
-from cdmisfa.public.shown import Shown, beside, curves, view
+from cdmisfa.public.shown import beside, curves, view
 from replay.arrays import ArrayLog
 from replay.camera_logs.options import CameraOptions
 

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Learner
+from cdmisfa.core.shown import Shown
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.recompute import Run as RecomputedRun
-from cdmisfa.public.shown import Shown, view, watched
+from cdmisfa.public.shown import view, watched
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
 from replay.runs.modules import SlowFeatures
 from replay.runs.run import read_outline

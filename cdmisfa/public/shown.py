@@ -1,52 +1,15 @@
-"""What a notebook shows of a run or a recording: a table of facts and a small picture."""
+"""Small pictures of runs and recordings, and their views."""
 
 from __future__ import annotations
 
-import base64
-import html
-import io
-from abc import abstractmethod
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.shown import ROW, WIDTH
 from replay.palette import colour
-
-WIDTH = 480
-"""Most pixels across of a picture."""
-
-ROW = 24
-"""Pixels of the height of a stream in a picture."""
-
-
-class Shown:
-    """An object with a short text, and a table and a small picture in a notebook."""
-
-    @abstractmethod
-    def _facts(self) -> Mapping[str, Any]:
-        """What is told of it, by names."""
-
-    @abstractmethod
-    def _picture(self) -> NDArray[np.uint8] | None:
-        """A picture (height, width) or (height, width, 3), if it has one."""
-
-    def __repr__(self) -> str:
-        first, *rest = self._facts().items()
-        facts = "".join(f", {name} {value}" for name, value in rest)
-        return f"<{type(self).__name__} {first[1]}{facts}>"
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f'<tr><th style="text-align:left">{html.escape(name)}</th>'
-            f'<td style="text-align:left">{html.escape(str(value))}</td></tr>'
-            for name, value in self._facts().items()
-        )
-        picture = self._picture()
-        image = "" if picture is None else f'<img alt="" src="{_png(picture)}">'
-        return f"<div><table>{rows}</table>{image}</div>"
 
 
 def watched(streams: NDArray[Any], count: int) -> NDArray[np.uint8]:
@@ -99,11 +62,3 @@ def view(path: Path, save: str | Path | None, *, tab: str | None = None) -> None
     from replay.viewer.window import open_window
 
     open_window(path, tab=tab)
-
-
-def _png(picture: NDArray[np.uint8]) -> str:
-    from PIL import Image
-
-    data = io.BytesIO()
-    Image.fromarray(picture).save(data, "PNG")
-    return f"data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}"

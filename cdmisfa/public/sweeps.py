@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.shown import Shown
 from cdmisfa.experiments.results import PointResult, differing, results
 from cdmisfa.experiments.sources import is_scene
 from cdmisfa.experiments.store import read_rows
 from cdmisfa.experiments.sweep import sweep as sweep_folder
 from cdmisfa.public.recording import Given, Recording
-from cdmisfa.public.shown import Shown
 from recorder.log.files import atomic_write
 from replay.camera_logs.options import CameraOptions
 from replay.runs.folders import REQUEST, read_request

@@ -153,6 +153,9 @@ class SlowFeatures:
         """
         return tuple(cls(module) for module in load_modules(Path(path)))
 
+    def __repr__(self) -> str:
+        return f"SlowFeatures({self.module!r})"
+
     @property
     def components_(self) -> FloatArray:
         """(J, I) weights, a row an output."""

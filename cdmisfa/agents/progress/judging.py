@@ -16,7 +16,7 @@ from cdmisfa.features.outputs import window_rate
 from cdmisfa.features.recursive import Likeness
 from cdmisfa.modules import Module
 
-FULL = 5.0
+FULL = 4.5
 """Windows of tests after which an output counts as settled at `learner.settled`; until then the
 threshold grows with the square of their number."""
 

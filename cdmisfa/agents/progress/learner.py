@@ -56,7 +56,7 @@ FEWEST_BLOCKS = 20
 WATCHED = 0.4
 """Windows of tests that the output of a decided stream's module is told over."""
 
-DECIDING = 1
+DECIDING = 2
 """Rises when something else is decided than before, so that runs of then are not gone on with."""
 
 COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle", "i8")])

@@ -1,0 +1,67 @@
+"""What a notebook shows of an object: a table of facts and a small picture."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+WIDTH = 480
+"""Most pixels across of a picture, as a rule."""
+
+ROW = 24
+"""Pixels of the height of a row in a picture."""
+
+
+class Shown:
+    """An object with a short text, and a table and a small picture in a notebook."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def _facts(self) -> Mapping[str, Any]:
+        """What is told of it, by names."""
+
+    @abstractmethod
+    def _picture(self) -> NDArray[np.uint8] | None:
+        """A picture (height, width) or (height, width, 3), if it has one."""
+
+    def __repr__(self) -> str:
+        first, *rest = self._facts().items()
+        facts = "".join(f", {name} {value}" for name, value in rest)
+        return f"<{type(self).__name__} {first[1]}{facts}>"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f'<tr><th style="text-align:left">{html.escape(name)}</th>'
+            f'<td style="text-align:left">{html.escape(str(value))}</td></tr>'
+            for name, value in self._facts().items()
+        )
+        picture = self._picture()
+        image = "" if picture is None else f'<img alt="" src="{_png(picture)}">'
+        return f"<div><table>{rows}</table>{image}</div>"
+
+
+def weights(values: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Weights (rows, columns), blue below 0, white 0, red above, the largest in full colour."""
+    most = float(np.abs(values).max()) or 1.0
+    rest = np.rint(255 * (1 - np.abs(values) / most)).astype(np.uint8)
+    full, below = np.full_like(rest, 255), values < 0
+    picture = np.stack([np.where(below, rest, full), rest, np.where(below, full, rest)], axis=2)
+    across = max(WIDTH // picture.shape[1], 1)
+    down = across if len(picture) > 1 else ROW
+    return np.repeat(np.repeat(picture, down, axis=0), across, axis=1)
+
+
+def _png(picture: NDArray[np.uint8]) -> str:
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(picture).save(data, "PNG")
+    return f"data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}"
