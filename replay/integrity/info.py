@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
