@@ -129,8 +129,8 @@ class VideoCamera:
         most = most_pixels(shown.format, codec)
         if not 0 < shown.width * shown.height <= most:
             raise CdmisfaError(
-                f"{self.name}: images of {shown.width}x{shown.height}, live ones of this kind have "
-                f"1 to {most} pixels"
+                f"{self._shown_word}: images of {shown.width}x{shown.height}, live ones of this "
+                f"kind have 1 to {most} pixels"
             )
 
 

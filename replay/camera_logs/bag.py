@@ -128,7 +128,7 @@ class BagImages(MessageImages):
                 raise UsageError(f"{path}: there is no message on {self.topic}")
             self.times = sorted_times(f"{path}: {self.topic}", stamps)
             self._opened = opened.pop_all()
-        self.warnings = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
+        self.remarks = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
 
     def taken(self, row: int, take: Callable[[bytes], Found]) -> Found:
         with explained(self.path, "rosbags"):

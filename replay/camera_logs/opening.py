@@ -206,7 +206,7 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
         first, last = map(int, images.times[[0, -1]]) if len(images.times) else (None, None)
         kind_of_image = "picture" if kind == "pictures" else "video"
         facts = (images.topic, images.encoding, kind_of_image, images.count, first, last)
-        return [ChannelFacts(*facts, missing=images.missing)]
+        return [ChannelFacts(*facts, missing=images.missing, remarks=tuple(images.remarks))]
 
 
 def named_streams(

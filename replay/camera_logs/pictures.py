@@ -59,7 +59,7 @@ class FolderImages(ImageStream):
             check_regular(file, MAX_PICTURE)
         self.encoding = " ".join(sorted({p.suffix.lower()[1:] for p in self._files}))
         if self.encoding != "png":
-            self.warnings = [f"{path}: a JPEG has no checksums, damaged pixels may go unnoticed"]
+            self.remarks = [f"{path}: a JPEG has no checksums, damaged pixels may go unnoticed"]
         self.times = np.empty(0, np.uint64)
 
     @property
@@ -147,15 +147,15 @@ class VideoImages(ImageStream):
         except BaseException:
             self.close()
             raise
-        said = ["a video has no checksums, damaged pixels may go unnoticed"]
-        if self.missing:
-            said.append(self.missing)
-        elif not extent.stated:
-            said.append("it does not state where it ends, a missing end would go unnoticed")
+        remarks = ["a video has no checksums, damaged pixels may go unnoticed"]
+        said = [self.missing] if self.missing else []
+        if not self.missing and not extent.stated:
+            remarks.append("it does not state where it ends, a missing end would go unnoticed")
         last, stated = int(self.times[-1]) / NANOSECONDS, self._stated_seconds
         if stated > last + 1:
             said.append(f"it states {stated:g} s, its last frame is at {last:g} s")
         self.warnings = [f"{path}: {line}" for line in said]
+        self.remarks = [f"{path}: {line}" for line in remarks]
 
     def image(self, row: int) -> ByteArray:
         stamp = int(self._stamps[row])

@@ -45,6 +45,7 @@ class ChannelFacts:
         end_ns: time of the last.
         images: whether they are images that are read.
         missing: what the file that they are in lacks, as it was cut, in words.
+        remarks: what its format cannot tell of it.
     """
 
     topic: str
@@ -55,6 +56,7 @@ class ChannelFacts:
     end_ns: int | None = None
     images: bool = True
     missing: str = ""
+    remarks: tuple[str, ...] = ()
 
 
 class ImageStream(ABC):
@@ -69,6 +71,7 @@ class ImageStream(ABC):
         recipe: how an image becomes a frame, for the record.
         fields: the numbers that are taken instead of images, in their order.
         warnings: what the user should know: what was cut or left out.
+        remarks: what its format cannot tell of it, for who asks whether it is whole.
         missing: what a file that was cut lacks, in words, which is a warning, too; "" for others.
         told_rounded: whether warnings say of every number that is held rounded.
         decode: what makes an image of a message; None where they are no messages of a log.
@@ -81,6 +84,7 @@ class ImageStream(ABC):
     recipe: str = RECIPE
     fields: Sequence[str] = ()
     warnings: Sequence[str] = ()
+    remarks: Sequence[str] = ()
     missing: str = ""
     told_rounded: bool = False
     decode: Decoder | None = None

@@ -213,6 +213,7 @@ def _describe_foreign(place: Path) -> LogInfo:
         problems=(*missing, *(broken or ())),
         metadata={},
         state="cut short" if missing else state,
+        notes=tuple(dict.fromkeys(line for c in known for line in c.remarks)),
     )
 
 

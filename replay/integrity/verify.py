@@ -275,7 +275,7 @@ def _check_topics(path: Location, topics: Iterable[str]) -> LogCheck:
             with contextlib.closing(open_images(path, topic)) as images:
                 problems += _broken(images)
                 missing |= dict.fromkeys([images.missing] if images.missing else [])
-                notes |= dict.fromkeys(images.warnings)
+                notes |= dict.fromkeys((*images.remarks, *images.warnings))
         except LogDamagedError as error:
             problems.append(as_problem(path, error))
         except UsageError as error:  # it needs an option, or what is not installed
