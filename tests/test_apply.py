@@ -7,6 +7,7 @@ import re
 import socket
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,9 @@ from run_data import module_of
 from waiting import started
 
 from cdmisfa import Recipe, Run
+from cdmisfa.core.errors import LogWriteError
 from cdmisfa.experiments.apply import Application
+from cdmisfa.experiments.applying import Tally, follow, written
 from cdmisfa.modules import Module
 from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
@@ -140,6 +143,27 @@ def test_what_came_before_damage_is_kept(run: Path, cdmisfa: Cdmisfa, tmp_path: 
     module = Run(run).modules[1]
     np.testing.assert_array_equal(outputs(table, 2), module.transform(shown))
     assert cdmisfa("apply", run, log, "-o", tmp_path / "w.csv", "--salvage").code == 0
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv"])
+def test_a_full_disk_leaves_nothing_and_says_so(
+    form: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*batch: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    writer = SimpleNamespace(write_batch=full, close=full)
+    monkeypatch.setattr(pq, "ParquetWriter", lambda *told, **how: writer)
+    monkeypatch.setattr(pacsv, "CSVWriter", lambda *told: writer)
+    application, out = Application(run), tmp_path / "out" / f"o.{form}"
+    source = ForeignSource(camera(tmp_path / "a.mcap", 30), size=SIZE)
+    about = source.spec, application.modules
+    with (
+        pytest.raises(LogWriteError, match="cannot be written: No space left"),
+        written(out, *about, force=False) as sink,
+    ):
+        follow(application.to(source), [sink], Tally(*about))
+    assert list(out.parent.iterdir()) == []
 
 
 def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(

@@ -184,6 +184,7 @@ class TestRuns:
         words = ("learn", oscillatory_recording, "--algorithm", algorithm)
         done = cdmisfa(*words, "-o", run, "--no-rerun")
         assert done.code == 0
+        assert "the source ended: " in done.err
         assert "0 frames are left at frame 2000" in done.err
         assert "--loop" in done.err
         assert said in done.out

@@ -161,6 +161,48 @@ def test_commands_name_the_damaged_picture(
     assert cdmisfa("convert", *words, "--force", "--salvage").code == 0
 
 
+@pytest.mark.parametrize(
+    ("ending", "damage", "state", "crc"),
+    [
+        ("png", None, "whole", "ok"),
+        ("png", end_of_zeros, "damaged", "bad"),
+        ("png", cut, "damaged", "bad"),
+        ("png", part_of_zeros, "damaged", "bad"),
+        ("jpg", None, "unchecked", "absent"),
+        ("jpg", end_of_zeros, "unchecked", "absent"),
+    ],
+)
+def test_info_and_verify_judge_a_folder_alike(
+    tmp_path: Path, cdmisfa: Cdmisfa, ending: str, damage: Damage | None, state: str, crc: str
+) -> None:
+    """Of pictures without checksums `info` says that it has not looked."""
+    random = np.random.default_rng(4)
+    pictures = [packed(scene(random), format={"png": "PNG", "jpg": "JPEG"}[ending])] * 6
+    if damage:
+        pictures[3] = damage(pictures[3], random)
+    path, where = in_folder(tmp_path, pictures, ending)
+    info, verify = cdmisfa("info", path, "--json"), cdmisfa("verify", path, "--json")
+    assert (info.json["state"], info.json["crc"]) == (state, crc)
+    assert [where in p["where"] for p in info.json["problems"]] == [True] * (state == "damaged")
+    assert verify.json["state"] == ("damaged" if damage else "whole")
+    assert verify.json["files"][0]["crc"] == crc
+    if state != "unchecked":
+        assert info.code == verify.code
+
+
+@pytest.mark.parametrize("written", [in_folder, in_log])
+def test_info_calls_nothing_whole_that_only_verify_reads(
+    tmp_path: Path, cdmisfa: Cdmisfa, written: Any
+) -> None:
+    random = np.random.default_rng(5)
+    kind = "png" if written is in_log else "jpg"
+    pictures = [packed(scene(random), format="PNG" if kind == "png" else "JPEG")] * 6
+    pictures[3] = end_of_zeros(pictures[3], random)
+    path, _ = written(tmp_path, pictures, kind)
+    assert ", contents unchecked, " in cdmisfa("info", path).out
+    assert cdmisfa("verify", path).code == 3
+
+
 def test_verify_says_that_nothing_vouches_for_a_jpeg(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
     random = np.random.default_rng(3)
     for ending, said in (("png", []), ("jpg", ["a JPEG has no checksums"])):

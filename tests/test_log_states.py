@@ -95,10 +95,12 @@ def test_commands_that_judge_a_log_agree(cdmisfa: Cdmisfa, tmp_path: Path, state
     assert [(file["crc"], file["state"]) for file in done.json["files"]] == [(crc, word)]
     done = cdmisfa("info", path)
     assert (done.code, said in done.out + done.err) == (code, True)
-    if state not in UNREADABLE:
-        assert f"{path}: foreign, {word}, checksums {crc}\n" in done.out
+    if state not in UNREADABLE:  # images in messages are decoded by verify alone
+        seen = word.replace("whole", "unchecked")
+        said = word.replace("whole", "contents unchecked")
+        assert f"{path}: foreign, {said}, checksums {crc}\n" in done.out
         done = cdmisfa("info", path, "--json")
-        assert (done.code, done.json["state"], done.json["crc"]) == (code, word, crc)
+        assert (done.code, done.json["state"], done.json["crc"]) == (code, seen, crc)
 
 
 def broken_among_whole(folder: Path) -> tuple[Path, Path, Path]:
@@ -117,9 +119,47 @@ def test_one_broken_log_does_not_hide_the_others(cdmisfa: Cdmisfa, tmp_path: Pat
     assert "/two" in cdmisfa("info", *logs).out
     document = cdmisfa("info", *logs, "--json").json
     assert [file["path"] for file in document["files"]] == [str(log) for log in logs]
-    assert [file["state"] for file in document["files"]] == ["whole", "damaged", "whole"]
+    assert [file["state"] for file in document["files"]] == ["unchecked", "damaged", "unchecked"]
     assert [c["topic"] for c in document["files"][2]["channels"]] == ["/two"]
     assert document["problems"] == [{"where": str(logs[1]), "what": "empty, nothing was written"}]
+
+
+NO_LOGS = ("missing.mcap", "no-*.mcap", "a.flv", "a.ts", "a.gif", "empty")
+
+
+@pytest.mark.parametrize("bad", [False, True])
+@pytest.mark.parametrize("command", ["info", "verify"])
+@pytest.mark.parametrize("word", NO_LOGS)
+def test_what_is_no_log_does_not_hide_the_others(
+    cdmisfa: Cdmisfa, tmp_path: Path, command: str, word: str, bad: bool
+) -> None:
+    one, broken, two = broken_among_whole(tmp_path)
+    (tmp_path / "empty").mkdir()
+    for name in NO_LOGS[2:5]:
+        (tmp_path / name).write_bytes(b"FLV" * 9)
+    logs = (one, tmp_path / word, *((broken,) if bad else ()), two)
+    done = cdmisfa(command, *logs)
+    assert (done.code, done.err, str(tmp_path / word) in done.out) == (3 if bad else 2, "", True)
+    document = cdmisfa(command, *logs, "--json").json
+    states = [file["state"] for file in document["files"]]
+    as_seen = "unchecked" if command == "info" else "whole"
+    expected = {as_seen: 2, "not read": 1, "damaged": int(bad)}
+    assert {state: states.count(state) for state in expected} == expected
+    assert document["state"] == ("damaged" if bad else "not read")
+    assert len(document["problems"]) == 1 + bad
+
+
+def test_info_says_of_each_of_several_logs_in_which_state_it_is(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    one, bad, two = broken_among_whole(tmp_path)
+    lines = cdmisfa("info", one, bad, two, tmp_path / "none").out.splitlines()
+    assert lines[:4] == [
+        f"{one}: foreign, contents unchecked, checksums ok",
+        f"{bad}: foreign, damaged, checksums bad",
+        f"{two}: foreign, contents unchecked, checksums ok",
+        f"{tmp_path / 'none'}: not read",
+    ]
 
 
 @pytest.mark.parametrize("topics", [(), ("/one", "/bad", "/two")])

@@ -190,7 +190,8 @@ def outcome_line(outcome: Mapping[str, Any]) -> str:
     if outcome["slowness"] is not None:
         came += f", slowness {outcome['slowness']:.4f} on frames not learned from"
     because = f": {outcome['why']}" if outcome["why"] else ""
-    return f"{outcome['stream']}: {came}, after {outcome['blocks']} blocks{because}"
+    after = f"{outcome['blocks']} block{'' if outcome['blocks'] == 1 else 's'}"
+    return f"{outcome['stream']}: {came}, after {after}{because}"
 
 
 BRACKETS = "in brackets: not slow on frames that were not learned from"

@@ -112,11 +112,15 @@ def written(
             raise
         log.close()
         return
-    with (
-        atomic_write(out) as partial,
-        contextlib.closing(TableSink(partial, form, spec, modules)) as table,
-    ):
-        yield table
+    with atomic_write(out) as partial:
+        table = TableSink(partial, form, spec, modules)
+        try:
+            yield table
+        except BaseException:
+            with contextlib.suppress(Exception):  # the first error counts
+                table.close()
+            raise
+        table.close()
 
 
 def places(

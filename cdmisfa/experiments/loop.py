@@ -79,7 +79,7 @@ def learn_blocks(
                 raise
             ended = EXHAUSTED
             for sink in sinks:
-                sink.event(source.t, learner.iteration - 1, str(error), "WARNING")
+                sink.event(source.t, learner.iteration - 1, f"the source ended: {error}", "WARNING")
             break
         signals = learner.step(block)
         for sink in sinks:

@@ -19,7 +19,7 @@ from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import MAX_LIST
 from cdmisfa.experiments.documents import as_text, plain, write_json
-from cdmisfa.experiments.run_folder import module_table
+from cdmisfa.experiments.run_folder import module_table, with_recipes
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import (
     Configuration,
@@ -248,10 +248,12 @@ def _whole_trial(trial: SweepTrial) -> dict[str, Any]:
         max_iterations=trial.max_iterations,
         max_modules=trial.max_modules,
     )
+    source = trial.configuration.open_scene()
+    modules = with_recipes(result.modules, source, source.describe())
     return {
         "iterations": result.iterations,
         "frames": result.frames,
-        "modules": [module_table(module) for module in result.modules],
+        "modules": [module_table(module) for module in modules],
         "final_policy": list(result.final_policy),
         "epsilon": result.epsilon,
         "ended": result.ended,

@@ -23,7 +23,7 @@ class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with a
 
 
 _JPEG: Final = b"\xff\xd8"
-_PNG_HEAD: Final = 8
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
 _MARKER: Final = re.compile(rb"\xff(?=[^\x00\xff])")
 _END: Final = 0xD9
 _RESTARTS: Final = range(0xD0, 0xD8)
@@ -70,9 +70,23 @@ def load_picture(image: ImageFile, data: bytes) -> None:
         image.load()
 
 
+def check_png(data: bytes) -> bool:
+    """Check the checksums of a PNG without decoding it; false of a JPEG, which has none.
+
+    Raises:
+        MalformedImage: it is damaged, or neither.
+    """
+    if data.startswith(_JPEG):
+        return False
+    if not data.startswith(_PNG):
+        raise MalformedImage("it does not begin as a PNG")
+    _check_chunks(data)
+    return True
+
+
 def _check_chunks(data: bytes) -> None:
     """Check the length and the CRC-32 of each chunk of a PNG; see its specification, 5.3."""
-    view, at, kind = memoryview(data), _PNG_HEAD, b""
+    view, at, kind = memoryview(data), len(_PNG), b""
     while kind != b"IEND":
         end = at + 8 + int.from_bytes(view[at : at + 4], "big")
         kind = bytes(view[at + 4 : at + 8])

@@ -22,7 +22,8 @@ from cdmisfa.core.untrusted import check_regular, data_bytes, opened_regular, re
 from recorder.images.options import VIDEO_RECIPE, Size
 from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
 from recorder.images.videos import frame_colors, frame_gray, pyav
-from recorder.mcap.records import MalformedRecord
+from recorder.images.whole import MalformedImage, check_png
+from recorder.mcap.records import MalformedRecord, Problem
 from replay.camera_logs.containers import extent_of
 from replay.camera_logs.stream import ImageStream, UnreadableError, explained, sorted_times
 
@@ -78,6 +79,29 @@ class FolderImages(ImageStream):
 
     def where(self, row: int) -> str:
         return str(self._files[row])
+
+    def broken(self, most: int) -> list[Problem] | None:
+        """Check the checksums of PNGs, without decoding any.
+
+        Args:
+            most: bytes that are read.
+
+        Returns:
+            What is wrong; None where there are pictures without checksums, or more bytes.
+
+        Raises:
+            LogDamagedError: the disk does not give a file.
+        """
+        if self.encoding != "png" or sum(file.stat().st_size for file in self._files) > most:
+            return None
+        found = []
+        for file in self._files:
+            try:
+                if not check_png(read_regular(file, MAX_PICTURE)):
+                    return None
+            except MalformedImage as error:
+                found.append(Problem(str(file), str(error)))
+        return found
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:

@@ -203,10 +203,10 @@ class Messages:
             topic = self._outputs[block.stream][i]
             rows = _encoded(applied, i, own)
             for at, row in zip(times, rows, strict=True):
-                yield topic, at, row.tobytes()
+                yield topic, at, row
 
 
-def _encoded(applied: Applied, module: int, own: slice) -> NDArray[np.void]:
+def _encoded(applied: Applied, module: int, own: slice) -> list[bytes]:
     """The messages `cdmisfa.ModuleOutput` of a module on a block, all laid out alike."""
     count = own.stop - own.start
     head = varint(8 * count)
@@ -224,7 +224,8 @@ def _encoded(applied: Applied, module: int, own: slice) -> NDArray[np.void]:
     for name, (tag, _, given) in values.items():
         rows[f"{name}_tag"] = np.void(tag)
         rows[name] = given
-    return rows
+    data, size = rows.tobytes(), rows.itemsize
+    return [data[start : start + size] for start in range(0, len(data), size)]
 
 
 class LogSink:

@@ -5,23 +5,29 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import parse_json
+from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.reader import Check, LogReader
-from recorder.mcap.records import Channel, MalformedRecord, Problem, Segment
-from recorder.mcap.tables import MessageTable
-from replay.camera_logs.opening import channels_of, only_foreign
-from replay.inputs import locations
-from replay.integrity.state import Crc, State, crc_of, state_of, worst
+from recorder.mcap.records import Channel, Problem
+from replay.camera_logs.opening import channels_of, log_format, only_foreign
+from replay.camera_logs.pictures import FolderImages
+from replay.integrity.counting import count_messages
+from replay.integrity.state import (
+    Crc,
+    State,
+    crc_of,
+    judged,
+    located,
+    state_of,
+    worst,
+)
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
@@ -35,28 +41,6 @@ CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""
 
 Kind = Literal["recording", "run", "foreign"]
-Times = NDArray[np.uint64]
-
-
-@dataclass(slots=True)
-class ChannelCount:
-    """How many messages of a channel there are, from when to when (log time, nanoseconds)."""
-
-    messages: int = 0
-    start: int | None = None
-    end: int | None = None
-
-    def add(self, times: Times) -> None:
-        """Take more messages in, by their log times, (n,) nanoseconds."""
-        self.messages += len(times)
-        self.widen(times)
-
-    def widen(self, times: Times) -> None:
-        """Take log times in of messages that are counted otherwise, (n,) nanoseconds."""
-        if len(times):
-            low, high = int(times.min()), int(times.max())
-            self.start = low if self.start is None else min(self.start, low)
-            self.end = high if self.end is None else max(self.end, high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +90,7 @@ class LogInfo:
         modules: of a run, where they lie in its folder.
         held_out: how slow they are on frames that were held out, where its folder says so.
         signals: of a run.
-        state: the worst of the files.
+        state: the worst of the files; "unchecked" where only `check_log` reads what is in them.
         notes: what is no problem, and what nothing proves.
         files: each file by itself.
     """
@@ -137,15 +121,17 @@ def describe(*words: str | Location) -> LogInfo:
     """Describe a recording's or run's folder, any MCAP file, or camera logs; several as one.
 
     Torn and damaged files are described as far as they can be read. Of a URL whose summary
-    accounts for every message no more than that is read, and `crc` is "unchecked".
+    accounts for every message no more than that is read, and `crc` is "unchecked". Of several, one
+    that cannot be read is described as such.
 
     Raises:
         UsageError: no such log.
         LogDamagedError: not an MCAP file, or a camera log that cannot be read.
     """
-    named = locations(words)
-    logs = [file for place in named for file in _logs_at(place)]
-    files = [_describe_log(log, alone=len(logs) == 1) for log in logs]
+    named, refused = located(words)
+    alone = len(words) == len(named) == 1
+    files = [info for place in named for info in _describe_place(place, alone=alone)]
+    files += [_unread(word, error) for word, error in refused]
     kinds, states = {f.kind for f in files if f.channels or f.metadata}, {f.crc for f in files}
     by_weight: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
     named_alike = Counter(name for f in files for name in f.metadata)
@@ -157,7 +143,7 @@ def describe(*words: str | Location) -> LogInfo:
     folder = named[0] if len(named) == 1 and isinstance(named[0], Path) else None
     records = [values for found in metadata.values() for values in found.values()]
     return LogInfo(
-        path=" ".join(map(str, named)),
+        path=" ".join([*map(str, named), *(word for word, _ in refused)]),
         kind=kinds.pop() if len(kinds) == 1 else "foreign",
         channels=tuple(c for f in files for c in f.channels),
         chunks=sum(f.chunks for f in files),
@@ -176,22 +162,33 @@ def describe(*words: str | Location) -> LogInfo:
     )
 
 
-def _logs_at(place: Location) -> list[Location]:
-    foreign = isinstance(place, Path) and only_foreign(place)
-    return [place] if foreign else log_files(place)
-
-
-def _describe_log(place: Location, *, alone: bool) -> LogInfo:
-    """Describe a log; of several one that cannot be read is described as such."""
+def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
+    """Describe the logs at a place; of several one that cannot be read is described as such."""
+    logs: list[Location] = [place]
     try:
-        if isinstance(place, Path) and only_foreign(place):
-            return _describe_foreign(place)
-        return _describe_file(place)
-    except LogDamagedError as error:
+        if not only_foreign(place):
+            logs = log_files(place)
+    except CdmisfaError as error:
         if alone:
             raise
-        wrong = (as_problem(place, error),)
-        return LogInfo(str(place), "foreign", (), 0, False, "bad", wrong, {}, state="damaged")
+        yield _unread(place, error)
+        return
+    for log in logs:
+        try:
+            if isinstance(log, Path) and only_foreign(log):
+                yield _describe_foreign(log)
+            else:
+                yield _describe_file(log)
+        except CdmisfaError as error:
+            if alone and (len(logs) == 1 or not isinstance(error, LogDamagedError)):
+                raise
+            yield _unread(log, error)
+
+
+def _unread(place: str | Location, error: CdmisfaError) -> LogInfo:
+    crc, state = judged(error)
+    wrong = (as_problem(place, error),)
+    return LogInfo(str(place), "foreign", (), 0, False, crc, wrong, {}, state=state)
 
 
 def _describe_foreign(place: Path) -> LogInfo:
@@ -200,17 +197,22 @@ def _describe_foreign(place: Path) -> LogInfo:
         ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
         for c in known
     ]
-    problems = tuple(Problem(str(place), c.missing) for c in known if c.missing)
+    missing = tuple(Problem(str(place), c.missing) for c in known if c.missing)
+    broken = None
+    if log_format(place) == "pictures":
+        with contextlib.closing(FolderImages(place, None)) as pictures:
+            broken = pictures.broken(CHECK_BYTES)
+    state: State = "damaged" if broken else "unchecked" if broken is None else "whole"
     return LogInfo(
         path=str(place),
         kind="foreign",
         channels=tuple(channels),
         chunks=0,
-        complete=not problems,
-        crc="absent",
-        problems=problems,
+        complete=not missing,
+        crc="absent" if broken is None else "bad" if broken else "ok",
+        problems=(*missing, *(broken or ())),
         metadata={},
-        state="cut short" if problems else "whole",
+        state="cut short" if missing else state,
     )
 
 
@@ -229,6 +231,9 @@ def _describe_file(path: Location) -> LogInfo:
             entry = (channel.topic, channel.encoding, name, found.messages, *times, path.name)
             channels.append(ChannelInfo(*entry))
         metadata = {m.name: m.values for m in reader.metadata}
+        state = state_of(reader)
+        if state == "whole" and not (decode and _all_checked(reader)):
+            state = "unchecked"
         version = record_version(metadata.get(RUN_METADATA, {}))
         return LogInfo(
             path=str(path),
@@ -240,9 +245,15 @@ def _describe_file(path: Location) -> LogInfo:
             problems=problems_of(reader),
             metadata={path.name: metadata},
             signals=RecordInfo(version, missing_signals(version)) if version else None,
-            state=state_of(reader),
+            state=state,
             notes=tuple(reader.unproven()),
         )
+
+
+def _all_checked(reader: LogReader) -> bool:
+    """Whether checksums are all there is to check; images of others may be broken within."""
+    images = any(schema.name in SCHEMAS for schema in reader.schemas.values())
+    return kind_of(reader) != "foreign" or not images
 
 
 def kind_of(reader: LogReader) -> Kind:
@@ -258,7 +269,7 @@ def moved(problem: Problem, copy: Path, place: Location) -> Problem:
     return Problem(problem.where.replace(str(copy), str(place)), problem.what)
 
 
-def as_problem(path: Location, error: CdmisfaError) -> Problem:
+def as_problem(path: str | Location, error: CdmisfaError) -> Problem:
     """An error as a problem of the file that it names."""
     return Problem(str(path), str(error).removeprefix(f"{path}: "))
 
@@ -267,73 +278,6 @@ def problems_of(reader: LogReader) -> tuple[Problem, ...]:
     """What was found to be wrong so far, and what is missing at the end."""
     found = [Problem(f"{reader.path}: {p.where}", p.what) for p in reader.problems]
     return (*found, *([Problem(str(reader.path), reader.missing)] if reader.missing else ()))
-
-
-def count_messages(
-    reader: LogReader, *, decode: bool, told: Callable[[Segment], None] = lambda _: None
-) -> dict[int, ChannelCount]:
-    """Count the messages of each channel.
-
-    Args:
-        reader: of a log; of one behind a URL the summary and few message indexes are read.
-        decode: decode every chunk, which finds all damage. The file is read in one pass.
-        told: of every chunk that is decoded, in file order.
-
-    Raises:
-        LogDamagedError: a message index is damaged.
-    """
-    found = {number: ChannelCount() for number in reader.channels}
-    if not decode:
-        _count_by_index(reader, found)
-        return found
-    for segment, table in reader.one_pass():
-        told(segment)
-        for number in () if table is None else np.unique(table.channel).tolist():
-            times = _times_in(table, number)
-            found.setdefault(number, ChannelCount()).add(times)
-    return found
-
-
-def _count_by_index(reader: LogReader, found: dict[int, ChannelCount]) -> None:
-    """Count by the indexes of chunks.
-
-    A channel begins in one of the chunks that begin before any message of it that is known.
-    """
-    chunks: dict[int, list[Segment]] = {}
-    for segment in reader.segments:
-        counts = segment.channel_counts()
-        if counts is None:
-            table = reader.table(segment)
-            counts = {} if table is None else Counter(table.channel.tolist())
-        for number, count in counts.items():
-            if count:
-                chunks.setdefault(number, []).append(segment)
-                found.setdefault(number, ChannelCount()).messages += count
-    for number, segments in chunks.items():
-        channel = found[number]
-        for segment in sorted(segments, key=lambda s: s.start):
-            if channel.start is not None and segment.start >= channel.start:
-                break
-            channel.widen(_times_of(reader, segment, number))
-        for segment in sorted(segments, key=lambda s: s.end, reverse=True):
-            if channel.end is not None and segment.end <= channel.end:
-                break
-            channel.widen(_times_of(reader, segment, number))
-
-
-def _times_of(reader: LogReader, segment: Segment, number: int) -> Times:
-    """Log times of a channel's messages in a chunk, by its message index if it has one."""
-    if not segment.indexes:
-        return _times_in(reader.table(segment), number)
-    try:
-        pairs = reader.index(segment)
-    except MalformedRecord as error:
-        raise LogDamagedError(f"{reader.path}: {segment.name}: {error}") from None
-    return np.concatenate([own[:, 0] for channel, own in pairs if channel == number])
-
-
-def _times_in(table: MessageTable | None, number: int) -> Times:
-    return np.empty(0, np.uint64) if table is None else table.log_time[table.channel == number]
 
 
 def _seed(records: Sequence[Mapping[str, str]]) -> int | None:

@@ -21,7 +21,8 @@ from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem
 from recorder.mcap.store import PARTIAL
 from replay.camera_logs.opening import only_foreign
-from replay.integrity.info import SCHEMA, ChannelCount, moved, problems_of
+from replay.integrity.counting import ChannelCount
+from replay.integrity.info import SCHEMA, moved, problems_of
 from replay.storage.location import Location, location
 from replay.storage.opening import fetched, log_files, open_store
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal
 
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.mcap.reader import LogReader
+from replay.inputs import locations
+from replay.storage.location import Location
 
-State = Literal["whole", "cut short", "damaged"]
+State = Literal["whole", "unchecked", "not read", "cut short", "damaged"]
+"""Unchecked: nothing is wrong as far as was looked. Not read: no log, or not one that is read."""
 Crc = Literal["ok", "absent", "bad", "unchecked"]
 
 EXIT_CODES: Final[Mapping[State, int]] = {
     "whole": 0,
+    "unchecked": 0,
+    "not read": UsageError.exit_code,
     "cut short": LogDamagedError.exit_code,
     "damaged": LogDamagedError.exit_code,
 }
@@ -24,6 +29,32 @@ def state_of(reader: LogReader) -> State:
     if reader.problems:
         return "damaged"
     return "cut short" if reader.missing else "whole"
+
+
+def judged(error: CdmisfaError) -> tuple[Crc, State]:
+    """The checksums and the state of a log, one of several, that ended in an error."""
+    damaged = isinstance(error, LogDamagedError)
+    return ("bad", "damaged") if damaged else ("unchecked", "not read")
+
+
+def located(
+    words: Sequence[str | Location],
+) -> tuple[list[Location], list[tuple[str, CdmisfaError]]]:
+    """The places that words name, and each word of several that names none, with why.
+
+    Raises:
+        UsageError: there is one word, and it names none.
+    """
+    places: list[Location] = []
+    refused: list[tuple[str, CdmisfaError]] = []
+    for word in words:
+        try:
+            places += locations([word])
+        except CdmisfaError as error:
+            if len(words) == 1:
+                raise
+            refused.append((str(word), error))
+    return places, refused
 
 
 def crc_of(reader: LogReader) -> Crc:

@@ -26,16 +26,9 @@ from replay.camera_logs.opening import (
 )
 from replay.camera_logs.stream import ImageStream
 from replay.camera_logs.table import table_notes
-from replay.inputs import locations
-from replay.integrity.info import (
-    SCHEMA,
-    as_problem,
-    count_messages,
-    kind_of,
-    moved,
-    problems_of,
-)
-from replay.integrity.state import Crc, State, crc_of, state_of, worst
+from replay.integrity.counting import count_messages
+from replay.integrity.info import SCHEMA, as_problem, kind_of, moved, problems_of
+from replay.integrity.state import Crc, State, crc_of, judged, located, state_of, worst
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
@@ -178,7 +171,9 @@ class LogCheck:
     def state(self) -> State:
         """The worst of the files; "damaged" where these are whole, and hold what they must not."""
         found = worst(file.state for file in self.files)
-        return "damaged" if self.problems and found == "whole" else found
+        refused = {file.file for file in self.files if file.state == "not read"}
+        wrong = any(problem.where not in refused for problem in self.problems)
+        return "damaged" if wrong and found in ("whole", "not read") else found
 
     def as_json(self) -> dict[str, Any]:
         """What was found as JSON values."""
@@ -186,13 +181,26 @@ class LogCheck:
 
 
 def check_logs(*words: str | Location) -> LogCheck:
-    """Check several logs, each by itself; see `check_log`."""
-    checks = [check_log(place) for place in locations(words)]
+    """Check several logs, each by itself; see `check_log`, which raises where there is one."""
+    named, refused = located(words)
+    checks = []
+    for place in named:
+        try:
+            checks.append(check_log(place))
+        except CdmisfaError as error:
+            if len(words) == len(named) == 1:
+                raise
+            checks.append(_unread(place, error))
+    checks += [_unread(word, error) for word, error in refused]
     return LogCheck(
         tuple(problem for check in checks for problem in check.problems),
         tuple(file for check in checks for file in check.files),
         tuple(note for check in checks for note in check.notes),
     )
+
+
+def _unread(place: str | Location, error: CdmisfaError) -> LogCheck:
+    return LogCheck((as_problem(place, error),), (FileCheck(str(place), *judged(error)),))
 
 
 def check_log(path: str | Location) -> LogCheck:
@@ -251,7 +259,10 @@ def _check_images(path: Path) -> LogCheck:
     except LogDamagedError as error:
         return LogCheck((as_problem(path, error),), (FileCheck(str(path), "absent", "damaged"),))
     found = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
-    return replace(found, notes=(*notes, *found.notes))
+    files = found.files
+    if kind == "pictures" and channels[0].encoding == "png":
+        files = (replace(files[0], crc="bad" if found.problems else "ok"),)
+    return replace(found, files=files, notes=(*notes, *found.notes))
 
 
 def _check_topics(path: Location, topics: Iterable[str]) -> LogCheck:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,7 +41,8 @@ def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> No
     """Say what is in a recording, a run, any MCAP file, or a camera log.
 
     PATH may be several, a pattern such as 'logs/*.mcap', or a URL. Exits with 3 when one is cut
-    short or damaged.
+    short or damaged, else with 2 when one of several is no log. What only `verify` reads, images
+    in logs of others, videos, bags, tables, all at URLs or above 1 GiB, is called unchecked.
     """
     from replay.integrity.info import describe
     from replay.integrity.state import EXIT_CODES
@@ -54,14 +56,9 @@ def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> No
 
 
 def _print_info(found: LogInfo) -> None:
-    words = [found.kind, found.state, f"checksums {found.crc}"]
-    if found.seed is not None:
-        words.append(f"seed {found.seed}")
-    if found.ended is not None:
-        from cdmisfa.experiments.loop import ENDINGS
-
-        words.append(f"ended: {ENDINGS.get(found.ended, found.ended)}")
-    print_line(f"{found.path}: {', '.join(words)}")
+    together = all(file.path.startswith(found.path) for file in found.files)
+    for each in [found] if together else found.files:
+        print_line(f"{each.path}: {', '.join(_words_of(each))}")
     for line in (*(f"{p.where}: {p.what}" for p in found.problems), *found.notes):
         print_line(line)
     if found.signals is not None and found.signals.missing:
@@ -85,6 +82,21 @@ def _print_info(found: LogInfo) -> None:
     print_table(head, rows)
 
 
+def _words_of(found: LogInfo) -> Iterator[str]:
+    """What a log is, and in which state."""
+    if found.state == "not read":
+        yield found.state
+        return
+    yield from (found.kind, found.state.replace("unchecked", "contents unchecked"))
+    yield f"checksums {found.crc}"
+    if found.seed is not None:
+        yield f"seed {found.seed}"
+    if found.ended is not None:
+        from cdmisfa.experiments.loop import ENDINGS
+
+        yield f"ended: {ENDINGS.get(found.ended, found.ended)}"
+
+
 def _clock(ns: int | None) -> str:
     """A log time as date and time of day, UTC, to the millisecond."""
     if ns is None:
@@ -103,7 +115,8 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
     """Check that a log is whole: structure, checksums, nothing lost.
 
     Of a camera log without checksums every image is decoded. PATH may be several, a pattern such
-    as 'logs/*.mcap', or a URL. Exits with 3 when anything is wrong.
+    as 'logs/*.mcap', or a URL. Exits with 3 when anything is wrong, else with 2 when one of
+    several is no log.
     """
     from replay.integrity.state import EXIT_CODES
     from replay.integrity.verify import check_logs
