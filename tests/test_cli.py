@@ -168,7 +168,7 @@ class TestRuns:
         ("algorithm", "blocks", "said"),
         [
             ("2.0", 20, "not decided: x1, x2, x3\n"),
-            ("progress", 50, "x3: not decided, slowness 0.00"),
+            ("progress", 50, "x2: not decided, slowness 0.00"),
         ],
     )
     def test_a_recording_that_ends_is_the_end_of_its_run(

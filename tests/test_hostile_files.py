@@ -352,7 +352,7 @@ def test_of_what_is_no_log_it_is_said_which_kinds_are(
             assert KINDS in done.err
 
 
-@pytest.mark.parametrize("ending", [*WHOLE_FILES, *ENDINGS, ".mcap"])
+@pytest.mark.parametrize("ending", sorted({*WHOLE_FILES, *ENDINGS, ".mcap"}))
 def test_every_kind_that_is_read_is_named(ending: str) -> None:
     assert re.search(rf"{re.escape(ending.replace('.jpeg', '.jpg'))}\b", KINDS)
 

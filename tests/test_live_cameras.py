@@ -177,7 +177,7 @@ def rough(seconds: float = 40.0) -> list[Arrival]:
 
 CONFIGS = [
     LearnerConfig(tau=20, components=3, expansion="none", warm_up=3),
-    ProgressConfig(tau=20, components=3),
+    ProgressConfig(tau=20, components=3, outputs=1),
 ]
 
 
@@ -267,7 +267,7 @@ def test_a_live_run_that_ends_within_a_block_is_checked_by_its_recording(
 ) -> None:
     script = [*steady(0, 0, 100), *steady(0, 5, 30)]  # a gap, and less than a block behind it
     with RecordedWhileWatched(opened(script), tmp_path / "rec") as live:
-        run(live, ProgressConfig(tau=40, components=3), tmp_path / "run", rerun=False)
+        run(live, ProgressConfig(tau=40, components=3, outputs=1), tmp_path / "run", rerun=False)
     assert live.t > 100
     checked = cdmisfa("check", tmp_path / "run", "--source", tmp_path / "rec")
     assert (checked.code, checked.out) == (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,10 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.modules import Module
-from replay.camera_logs.source import ForeignSource
 from replay.stored import StoredSource
+
+if TYPE_CHECKING:
+    from replay.camera_logs.source import ForeignSource
 
 PIECE = 256
 """Frames that are held at once."""
@@ -31,6 +33,12 @@ class _StoppedError(Exception):
     """The run is to end."""
 
 
+def _of_cameras(source: FrameSource) -> TypeGuard[ForeignSource]:
+    from replay.camera_logs.source import ForeignSource
+
+    return isinstance(source, ForeignSource)
+
+
 def hold_out(source: FrameSource, share: float | None, *, judged: bool) -> None:
     """Keep the last frames of a camera log from what learns, which is judged on them at its end.
 
@@ -44,7 +52,7 @@ def hold_out(source: FrameSource, share: float | None, *, judged: bool) -> None:
     """
     if share == 0.0:
         return
-    if not judged or not isinstance(source, ForeignSource) or source.spec.length is None:
+    if not judged or source.spec.length is None or not _of_cameras(source):
         if share is not None:
             raise UsageError(
                 "--holdout is for camera logs that the progress learner learns from once: leave it "

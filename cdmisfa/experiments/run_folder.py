@@ -28,7 +28,6 @@ from recorder.log.files import (
     refuse_special,
 )
 from recorder.world.scenes import SCENES, scene_of
-from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.modules import save_modules
@@ -122,6 +121,8 @@ def with_recipes(
         described = source.origin()
 
     def recipe(stream: int) -> Recipe:
+        from replay.camera_logs.source import ForeignSource
+
         own = Recipe.of(described, source.spec.frame_shape, stream)
         stated = source.pixels(stream) if isinstance(source, ForeignSource) else ""
         return replace(own, pixels=stated) if stated.startswith("bayer_") else own
