@@ -55,7 +55,7 @@ def test_a_whole_video_is_whole(cdmisfa: Cdmisfa, tmp_path: Path, kind: str) -> 
     assert UNKNOWN not in done.out
 
 
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.95, 1])
+@pytest.mark.parametrize("share", [0.4, 0.6, 0.95, 1])
 @pytest.mark.parametrize("kind", STATED)
 def test_a_cut_video_is_cut_in_every_command(
     cdmisfa: Cdmisfa, tmp_path: Path, kind: str, share: float
