@@ -23,14 +23,14 @@ from waiting import started
 
 from cdmisfa import Recipe, Run
 from cdmisfa.core.errors import LogWriteError
-from cdmisfa.experiments.apply import Application
-from cdmisfa.experiments.applying import Tally, follow, written
+from cdmisfa.experiments.apply import Application, Totals, follow
 from cdmisfa.modules import Module
 from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
 from recorder.images.options import Reading
 from recorder.recording import record
 from replay.camera_logs.source import ForeignSource
+from replay.export.applied import written
 from replay.runs.modules import save_modules
 
 TAU = 20
@@ -162,7 +162,7 @@ def test_a_full_disk_leaves_nothing_and_says_so(
         pytest.raises(LogWriteError, match="cannot be written: No space left"),
         written(out, *about, force=False) as sink,
     ):
-        follow(application.to(source), [sink], Tally(*about))
+        follow(application.to(source), [sink], Totals(*about))
     assert list(out.parent.iterdir()) == []
 
 

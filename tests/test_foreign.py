@@ -23,7 +23,7 @@ from video_packets import cdr as ros2
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.decoding import MessageKind
-from recorder.images.messages import image_decoder, pixel_format
+from recorder.images.messages import image_decoder, stated_format
 from recorder.images.pixels import (
     DISTANCES,
     ENCODINGS,
@@ -181,7 +181,7 @@ def test_compressed_distances_are_shown_in_a_range() -> None:
         ("32FC1; compressedDepth png", head + packed),
     ):
         for kind, message in ros_compressed(form, data).items():
-            assert pixel_format(*kind, message) in DISTANCES
+            assert stated_format(*kind, message) in DISTANCES
             np.testing.assert_array_equal(shown(kind, message, depth=(1.0, 2.0)), expected)
             if form.startswith("16"):
                 high = (metres * 1000).astype(np.uint16) >> 8

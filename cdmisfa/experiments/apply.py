@@ -1,11 +1,11 @@
-"""Frozen modules at work: applied to a source, block by block."""
+"""Frozen modules at work: applied to a source, block by block, and what they come to there."""
 
 from __future__ import annotations
 
 import contextlib
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from cdmisfa import kernels
 from cdmisfa.agents.progress.candidate import log_ratio
 from cdmisfa.agents.progress.judging import PRESENT, STRANGE
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.blocks import Block, FrameSource, freeze
+from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, freeze
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.options import option_name
 from cdmisfa.experiments.sources import configure, is_scene, open_logs
@@ -28,7 +28,7 @@ from recorder.images.options import ImageOptions
 from replay.camera_logs.opening import ALL
 from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import UnequalError
-from replay.export.applied import Applied, columns_of
+from replay.export.applied import Applied, AppliedSink, columns_of
 from replay.inputs import locations
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
@@ -276,3 +276,69 @@ def _novelty(module: Module, y: FloatArray, slowness: FloatArray) -> float:
         return math.nan
     turn = 2 * math.pi * float(module.eta[0])
     return abs(log_ratio(math.sqrt(float(np.mean(steps * steps))), turn)) / STRANGE
+
+
+class Totals:
+    """What modules came to on the streams of a source.
+
+    Args:
+        spec: of the source.
+        modules: in their order.
+
+    Attributes:
+        frames: of all streams.
+        damaged: why the log was not applied to its end; None where it was.
+    """
+
+    def __init__(self, spec: SourceSpec, modules: Sequence[Module]) -> None:
+        self.frames = 0
+        self.damaged: LogDamagedError | None = None
+        self._spec, self._modules = spec, list(columns_of(modules))
+        self._sums: dict[tuple[int, int], list[float]] = {}
+
+    def add(self, applied: Applied) -> None:
+        """Take a block in."""
+        block, count = applied.block, len(applied.block)
+        self.frames += count
+        for i, (_, own) in enumerate(self._modules):
+            sums = self._sums.setdefault((block.stream, i), [0.0] * 5)
+            sums[0] += count
+            sums[1] += count * bool(applied.alive[i])
+            sums[2] += count * (float(applied.novelty[i]) < 1)
+            slowness = float(applied.slowness[own.start])
+            if math.isfinite(slowness):
+                sums[3] += count * slowness
+                sums[4] += count
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row a stream and module, as JSON values: shares of its frames, mean slowness."""
+        return [
+            {
+                "stream": self._spec.streams[stream],
+                "module": self._modules[i][0].index,
+                "frames": int(frames),
+                "slowness": slowness / counted if counted else None,
+                "alive": alive / frames,
+                "known": known / frames,
+            }
+            for (stream, i), (frames, alive, known, slowness, counted) in sorted(self._sums.items())
+        ]
+
+
+def follow(
+    applied: Iterable[Applied],
+    sinks: Sequence[AppliedSink],
+    totals: Totals,
+    told: Callable[[], None] = lambda: None,
+) -> None:
+    """Hand every block to sinks and totals; damage of the log ends it and is noted."""
+    try:
+        for one in applied:
+            for sink in sinks:
+                sink.add(one)
+            totals.add(one)
+            told()
+    except LogDamagedError as error:
+        if not totals.frames:
+            raise
+        totals.damaged = error

@@ -278,7 +278,7 @@ def _point(point: Mapping[str, Any], rows: Sequence[Mapping[str, Any] | None]) -
     )
 
 
-def differing(points: Sequence[PointResult]) -> dict[str, list[Any]]:
+def varied(points: Sequence[PointResult]) -> dict[str, list[Any]]:
     """The settings that differ between points, and their values in order, each once."""
     found: dict[str, list[Any]] = {}
     for point in points:
@@ -292,7 +292,7 @@ def differing(points: Sequence[PointResult]) -> dict[str, list[Any]]:
 def as_json(points: Sequence[PointResult]) -> dict[str, Any]:
     """The results as one JSON document."""
     found = [asdict(point) for point in points]
-    return {"schema": SCHEMA, "differ": differing(points), "points": found}
+    return {"schema": SCHEMA, "differ": varied(points), "points": found}
 
 
 def measure_names(points: Sequence[PointResult]) -> list[str]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.shown import Shown
-from cdmisfa.experiments.results import PointResult, differing, results
+from cdmisfa.experiments.results import PointResult, results, varied
 from cdmisfa.experiments.sources import is_scene
 from cdmisfa.experiments.store import read_rows
 from cdmisfa.experiments.sweep import sweep as sweep_folder
@@ -53,7 +53,7 @@ class Sweep(Shown):
     @property
     def differs(self) -> Mapping[str, Sequence[Any]]:
         """The settings that differ between its points, and their values."""
-        return differing(self.points)
+        return varied(self.points)
 
     def to_arrow(self) -> Any:
         """A table of pyarrow, a row for each trial that was asked for last, in the grid's order.

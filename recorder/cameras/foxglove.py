@@ -21,7 +21,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.video import Steady
 from recorder.images.decoding import MessageKind, decoder_of
-from recorder.images.messages import Decoder, pixel_format
+from recorder.images.messages import Decoder, stated_format
 from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import DISTANCES, Shown
 from recorder.images.videos import VideoPackets
@@ -132,7 +132,7 @@ class FoxgloveCamera:
                 age = steady.age(time.monotonic(), log_time / NANOSECONDS if log_time else None)
                 data = message[_HEADER.size :]
                 if self.distances is None and not self._reading.fields:
-                    stated = pixel_format(kind.schema, kind.encoding, data)
+                    stated = stated_format(kind.schema, kind.encoding, data)
                     self.distances = stated in DISTANCES
                 if video is None or video.begins(data):
                     video = None  # it has begun

@@ -102,7 +102,7 @@ def image_decoder(
     return None if packet is None else VideoPackets(packet, color=color)
 
 
-def pixel_format(schema: str, encoding: str, data: bytes | memoryview) -> str:
+def stated_format(schema: str, encoding: str, data: bytes | memoryview) -> str:
     """The format of pixels that a message of such a kind states, "" of none; raises MalformedImage.
 
     Of what is compressed it is that of the pixels before.

@@ -100,11 +100,6 @@ class ForeignSource(LoggedSource):
             LogDamagedError: a log is damaged.
         """
         self._options = options = CameraOptions(topics=tuple(topics), **chosen)
-        if options.stop is not None and not options.start < options.stop:
-            raise UsageError(
-                f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in "
-                "seconds after the first image: no image lies between them"
-            )
         if options.color == "auto":
             how = {"loop": loop, "salvage": salvage, "goal": goal, **chosen, "color": True}
             with contextlib.closing(type(self)(paths, topics, **how)) as shown:
@@ -124,12 +119,7 @@ class ForeignSource(LoggedSource):
             except UsageError as error:
                 raise self._of_copies(error) from None
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
-            images = firsts[0].ndim > 1
-            if (
-                options.depth
-                and images
-                and not any(s.pixels() in (None, *DISTANCES) for s in self._streams)
-            ):
+            if options.depth and firsts[0].ndim > 1 and not self._may_show_distances():
                 raise UsageError(
                     f"{self._files[0]}: it holds no distances (16UC1, 32FC1): --range is for these"
                 )
@@ -156,6 +146,11 @@ class ForeignSource(LoggedSource):
     def _open(self) -> None:
         """Open the streams, and find what is taken of them and when each image was."""
         options, reading = self._options, self._options.reading
+        if options.stop is not None and not options.start < options.stop:
+            raise UsageError(
+                f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in "
+                "seconds after the first image: no image lies between them"
+            )
         for path, topic in named_streams(self._files, options.topics, reading):
             images = open_images(path, topic, salvage=self._salvage, reading=reading)
             self._streams.append(images)
@@ -173,6 +168,9 @@ class ForeignSource(LoggedSource):
 
     def _firsts(self) -> list[Shown]:
         return [self._image(stream, 0) for stream in range(len(self._streams))]
+
+    def _may_show_distances(self) -> bool:
+        return any(stream.pixels() in (None, *DISTANCES) for stream in self._streams)
 
     def _warned(self) -> Iterator[str]:
         for images in self._streams:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
-from recorder.images.messages import SCHEMAS, Decoder, pixel_format
+from recorder.images.messages import SCHEMAS, Decoder, stated_format
 from recorder.images.options import RECIPE, Reading, Size
 from recorder.images.pixels import Shown
 from recorder.log.messages import VECTOR_SCHEMA
@@ -157,7 +157,7 @@ class MessageImages(ImageStream):
         return self.taken(row, self.decode)
 
     def pixels(self) -> str | None:
-        return self.taken(0, partial(pixel_format, self.kind.schema, self.kind.encoding))
+        return self.taken(0, partial(stated_format, self.kind.schema, self.kind.encoding))
 
     def stamp(self, row: int) -> int:
         if self._stamp is None:

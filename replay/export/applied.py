@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,6 +19,7 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.clock import times_of
 from cdmisfa.modules import Module
+from recorder.log.files import atomic_write, refuse_special, refuse_taken
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, VectorEncoder, varint, view_topic
 from replay.runs.codec import define_message
@@ -257,7 +259,7 @@ class LogSink:
         self._log.abandon()
 
 
-def as_json(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> Mapping[str, Any]:
+def _as_json(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> Mapping[str, Any]:
     """A block as JSON values; what is no finite number is null."""
     block = applied.block
     return {
@@ -296,7 +298,46 @@ class LinesSink:
 
     def add(self, applied: Applied) -> None:
         """See `AppliedSink`."""
-        self._write(json.dumps(as_json(applied, self._spec, self._modules), allow_nan=False))
+        self._write(json.dumps(_as_json(applied, self._spec, self._modules), allow_nan=False))
 
     def close(self) -> None:
         """See `AppliedSink`."""
+
+
+@contextlib.contextmanager
+def written(
+    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool
+) -> Iterator[AppliedSink]:
+    """A file for what modules give, whole when the body has ended.
+
+    Args:
+        out: the file, .parquet, .csv or .mcap.
+        spec: of the source.
+        modules: in their order.
+        force: replace an existing file.
+
+    Raises:
+        UsageError: it exists.
+        LogWriteError: it cannot be written.
+    """
+    form = out.suffix.lower().removeprefix(".")
+    refuse_special(out)
+    refuse_taken(out, force=force)
+    if form == "mcap":
+        log = LogSink(out, spec, modules, force=force)
+        try:
+            yield log
+        except BaseException:
+            log.abandon()
+            raise
+        log.close()
+        return
+    with atomic_write(out) as partial:
+        table = TableSink(partial, form, spec, modules)
+        try:
+            yield table
+        except BaseException:
+            with contextlib.suppress(Exception):  # the first error counts
+                table.close()
+            raise
+        table.close()

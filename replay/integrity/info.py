@@ -23,7 +23,7 @@ from replay.integrity.state import (
     Crc,
     State,
     crc_of,
-    judged,
+    failed_state,
     located,
     state_of,
     worst,
@@ -186,7 +186,7 @@ def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
 
 
 def _unread(place: str | Location, error: CdmisfaError) -> LogInfo:
-    crc, state = judged(error)
+    crc, state = failed_state(error)
     wrong = (as_problem(place, error),)
     return LogInfo(str(place), "foreign", (), 0, False, crc, wrong, {}, state=state)
 

@@ -31,7 +31,7 @@ def state_of(reader: LogReader) -> State:
     return "cut short" if reader.missing else "whole"
 
 
-def judged(error: CdmisfaError) -> tuple[Crc, State]:
+def failed_state(error: CdmisfaError) -> tuple[Crc, State]:
     """The checksums and the state of a log, one of several, that ended in an error."""
     damaged = isinstance(error, LogDamagedError)
     return ("bad", "damaged") if damaged else ("unchecked", "not read")

@@ -28,7 +28,7 @@ from replay.camera_logs.stream import ImageStream
 from replay.camera_logs.table import table_notes
 from replay.integrity.counting import count_messages
 from replay.integrity.info import SCHEMA, as_problem, kind_of, moved, problems_of
-from replay.integrity.state import Crc, State, crc_of, judged, located, state_of, worst
+from replay.integrity.state import Crc, State, crc_of, failed_state, located, state_of, worst
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
@@ -200,7 +200,7 @@ def check_logs(*words: str | Location) -> LogCheck:
 
 
 def _unread(place: str | Location, error: CdmisfaError) -> LogCheck:
-    return LogCheck((as_problem(place, error),), (FileCheck(str(place), *judged(error)),))
+    return LogCheck((as_problem(place, error),), (FileCheck(str(place), *failed_state(error)),))
 
 
 def check_log(path: str | Location) -> LogCheck:

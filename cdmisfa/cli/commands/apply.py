@@ -30,8 +30,7 @@ from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
-    from cdmisfa.experiments.apply import Application
-    from cdmisfa.experiments.applying import Tally
+    from cdmisfa.experiments.apply import Application, Totals
     from recorder.cameras.options import LiveOptions
 
 OF_FILES = ("parquet", "csv", "mcap")
@@ -93,32 +92,20 @@ def apply_command(
     A log that cannot be read does not end the rest; the exit code is then 3, or 2.
     """
     from cdmisfa.experiments.apply import Application
-    from cdmisfa.experiments.applying import places
-    from recorder.cameras.words import is_live
 
-    target, logs = targets(ctx, to, port), logs_of(source)
-    if target.way == STDOUT and as_json:
-        raise UsageError("--to stdout prints JSON lines, --json one document: use one of them")
-    if not any(map(is_live, source)):
-        options.refuse_live_options(live, source)
-    elif loop or salvage:
-        raise UsageError("live streams cannot go back: leave out --loop and --salvage")
-    if target.way == FOXGLOVE and not any(map(is_live, source)):
-        raise UsageError(
-            "--to foxglove is for live streams: write -o OUT.mcap, and cdmisfa play it so"
-        )
-    outs = places(out, target.form, [words[0] for words in logs], force=force)
+    outlet, logs = outlet_of(ctx, to, port), logs_of(source)
+    refuse_unfit(source, outlet, live, again=loop or salvage, as_json=as_json)
+    outs = places(out, outlet.form, [words[0] for words in logs], force=force)
     application = Application(run)
-    told: dict[str, Any] = {"cameras": replace(cameras, stop=target.until), "live": live}
+    told: dict[str, Any] = {"cameras": replace(cameras, stop=outlet.until), "live": live}
     told |= {"loop": loop, "salvage": salvage, "say": tell}
-    rows: list[dict[str, Any]] = []
-    failed: list[CdmisfaError] = []
+    rows, failed = list[dict[str, Any]](), list[CdmisfaError]()
     with stoppable() as stop:
         for words, place in zip(logs, outs, strict=True):
             row: dict[str, Any] = {"log": " ".join(words), "out": place and str(place)}
             try:
                 with contextlib.closing(application.open(words, **told)) as opened:
-                    tally = applied(application, opened, place, target, frames, stop, force=force)
+                    totals = applied(application, opened, place, outlet, frames, stop, force=force)
             except CdmisfaError as error:
                 if len(logs) == 1:
                     raise
@@ -126,14 +113,14 @@ def apply_command(
                 failed.append(error)
                 rows.append(row | {"out": None, "frames": 0, "error": str(error), "modules": []})
                 continue
-            rows.append(row | {"frames": tally.frames, "error": None, "modules": tally.rows()})
-            if tally.damaged is not None:
-                tell(f"{tally.damaged}: what came before was applied, and is kept")
-                failed.append(tally.damaged)
-                rows[-1]["error"] = str(tally.damaged)
+            rows.append(row | {"frames": totals.frames, "error": None, "modules": totals.rows()})
+            if (damaged := totals.damaged) is not None:
+                tell(f"{damaged}: what came before was applied, and is kept")
+                failed.append(damaged)
+                rows[-1]["error"] = str(damaged)
             if stop.number:
                 break
-    if target.way != STDOUT:
+    if outlet.way != STDOUT:
         print_applied(str(run), rows, as_json=as_json)
     if stop.number:
         ctx.exit(stop.exit_code)
@@ -141,19 +128,42 @@ def apply_command(
         ctx.exit(max(error.exit_code for error in failed))
 
 
+def refuse_unfit(
+    source: Sequence[str], outlet: Outlet, live: LiveOptions, *, again: bool, as_json: bool
+) -> None:
+    """Refuse options that do not go with the source, or with one another.
+
+    Raises:
+        UsageError: some are given.
+    """
+    from recorder.cameras.words import is_live
+
+    if outlet.way == STDOUT and as_json:
+        raise UsageError("--to stdout prints JSON lines, --json one document: use one of them")
+    if any(map(is_live, source)):
+        if again:
+            raise UsageError("live streams cannot go back: leave out --loop and --salvage")
+        return
+    options.refuse_live_options(live, source)
+    if outlet.way == FOXGLOVE:
+        raise UsageError(
+            "--to foxglove is for live streams: write -o OUT.mcap, and cdmisfa play it so"
+        )
+
+
 def applied(
     application: Application,
     source: FrameSource,
     place: Path | None,
-    target: Target,
+    outlet: Outlet,
     frames: int | None,
     stop: Stop,
     *,
     force: bool,
-) -> Tally:
+) -> Totals:
     """Apply modules to an open source, into its file and to where blocks go as they come."""
-    from cdmisfa.experiments.applying import Tally, follow, written
-    from replay.export.applied import LinesSink
+    from cdmisfa.experiments.apply import Totals, follow
+    from replay.export.applied import LinesSink, written
 
     live = hasattr(source, "stop")
     if hasattr(source, "stop"):
@@ -161,30 +171,30 @@ def applied(
     else:
         say_about(source)
     modules, spec = application.modules, source.spec
-    tally, sinks = Tally(spec, modules), []
+    totals, sinks = Totals(spec, modules), []
     with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
         if place is not None:
             sinks.append(stack.enter_context(written(place, spec, modules, force=force)))
-        if target.way == STDOUT:
+        if outlet.way == STDOUT:
             sinks.append(LinesSink(print_line, spec, modules))
-        if target.way == FOXGLOVE:
+        if outlet.way == FOXGLOVE:
             from replay.playing.as_robot import HOST, PORT, RobotSink
 
-            robot = RobotSink(PORT if target.port is None else target.port, spec, modules)
+            robot = RobotSink(PORT if outlet.port is None else outlet.port, spec, modules)
             sinks.append(stack.enter_context(contextlib.closing(robot)))
             tell(f"applying at ws://{HOST}:{robot.port}")
         blocks = application.to(source, frames, stop)
         total = None if spec.length is None else spec.length * len(spec.streams)
-        follow(blocks, sinks, tally, lambda: shown.update(tally.frames, total))
+        follow(blocks, sinks, totals, lambda: shown.update(totals.frames, total))
     if live:
         say_counts(source)
     else:
         say_changes(source)
-    return tally
+    return totals
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class Outlet:
     """What --to and --port say.
 
     Attributes:
@@ -200,9 +210,9 @@ class Target:
     port: int | None = None
 
 
-def targets(ctx: click.Context, words: Sequence[str], port: int | None) -> Target:
+def outlet_of(ctx: click.Context, words: Sequence[str], port: int | None) -> Outlet:
     """Read what --to says, each kind of it once."""
-    found = Target(port=port)
+    found = Outlet(port=port)
     for word in words:
         if word in OF_FILES:
             found = replace(found, form=word)
@@ -215,6 +225,57 @@ def targets(ctx: click.Context, words: Sequence[str], port: int | None) -> Targe
             raise UsageError(f"--to {word}: name {names}, or a time, as 1:30")
     if port is not None and found.way != FOXGLOVE:
         raise UsageError("--port goes with --to foxglove")
+    return found
+
+
+def places(
+    out: Path | None, form: str | None, logs: Sequence[str], *, force: bool
+) -> list[Path | None]:
+    """The file of each log that is written: one, or one each in a folder.
+
+    Args:
+        out: the file of one log, or the folder.
+        form: as asked for; else by the name of the file, Parquet in a folder.
+        logs: as named.
+        force: replace existing files.
+
+    Raises:
+        UsageError: a file for several logs, no form that it could have, no place to write it, or
+            it exists.
+    """
+    from recorder.log.files import refuse_taken
+
+    if out is None:
+        if form is not None:
+            raise UsageError(f"--to {form} is written to a file: name it with -o")
+        return [None] * len(logs)
+    found = _named(out, form, logs)
+    for place in found:
+        refuse_taken(place, force=force)
+    return [*found]
+
+
+def _named(out: Path, form: str | None, logs: Sequence[str]) -> list[Path]:
+    from cdmisfa.core.blocks import stream_name
+
+    ending = out.suffix.lower().removeprefix(".")
+    if ending in OF_FILES and not out.is_dir():
+        if form not in (None, ending):
+            raise UsageError(f"{out}: as {form} it is written, name it {out.stem}.{form}")
+        if len(logs) > 1:
+            raise UsageError(
+                f"{len(logs)} logs are a file each: name a folder with -o, without .{ending}"
+            )
+        return [out]
+    form = form or OF_FILES[0]
+    found: list[Path] = []
+    for log in logs:
+        name = base = stream_name(Path(log.rstrip("/")).name.partition(".mcap")[0])
+        number = 1
+        while out / f"{name}.{form}" in found:
+            number += 1
+            name = f"{base}-{number}"
+        found.append(out / f"{name}.{form}")
     return found
 
 

@@ -159,7 +159,7 @@ def results_command(folder: Path, csv: bool, latex: bool, as_json: bool) -> None
     if csv + latex + as_json > 1:
         raise click.UsageError("choose one of --csv, --latex and --json")
     points = results.results(folder)
-    for key, values in results.differing(points).items():
+    for key, values in results.varied(points).items():
         tell(f"{key} differs: {', '.join(map(str, values))}")
     if as_json:
         print_json(results.as_json(points))

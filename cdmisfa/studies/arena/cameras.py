@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.studies.arena.pictures import Footage, Rng, in_pieces, normal, wandering
+from cdmisfa.studies.arena.pictures import Footage, Rng, gaussian, in_pieces, wandering
 
 LIGHT: Final = 40
 """Frames of the memory of a light that changes, see `wandering`: some 250 to come and go."""
@@ -29,7 +29,7 @@ def flicker(rng: Rng, plain: Footage) -> Footage:
 
     def seen(at: int, n: int) -> NDArray[np.floating]:
         exposure = rng.normal(1, 0.1, (n, 1, 1))
-        return np.asarray(plain.frames[at : at + n] * exposure + 5 * normal(rng, n))
+        return np.asarray(plain.frames[at : at + n] * exposure + 5 * gaussian(rng, n))
 
     return _seen(plain, seen)
 

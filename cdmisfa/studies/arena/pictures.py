@@ -113,7 +113,7 @@ def light(rng: Rng, n: int) -> Footage:
     brightness = 30 * np.sin(np.cumsum(rng.normal(0, 0.5, n)) / 10)
     drifting = brightness[:, None, None]
     frames = in_pieces(
-        n, lambda at, m: shown + drifting[at : at + m] + SENSOR_SD * normal(rng, m)
+        n, lambda at, m: shown + drifting[at : at + m] + SENSOR_SD * gaussian(rng, m)
     ).frames
     return Footage(frames, brightness[:, None], ("brightness",))
 
@@ -125,7 +125,7 @@ def drifting(rng: Rng, n: int) -> Footage:
     drift = np.sin(2 * np.pi * (np.arange(n) / DRIFT + rng.random()))
     frames = in_pieces(
         n,
-        lambda at, m: shown + drift[at : at + m, None, None] * side + SENSOR_SD * normal(rng, m),
+        lambda at, m: shown + drift[at : at + m, None, None] * side + SENSOR_SD * gaussian(rng, m),
     ).frames
     return Footage(frames, drift[:, None], ("drift",))
 
@@ -166,7 +166,7 @@ def full_noise(rng: Rng, n: int) -> Footage:
 
 def gaussian_noise(sd: float) -> Maker:
     """Gaussian noise about grey, its standard deviation as a share of the full range."""
-    return lambda rng, n: in_pieces(n, lambda at, m: GREY + 255 * sd * normal(rng, m))
+    return lambda rng, n: in_pieces(n, lambda at, m: GREY + 255 * sd * gaussian(rng, m))
 
 
 def uniform_noise(sd: float) -> Maker:
@@ -197,7 +197,7 @@ def constant(rng: Rng, n: int) -> Footage:
 def still(rng: Rng, n: int) -> Footage:
     """A picture that stands still, seen through a sensor's noise."""
     shown = soft_picture(rng)
-    return in_pieces(n, lambda at, m: shown + SENSOR_SD * normal(rng, m))
+    return in_pieces(n, lambda at, m: shown + SENSOR_SD * gaussian(rng, m))
 
 
 def pink(rng: Rng, n: int) -> Footage:
@@ -208,7 +208,7 @@ def pink(rng: Rng, n: int) -> Footage:
     scale = 40 / np.sqrt((falling**2).mean())
 
     def seen(at: int, m: int) -> NDArray[np.floating]:
-        return np.asarray(GREY + scale * np.fft.irfft2(np.fft.rfft2(normal(rng, m)) * falling))
+        return np.asarray(GREY + scale * np.fft.irfft2(np.fft.rfft2(gaussian(rng, m)) * falling))
 
     return in_pieces(n, seen)
 
@@ -227,7 +227,7 @@ def salt(rng: Rng, n: int) -> Footage:
 def speckle(rng: Rng, n: int) -> Footage:
     """A still picture, each pixel times Gaussian noise about 1, as of a laser or a radar."""
     shown = soft_picture(rng)
-    return in_pieces(n, lambda at, m: shown * (1 + 0.3 * normal(rng, m)))
+    return in_pieces(n, lambda at, m: shown * (1 + 0.3 * gaussian(rng, m)))
 
 
 def shot(rng: Rng, n: int) -> Footage:
@@ -244,7 +244,7 @@ def bands(rng: Rng, n: int) -> Footage:
 
     def seen(at: int, m: int) -> NDArray[np.floating]:
         rolling = 20 * np.cos(rows - phase[at : at + m, None])[:, :, None]
-        return np.asarray(shown + rolling + SENSOR_SD * normal(rng, m))
+        return np.asarray(shown + rolling + SENSOR_SD * gaussian(rng, m))
 
     return in_pieces(n, seen)
 
@@ -256,7 +256,7 @@ def soft_picture(rng: Rng) -> FloatArray:
     return np.asarray(128 + 40 * np.asarray(smooth, np.float64)).clip(0, 255)
 
 
-def normal(rng: Rng, n: int) -> NDArray[np.float32]:
+def gaussian(rng: Rng, n: int) -> NDArray[np.float32]:
     return rng.standard_normal((n, HEIGHT, WIDTH), np.float32)
 
 
