@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
@@ -41,8 +43,12 @@ KNOWN_WITHIN: Final = 2.0
 WINDOW: Final = 2000
 """Frames over which the variance is taken that tells whether a module is alive."""
 
-AHEAD: Final = 640
-"""Frames of a log that are read at once, about."""
+READ: Final = 2**22
+"""Bytes of frames and outputs of a log that are taken at once, about."""
+
+
+Part = tuple[Block, FloatArray]
+"""Frames that follow one another within a block of the clock, and the outputs on them, (n, R)."""
 
 
 class Application:
@@ -151,7 +157,7 @@ class Application:
         source: FrameSource,
         frames: int | None = None,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Iterator[Applied]:
+    ) -> Generator[Applied]:
         """Apply the modules to a source, from where it is.
 
         What is given of a block follows from its frames, and those before it since then: it is the
@@ -170,28 +176,59 @@ class Application:
             LogDamagedError: the log is damaged there; all before was given.
         """
         judges = [_Judge(self.modules) for _ in source.spec.streams]
-        reads = _reads(source, self.tau, frames)
-        for blocks in _ahead(reads) if isinstance(source, StoredSource) else reads:
-            found = [part for block in blocks for part in self._parts(block)]
+        stored = isinstance(source, StoredSource)
+        reads = _reads(source, self._step(source.spec) if stored else self.tau, self.tau, frames)
+        for found in self._ahead(reads) if stored else map(self._projected, reads):
             for part, y in sorted(found, key=lambda one: (one[0].t, one[0].stream)):
                 yield judges[part.stream].judge(part, y)
             if stop():
                 return
 
-    def _parts(self, block: Block) -> Iterator[tuple[Block, FloatArray]]:
+    def _step(self, spec: SourceSpec) -> int:
+        """Frames of a log that are read at once, whole blocks."""
+        pixels = math.prod(spec.frame_shape) * np.dtype(spec.dtype).itemsize
+        each = len(spec.streams) * (pixels + 8 * sum(len(module.phi) for module in self.modules))
+        return max(READ // each // self.tau, 1) * self.tau
+
+    def _ahead(self, reads: Iterator[Sequence[Block]]) -> Iterator[list[Part]]:
+        """What is read in a thread, and projected in as many as there are processors."""
+        cores = os.cpu_count() or 1
+
+        def read() -> Future[list[Part]] | None:
+            blocks = next(reads, None)
+            return None if blocks is None else pool.submit(self._projected, blocks)
+
+        with ThreadPoolExecutor(cores) as pool, ThreadPoolExecutor(1) as reader:
+            coming = deque(reader.submit(read) for _ in range(cores + 1))
+            while (parts := coming.popleft().result()) is not None:
+                coming.append(reader.submit(read))
+                yield parts.result()
+
+    def _projected(self, blocks: Sequence[Block]) -> list[Part]:
+        return [part for block in blocks for part in self._parts(block)]
+
+    def _parts(self, block: Block) -> list[Part]:
         """A stretch cut where blocks of the clock begin, with the outputs on each part."""
-        y, end = self._stack.transform(block.frames), block.t + len(block)
+        y, end, parts = self._stack.transform(block.frames), block.t + len(block), []
         cuts = range(block.t + self.tau - block.t % self.tau, end, self.tau)
         for low, high in itertools.pairwise([block.t, *cuts, end]):
             own = slice(low - block.t, high - block.t)
             part = Block(block.stream, low, block.frames[own], block.truth[own])
-            yield part, np.ascontiguousarray(y[own])
+            parts.append((part, y[own]))
+        return parts
 
 
-def _reads(source: FrameSource, tau: int, frames: int | None) -> Iterator[Sequence[Block]]:
-    """What a source shows, read after read, each to where a block of the clock ends."""
-    stored = isinstance(source, StoredSource)
-    step = max(AHEAD // tau, 1) * tau if stored else tau
+def _reads(
+    source: FrameSource, step: int, tau: int, frames: int | None
+) -> Iterator[Sequence[Block]]:
+    """What a source shows, read after read, each to where a block of the clock ends.
+
+    Args:
+        source: from where it is.
+        step: frames that are read at once, whole blocks.
+        tau: frames of a block.
+        frames: end after so many.
+    """
     end = None if frames is None else source.t + frames
     if source.spec.length is not None:
         whole = source.t + source.spec.length
@@ -228,29 +265,32 @@ def _rest(source: FrameSource) -> Sequence[Block]:
     return rest
 
 
-def _ahead(reads: Iterator[Sequence[Block]]) -> Iterator[Sequence[Block]]:
-    """The same, the next one read in a thread meanwhile."""
-    with ThreadPoolExecutor(1) as thread:
-        coming = thread.submit(next, reads, None)
-        while (now := coming.result()) is not None:
-            coming = thread.submit(next, reads, None)
-            yield now
-
-
 class _Judge:
-    """What tells, on one stream, whether modules are alive and how novel a block is."""
+    """What tells, on one stream, whether modules are alive and how novel a block is.
+
+    How far a block is from what a module learned is 1 at the bound of what its learner knows: by
+    the band of its slowness or, where its learner keeps none, by the steps from frame to frame of
+    its first output, which had variance 1: ln of their size over that of then.
+    """
 
     def __init__(self, modules: Sequence[Module]) -> None:
-        self._columns = list(columns_of(modules))
-        self._firsts = [own.start for _, own in self._columns]
-        self._mean = np.zeros(len(self._firsts))
-        self._square = np.zeros(len(self._firsts))
+        self._firsts = [own.start for _, own in columns_of(modules)]
+        self._centre = np.concatenate([module.band_mean for module in modules])
+        self._width = KNOWN_WITHIN * np.concatenate([module.band_sd for module in modules])
+        self._turns = {
+            i: 2 * math.pi * float(module.eta[0])
+            for i, module in enumerate(modules)
+            if not np.isfinite(module.band_sd).all()
+        }
+        self._mean = np.zeros(len(modules))
+        self._square = np.zeros(len(modules))
         self._frames = 0
 
     def judge(self, block: Block, y: FloatArray) -> Applied:
         """What the modules give on a block, (n, R)."""
-        count = y.shape[1]
-        slowness = kernels.instantaneous_slowness(y) if len(y) > 1 else np.full(count, np.nan)
+        slowness = np.full(y.shape[1], np.nan)
+        if len(y) > 1:
+            slowness = kernels.instantaneous_slowness(y)
         own = y[:, self._firsts]
         self._frames += len(y)
         rate = max(min(2 * len(y) / (WINDOW + len(y)), 1.0), len(y) / self._frames)
@@ -258,24 +298,14 @@ class _Judge:
         self._square += rate * ((own * own).mean(axis=0) - self._square)
         variance = self._square - self._mean * self._mean
         alive = (PRESENT[0] < variance) & (variance < PRESENT[1])
-        novelty = [_novelty(m, y[:, columns], slowness[columns]) for m, columns in self._columns]
-        return Applied(block, y, slowness, alive, np.array(novelty))
-
-
-def _novelty(module: Module, y: FloatArray, slowness: FloatArray) -> float:
-    """How far a block is from what the module learned, 1 at the bound of what its learner knows.
-
-    By the band of its slowness or, where its learner keeps none, by the steps from frame to frame
-    of its first output, which had variance 1: ln of their size over that of then.
-    """
-    if np.isfinite(module.band_sd).all():
-        away = np.abs(slowness - module.band_mean) / (KNOWN_WITHIN * module.band_sd)
-        return float(away.max())
-    steps = np.diff(y[:, 0])
-    if not len(steps):
-        return math.nan
-    turn = 2 * math.pi * float(module.eta[0])
-    return abs(log_ratio(math.sqrt(float(np.mean(steps * steps))), turn)) / STRANGE
+        away = np.abs(slowness - self._centre) / self._width
+        novelty = np.maximum.reduceat(away, self._firsts)
+        if self._turns and len(y) > 1:
+            steps = np.diff(own, axis=0)
+            sizes = np.sqrt((steps * steps).mean(axis=0)).tolist()
+            for i, turn in self._turns.items():
+                novelty[i] = abs(log_ratio(sizes[i], turn)) / STRANGE
+        return Applied(block, y, slowness, alive, novelty)
 
 
 class Totals:
@@ -293,35 +323,38 @@ class Totals:
     def __init__(self, spec: SourceSpec, modules: Sequence[Module]) -> None:
         self.frames = 0
         self.damaged: LogDamagedError | None = None
-        self._spec, self._modules = spec, list(columns_of(modules))
-        self._sums: dict[tuple[int, int], list[float]] = {}
+        self._spec, self._modules = spec, modules
+        self._firsts = [own.start for _, own in columns_of(modules)]
+        self._sums: dict[int, FloatArray] = {}
 
     def add(self, applied: Applied) -> None:
         """Take a block in."""
-        block, count = applied.block, len(applied.block)
+        count = len(applied.block)
         self.frames += count
-        for i, (_, own) in enumerate(self._modules):
-            sums = self._sums.setdefault((block.stream, i), [0.0] * 5)
-            sums[0] += count
-            sums[1] += count * bool(applied.alive[i])
-            sums[2] += count * (float(applied.novelty[i]) < 1)
-            slowness = float(applied.slowness[own.start])
-            if math.isfinite(slowness):
-                sums[3] += count * slowness
-                sums[4] += count
+        sums = self._sums.setdefault(applied.block.stream, np.zeros((5, len(self._modules))))
+        slowness = applied.slowness[self._firsts]
+        finite = np.isfinite(slowness)
+        sums[0] += count
+        sums[1] += count * applied.alive
+        sums[2] += count * (applied.novelty < 1)
+        sums[3] += count * np.where(finite, slowness, 0)
+        sums[4] += count * finite
 
     def rows(self) -> list[dict[str, Any]]:
         """A row a stream and module, as JSON values: shares of its frames, mean slowness."""
         return [
             {
                 "stream": self._spec.streams[stream],
-                "module": self._modules[i][0].index,
+                "module": module.index,
                 "frames": int(frames),
                 "slowness": slowness / counted if counted else None,
                 "alive": alive / frames,
                 "known": known / frames,
             }
-            for (stream, i), (frames, alive, known, slowness, counted) in sorted(self._sums.items())
+            for stream, sums in sorted(self._sums.items())
+            for module, (frames, alive, known, slowness, counted) in zip(
+                self._modules, sums.T.tolist(), strict=True
+            )
         ]
 
 

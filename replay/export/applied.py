@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -155,7 +156,7 @@ class TableSink:
         self._waiting, self._count = [], 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class OutputTopic:
     """A topic on which messages are told: of the frames of a stream, or of a module on it."""
 
@@ -210,24 +211,28 @@ class Messages:
 
 def _encoded(applied: Applied, module: int, own: slice) -> list[bytes]:
     """The messages `cdmisfa.ModuleOutput` of a module on a block, all laid out alike."""
-    count = own.stop - own.start
-    head = varint(8 * count)
-    values = {
-        "y": (b"\x0a" + head, f"({count},)<f8", applied.y[:, own]),
-        "slowness": (b"\x12" + head, f"({count},)<f8", applied.slowness[own]),
-        "alive": (b"\x18", "u1", applied.alive[module]),
-        "novelty": (b"\x21", "<f8", applied.novelty[module]),
-        "frame": (b"\x29", "<i8", applied.block.t + np.arange(len(applied.block))),
-    }
-    kinds = []
-    for name, (tag, kind, _) in values.items():
-        kinds += [(f"{name}_tag", f"V{len(tag)}"), (name, kind)]
-    rows = np.zeros(len(applied.block), np.dtype(kinds))
-    for name, (tag, _, given) in values.items():
-        rows[f"{name}_tag"] = np.void(tag)
-        rows[name] = given
+    rows = np.repeat(_row(own.stop - own.start), len(applied.block))
+    rows["y"], rows["slowness"] = applied.y[:, own], applied.slowness[own]
+    rows["alive"], rows["novelty"] = applied.alive[module], applied.novelty[module]
+    rows["frame"] = applied.block.t + np.arange(len(rows))
     data, size = rows.tobytes(), rows.itemsize
     return [data[start : start + size] for start in range(0, len(data), size)]
+
+
+@cache
+def _row(count: int) -> NDArray[np.void]:
+    """The message of a module with so many outputs, (1,), in which only the values are missing."""
+    head = varint(8 * count)
+    tags = {"y": b"\x0a" + head, "slowness": b"\x12" + head}
+    tags |= {"alive": b"\x18", "novelty": b"\x21", "frame": b"\x29"}
+    kinds = (f"({count},)<f8", f"({count},)<f8", "u1", "<f8", "<i8")
+    fields = []
+    for (name, tag), kind in zip(tags.items(), kinds, strict=True):
+        fields += [(f"{name}_tag", f"V{len(tag)}"), (name, kind)]
+    row = np.zeros(1, np.dtype(fields))
+    for name, tag in tags.items():
+        row[f"{name}_tag"] = np.void(tag)
+    return row
 
 
 class LogSink:

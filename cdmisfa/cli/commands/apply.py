@@ -183,7 +183,7 @@ def applied(
             robot = RobotSink(PORT if outlet.port is None else outlet.port, spec, modules)
             sinks.append(stack.enter_context(contextlib.closing(robot)))
             tell(f"applying at ws://{HOST}:{robot.port}")
-        blocks = application.to(source, frames, stop)
+        blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))
         total = None if spec.length is None else spec.length * len(spec.streams)
         follow(blocks, sinks, totals, lambda: shown.update(totals.frames, total))
     if live:
