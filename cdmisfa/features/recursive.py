@@ -56,14 +56,13 @@ class RecursiveState(NamedTuple):
 
 
 class Likeness(NamedTuple):
-    """What some outputs give of as many slow features of a stream, the slowest first.
+    """What some outputs give of the slowest feature of a stream: the sum that is most like it.
 
     Attributes:
-        variance: of the weighted sum of them that is most like the slowest, over the variance that
-            it has where the outputs have variance 1 and no correlation.
+        variance: of that weighted sum of them, over the variance that it has where the outputs
+            have variance 1 and no correlation.
         slowness: of that sum.
-        rho: root mean square of the correlations of the slow features with the sums that are most
-            like each, from 0 to 1.
+        rho: its correlation with the slowest feature, from 0 to 1.
     """
 
     variance: float
@@ -185,20 +184,19 @@ class RecursiveFeature:
             power += kernels.multiply(rest.T, rest) / len(rest)
             moved = np.diff(rest, axis=0)
             steps += kernels.multiply(moved.T, moved) / max(len(moved), 1)
-        own = self.state.weights[: max(1, min(len(phi), rank)), :rank]
-        shared = kernels.multiply(q * variance, own.T)
-        sums = _solved(power, shared)
-        given, a = (sums * shared).sum(axis=0).clip(0.0, 1.0), sums[:, 0]
+        shared = kernels.multiply(q * variance, self.state.weights[:1, :rank].T)[:, 0]
+        a = _solved(power, shared)
+        given = min(max(float((a * shared).sum()), 0.0), 1.0)
         moves = max(float((a * (steps * a).sum(axis=1)).sum()), 0.0)
         return Likeness(
-            variance=float(given[0]) / max(float((a * a).sum()), _TINY),
-            slowness=math.sqrt(moves / max(float(given[0]), _TINY)) / (2.0 * math.pi),
-            rho=math.sqrt(float(given.mean())),
+            variance=given / max(float((a * a).sum()), _TINY),
+            slowness=math.sqrt(moves / max(given, _TINY)) / (2.0 * math.pi),
+            rho=math.sqrt(given),
         )
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """The x of matrix x = right, of a covariance (R, R) and (R, n); 0 in what does not vary."""
+    """The x of matrix x = right, of a covariance (R, R) and (R,); 0 in what does not vary."""
     matrix, x = matrix.copy(), right.copy()
     least = _SAME_DIRECTION * matrix.diagonal().max(initial=0.0)
     for i in range(len(x)):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa import kernels
 from cdmisfa.agents.progress.candidate import Candidate, log_ratio
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.signals import STATES
@@ -45,22 +46,19 @@ PASSED_ON = 0.03
 TURNING = 4.0
 """Change over `learner.settled` from which an output has no direction at all."""
 
-SLOW_AGAIN = 0.65
+FITTED_SLOW = 0.65
 """Share of the typical slowness below which what was fitted counts as slow."""
-
-TOO_EVEN = 0.75
-"""Share of the typical slowness above which what was fitted counts as no slower than the rest."""
 
 PRESENT = (0.1, 10.0)
 """Variance of a module's output, which had 1, on a stream that shows what it encodes."""
 
-SAME = 0.85
+SAME = 0.8
 """Correlation from which outputs are the same, see `Likeness`."""
 
 TOGETHER = 3
-"""Slow outputs, at most, by which a module and a candidate are compared."""
+"""Slow outputs of a module, at most, that are compared with a candidate."""
 
-AS_SLOW = 1.3
+AS_SLOW = 1.4
 """Slowness of a module over the candidate's, up to which it is as slow."""
 
 FAINT = 0.003
@@ -156,7 +154,7 @@ def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
         and disagreement(candidate) < config.agreement
         and low < float(candidate.variance[0]) < high
         and gain(candidate) < config.slow
-        and flatness(candidate) < SLOW_AGAIN
+        and flatness(candidate) < FITTED_SLOW
     )
 
 
@@ -167,7 +165,7 @@ def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
     if (
         candidate.tests >= EARLY * candidate.test_window
         and gain(candidate) > config.even
-        and flatness(candidate) > TOO_EVEN
+        and flatness(candidate) > FITTED_SLOW
     ):
         return NOTHING_SLOW
     if candidate.blocks >= PATIENCE * candidate.test_window:
@@ -192,49 +190,42 @@ def promising(candidate: Candidate, config: ProgressConfig) -> bool:
         candidate.alive
         and candidate.tests >= EARLY * candidate.test_window
         and gain(candidate) < config.slow
-        and flatness(candidate) < SLOW_AGAIN
+        and flatness(candidate) < FITTED_SLOW
     )
 
 
-def gives(
-    module: Module, candidate: Candidate, config: ProgressConfig, frames: NDArray[Any]
-) -> Likeness:
-    """What a module gives of what a candidate found, by the outputs that are slow in both.
+def gives(module: Module, candidate: Candidate, frames: NDArray[Any]) -> Likeness:
+    """What a module's leading slow outputs give of what a candidate found.
 
     Args:
         module: frozen.
         candidate: tells by the statistics of its stream.
-        config: what is slow.
         frames: (n, I) the last block of the stream, see `RecursiveFeature.compare`.
     """
-    marks = np.zeros((2, TOGETHER), np.int64)
-    for row, slow in zip(marks, (module.slow, slow_outputs(candidate, config)), strict=True):
-        row[: len(slow)] = slow[:TOGETHER]
-    both = int(np.minimum.accumulate(marks.min(axis=0)).sum())
-    return candidate.sfa.compare(module.phi[: max(both, 1)], frames)
+    slow = int(np.minimum.accumulate(module.slow[:TOGETHER]).sum())
+    return candidate.sfa.compare(module.phi[: max(slow, 1)], frames)
 
 
 def known_by(
-    candidate: Candidate,
-    modules: list[Module],
-    own: int,
-    config: ProgressConfig,
-    frames: NDArray[Any],
+    candidate: Candidate, modules: list[Module], own: int, frames: NDArray[Any]
 ) -> int | None:
     """Index in `modules` of the one that `gives` what the candidate found, its own first, if any.
+
+    What is the same is also as slow where the module was learned. Light that falls on everything
+    is in the outputs of any module.
 
     Args:
         candidate: what was found.
         modules: frozen.
         own: index of the stream's own module, -1 where it has none.
-        config: what is slow.
         frames: (n, I) the last block of the stream.
     """
     low, high = PRESENT
-    found = [gives(module, candidate, config, frames) for module in modules]
     for index in sorted(range(len(modules)), key=lambda index: index != own):
-        variance, eta, rho = found[index]
-        if low < variance < high and rho > SAME and eta <= AS_SLOW * candidate.fitted:
+        variance, eta, rho = gives(modules[index], candidate, frames)
+        at_home = abs(log_ratio(float(modules[index].eta[0]), candidate.fitted))
+        as_slow = eta <= AS_SLOW * candidate.fitted and at_home < kernels.log(AS_SLOW)
+        if low < variance < high and rho > SAME and as_slow:
             return index
     if own >= 0 and _still_there(candidate, modules[own], frames):
         return own

@@ -56,7 +56,7 @@ FEWEST_BLOCKS = 20
 WATCHED = 0.4
 """Windows of tests that the output of a decided stream's module is told over."""
 
-DECIDING = 2
+DECIDING = 3
 """Rises when something else is decided than before, so that runs of then are not gone on with."""
 
 COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle", "i8")])
@@ -299,7 +299,7 @@ class ProgressLearner:
         own = self._streams[stream]
         state, before = int(own["state"]), int(own["module"])
         if index is None:
-            index = known_by(candidate, self.modules, before, self.config, frames)
+            index = known_by(candidate, self.modules, before, frames)
         new = index is None
         if index is None:
             self.modules.append(self._module(stream, candidate))
@@ -310,7 +310,7 @@ class ProgressLearner:
         begin_watching(own, alone.variance, alone.slowness)
         if index == before and state != LEARNING:
             return ()
-        given = gives(module, candidate, self.config, frames)
+        given = gives(module, candidate, frames)
         eta = float(candidate.tested[0]) if new else given.slowness
         learned = module.stream_index == stream
         decide(own, LEARNED if learned else KNOWN, index, eta)
