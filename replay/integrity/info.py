@@ -140,7 +140,8 @@ def describe(*words: str | Location) -> LogInfo:
         for f in files
         for name, records in f.metadata.items()
     }
-    folder = named[0] if len(named) == 1 and isinstance(named[0], Path) else None
+    run = _run_folder(named[0]) if len(named) == 1 else None
+    result = {} if run is None else _result(run)
     records = [values for found in metadata.values() for values in found.values()]
     return LogInfo(
         path=" ".join([*map(str, named), *(word for word, _ in refused)]),
@@ -152,9 +153,9 @@ def describe(*words: str | Location) -> LogInfo:
         problems=tuple(p for f in files for p in f.problems),
         metadata=metadata,
         seed=_seed(records),
-        ended=_ended(folder) if folder else None,
-        held_out=_held_out(folder) if folder else None,
-        modules=_modules(folder) if folder else (),
+        ended=None if result.get("ended") is None else str(result["ended"]),
+        held_out=_held_out(result),
+        modules=() if run is None else _modules(run),
         signals=next((f.signals for f in files if f.signals is not None), None),
         state=worst(f.state for f in files),
         notes=tuple(note for f in files for note in f.notes),
@@ -291,14 +292,23 @@ def _seed(records: Sequence[Mapping[str, str]]) -> int | None:
     return seeds.pop() if len(seeds) == 1 else None
 
 
-def _ended(path: Path) -> str | None:
-    ended = _result(path).get("ended")
-    return None if ended is None else str(ended)
+def _run_folder(place: Location) -> Path | None:
+    """The folder of the run that a place is, if it is one."""
+    if not isinstance(place, Path):
+        return None
+    folder = place.parent if place.name == RUN_FILE else place
+    return folder if (folder / RUN_FILE).is_file() else None
 
 
-def _held_out(path: Path) -> Mapping[str, Any] | None:
+def _result(run: Path) -> Mapping[str, Any]:
+    """What run.json says that a run came to; nothing where it does not say."""
+    result = read_run_json(run).get("result")
+    return result if isinstance(result, Mapping) else {}
+
+
+def _held_out(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
     with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):
-        found = _result(path)["held_out"]
+        found = result["held_out"]
         numbers = ("slowness", "of_batch")
         return {
             **{key: [int(t) for t in found[key]][:2] for key in ("frames", "fitted")},
@@ -311,21 +321,10 @@ def _held_out(path: Path) -> Mapping[str, Any] | None:
     return None
 
 
-def _result(path: Path) -> Mapping[str, Any]:
-    """What run.json says that a run came to; nothing where it is no run, or does not say."""
-    if path.name != RUN_FILE and not (path / RUN_FILE).is_file():
-        return {}
-    result = read_run_json(path if path.is_dir() else path.parent).get("result")
-    return result if isinstance(result, Mapping) else {}
-
-
-def _modules(path: Path) -> tuple[ModuleInfo, ...]:
-    folder = path if path.is_dir() else path.parent
-    if path.name != RUN_FILE and not (path / RUN_FILE).is_file():
-        return ()
+def _modules(run: Path) -> tuple[ModuleInfo, ...]:
     with contextlib.suppress(CdmisfaError):
         return tuple(
             ModuleInfo(m.index, m.stream, tuple(m.eta.tolist()), tuple(m.slow.tolist()))
-            for m in load_modules(folder)
+            for m in load_modules(run)
         )
     return ()
