@@ -150,6 +150,11 @@ def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
     last = [s for s in written if s.module == written[-1].module]
     assert f"Module {last[0].module} was not saved: " in text
     assert f"of its {len(last)} blocks" in text
+    novel = [s.stream for s in last if s.novel]
+    most = max(set(novel), key=novel.count)
+    share = f"{novel.count(most) / len(novel):.0%} of these were of {VECTOR.streams[most]}."
+    assert 0 < len(novel) < len(last)
+    assert share in text
     assert "It ended: nothing was left." in text
 
 

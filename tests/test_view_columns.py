@@ -107,8 +107,8 @@ def test_an_outline_sums_the_records_up(tmp_path):
     assert [s.iteration for s in outline.saved] == [s.iteration for s in written if s.saved]
     phase = [s for s in written if s.module == written[-1].module]
     assert (outline.last.blocks, outline.last.novel) == (len(phase), sum(s.novel for s in phase))
-    expected = np.bincount([s.stream for s in phase], minlength=3)
-    np.testing.assert_array_equal(outline.last.visits, expected)
+    expected = np.bincount([s.stream for s in phase if s.novel], minlength=3)
+    np.testing.assert_array_equal(outline.last.novel_of, expected)
     np.testing.assert_array_equal(outline.lines["xi"], [s.xi for s in written])
 
 

@@ -135,13 +135,13 @@ class Phase:
 
     Attributes:
         novel: how many of them the gate let through.
-        visits: (S,) how many of them were of each stream.
+        novel_of: (S,) how many of these were of each stream.
     """
 
     module: int
     blocks: int
     novel: int
-    visits: IntArray
+    novel_of: IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +223,9 @@ class Tally:
         if len(blocks.starts):
             module, novel = (np.concatenate(parts) for parts in self._phase.values())
             own = module == module[-1]
-            of_stream = np.bincount(blocks.streams[own], minlength=streams)
-            last = Phase(int(module[-1]), int(own.sum()), int(novel[own].sum()), of_stream)
+            through = own & novel.astype(bool)
+            novel_of = np.bincount(blocks.streams[through], minlength=streams)
+            last = Phase(int(module[-1]), int(own.sum()), int(through.sum()), novel_of)
         return Outline(
             header=self.header,
             iterations=len(blocks.starts),

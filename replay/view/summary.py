@@ -128,11 +128,12 @@ def _unfinished(outline: Outline) -> str:
     last = outline.last
     if last is None or any(save.module == last.module for save in outline.saved):
         return ""
-    most = int(last.visits.argmax())
+    most = int(last.novel_of.argmax())
+    share = last.novel_of[most] / max(last.novel, 1)
+    of_most = f", and {share:.0%} of these were of {outline.names()[most]}" if last.novel else ""
     return (
         f"Module {last.module} was not saved: {last.novel / last.blocks:.0%} of its "
-        f"{last.blocks:,} blocks were novel, and {last.visits[most] / last.blocks:.0%} of them "
-        f"were of {outline.names()[most]}."
+        f"{last.blocks:,} blocks were novel{of_most}."
     )
 
 
