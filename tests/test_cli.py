@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa, Outcome
+from mcap.reader import make_reader
 from run_data import VECTOR, write_run
 from waiting import started, wait_for
 
@@ -66,7 +68,9 @@ class TestJson:
     ) -> None:
         done = cdmisfa("info", oscillatory_run)
         assert done.code == 0
-        assert "run, whole, checksums ok, seed 0, ended: the asked number of iter" in done.out
+        assert "run, whole, checksums ok, seed 0\n" in done.out
+        assert "ended after 15 iterations of 100 frames: the asked number of iter" in done.out
+        assert "learner 2.0, 3 streams: x1, x2, x3" in done.out
         assert "2016-01-01 00:00:00.000Z" in done.out
         torn = tmp_path / "x1.mcap"
         data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())
@@ -77,6 +81,28 @@ class TestJson:
         torn.write_bytes(data[: len(data) // 3])
         assert "None" not in cdmisfa("recover", torn, "-o", tmp_path / "new" / "x1.mcap").out
         assert (tmp_path / "new" / "x1.mcap").is_file()
+
+    def test_info_says_of_a_log_what_others_say(
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path
+    ) -> None:
+        log = oscillatory_recording / "x1.mcap"
+        with log.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        stored, whole = (
+            sum(getattr(index, name) for index in summary.chunk_indexes)
+            for name in ("compressed_size", "uncompressed_size")
+        )
+        found = cdmisfa("info", log, "--json").json
+        chunks = {"zstd": len(summary.chunk_indexes)}
+        expected = {"file": log.stat().st_size, "stored": stored, "decompressed": whole}
+        assert found["size"] == {**expected, "compression": chunks}
+        said = cdmisfa("info", log).out
+        statistics = summary.statistics
+        seconds = (statistics.message_end_time - statistics.message_start_time) / 1e9
+        assert f"{statistics.message_count} protobuf messages, {seconds:.3f} s" in said
+        assert f"{chunks['zstd']} zstd chunks, " in said
+        assert f"({1 - stored / whole:.0%} saved)" in said
+        assert re.search(r"/view/x1 +2000 +50 +0.000 +39.980", said)
 
     def test_verify(self, cdmisfa: Cdmisfa, oscillatory_recording: Path) -> None:
         done = cdmisfa("verify", oscillatory_recording, "--json")
@@ -200,7 +226,8 @@ class TestRuns:
         assert (forked.code, forked.json["ended"]) == (0, "log_exhausted")
         info = cdmisfa("info", run)
         assert "whole" in info.out
-        assert "ended: there were no more frames" in info.out
+        assert f"ended after {blocks} iterations of " in info.out
+        assert "frames: there were no more frames" in info.out
         looped = cdmisfa(*words, "--loop", "--max-iterations", blocks + 5, "--json").json
         assert looped["iterations"] == blocks + 5
 

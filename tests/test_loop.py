@@ -9,13 +9,12 @@ from typing import Any
 import pytest
 
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.cli.printing import Bar, Reporter
+from cdmisfa.cli.progress import Bar
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn_blocks
-from cdmisfa.studies.demo import ProgressSink
 from cdmisfa.testing.learners import CONFIG, SinkContract
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
@@ -86,12 +85,7 @@ class TestLiveView(SinkContract):
 
 class TestReporter(SinkContract):
     def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
-        return Reporter(Bar(), None)
-
-
-class TestProgressSink(SinkContract):
-    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
-        return ProgressSink(Bar(), 20)
+        return Bar().sink(source.spec, None)
 
 
 def learner_for(source: OscillatorySource) -> CuriousLearner:

@@ -30,7 +30,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "apply": ("apply", "Apply the modules of a run to other logs."),
     "view": ("view", "Open a run or a recording in the Rerun viewer, or save, serve or draw it."),
     "play": ("view", "Show a recording as it was seen, in real time."),
-    "info": ("logs", "Say what is in a recording, a run, any MCAP file, or a camera log."),
+    "info": ("info", "Say what is in a recording, a run, any MCAP file, or a camera log."),
     "verify": ("logs", "Check that a log is whole: structure, checksums, nothing lost."),
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
     "convert": ("record", "Write camera logs of others as a recording."),

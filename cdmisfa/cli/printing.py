@@ -2,38 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
+import itertools
 import json
 import shlex
+import shutil
 import sys
-import time
-from collections.abc import Iterator, Mapping, Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.learning import Sink
 from cdmisfa.core.untrusted import printable
 
 if TYPE_CHECKING:
-    from cdmisfa.cli.interrupts import Stop
-    from cdmisfa.core.blocks import Block, FrameSource
-    from cdmisfa.core.learning import Learner
-    from cdmisfa.core.signals import BlockSignals
+    from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.run_folder import RunResult
+    from replay.integrity.learned import ModuleInfo
     from replay.viewer.broadcast import Broadcast
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
 
 
-MEGABYTE, GIGABYTE = 10**6, 10**9
-
-TICK = 0.1
-"""Seconds between two updates of the bar: a block may take only microseconds."""
+NARROWEST = 8
+"""Letters of a column in which words are broken, or fewer where it needs no more."""
 
 
 def quoted(path: str | Path) -> str:
@@ -65,12 +60,47 @@ def print_document(**each: Any) -> None:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Rows of cells in aligned columns under a ruled head, on stdout."""
+    """Rows of cells in aligned columns under a ruled head, on stdout; it fits into a terminal.
+
+    Where it does not, its widest cells go on in the next lines. What no terminal shows has a line
+    a row, for other programs.
+    """
     cells = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    columns = list(zip(*cells, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    if sys.stdout.isatty():
+        words = [
+            max(len(word) for cell in column for word in cell.split(" ")) for column in columns
+        ]
+        room = shutil.get_terminal_size().columns
+        widths = fitting(fitting(widths, words, room), [NARROWEST] * len(widths), room)
     cells.insert(1, ["-" * width for width in widths])
     for row in cells:
-        print_line("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
+        parts = [textwrap.wrap(c, w) or [""] for c, w in zip(row, widths, strict=True)]
+        for line in itertools.zip_longest(*parts, fillvalue=""):
+            print_line("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
+
+
+def print_columns(columns: Mapping[str, Sequence[Any]]) -> None:
+    """Columns below their names, as `print_table` does."""
+    print_table(list(columns), list(zip(*columns.values(), strict=True)))
+
+
+def fitting(widths: Sequence[int], least: Sequence[int], room: int) -> list[int]:
+    """Widths of columns, two spaces apart, of which the widest are narrowed until all fit.
+
+    Args:
+        widths: that they would like to have.
+        least: that they keep, even where they do not fit.
+        room: for all of them.
+    """
+    fit = list(widths)
+    while sum(fit) + 2 * (len(fit) - 1) > room:
+        spare = [width if width > keeps else 0 for width, keeps in zip(fit, least, strict=True)]
+        if not any(spare):
+            break
+        fit[spare.index(max(spare))] -= 1
+    return fit
 
 
 def say_failed(rows: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
@@ -80,9 +110,31 @@ def say_failed(rows: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
         print_line(f"failed: {at} seed {row['seed']}: {row['error']}", err=err)
 
 
+class Loudness:
+    """How much is said on stderr: as -q and -v of the command say.
+
+    Attributes:
+        level: -1 for errors alone, 0 for what the user should know, 1 for all.
+    """
+
+    level = 0
+
+
+def is_quiet() -> bool:
+    """Whether nothing but errors is said on stderr."""
+    return Loudness.level < 0
+
+
 def tell(line: str) -> None:
-    """A line on stderr."""
-    print_line(line, err=True)
+    """A line on stderr, unless that is to be quiet."""
+    if not is_quiet():
+        print_line(line, err=True)
+
+
+def detail(line: str) -> None:
+    """A line on stderr for those who want to know all."""
+    if Loudness.level > 0:
+        tell(line)
 
 
 def warn(line: str) -> None:
@@ -194,7 +246,25 @@ def outcome_line(outcome: Mapping[str, Any]) -> str:
     return f"{outcome['stream']}: {came}, after {after}{because}"
 
 
-BRACKETS = "in brackets: not slow on frames that were not learned from"
+def print_modules(modules: Sequence[ModuleInfo], *, policies: bool) -> None:
+    """Print a table of modules, with the policies that led to them where there are some."""
+    from cdmisfa.core.signals import ACTIONS
+
+    if not modules:
+        print_line("no module was learned")
+        return
+    columns: dict[str, list[object]] = {
+        "module": [m.index for m in modules],
+        "stream": [m.stream for m in modules],
+        "iteration": [m.iteration for m in modules],
+        "policy": [" ".join(ACTIONS[action] for action in m.policy) for m in modules],
+        "slowness": [slownesses(m.slowness, m.slow) for m in modules],
+    }
+    if not policies:
+        del columns["policy"]
+    print_columns(columns)
+    if any(0 in m.slow for m in modules):
+        print_line("in brackets: not slow on frames that were not learned from")
 
 
 def slownesses(eta: Sequence[float], slow: Sequence[int]) -> str:
@@ -207,6 +277,8 @@ def slownesses(eta: Sequence[float], slow: Sequence[int]) -> str:
 
 def print_held_out(found: Mapping[str, Any]) -> None:
     """Print how slow modules are on frames that were held out, beside batch SFA."""
+    if not found["modules"]:
+        return
     start, stop = found["frames"]
     print_line(f"slowness on the frames {start} to {stop - 1}, which were held out:")
     for one in found["modules"]:
@@ -216,159 +288,23 @@ def print_held_out(found: Mapping[str, Any]) -> None:
 
 def print_result(result: RunResult, *, as_json: bool) -> None:
     """Print what a run came to."""
-    from cdmisfa.core.signals import ACTIONS
     from cdmisfa.experiments.loop import ENDINGS
+    from replay.integrity.learned import ModuleInfo
 
     if as_json:
         print_json(result.as_json())
         return
-    rows = [
-        (
-            module.index,
-            module.stream,
-            module.iteration,
-            " ".join(ACTIONS[action] for action in module.policy),
-            slownesses(module.eta.tolist(), module.slow.tolist()),
-        )
-        for module in result.modules
-    ]
-    if rows and "streams" not in result.summary:
-        print_table(("module", "stream", "iteration", "policy", "eta"), rows)
-    elif rows:  # no policy led to them
-        without = [(index, stream, iteration, eta) for index, stream, iteration, _, eta in rows]
-        print_table(("module", "stream", "iteration", "eta"), without)
-    else:
-        print_line("no module was learned")
-    if any(0 in module.slow for module in result.modules):
-        print_line(BRACKETS)
+    modules = [ModuleInfo.of(module) for module in result.modules]
+    print_modules(modules, policies="streams" not in result.summary)
     if "streams" in result.summary:
         for outcome in result.summary["streams"]:
             print_line(outcome_line(outcome))
     elif result.undecided:
         print_line(f"not decided: {', '.join(result.undecided)}")
-    if result.held_out and result.modules:
+    if result.held_out:
         print_held_out(result.held_out)
     print_line(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
     print_line(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
         look = f"look at it: cdmisfa view {quoted(result.run)}"
         print_line(f"run {result.run}    {look}")
-
-
-class Bar:
-    """What a command reports to: how far it is, and lines worth reading."""
-
-    def update(self, done: float, total: float | None = None, note: str = "") -> None:
-        """So much is done, of so much where that is known; `note` stands behind the bar."""
-
-    def turn_to(self, title: str, unit: str) -> None:
-        """Show something else from now on."""
-
-    def say(self, line: str) -> None:
-        """A line that stays, above the bar."""
-        tell(line)
-
-
-@contextlib.contextmanager
-def bar(title: str, unit: str) -> Iterator[Bar]:
-    """Show progress while the body runs, if anyone is looking; the unit is what is counted."""
-    if not sys.stderr.isatty():
-        yield Bar()
-        return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.table import Column
-    from rich.text import Text
-
-    class Rate(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            speed = task.finished_speed or task.speed
-            return Text(no_wrap=True, text="" if speed is None else f"{speed:,.0f} {unit}/s")
-
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=16),
-        TextColumn("{task.completed:,.0f}"),
-        Rate(),
-        TimeElapsedColumn(),
-        TextColumn("passed,"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-        TextColumn("{task.fields[note]}", table_column=Column(no_wrap=True)),
-        console=Console(stderr=True),
-        transient=True,
-    )
-
-    class TerminalBar(Bar):
-        def update(self, done: float, total: float | None = None, note: str = "") -> None:
-            progress.update(task, completed=done, total=total, note=note)
-
-        def turn_to(self, title: str, what: str) -> None:
-            nonlocal unit
-            unit = what
-            progress.reset(task, description=title, total=None, note="")
-
-        def say(self, line: str) -> None:
-            progress.console.print(printable(line), markup=False, highlight=False, emoji=False)
-
-    with progress:
-        task = progress.add_task(title, total=None, note="")
-        yield TerminalBar()
-
-
-class Reporter(Sink):
-    """Shows a run's progress: every module once, the rest a few times a second.
-
-    Attributes:
-        told: whether any block was learned.
-    """
-
-    def __init__(self, shown: Bar, max_iterations: int | None) -> None:
-        self.told = self._hashing = False
-        self._shown, self._max_iterations = shown, max_iterations
-        self._next = 0.0
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """See `Sink`."""
-        self.told, modules = True, len(learner.modules)
-        for text in learner.events:
-            self._shown.say(f"iteration {signals.iteration}: {text}")
-        now = time.monotonic()
-        if now >= self._next:
-            self._next = now + TICK
-            if self._hashing:
-                self._hashing = False
-                self._shown.turn_to("learning", "blocks")
-            learning = int((signals.state == 0).sum())
-            left = f"{learning} being learned" if learning else f"ε {signals.epsilon:.2f}"
-            note = f"{modules} saved, {left}"
-            self._shown.update(learner.iteration, self._max_iterations, note)
-
-    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-        """See `Sink`."""
-        if level == "WARNING":
-            self._shown.say(text)
-
-    def hashing(self, done: int, size: int) -> None:
-        """Show how far the source's files are hashed, once that is waited for."""
-        if not self._hashing:
-            self._hashing = True
-            self._shown.turn_to("hashing", "MB")
-            read = f"{done / GIGABYTE:.1f} of {size / GIGABYTE:.1f} GB are read"
-            self._shown.say(f"waiting for the SHA-256 of what is learned from: {read}")
-        self._shown.update(done / MEGABYTE, size / MEGABYTE)
-
-
-@contextlib.contextmanager
-def learning(max_iterations: int | None) -> Iterator[tuple[Stop, Reporter]]:
-    """Show the progress of a run, and end it at a signal."""
-    with bar("learning", "blocks") as shown, stoppable() as stop:
-        yield stop, Reporter(shown, max_iterations)

@@ -13,7 +13,8 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.making import Command
-from cdmisfa.cli.printing import bar, quoted, tell
+from cdmisfa.cli.printing import quoted, tell
+from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import CdmisfaError, UsageError
 
 if TYPE_CHECKING:

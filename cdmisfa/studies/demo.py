@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, SeekableSource
+from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import NotReproducedError
-from cdmisfa.core.learning import Learner, Sink
-from cdmisfa.core.signals import ACTIONS, BlockSignals
+from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
@@ -67,7 +66,7 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[
                 seed=seed,
                 sections=configuration.tables(),
                 force=True,
-                sinks=(ProgressSink(bar, most),),
+                sinks=(bar.sink(source.spec, most),),
                 max_iterations=most,
                 max_modules=modules,
             )
@@ -104,19 +103,6 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[
             "live_equals_recorded": True,
             "modules": [followed_by(module, source) for module in result.modules],
         }
-
-
-class ProgressSink(Sink):
-    """Says how far a run is."""
-
-    def __init__(self, bar: Any, max_iterations: int | None) -> None:
-        self._bar, self._max_iterations = bar, max_iterations
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """See `Sink`."""
-        if learner.iteration % 10 == 0:
-            note = f"{len(learner.modules)} saved, ε {signals.epsilon:.2f}"
-            self._bar.update(learner.iteration, self._max_iterations, note)
 
 
 def _opened(word: str | Path, seed: int) -> AbstractContextManager[SeekableSource]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -19,6 +18,14 @@ from recorder.mcap.records import Channel, Problem
 from replay.camera_logs.opening import channels_of, log_format, only_foreign
 from replay.camera_logs.pictures import FolderImages
 from replay.integrity.counting import count_messages
+from replay.integrity.learned import (
+    ModuleInfo,
+    RunInfo,
+    held_out_of,
+    modules_of,
+    result_of,
+    run_folder,
+)
 from replay.integrity.state import (
     Crc,
     State,
@@ -29,9 +36,8 @@ from replay.integrity.state import (
     worst,
 )
 from replay.runs.codec import missing_signals
-from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
-from replay.runs.log import record_version
-from replay.runs.modules import load_modules
+from replay.runs.folders import RUN_METADATA
+from replay.runs.log import SIGNALS_TOPIC, record_version
 from replay.storage.location import Location
 from replay.storage.opening import log_files, open_store
 
@@ -39,6 +45,9 @@ SCHEMA: Final = 1
 """Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
 CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""
+
+SIZES: Final = ("stored", "size")
+"""Bytes of a part of a log, as they lie there and decompressed."""
 
 Kind = Literal["recording", "run", "foreign"]
 
@@ -55,6 +64,38 @@ class ChannelInfo:
     end_ns: int | None
     file: str
 
+    @property
+    def rate(self) -> float | None:
+        """Messages a second between the first and the last; None where that takes no time."""
+        if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
+            return None
+        return (self.messages - 1) * 1e9 / (self.end_ns - self.start_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class SizeInfo:
+    """How much room a log takes.
+
+    Attributes:
+        file: bytes of all of it.
+        stored: bytes of its messages as they lie there, and of the records beside them.
+        decompressed: those bytes decompressed.
+        compression: how many chunks are compressed by which algorithm, "none" among them.
+    """
+
+    file: int = 0
+    stored: int = 0
+    decompressed: int = 0
+    compression: Mapping[str, int] = field(default_factory=dict)
+
+    def __add__(self, other: SizeInfo) -> SizeInfo:
+        return SizeInfo(
+            self.file + other.file,
+            self.stored + other.stored,
+            self.decompressed + other.decompressed,
+            dict(Counter(self.compression) + Counter(other.compression)),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class RecordInfo:
@@ -62,16 +103,6 @@ class RecordInfo:
 
     version: int
     missing: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ModuleInfo:
-    """A module: the slowness of each output, and 1 or 0 where it is known to be slow or not."""
-
-    index: int
-    stream: str
-    slowness: tuple[float, ...]
-    slow: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +119,13 @@ class LogInfo:
         seed: the one that all files name, if they do.
         ended: why a run ended, where its folder says so.
         modules: of a run, where they lie in its folder.
+        run: how it was learned, where it is a folder.
         held_out: how slow they are on frames that were held out, where its folder says so.
         signals: of a run.
         state: the worst of the files; "unchecked" where only `check_log` reads what is in them.
         notes: what is no problem, and what nothing proves.
+        size: in bytes.
+        library: what wrote the file, where it says so; "" of several that differ.
         files: each file by itself.
     """
 
@@ -106,11 +140,26 @@ class LogInfo:
     seed: int | None = None
     ended: str | None = None
     modules: tuple[ModuleInfo, ...] = ()
+    run: RunInfo | None = None
     held_out: Mapping[str, Any] | None = None
     signals: RecordInfo | None = None
     state: State = "whole"
     notes: tuple[str, ...] = ()
+    size: SizeInfo = SizeInfo()
+    library: str = ""
     files: tuple[LogInfo, ...] = ()
+
+    @property
+    def messages(self) -> int:
+        """How many there are on all channels."""
+        return sum(c.messages for c in self.channels)
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """Log times of the first and of the last message, nanoseconds."""
+        starts = [c.start_ns for c in self.channels if c.start_ns is not None]
+        ends = [c.end_ns for c in self.channels if c.end_ns is not None]
+        return (min(starts), max(ends)) if starts and ends else None
 
     def as_json(self) -> dict[str, Any]:
         """The description as JSON values."""
@@ -140,13 +189,15 @@ def describe(*words: str | Location) -> LogInfo:
         for f in files
         for name, records in f.metadata.items()
     }
-    run = _run_folder(named[0]) if len(named) == 1 else None
-    result = {} if run is None else _result(run)
+    run = run_folder(named[0]) if len(named) == 1 else None
+    result = {} if run is None else result_of(run)
+    channels = tuple(c for f in files for c in f.channels)
+    libraries = {f.library for f in files}
     records = [values for found in metadata.values() for values in found.values()]
     return LogInfo(
         path=" ".join([*map(str, named), *(word for word, _ in refused)]),
         kind=kinds.pop() if len(kinds) == 1 else "foreign",
-        channels=tuple(c for f in files for c in f.channels),
+        channels=channels,
         chunks=sum(f.chunks for f in files),
         complete=all(f.complete for f in files),
         crc=next(state for state in by_weight if state in states),
@@ -154,13 +205,21 @@ def describe(*words: str | Location) -> LogInfo:
         metadata=metadata,
         seed=_seed(records),
         ended=None if result.get("ended") is None else str(result["ended"]),
-        held_out=_held_out(result),
-        modules=() if run is None else _modules(run),
+        held_out=held_out_of(result),
+        modules=() if run is None else modules_of(run),
+        run=None if run is None else RunInfo.of(run, result, _iterations(channels)),
         signals=next((f.signals for f in files if f.signals is not None), None),
         state=worst(f.state for f in files),
         notes=tuple(note for f in files for note in f.notes),
+        size=sum((f.size for f in files), SizeInfo()),
+        library=libraries.pop() if len(libraries) == 1 else "",
         files=tuple(files),
     )
+
+
+def _iterations(channels: Sequence[ChannelInfo]) -> int:
+    """Iterations of a run whose log has these channels: the records of its signals."""
+    return sum(c.messages for c in channels if c.topic == SIGNALS_TOPIC)
 
 
 def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
@@ -214,8 +273,15 @@ def _describe_foreign(place: Path) -> LogInfo:
         problems=(*missing, *(broken or ())),
         metadata={},
         state="cut short" if missing else state,
+        size=SizeInfo(_bytes_of(place)),
         notes=tuple(dict.fromkeys(line for c in known for line in c.remarks)),
     )
+
+
+def _bytes_of(place: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    files = [place] if place.is_file() else place.rglob("*")
+    return sum(path.stat().st_size for path in files if path.is_file())
 
 
 def _describe_file(path: Location) -> LogInfo:
@@ -237,6 +303,8 @@ def _describe_file(path: Location) -> LogInfo:
         if state == "whole" and not (decode and _all_checked(reader)):
             state = "unchecked"
         version = record_version(metadata.get(RUN_METADATA, {}))
+        stored, decompressed = (sum(getattr(s, n) for s in reader.segments) for n in SIZES)
+        compression = Counter(s.compression or "none" for s in reader.segments if s.chunked)
         return LogInfo(
             path=str(path),
             kind=kind_of(reader),
@@ -249,6 +317,8 @@ def _describe_file(path: Location) -> LogInfo:
             signals=RecordInfo(version, missing_signals(version)) if version else None,
             state=state,
             notes=tuple(reader.unproven()),
+            size=SizeInfo(reader.size, stored, decompressed, dict(compression)),
+            library=reader.library,
         )
 
 
@@ -290,41 +360,3 @@ def _seed(records: Sequence[Mapping[str, str]]) -> int | None:
             manifest = parse_json(values.get("manifest", "{}"))
             seeds.add(int(values.get("seed", manifest.get("seed"))))
     return seeds.pop() if len(seeds) == 1 else None
-
-
-def _run_folder(place: Location) -> Path | None:
-    """The folder of the run that a place is, if it is one."""
-    if not isinstance(place, Path):
-        return None
-    folder = place.parent if place.name == RUN_FILE else place
-    return folder if (folder / RUN_FILE).is_file() else None
-
-
-def _result(run: Path) -> Mapping[str, Any]:
-    """What run.json says that a run came to; nothing where it does not say."""
-    result = read_run_json(run).get("result")
-    return result if isinstance(result, Mapping) else {}
-
-
-def _held_out(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):
-        found = result["held_out"]
-        numbers = ("slowness", "of_batch")
-        return {
-            **{key: [int(t) for t in found[key]][:2] for key in ("frames", "fitted")},
-            "modules": [
-                {"module": int(one["module"]), "stream": str(one["stream"])}
-                | {key: [math.nan if v is None else float(v) for v in one[key]] for key in numbers}
-                for one in found["modules"]
-            ],
-        }
-    return None
-
-
-def _modules(run: Path) -> tuple[ModuleInfo, ...]:
-    with contextlib.suppress(CdmisfaError):
-        return tuple(
-            ModuleInfo(m.index, m.stream, tuple(m.eta.tolist()), tuple(m.slow.tolist()))
-            for m in load_modules(run)
-        )
-    return ()

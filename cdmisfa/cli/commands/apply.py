@@ -14,7 +14,6 @@ from cdmisfa.cli import options, uploads
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import WRITTEN, grouped, number, option, options_of
 from cdmisfa.cli.printing import (
-    bar,
     print_document,
     print_line,
     print_table,
@@ -24,6 +23,7 @@ from cdmisfa.cli.printing import (
     tell,
     warn,
 )
+from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.options import TIME
 from replay.camera_logs.options import CameraOptions

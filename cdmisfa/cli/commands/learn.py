@@ -15,7 +15,6 @@ from cdmisfa.cli import options, uploads
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     announce,
-    learning,
     print_plan,
     print_result,
     quoted,
@@ -25,6 +24,7 @@ from cdmisfa.cli.printing import (
     say_counts,
     tell,
 )
+from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import LogDamagedError, UsageError, are_for
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def learn_command(
             print_plan(frames, as_json=as_json)
             return
         color = getattr(frames, "color", cameras.color)  # what auto chose stays
-        with learning(told["max_iterations"]) as (stop, reporter):
+        with learning(frames.spec, told["max_iterations"]) as (stop, reporter):
             if hasattr(frames, "stop"):
                 frames.stop = stop  # waiting for frames ends with a signal, too
             result = run(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,97 +11,19 @@ import click
 from cdmisfa.cli import options, uploads
 from cdmisfa.cli.making import flag, option
 from cdmisfa.cli.printing import (
-    BRACKETS,
     print_document,
-    print_held_out,
     print_json,
     print_line,
     print_table,
     print_text,
     quoted,
     say_about,
-    slownesses,
     tell,
 )
 from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
 
 if TYPE_CHECKING:
     from replay.camera_logs.options import CameraOptions
-    from replay.integrity.info import LogInfo
-
-
-@click.command("info")
-@click.argument("path", nargs=-1, required=True)
-@options.server_limits
-@options.as_json
-@click.pass_context
-def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
-    """Say what is in a recording, a run, any MCAP file, or a camera log.
-
-    PATH may be several, a pattern such as 'logs/*.mcap', or a URL. Exits with 3 when one is cut
-    short or damaged, else with 2 when one of several is no log. What only `verify` reads, images
-    in logs of others, videos, bags, tables, all at URLs or above 1 GiB, is called unchecked.
-    """
-    from replay.integrity.info import describe
-    from replay.integrity.state import EXIT_CODES
-
-    found = describe(*path)
-    if as_json:
-        print_json(found.as_json())
-    else:
-        _print_info(found)
-    ctx.exit(EXIT_CODES[found.state])
-
-
-def _print_info(found: LogInfo) -> None:
-    together = all(file.path.startswith(found.path) for file in found.files)
-    for each in [found] if together else found.files:
-        print_line(f"{each.path}: {', '.join(_words_of(each))}")
-    for line in (*(f"{p.where}: {p.what}" for p in found.problems), *found.notes):
-        print_line(line)
-    if found.signals is not None and found.signals.missing:
-        version, lacks = found.signals.version, ", ".join(found.signals.missing)
-        print_line(f"signals of version {version}: {lacks} are not in it, read as NaN")
-    for module in found.modules:
-        told = slownesses(module.slowness, module.slow)
-        print_line(f"module {module.index} of {module.stream}: slowness {told}")
-    if any(0 in module.slow for module in found.modules):
-        print_line(BRACKETS)
-    if found.held_out is not None:
-        print_held_out(found.held_out)
-    head: tuple[str, ...] = ("topic", "messages", "encoding", "schema", "from", "to")
-    rows: list[tuple[object, ...]] = [
-        (c.topic, c.messages, c.encoding, c.schema, _clock(c.start_ns), _clock(c.end_ns))
-        for c in found.channels
-    ]
-    files = [(c.file,) for c in found.channels]
-    if len(set(files)) > 1:
-        head, rows = (*head, "file"), [(*row, *file) for row, file in zip(rows, files, strict=True)]
-    print_table(head, rows)
-
-
-def _words_of(found: LogInfo) -> Iterator[str]:
-    """What a log is, and in which state."""
-    if found.state == "not read":
-        yield found.state
-        return
-    yield from (found.kind, found.state.replace("unchecked", "contents unchecked"))
-    yield f"checksums {found.crc}"
-    if found.seed is not None:
-        yield f"seed {found.seed}"
-    if found.ended is not None:
-        from cdmisfa.experiments.loop import ENDINGS
-
-        yield f"ended: {ENDINGS.get(found.ended, found.ended)}"
-
-
-def _clock(ns: int | None) -> str:
-    """A log time as date and time of day, UTC, to the millisecond."""
-    if ns is None:
-        return "-"
-    whole, rest = divmod(ns, 10**9)
-    time = datetime.fromtimestamp(whole, tz=UTC)
-    return f"{time:%Y-%m-%d %H:%M:%S}.{rest // 10**6:03}Z"
 
 
 @click.command("verify")
@@ -322,14 +242,18 @@ def _is_film(out: Path) -> bool:
 @flag("--markdown", "Print the page docs/signals.md.")
 @options.as_json
 def signals_command(markdown: bool, as_json: bool) -> None:
-    """List every signal that a run records."""
+    """List every signal that a run records.
+
+    --json and --markdown say more of each: its type, how it is shown, since when there is one.
+    """
     from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
 
     signals = [dataclasses.asdict(signal) for signal in SIGNALS.values()]
     if as_json:
         print_document(signals_version=SCHEMA_VERSION, signals=signals)
         return
-    columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "show", "since", "about")
+    more = ("dtype", "show", "since") if markdown else ()
+    columns = ("name", "symbol", "equation", "unit", "dims", *more, "about")
     rows = [[signal[column] for column in columns] for signal in signals]
     if markdown:
         print_text(_page(SCHEMA_VERSION, columns, rows))

@@ -10,7 +10,6 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.making import WholeRange, number, option, word
 from cdmisfa.cli.printing import (
-    learning,
     outcome_line,
     print_document,
     print_line,
@@ -18,6 +17,7 @@ from cdmisfa.cli.printing import (
     quoted,
     tell,
 )
+from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
 source = word(
@@ -180,8 +180,8 @@ def fork_command(
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
     limits = {name: value for name, value in given.items() if value is not None}
     with (
-        learning(max_iterations) as (stop, reporter),
         Session.fork(run, folder=out, limits=limits, **told) as session,
+        learning(session.source.spec, max_iterations) as (stop, reporter),
     ):
         result = session.learn(
             sinks=(reporter,),

@@ -16,7 +16,6 @@ from cdmisfa.cli import options, uploads
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
-    bar,
     print_document,
     print_plan,
     print_table,
@@ -26,6 +25,7 @@ from cdmisfa.cli.printing import (
     say_counts,
     tell,
 )
+from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import LogDamagedError, UsageError
 
 if TYPE_CHECKING:

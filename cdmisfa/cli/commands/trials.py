@@ -15,8 +15,6 @@ import click
 from cdmisfa.cli import options, uploads
 from cdmisfa.cli.making import flag, grouped, number, word
 from cdmisfa.cli.printing import (
-    Bar,
-    bar,
     print_document,
     print_json,
     print_line,
@@ -26,6 +24,7 @@ from cdmisfa.cli.printing import (
     say_failed,
     tell,
 )
+from cdmisfa.cli.progress import Bar, bar
 from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:

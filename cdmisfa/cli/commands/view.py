@@ -12,7 +12,8 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, options_of, word
-from cdmisfa.cli.printing import announce, bar, print_document, print_line, say_about, tell, warn
+from cdmisfa.cli.printing import announce, print_document, print_line, say_about, tell, warn
+from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.options import CameraOptions
 
