@@ -153,7 +153,7 @@ def test_a_run_that_states_something_else_is_described_without(
 @pytest.mark.parametrize("size", [7, 100, 5000])
 def test_slowness_in_pieces_is_that_of_all_frames(size: int) -> None:
     x = values(3000)
-    phi, mean = batch_outputs(in_pieces(x, size), len(x), components=6, outputs=2)
+    phi, mean, _ = batch_outputs(in_pieces(x, size), len(x), components=6, outputs=2)
     exact = slowness((x - x.mean(axis=0)) @ batch_sfa(x, 2).T)
     np.testing.assert_allclose(mean, x.mean(axis=0), rtol=1e-9, atol=1e-12)
     (found,) = following_slowness(in_pieces(x, size), [(phi, mean)])
@@ -217,6 +217,6 @@ def test_the_leading_components_of_many_directions_are_those_of_frames_in_memory
     centred = x - x.mean(axis=0)
     within = leading_directions(centred, 4)
     exact = slowness(centred @ within @ batch_sfa(centred @ within, 2).T)
-    phi, mean = batch_outputs(in_pieces(x, 256), len(x), components=4, outputs=2)
+    phi, mean, _ = batch_outputs(in_pieces(x, 256), len(x), components=4, outputs=2)
     (found,) = following_slowness(in_pieces(x, 256), [(phi, mean)])
     np.testing.assert_allclose(found, exact, rtol=1e-3)

@@ -133,7 +133,7 @@ def _of_stream(
 
     outputs = len(modules[0].phi)
     batch = batch_outputs(pieces(fitted), fitted[1] - fitted[0], components, outputs)
-    each = [(module.phi, module.mean) for module in modules] + [batch]
+    each = [(module.phi, module.mean) for module in modules] + [batch[:2]]
     slow = following_slowness(pieces(held), each)
     return {
         module.index: {

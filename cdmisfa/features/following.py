@@ -6,7 +6,7 @@ Frames are taken block by block, so that memory holds few of them, however many 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,21 @@ NOTHING = 1e-10
 """Share of the largest variance below which a direction holds rounding noise."""
 
 
-def batch_outputs(
-    pieces: Pieces, frames: int, components: int, outputs: int
-) -> tuple[FloatArray, FloatArray]:
+class BatchOutputs(NamedTuple):
+    """What batch SFA finds of frames, fewer of each where the frames vary in fewer directions.
+
+    Attributes:
+        phi: (J, I) the slowest outputs as weights of the centred frame.
+        mean: (I,) of the frames.
+        directions: (K, I) the leading principal components, orthonormal, in which they are.
+    """
+
+    phi: FloatArray
+    mean: FloatArray
+    directions: FloatArray
+
+
+def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) -> BatchOutputs:
     """The slowest outputs of frames that all count the same, in their leading components.
 
     That is what `batch_sfa` finds of frames in memory within their `leading_directions`, up to how
@@ -39,10 +51,6 @@ def batch_outputs(
         frames: how many there are in all.
         components: K.
         outputs: J.
-
-    Returns:
-        phi (J, I), their weights of the centred frame, and the mean (I,); fewer outputs where the
-        frames vary in fewer directions.
     """
     sfa: RecursiveFeature | None = None
     for x, gap in pieces:
@@ -54,7 +62,8 @@ def batch_outputs(
     variance = variance[variance > NOTHING * variance.max(initial=0.0)]
     size, scale = len(variance), 1 / np.sqrt(variance)
     _, rotation = np.linalg.eigh(state.differences[:size, :size] * scale * scale[:, None])
-    return (rotation[:, :outputs].T * scale) @ state.basis[:size], state.mean
+    directions = state.basis[:size]
+    return BatchOutputs((rotation[:, :outputs].T * scale) @ directions, state.mean, directions)
 
 
 def following_slowness(

@@ -28,15 +28,16 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.documents import write_json
-from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
+from cdmisfa.features.following import batch_outputs
+from cdmisfa.features.sfa import slowness
 from cdmisfa.modules import Module
 from cdmisfa.studies.arena.pictures import FITTED, PARTS, Footage, Part
 from cdmisfa.studies.arena.streams import CHANGE, STREAMS, Showing, make_footage, parse
 from recorder.log.files import atomic_write
 from replay.storage.arrays import read_arrays
 
-RECIPE: Final = 3
-"""Rises when streams are made in another way, so that those on disk are made anew."""
+RECIPE: Final = 4
+"""Rises when streams or references are made in another way: those on disk are made anew."""
 
 BEGIN_APART: Final = 997
 """Frames between the beginnings of a stream shown twice."""
@@ -171,16 +172,13 @@ def refer(stream: Footage, components: int, expansion: str) -> dict[str, Any]:
         The arrays of a `Reference`: slowness of each of `PARTS`, phi (1, I), directions (K, I),
         mean (I,), scale.
     """
-    scale = PIXEL if stream.frames.dtype == UINT8 else 1.0
     shown = stream.part(FITTED)
-    x = expand(expansion, shown.reshape(len(shown), -1).astype(np.float64) * scale)
-    mean = x.mean(axis=0)
-    x = x - mean
-    directions = leading_directions(x, components)
-    phi = batch_sfa(x @ directions, 1) @ directions.T
+    x = expand(expansion, shown.reshape(len(shown), -1))
+    scale = PIXEL if shown.dtype == UINT8 else 1.0
+    phi, mean, directions = batch_outputs([(x, False)], len(x), components, outputs=1)
     slowest = linear(phi, mean, expansion, scale)
     slow = [slowness(slowest.transform(stream.part(part)))[0] for part in PARTS]
-    found = {"slowness": np.array(slow), "phi": phi, "directions": directions.T}
+    found = {"slowness": np.array(slow), "phi": phi, "directions": directions}
     return {**found, "mean": mean, "scale": scale}
 
 
