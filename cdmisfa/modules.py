@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate, pairwise
 from math import prod
 from typing import TYPE_CHECKING, Any
 
@@ -188,6 +189,13 @@ class Module(Shown):
         """
         kinds = (self.expansion,) if self.expansion else ("none", "quadratic")
         return next((k for k in kinds if expanded_size(k, size) == self.phi.shape[1]), None)
+
+
+def columns_of(modules: Sequence[Module]) -> Iterator[tuple[Module, slice]]:
+    """Each module with its columns among the outputs of all."""
+    ends = accumulate((len(module.phi) for module in modules), initial=0)
+    for module, (low, high) in zip(modules, pairwise(ends), strict=True):
+        yield module, slice(low, high)
 
 
 class Stack:

@@ -19,6 +19,7 @@ from conftest import Cdmisfa
 from mcap.reader import make_reader
 from message_files import write_table
 from run_data import module_of
+from view_data import View, scalars
 from waiting import started
 
 from cdmisfa import Recipe, Run
@@ -109,6 +110,35 @@ def test_an_mcap_has_a_topic_a_module_beside_the_frames(
         times = [m.log_time for _, c, m in make_reader(file).iter_messages() if "1/cam" in c.topic]
     assert times == [(1000 + 20 * i) * 10**6 for i in range(50)]
     assert cdmisfa("verify", out).code == 0
+
+
+@pytest.mark.parametrize("gap", [0, 3])
+def test_a_view_has_the_outputs_beside_the_pictures(
+    gap: int, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log, out = camera(tmp_path / "a.mcap", 90, gap=gap), tmp_path / "o.rrd"
+    assert cdmisfa("apply", run, log, "-o", out).code == 0
+    applied = list((application := Application(run)).to(application.open([str(log)])))
+    view, frames = View(out), np.concatenate([np.arange(len(a.y)) + a.block.t for a in applied])
+    y = np.concatenate([a.y for a in applied])
+    for i, own in enumerate((slice(0, 3), slice(3, 6)), 1):
+        rows = view.rows[f"/outputs/1_cam/{i}"]
+        found = scalars(rows)
+        there = ~np.isnan(found[:, 0])  # a row of NaN ends lines where a gap begins
+        np.testing.assert_array_equal(found[there], y[:, own])
+        assert np.count_nonzero(~there) == bool(gap)
+        assert (
+            np.array(view.rows[f"/outputs/1_cam/{i}"]["frame"])[there].tolist() == frames.tolist()
+        )
+    begins = [a.block.t for a in applied]
+    for name in ("slowness", "novelty"):
+        told = view.rows[f"/{name}/1_cam"]
+        values = {t: row[:2] for t, row in zip(told["frame"], scalars(told).tolist(), strict=True)}
+        columns = [0, 3] if name == "slowness" else [0, 1]
+        assert [values[t] for t in begins] == [getattr(a, name)[columns].tolist() for a in applied]
+    states = [s for [s] in view.rows["/known/1_cam/1"]["StateChange:state"]]
+    assert states.count("") == 1 + bool(gap)
+    assert view.rows["/views/1_cam"]["frame"] == [t for t in frames.tolist() if t % 10 == 0]
 
 
 def test_several_logs_are_a_file_each_and_a_bad_one_does_not_end_the_rest(

@@ -23,14 +23,14 @@ from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, freeze
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.options import option_name
 from cdmisfa.experiments.sources import configure, is_scene, open_logs
-from cdmisfa.modules import Module, Stack
+from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, open_live
 from recorder.images.options import ImageOptions
 from replay.camera_logs.opening import ALL
 from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import UnequalError
-from replay.export.applied import Applied, AppliedSink, columns_of
+from replay.export.applied import Applied, AppliedSink
 from replay.inputs import locations
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError

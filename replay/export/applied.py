@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.clock import times_of
-from cdmisfa.modules import Module
+from cdmisfa.modules import Module, columns_of
 from recorder.log.files import atomic_write, refuse_special, refuse_taken
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, VectorEncoder, varint, view_topic
@@ -71,13 +70,6 @@ class AppliedSink(Protocol):
 
     def close(self) -> None:
         """Let go; what was taken in is written."""
-
-
-def columns_of(modules: Sequence[Module]) -> Iterator[tuple[Module, slice]]:
-    """Each module with its columns among the outputs of all."""
-    ends = accumulate((len(module.phi) for module in modules), initial=0)
-    for module, (low, high) in zip(modules, pairwise(ends), strict=True):
-        yield module, slice(low, high)
 
 
 class TableSink:

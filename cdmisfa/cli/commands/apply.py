@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,8 +33,9 @@ if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.apply import Application, Totals
     from recorder.cameras.options import LiveOptions
+    from replay.export.applied import AppliedSink
 
-OF_FILES = ("parquet", "csv", "mcap")
+OF_FILES = ("parquet", "csv", "mcap", "rrd")
 STDOUT, FOXGLOVE = AS_THEY_COME = ("stdout", "foxglove")
 
 log_options = options_of(
@@ -47,7 +49,8 @@ log_options = options_of(
 @options.path_argument("run")
 @click.argument("source", nargs=-1, required=True)
 @uploads.out_option(
-    "The file of one log, .parquet, .csv or .mcap; of several the folder of theirs. Or s3://..."
+    "The file of one log, .parquet, .csv, .mcap or .rrd (a view); of several the folder of theirs. "
+    "Or s3://..."
 )
 @option(
     "--to",
@@ -163,7 +166,7 @@ def applied(
 ) -> Totals:
     """Apply modules to an open source, into its file and to where blocks go as they come."""
     from cdmisfa.experiments.apply import Totals, follow
-    from replay.export.applied import LinesSink, written
+    from replay.export.applied import LinesSink
 
     live = hasattr(source, "stop")
     if hasattr(source, "stop"):
@@ -174,7 +177,7 @@ def applied(
     totals, sinks = Totals(spec, modules), []
     with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
         if place is not None:
-            sinks.append(stack.enter_context(written(place, spec, modules, force=force)))
+            sinks.append(stack.enter_context(written_to(place, spec, modules, force=force)))
         if outlet.way == STDOUT:
             sinks.append(LinesSink(print_line, spec, modules))
         if outlet.way == FOXGLOVE:
@@ -191,6 +194,17 @@ def applied(
     else:
         say_changes(source)
     return totals
+
+
+def written_to(place: Path, *about: Any, force: bool) -> AbstractContextManager[AppliedSink]:
+    """What writes a file of outputs, by its name."""
+    if place.suffix.lower() == ".rrd":
+        from replay.view.applied import written_view  # takes half a second
+
+        return written_view(place, *about, force=force)
+    from replay.export.applied import written
+
+    return written(place, *about, force=force)
 
 
 @dataclass(frozen=True, slots=True)
