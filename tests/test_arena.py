@@ -19,6 +19,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.modules import Module
 from cdmisfa.studies.arena import arena
 from cdmisfa.studies.arena.arena import arena_results, plan_arena
+from cdmisfa.studies.arena.figure import comparisons
 from cdmisfa.studies.arena.library import ArenaSource, Library, linear
 from cdmisfa.studies.arena.streams import ArenaSet
 from cdmisfa.studies.arena.trial import (
@@ -312,12 +313,31 @@ def test_a_small_arena_from_trials_to_page(cdmisfa: Cdmisfa, tmp_path: Path, str
     assert "## What `progress` did not do" in text
     assert "\nNothing.\n" in text
     assert "| tiny | 2 | 1.00 | 1.00 | 0.0 | 0.0 |" in text
-    assert "| 2.0 | - | 2 | 2 | 0.50 |" in text
+    assert "Means over `oscillatory`, `tiny`:" in text
+    assert "| 2.0 | 2 | 0.50 |" in text
     assert (tmp_path / "arena" / "results.json").name in text
     assert (tmp_path / "arena" / "arena.png").stat().st_size > 0
     head, _, *rows = first.out.splitlines()
     assert head.split()[:3] == ["set", "learner", "seeds"]
     assert [tuple(row.split()[:3]) for row in rows] == [(*point, "2") for point in points]
+
+
+def test_learners_are_compared_on_the_sets_that_all_of_them_were_on() -> None:
+    def entries(learner: str, sets: str, **more: str) -> list[dict[str, Any]]:
+        return [{"point": {"set": name, "learner": learner, **more}} for name in sets]
+
+    run = [*entries("progress", "abcd"), *entries("2.0", "d"), *entries("robin", "bc")]
+    run += [*entries("learning-progress", "abc"), *entries("robin", "a", budget="60")]
+    found = [(one.condition, "".join(one.sets), list(one.learners)) for one in comparisons(run)]
+    assert found == [
+        ("", "d", ["progress", "2.0"]),
+        ("", "abc", ["progress", "learning-progress"]),
+        ("", "bc", ["progress", "learning-progress", "robin"]),
+        ("budget=60", "a", ["robin"]),
+    ]
+    for one in comparisons(run):
+        for of in one.learners.values():
+            assert [entry["point"]["set"] for entry in of] == list(one.sets)
 
 
 def test_of_a_trial_that_several_versions_computed_that_of_now_counts(tmp_path: Path) -> None:

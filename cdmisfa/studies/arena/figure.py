@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +21,7 @@ DEFAULT: Final = next(iter(CONTESTANTS))
 
 
 def draw_figure(document: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Draw all results, as PNG and SVG: four panels.
+    """Draw all results, as PNG and SVG: six panels.
 
     Returns:
         The files.
@@ -30,26 +31,20 @@ def draw_figure(document: Mapping[str, Any], folder: Path) -> list[Path]:
     from replay.export.figures import STYLE
 
     entries = document["entries"]
-    plain = [entry for entry in entries if not conditions(entry)] or entries
-    mine = [entry for entry in plain if entry["point"]["learner"] == DEFAULT]
+    mine = [e for e in entries if e["point"]["learner"] == DEFAULT and not conditions(e)]
+    compared = sorted(comparisons(entries), key=lambda one: -len(one.learners))
+    free = next((one for one in compared if not one.condition), None)
+    under = next((one for one in compared if one.condition), None)
     with matplotlib.rc_context(STYLE):
-        figure, axes = new_figure(2, 2, 4.4, 3.3)
-        curves, slowness, told, order = axes.ravel()
-        shared = _shared(plain)
-        _draw_curves(curves, shared)
+        figure, axes = new_figure(3, 2, 4.4, 3.3)
+        slowness, state, told, spent, curves, costly = axes.ravel()
         _draw_slowness(slowness, mine)
+        _draw_state(state, mine)
         _draw_blocks(told, _told(mine), "blocks until noise is told")
-        _draw_blocks(order, _spent(shared), "share of blocks on what cannot be learned")
+        _draw_blocks(spent, _spent(free), "share of blocks on what cannot be learned")
+        _draw_curves(curves, free)
+        _draw_curves(costly, under)
         return save_figure(figure, folder, "arena")
-
-
-def _shared(entries: Sequence[Entry]) -> list[Entry]:
-    """Results on the sets that every learner was on, or all where there is no such set."""
-    sets: dict[str, set[str]] = {}
-    for entry in entries:
-        sets.setdefault(entry["point"]["learner"], set()).add(entry["point"]["set"])
-    common = set.intersection(*sets.values())
-    return [entry for entry in entries if entry["point"]["set"] in common] or list(entries)
 
 
 def conditions(entry: Entry) -> str:
@@ -58,18 +53,63 @@ def conditions(entry: Entry) -> str:
     return ", ".join(f"{k}={v}" for k, v in more.items())
 
 
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Learners that were run on the same sets under the same condition.
+
+    Attributes:
+        condition: as `conditions` says it.
+        sets: their names.
+        learners: results of each, on these sets alone.
+    """
+
+    condition: str
+    sets: tuple[str, ...]
+    learners: Mapping[str, Sequence[Entry]]
+
+
+def comparisons(entries: Sequence[Entry]) -> list[Comparison]:
+    """What can be compared: for all sets that a learner was on, whoever was on all of these.
+
+    A learner alone is one only where something else was set.
+    """
+    found = []
+    for condition in dict.fromkeys(map(conditions, entries)):
+        by: dict[str, dict[str, Entry]] = {}
+        for entry in entries:
+            if conditions(entry) == condition:
+                by.setdefault(entry["point"]["learner"], {})[entry["point"]["set"]] = entry
+        order = sorted(by, key=lambda learner: (_place(learner), learner))
+        for sets in dict.fromkeys(tuple(by[learner]) for learner in order):
+            learners = {
+                learner: [by[learner][name] for name in sets]
+                for learner in order
+                if set(sets) <= set(by[learner])
+            }
+            if condition or len(learners) > 1:
+                found.append(Comparison(condition, sets, learners))
+    return found
+
+
+def _place(learner: str) -> int:
+    names = list(CONTESTANTS)
+    return names.index(learner) if learner in names else len(names)
+
+
 DASHES: Final = ("-", "--", ":", "-.")
 """Of lines, by how often their colour was there before."""
 
 
-def _draw_curves(panel: Any, entries: Sequence[Entry]) -> None:
-    """The share learned by frames seen, a line a learner: mean over the sets it was run on."""
-    last = max((e["curve"]["frames"][-1] for e in entries if e["curve"]["frames"]), default=1e4)
-    at = np.geomspace(1000, last, POINTS)
-    learners = dict.fromkeys(entry["point"]["learner"] for entry in entries)
-    for place, learner in enumerate(learners):
-        curves = [e["curve"] for e in entries if e["point"]["learner"] == learner]
-        found = [np.interp(at, c["frames"], c["mean"]) for c in curves if c["frames"]]
+def _draw_curves(panel: Any, one: Comparison | None) -> None:
+    """The share learned by frames seen, a line a learner: mean over sets."""
+    if one is None:
+        panel.set_axis_off()
+        return
+    ends = [e["curve"]["frames"][-1] for of in one.learners.values() for e in of if _curved(e)]
+    at = np.geomspace(1000, max(ends, default=1e4), POINTS)
+    for place, (learner, entries) in enumerate(one.learners.items()):
+        curves = [entry["curve"] for entry in entries if _curved(entry)]
+        found = [np.interp(at, curve["frames"], curve["mean"]) for curve in curves]
         if found:
             again, which = divmod(place, len(CYCLE))
             rgb = tuple(part / 255 for part in CYCLE[which])
@@ -77,10 +117,15 @@ def _draw_curves(panel: Any, entries: Sequence[Entry]) -> None:
             panel.plot(at, np.mean(found, axis=0), dash, color=rgb, label=learner)
     panel.set_xscale("log")
     panel.set_ylim(-0.03, 1.03)
-    panel.set_xlabel("frames seen")
-    panel.set_ylabel(f"share learned, {len({e['point']['set'] for e in entries})} sets")
+    panel.set_xlabel(", ".join(filter(None, ("frames seen", one.condition))))
+    many = len(one.sets) > 1
+    panel.set_ylabel("share learned, " + (f"{len(one.sets)} sets" if many else one.sets[0]))
     if panel.get_lines():
         panel.legend(fontsize=6)
+
+
+def _curved(entry: Entry) -> bool:
+    return bool(entry["curve"]["frames"])
 
 
 def _draw_slowness(panel: Any, entries: Sequence[Entry]) -> None:
@@ -98,6 +143,16 @@ def _draw_slowness(panel: Any, entries: Sequence[Entry]) -> None:
     panel.legend(fontsize=6)
 
 
+def _draw_state(panel: Any, entries: Sequence[Entry]) -> None:
+    """What modules tell of the world's state, over what principal components do, by stream."""
+    probes = [probe for entry in entries for probe in entry["probes"].values()]
+    told = [[probe[key]["mean"] for probe in probes] for key in ("components", "modules")]
+    panel.plot(*told, ".", color="0.3", markersize=5)
+    panel.plot([0, 1], [0, 1], color="black", linewidth=0.7, linestyle=":")
+    panel.set_xlabel("R² of the state by principal components")
+    panel.set_ylabel("by as many outputs of modules")
+
+
 def _told(entries: Sequence[Entry]) -> dict[str, list[float]]:
     """Blocks until each kind of noise was said to be it, of all trials."""
     found: dict[str, list[float]] = {}
@@ -107,12 +162,13 @@ def _told(entries: Sequence[Entry]) -> dict[str, list[float]]:
     return found
 
 
-def _spent(entries: Sequence[Entry]) -> dict[str, list[float]]:
+def _spent(one: Comparison | None) -> dict[str, list[float]]:
     """The share of blocks in vain, of each learner on every set."""
-    found: dict[str, list[float]] = {}
-    for entry in entries:
-        if (mean := entry["measures"]["in_vain"]["mean"]) is not None:
-            found.setdefault(entry["point"]["learner"], []).append(mean)
+    found = {}
+    for learner, entries in one.learners.items() if one else ():
+        means = [entry["measures"]["in_vain"]["mean"] for entry in entries]
+        if known := [mean for mean in means if mean is not None]:
+            found[learner] = known
     return found
 
 

@@ -10,8 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa.experiments.documents import markdown
-from cdmisfa.studies.arena.arena import CONTESTANTS
-from cdmisfa.studies.arena.figure import DEFAULT, Entry, conditions
+from cdmisfa.studies.arena.figure import DEFAULT, Comparison, Entry, comparisons, conditions
 from cdmisfa.studies.arena.pictures import FOLLOW
 from cdmisfa.studies.arena.streams import REPORTED, SETS
 from cdmisfa.studies.arena.trial import KNOWS, SLOW_ENOUGH, SLOW_ENOUGH_LOOPED, THE_SAME
@@ -31,30 +30,45 @@ COLUMNS: Final[Mapping[str, tuple[str, int]]] = {
 }
 """Of the measures that a table shows, in their order: the head and digits."""
 
-HEAD: Final = ("seeds", *(head for head, _ in COLUMNS.values()), "R²")
+R2: Final = "R²"
+
+OF_ALL: Final = ("seeds", *(head for head, _ in COLUMNS.values()), R2)
+"""What a terminal shows of every entry; the page has two choices of it, and all of it as data."""
+
+OF_SETS: Final = (
+    "seeds", "learned", "fitted", "noise learned", "twice", "noise told", "blocks", R2
+)  # fmt: skip
+OF_LEARNERS: Final = (
+    "seeds", "learned", "noise learned", "in vain", "ends", "blocks", "all learned", "frames"
+)  # fmt: skip
 
 HEAD_CHANGED: Final = ("set", "after the change shows", "learned", "blocks of watching it")
 
 
 def arena_table(document: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Head and rows of all results, for a terminal."""
-    rows = [[_set(e), e["point"]["learner"], *_cells(e)] for e in document["entries"]]
-    return ["set", "learner", *HEAD], rows
+    rows = []
+    for entry in document["entries"]:
+        cells = _cells(entry)
+        rows.append([_set(entry), entry["point"]["learner"], *(cells[head] for head in OF_ALL)])
+    return ["set", "learner", *OF_ALL], rows
 
 
 def _set(entry: Entry) -> str:
     return ", ".join(filter(None, (entry["point"]["set"], conditions(entry))))
 
 
-def _cells(entry: Entry) -> list[str]:
+def _cells(entry: Entry) -> dict[str, str]:
+    """What a result came to, by the heads of columns."""
     m = entry["measures"]
     failed = f" ({len(entry['failed'])} failed)" if entry["failed"] else ""
     tells = f"{_number(m['probe'], 2)} ({_number(m['probe_components'], 2)})"
-    return [
-        f"{len(entry['seeds'])}{failed}",
-        *(_interval(m[name], digits, _HIGHEST.get(name)) for name, (_, digits) in COLUMNS.items()),
-        tells if m["probe"]["n"] else "-",
-    ]
+    found = {
+        head: _interval(m[name], digits, _HIGHEST.get(name))
+        for name, (head, digits) in COLUMNS.items()
+    }
+    seeds = f"{len(entry['seeds'])}{failed}"
+    return {"seeds": seeds, **found, R2: tells if m["probe"]["n"] else "-"}
 
 
 _HIGHEST: Final = {"learned": 1.0, "fitted": 1.0, "in_vain": 1.0}
@@ -90,17 +104,17 @@ def write_arena_page(document: Mapping[str, Any], figure: Path, path: Path) -> N
     mine = [entry for entry in mine if not conditions(entry)]
     mine.sort(key=lambda entry: not entry["point"]["set"].startswith(REPORTED))
     page.add(f"## The learner `{DEFAULT}`", "")
-    rows = [[entry["point"]["set"], *_cells(entry)] for entry in mine]
-    for name, group in _groups(mine).items():
-        rows.append([f"**{name}**", *_means(group)])
-    page.add(markdown(["set", *HEAD], rows), "")
+    cells = {entry["point"]["set"]: _cells(entry) for entry in mine}
+    cells |= {f"**{name}**": _means(group) for name, group in _groups(mine).items()}
+    rows = [[name, *(of[head] for head in OF_SETS)] for name, of in cells.items()]
+    page.add(markdown(["set", *OF_SETS], rows), "")
     if changes := [row for entry in mine for row in _changes(entry)]:
         page.add(markdown(HEAD_CHANGED, changes), "")
-    page.picture(figure, "Learning by frames, slowness, noise told, and blocks spent in vain")
-    if others := _others(document["entries"]):
+    page.picture(figure, "Learning by frames, slowness, noise told, state told, blocks in vain")
+    if compared := comparisons(document["entries"]):
         page.add("## Other learners, and other rules of attention", "")
-        page.add("Means over the sets that all of those were run on that are under one condition.")
-        page.add("", markdown(["learner", "condition", "sets", *HEAD], others), "")
+    for one in compared:
+        page.add(*_compared(one), "")
     page.add(f"## What `{DEFAULT}` did not do", "")
     page.add("With how many of the seeds a stream was not learned, and modules over all seeds.", "")
     failures = [line for entry in mine for line in _failures(entry)]
@@ -134,13 +148,14 @@ def _groups(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
     return {name: group for name, group in found.items() if len(group) > 1}
 
 
-def _means(entries: Sequence[Entry]) -> list[str]:
+def _means(entries: Sequence[Entry]) -> dict[str, str]:
     """Cells of several sets together: means over sets of the means over seeds."""
     seeds = sorted({len(entry["seeds"]) for entry in entries})
-    cells = [str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"]
-    for name, (_, digits) in COLUMNS.items():
-        cells.append(_mean(entries, name, digits))
-    return [*cells, f"{_mean(entries, 'probe', 2)} ({_mean(entries, 'probe_components', 2)})"]
+    found = {"seeds": str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"}
+    for name, (head, digits) in COLUMNS.items():
+        found[head] = _mean(entries, name, digits)
+    tells = f"{_mean(entries, 'probe', 2)} ({_mean(entries, 'probe_components', 2)})"
+    return {**found, R2: tells}
 
 
 def _mean(entries: Sequence[Entry], name: str, digits: int) -> str:
@@ -149,26 +164,16 @@ def _mean(entries: Sequence[Entry], name: str, digits: int) -> str:
     return f"{sum(known) / len(known):.{digits}f}" if known else "-"
 
 
-def _others(entries: Sequence[Entry]) -> list[list[str]]:
-    """Rows of all learners under each condition, where there is more than the first's plain one."""
+def _compared(one: Comparison) -> list[str]:
+    """Lines on learners that were run on the same sets."""
+    sets = ", ".join(f"`{name}`" for name in one.sets)
+    about = f"{'Means over' if len(one.sets) > 1 else 'On'} {sets}"
     rows = []
-    for condition in dict.fromkeys(conditions(entry) for entry in entries):
-        alike = [entry for entry in entries if conditions(entry) == condition]
-        by: dict[str, dict[str, Entry]] = {}
-        for entry in alike:
-            by.setdefault(entry["point"]["learner"], {})[entry["point"]["set"]] = entry
-        if not condition and len(by) == 1:
-            continue
-        shared = set.intersection(*(set(of) for of in by.values()))
-        for learner in sorted(by, key=_place):
-            chosen = [of for name, of in by[learner].items() if name in shared or not shared]
-            rows.append([learner, condition or "-", str(len(chosen)), *_means(chosen)])
-    return rows
-
-
-def _place(learner: str) -> int:
-    names = list(CONTESTANTS)
-    return names.index(learner) if learner in names else len(names)
+    for learner, entries in one.learners.items():
+        cells = _cells(entries[0]) if len(entries) == 1 else _means(entries)
+        rows.append([learner, *(cells[head] for head in OF_LEARNERS)])
+    condition = f", with {one.condition}" if one.condition else ""
+    return [f"{about}{condition}:", "", markdown(["learner", *OF_LEARNERS], rows)]
 
 
 def _shortened(words: Sequence[str]) -> list[str]:
