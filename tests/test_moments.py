@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from replay.runs.compare import first_difference
 from replay.runs.keyframes import encode_keyframe, read_keyframe
 from replay.runs.log import read_header
 from replay.runs.modules import load_modules
+from replay.runs.run import read_outline
 
 EASY = ("learner.tau=40", "learner.eta_dot_window=8", "learner.warm_up=3", "learner.delta=1.0")
 EASIER = (*EASY, "learner.min_variance=1e-6", "learner.novel_share=0.0")
@@ -362,6 +364,10 @@ def test_an_option_that_is_short_for_a_key_is_kept(tmp_path: Path, cdmisfa: Cdmi
     assert Session.check(run).difference is None
 
 
+SAME, OTHER = "the same was learned, at other iterations", "what was learned differs"
+SIGNALS_OF = "signals of iteration 20 that differ:"
+
+
 def test_compare_says_what_differs_and_shows_both(
     place: Path, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
@@ -372,19 +378,25 @@ def test_compare_says_what_differs_and_shows_both(
     assert found.code == 4
     told = "fork was told otherwise: learner.epsilon_decay 0.999 against 0.5; seed 3 against 8"
     assert told in found.out
-    assert "signals of iteration 20:" in found.out
-    row = next(line for line in found.out.splitlines() if line.startswith("epsilon "))
-    assert row.endswith("differs")
+    lines = found.out.splitlines()
+    shown = [line.split()[0] for line in lines[lines.index(SIGNALS_OF) + 3 :]]
+    assert "epsilon" in shown
+    assert "t" not in shown
     document = cdmisfa("compare", parent, fork, "--json").json
     assert (document["identical"], document["first_difference"]["iteration"]) == (False, 20)
     first, second = document["signals"]["epsilon"]
     assert (first > second, document["signals"]["t"]) == (True, [800, 800])
     keys = [told["key"] for told in document["runs"][1]["told_otherwise"]]
     assert keys == ["learner.epsilon_decay", "seed"]
+    assert document["runs"][1]["verdict"] in (SAME, OTHER)
+    both = [read_outline(run) for run in (parent, fork)]
+    learned = [[(s.module, s.stream) for s in outline.saved] for outline in both]
+    assert lines[0] == (SAME if learned[0] == learned[1] else OTHER)
     other = cdmisfa("compare", parent, place / "progress-live").out
+    assert other.splitlines()[0] == OTHER
     assert "learner.algorithm 2.0 against progress; " in other
     assert "; only one of them says learner.agreement, learner.alpha" in other
-    assert other.splitlines()[1].endswith(" more")
+    assert re.search(r"; only one of them says .* more$", other, re.MULTILINE)
     assert "None against" not in other
     same = cdmisfa("compare", parent, place / "2.0-live-resumed", "--json").json
     assert (same["signals"], same["identical"]) == ({}, True)

@@ -43,7 +43,7 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
     build_overlay(runs, side_by_side(runs), out)
     view = View(out)
     assert len(view.blueprints) == 1
-    for name, signals in zip(("1_run", "2_run", "3_c"), records, strict=True):
+    for name, signals in zip((r"1_a\/run", r"2_b\/run", "3_c"), records, strict=True):
         expected = [s.epsilon for s in signals]
         found = view.rows[f"/compare/{name}/epsilon"]
         assert found["iteration"] == list(range(12))
@@ -62,7 +62,7 @@ def test_what_falls_through_powers_of_ten_is_drawn_so(name, three, tmp_path):
     build_overlay(runs, side_by_side(runs), tmp_path / "all.rrd")
     view = View(tmp_path / "all.rrd")
     assert not [entity for entity in view.names if entity.endswith(f"/{name}")]
-    found = scalars(view.rows[f"/compare/1_run/log_{name}"])[:, 0]
+    found = scalars(view.rows[rf"/compare/1_a\/run/log_{name}"])[:, 0]
     np.testing.assert_allclose(
         np.power(10, found), [np.ravel(getattr(r, name))[0] for r in records]
     )
@@ -79,7 +79,7 @@ def test_where_a_fork_begins_is_marked_on_each_curve(batch, three, tmp_path, mon
     for s, name in enumerate(VECTOR.streams):
         own = [(r.iteration, r.learning_error) for r in records if r.stream == s]
         first, value = next(point for point in own if point[0] >= 5)
-        mark = view.rows[f"/compare/1_run/forked/learning_error_of/{s + 1}_{name}"]
+        mark = view.rows[rf"/compare/1_a\/run/forked/learning_error_of/{s + 1}_{name}"]
         assert (mark["iteration"], scalars(mark).tolist()) == ([first], [[value]])
 
 
@@ -127,7 +127,7 @@ def test_the_command_exits_with_4_only_for_two_that_differ(three, tmp_path, cdmi
     assert cdmisfa("compare", a, c).code == 4
     done = cdmisfa("compare", a, b, c, "--save", tmp_path / "v.rrd")
     assert done.code == 0
-    assert done.out.count("identical, bit for bit") == 2
+    assert done.out.count("identical, bit for bit") == 1
     assert "iteration 0" in done.out
     assert (tmp_path / "v.rrd").is_file()
     assert cdmisfa("compare", a).code == 2

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.config import differences
 from cdmisfa.core.learning import ARITHMETIC
-from cdmisfa.core.signals import SIGNALS
+from cdmisfa.core.signals import SIGNALS, STATES
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import read_columns, read_header
@@ -192,17 +192,16 @@ def signals_of(run: Path, iteration: int) -> Mapping[str, NDArray[Any]]:
     return {}
 
 
-def both_signals(
+def differing_signals(
     first: Mapping[str, NDArray[Any]], second: Mapping[str, NDArray[Any]]
-) -> tuple[tuple[str, str, str, str], ...]:
-    """An iteration's signals of two runs as words: name, both values, and whether they differ."""
+) -> tuple[tuple[str, str, str], ...]:
+    """The signals of an iteration that two runs differ in, as words: name and both values."""
     rows = []
-    for name in first.keys() & second.keys():
+    for name in (name for name in SIGNALS if name in first and name in second):
         x, y = (np.asarray(signals[name])[None] for signals in (first, second))
-        differ = "" if x.shape == y.shape and not differing(x, y).any() else "differs"
-        rows.append((name, _words(x[0]), _words(y[0]), differ))
-    order = list(SIGNALS)
-    return tuple(sorted(rows, key=lambda row: order.index(row[0])))
+        if x.shape != y.shape or differing(x, y).any():
+            rows.append((name, _words(x[0]), _words(y[0])))
+    return tuple(rows)
 
 
 def _words(value: NDArray[Any]) -> str:
@@ -211,12 +210,56 @@ def _words(value: NDArray[Any]) -> str:
     return " ".join(map(str, value.ravel().tolist())) or "-"
 
 
+ITERATIONS = "iterations"
+"""How many there were in all, beside what became of each stream."""
+
+
+def outcome(outline: Outline, *, timed: bool = False) -> dict[str, str]:
+    """What became of each stream of a run, in words, by its name.
+
+    Args:
+        outline: the run in short.
+        timed: with the iterations of modules, and how many there were in all.
+    """
+    found = {}
+    for s, name in enumerate(outline.names()):
+        modules = [
+            f"module {save.module}" + (f" at {save.iteration}" if timed else "")
+            for save in outline.saved
+            if save.stream == s
+        ]
+        state = outline.states[s]
+        without = "no module" if state < 0 else STATES[state].replace("_", " ")
+        found[name] = ", ".join(modules) or without
+    return {**found, ITERATIONS: str(outline.iterations)} if timed else found
+
+
+def differing_outcomes(first: Outline, second: Outline) -> tuple[tuple[str, str, str], ...]:
+    """Streams of which two runs came to something else, or at another time, and both in words."""
+    a, b = (outcome(outline, timed=True) for outline in (first, second))
+    return tuple(
+        (name, a.get(name, "-"), b.get(name, "-"))
+        for name in sorted({**a, **b}, key=ITERATIONS.__eq__)  # which come last
+        if a.get(name) != b.get(name)
+    )
+
+
+def verdict(first: Outline, second: Outline) -> str:
+    """Whether two runs came to the same, in a sentence."""
+    if outcome(first) != outcome(second):
+        return "what was learned differs"
+    if differing_outcomes(first, second):
+        return "the same was learned, at other iterations"
+    return "the same was learned, at the same iterations"
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """A run in a table of runs, and where its signals first differ from the first run's.
 
     Attributes:
         difference: from the first run, None where there is none.
+        verdict: whether it came to the same as the first one, see `verdict`; "" of that.
         otherwise: what explains it, see `computed_otherwise`.
         told: what it was told otherwise, see `told_otherwise`.
     """
@@ -224,6 +267,7 @@ class Row:
     name: str
     outline: Outline
     difference: Difference | None
+    verdict: str = ""
     otherwise: tuple[str, ...] = ()
     told: tuple[tuple[str, Any, Any], ...] = ()
 
@@ -235,6 +279,8 @@ class Row:
             "seed": self.outline.header.manifest.get("seed"),
             "iterations": self.outline.iterations,
             "modules": [streams[saved.stream] for saved in self.outline.saved],
+            "outcome": outcome(self.outline),
+            "verdict": self.verdict,
             "first_difference": None if self.difference is None else self.difference.as_json(),
             "told_otherwise": [{"key": k, "first": a, "second": b} for k, a, b in self.told],
             "computed_otherwise": list(self.otherwise),
@@ -243,9 +289,9 @@ class Row:
     def cells(self) -> tuple[str, ...]:
         """The row as words, in the order of `HEAD`."""
         found = self.as_json()
-        same = "identical, bit for bit" if self.difference is None else str(self.difference)
+        found_in = f"{self.verdict}; {self.difference}" if self.difference else self.verdict
         learned = ", ".join(found["modules"]) or "none"
-        return self.name, str(found["seed"]), str(found["iterations"]), learned, same
+        return self.name, str(found["seed"]), str(found["iterations"]), learned, found_in or "-"
 
     def explanation(self) -> str:
         """Explanation of its difference in words; "" where nothing known explains it."""
@@ -269,18 +315,35 @@ def _short(value: Any) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
+IDENTICAL = "identical, bit for bit"
+
 HEAD = ("run", "seed", "iterations", "modules", "against the first run")
 
 
 def side_by_side(runs: Sequence[Path]) -> tuple[Row, ...]:
     """Outline of each run, and its `first_difference` from the first one."""
     rows: list[Row] = []
-    for run in runs:
-        name, outline = run_log(run).resolve().parent.name, read_outline(run)
-        found = first_difference(runs[0], run) if rows else None
-        if found is None:
+    for run, name in zip(runs, told_apart(runs), strict=True):
+        outline = read_outline(run)
+        if not rows:
             rows.append(Row(name, outline, None))
-            continue
-        because, told = computed_otherwise(runs[0], run), told_otherwise(runs[0], run)
-        rows.append(Row(name, outline, found, because, told))
+        elif (found := first_difference(runs[0], run)) is None:
+            rows.append(Row(name, outline, None, IDENTICAL))
+        else:
+            same, told = verdict(rows[0].outline, outline), told_otherwise(runs[0], run)
+            because = computed_otherwise(runs[0], run)
+            rows.append(Row(name, outline, found, same, because, told))
     return tuple(rows)
+
+
+def told_apart(runs: Sequence[Path]) -> list[str]:
+    """Names of runs: those of their folders, with the folders around where others have the same."""
+    folders = [run_log(run).resolve().parent.parts for run in runs]
+    names = []
+    for folder in folders:
+        others = [other for other in folders if other != folder]
+        few = 1
+        while any(other[-few:] == folder[-few:] for other in others):
+            few += 1
+        names.append("/".join(folder[-few:]))
+    return names

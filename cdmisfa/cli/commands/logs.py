@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
 
 if TYPE_CHECKING:
     from replay.camera_logs.options import CameraOptions
+    from replay.runs.compare import Row
 
 
 @click.command("verify")
@@ -118,14 +120,14 @@ def compare_command(
 ) -> None:
     """Check that runs' signals are the same bits, and show their curves.
 
-    Of two runs it says where they first differ, with all signals there and what the runs were
-    told or computed otherwise, and exits with 4 if they do. Of more it
+    Of two runs it says whether they came to the same, where they first differ, in which signals
+    there, and what they were told or computed otherwise, and exits with 4 if they do. Of more it
     prints a table, each run compared with the first, and exits with 0. A run may be the URL of
     its run.mcap, of which a copy is made.
     """
     if len(runs) < 2:
         raise click.UsageError("name two runs, or more")
-    from replay.runs.compare import HEAD, both_signals, side_by_side, signals_of
+    from replay.runs.compare import differing_signals, side_by_side, signals_of
 
     rows = side_by_side(runs)
     if save is not None:
@@ -143,20 +145,40 @@ def compare_command(
             runs=[row.as_json() for row in rows],
             view=save,
         )
-    elif len(runs) == 2:
-        print_line(str(different[0]) if different else "identical, bit for bit")
     else:
-        print_table(HEAD, [row.cells() for row in rows])
-    for explanation in filter(None, (row.explanation() for row in rows)):
-        if not as_json:
-            print_text(explanation)
-    if first and second and not as_json:
-        print_line(f"signals of iteration {at}:")
-        print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
+        _print_comparison(rows, at, differing_signals(first, second))
     if save is not None and not as_json:
         tell(f"view {save}    look at it: cdmisfa view {quoted(save)}")
     if different and len(runs) == 2:
         ctx.exit(NotReproducedError.exit_code)
+
+
+def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[str]]) -> None:
+    """Print what runs came to, and where they differ.
+
+    Args:
+        rows: of the runs.
+        at: the iteration at which two of them first differ.
+        signals: those that differ there.
+    """
+    from replay.runs.compare import HEAD, differing_outcomes
+
+    one, *others = rows
+    if len(others) > 1:
+        print_table(HEAD, [row.cells() for row in rows])
+    else:
+        (other,) = others
+        both = one.name, other.name
+        print_line(other.verdict)
+        if outcomes := differing_outcomes(one.outline, other.outline):
+            print_table(("", *both), outcomes)
+        if other.difference is not None:
+            print_line(f"first difference: {other.difference}")
+    for explanation in filter(None, (row.explanation() for row in rows)):
+        print_text(explanation)
+    if signals:
+        print_line(f"signals of iteration {at} that differ:")
+        print_table(("signal", *both), signals)
 
 
 @click.command("plot")
