@@ -19,8 +19,9 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.modules import Module
 from cdmisfa.studies.arena import arena
 from cdmisfa.studies.arena.arena import arena_results, plan_arena
-from cdmisfa.studies.arena.figure import comparisons
+from cdmisfa.studies.arena.figure import comparisons, draw_figure
 from cdmisfa.studies.arena.library import ArenaSource, Library, linear
+from cdmisfa.studies.arena.page import write_arena_page
 from cdmisfa.studies.arena.streams import ArenaSet
 from cdmisfa.studies.arena.trial import (
     Course,
@@ -340,16 +341,20 @@ def test_learners_are_compared_on_the_sets_that_all_of_them_were_on() -> None:
             assert [entry["point"]["set"] for entry in of] == list(one.sets)
 
 
+def came_to(**more: Any) -> dict[str, Any]:
+    """A result: of a run that did not learn sway."""
+    result = {"frames": 400, "blocks": 10, "ended": "", "modules": [], "wrong": 0, "doubles": 0}
+    result |= {"targets": [{**UNLEARNED, "stream": "sway", "signal": "sway"}]}
+    return result | {"probes": [], "in_vain": 0.0, "told": {}, **more}
+
+
 def test_of_a_trial_that_several_versions_computed_that_of_now_counts(tmp_path: Path) -> None:
-    target = {**UNLEARNED, "stream": "sway", "signal": "sway"}
     point = {"set": "tiny", "learner": "2.0", "learner.nu": "0.02"}
     (now,) = plan_arena(["tiny"], ["2.0"], [0], ["learner.nu=0.02"], tmp_path)
 
     def row(code: str, wrong: int) -> str:
-        result = {"frames": 400, "blocks": 10, "ended": "", "modules": [], "targets": [target]}
-        result |= {"wrong": wrong, "doubles": 0, "probes": [], "in_vain": 0.0, "told": {}}
         found = {"id": code, "status": "done", "point": point, "seed": 0, "code": code}
-        return json.dumps(found | {"result": result}) + "\n"
+        return json.dumps(found | {"result": came_to(wrong=wrong)}) + "\n"
 
     for rows, wrong, outdated in (
         ([row("old", 1), row("newer", 2)], 2, 1),
@@ -361,15 +366,32 @@ def test_of_a_trial_that_several_versions_computed_that_of_now_counts(tmp_path: 
         assert document["outdated"] == outdated
 
 
+def test_a_page_says_what_was_not_learned_and_of_what_there_is_a_module(tmp_path: Path) -> None:
+    parts = ("following", "following_of_batch", "fitted", "fitted_of_batch")
+    module = {"signal": "sway", "learnable": True, **dict.fromkeys(parts, 1.0)}
+    noise = {"signal": "hiss", "learnable": False}
+    rows = []
+    for seed, modules in enumerate(([], [module, noise])):
+        result = came_to(modules=modules, wrong=seed, doubles=seed)
+        point = {"set": "tiny", "learner": "progress"}
+        row = {"id": str(seed), "status": "done", "point": point, "seed": seed, "code": "old"}
+        rows.append(json.dumps(row | {"result": result}) + "\n")
+    (tmp_path / "rows.jsonl").write_text("".join(rows))
+    document, page = arena_results(tmp_path), tmp_path / "page.md"
+    write_arena_page(document, draw_figure(document, tmp_path)[0], page)
+    text = page.read_text("utf-8")
+    assert "not learned `sway` 2/2 (1 with a module that is too fast); 1 module of `hiss`; " in text
+    assert "1 too many of what it had; 2 of 2 runs did not end." in text
+    assert "2 trials are of an earlier version of the code." in text
+
+
 def test_a_trial_that_breaks_is_a_failure_and_the_others_go_on(
     cdmisfa: Cdmisfa, tmp_path: Path, streams: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(trial: Any) -> dict[str, Any]:
         if trial.seed == 1:
             raise UsageError("it broke")
-        target = {**UNLEARNED, "stream": "sway", "signal": "sway"}
-        row = {"frames": 400, "blocks": 10, "ended": "", "modules": [], "targets": [target]}
-        return row | {"wrong": 0, "doubles": 0, "probes": [], "in_vain": 0.0, "told": {}}
+        return came_to()
 
     monkeypatch.setattr(arena, "run_arena_trial", broken)
     words = ("arena", "tiny", "--learners", "2.0", "--seeds", "0:2", "--streams", streams)

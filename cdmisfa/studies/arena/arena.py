@@ -8,6 +8,7 @@ progress learner with every other rule for choosing the stream to watch.
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -229,7 +230,9 @@ def arena_results(folder: Path) -> dict[str, Any]:
     document: dict[str, Any] = plain(
         {"schema": 1, "entries": entries, "outdated": outdated, "versions": used}
     )
-    write_json(folder / "results.json", document)
+    write_json(
+        folder / "results.json", json.dumps(document) + "\n"
+    )  # half as large as with line ends
     return document
 
 
@@ -307,11 +310,17 @@ def _probe(row: Row, key: str) -> float | None:
 
 
 def _targets(found: Sequence[Row]) -> list[dict[str, Any]]:
-    """Of everything that can be learned, with how many seeds it was, and how soon."""
+    """Of everything that can be learned, with how many seeds it was, and how soon.
+
+    Where it was not there may be modules of it: "too_fast" is with how many seeds.
+    """
     tables = []
     for same in zip(*(row["targets"] for row in found), strict=True):
+        signal = same[0]["signal"]
         learned = [t for t in same if t["frame"] is not None]
-        table = {"stream": same[0]["stream"], "signal": same[0]["signal"]}
+        saved = [signal in [m["signal"] for m in row["modules"]] for row in found]
+        fast = sum(had and t["frame"] is None for had, t in zip(saved, same, strict=True))
+        table = {"stream": same[0]["stream"], "signal": signal, "too_fast": fast}
         table |= {"learned": len(learned), "trials": len(same)}
         tables.append(table | {k: _measure([t[k] for t in learned]) for k in ("block", "watched")})
     return tables

@@ -202,6 +202,7 @@ def _failures(entry: Entry) -> list[str]:
         f"`{t['stream']}`"
         + (f" as `{t['signal']}`" if ">" in t["stream"] else "")
         + f" {t['trials'] - t['learned']}/{t['trials']}"
+        + (f" ({t['too_fast']} with a module that is too fast)" if t["too_fast"] else "")
         for t in entry["targets"]
         if t["learned"] < t["trials"]
     ]
