@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from cdmisfa.core.blocks import Block, FrameSource
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
 
@@ -165,3 +166,42 @@ class Keyframes(Sink):
         # Cameras have moved on, where they ended or were stopped within the next block.
         t = self._source.t if self._t is None else self._t
         return Keyframe(learner.iteration, t, learner.state, self._versions, taken)
+
+
+class BestEffort(Sink):
+    """A sink that learning does not depend on: where it fails, it is let go with a warning.
+
+    Args:
+        sink: told of everything until it raises; then not even that the run is over.
+        others: all sinks of the run, which are told of it.
+    """
+
+    def __init__(self, sink: Sink, others: Sequence[Sink]) -> None:
+        self._sink: Sink | None = sink
+        self._others = others
+        self._at = 0, 0
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        self._at = block.t, signals.iteration
+        self._tell("block", block, signals, learner)
+
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """See `Sink`."""
+        self._tell("event", t, iteration, text, level)
+
+    def finish(self) -> None:
+        """See `Sink`."""
+        self._tell("finish")
+
+    def _tell(self, method: str, *what: Any) -> None:
+        if (sink := self._sink) is None:
+            return
+        try:
+            getattr(sink, method)(*what)
+        except Exception as error:  # whatever the caller's code raises
+            self._sink = None
+            said = f"the sink {type(sink).__name__} failed and is told no more: {one_line(error)}"
+            warnings.warn(said, RuntimeWarning, stacklevel=2)
+            for other in self._others:
+                other.event(*self._at, said, "WARNING")

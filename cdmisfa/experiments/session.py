@@ -18,7 +18,7 @@ from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.experiments.holdout import judged
-from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn_blocks
+from cdmisfa.experiments.loop import INTERRUPTED, BestEffort, Digest, Keyframes, learn_blocks
 from cdmisfa.experiments.names import placed
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
@@ -257,7 +257,8 @@ class Session:
         """Learn until nothing is left to learn, and log every signal.
 
         Args:
-            sinks: told of everything, after the log.
+            sinks: told of everything, after the log; one that fails is let go, and a warning and
+                an event say so.
             stop: asked before every iteration; true ends the run cleanly, without a view, and a
                 long source is known by a sample.
             keyframes: iterations between keyframes, see `Keyframes`.
@@ -302,7 +303,7 @@ class Session:
                 self._copy_log(log, digest)
                 if live:
                     view.earlier(log.path.parent)
-            told += sinks
+            told += [BestEffort(sink, told) for sink in sinks]
             ended = learn_blocks(self.source, self.learner, told, stop=stop, **self._limits)
             ended, held_out = self._judged(ended, stop)
             stopped = ended == INTERRUPTED  # then nothing is done that takes as long as the log

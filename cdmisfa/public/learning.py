@@ -75,7 +75,7 @@ def learn(
         loop: begin logs or arrays again at their end.
         force: replace an existing run.
         view: also write the view, run.rrd.
-        sinks: told of every iteration.
+        sinks: told of every iteration; one that raises is let go with a warning.
         stop: asked before every iteration; true ends the run.
         settings: keys of the learner: `tau=20`, `outputs=4`; see docs/configuration.md.
 
