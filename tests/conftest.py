@@ -54,7 +54,7 @@ Cdmisfa = Callable[..., Outcome]
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what would leave other processes idle at the end: a browser is slow to draw."""
-    items.sort(key=lambda item: item.path.name != "test_web.py")
+    items.sort(key=lambda item: item.path.name not in ("test_web.py", "test_notebook.py"))
 
 
 @pytest.fixture(scope="session", autouse=True)

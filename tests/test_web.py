@@ -5,10 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import http.server
-import io
-import json
 import re
-import shutil
 import signal
 import sys
 import tempfile
@@ -17,55 +14,18 @@ import time
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import numpy as np
 import pytest
-from PIL import Image
+from browser import chromium, drawn, errors
 from run_data import VECTOR, write_run
 from waiting import started
 
 from replay.viewer import web
 from replay.viewer.web import POLICY, page_of, pieces_of, served
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-DRIVER = shutil.which("chromedriver")
-SECONDS = 240
-"""Longest wait for a page that is drawn without a graphics card on a busy machine."""
-
-LANES = {"stream watched": (124, 195, 238), "novel": (193, 181, 216)}
-"""Colours of lanes of the overview, as the browser shows them."""
-
-FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--force-device-scale-factor=1",
-    "--window-size=1200,800",
-)
-
 
 @pytest.fixture
 def browser(tmp_path):
-    """Chromium without a screen, which can reach this machine only."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="pip install selenium")
-    if BROWSER is None or DRIVER is None:
-        pytest.skip("no browser: apt-get install chromium chromium-driver")
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = BROWSER
-    for flag in FLAGS:
-        options.add_argument(flag)
-    options.add_argument(f"--user-data-dir={tmp_path / 'profile'}")
-    options.add_argument("--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1")
-    options.set_capability("goog:loggingPrefs", {"performance": "ALL", "browser": "WARNING"})
-    with webdriver.Chrome(options=options, service=Service(DRIVER)) as driver:
+    with chromium(tmp_path) as driver:
         yield driver
 
 
@@ -91,65 +51,10 @@ def address(command):
     return found[0]
 
 
-def picture(driver):
-    """The page's pixels (height, width, 3); none where the browser is too busy to say."""
-    from selenium.common.exceptions import WebDriverException
-
-    try:
-        png = driver.get_screenshot_as_png()
-    except WebDriverException as error:
-        print(f"{time.monotonic():.0f} s: {str(error).splitlines()[0]}")
-        return np.empty((0, 0, 3), dtype=int)
-    pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
-    print(f"{time.monotonic():.0f} s: {shown(pixels)} in a picture of {len(png)} bytes")
-    return pixels
-
-
-def shown(pixels):
-    """How many pixels have each lane's colour."""
-    return {
-        name: int((np.abs(pixels - colour).max(axis=2) <= 12).sum())
-        for name, colour in LANES.items()
-    }
-
-
 def test_the_page_draws_the_run_and_asks_this_machine_only(browser, address):
     browser.get(address)
-    events, end = [], time.monotonic() + SECONDS
-
-    def heard(word):
-        """Whether the page has asked for it; asks the driver, not the busy page."""
-        for entry in browser.get_log("performance"):
-            events.append(json.loads(entry["message"])["message"])
-        return any(word in str(event["params"].get("request")) for event in events)
-
-    def drawn():
-        return min(shown(picture(browser)).values()) > 1000
-
-    for ready in (lambda: heard("/run.rrd"), drawn):
-        while not ready():
-            assert time.monotonic() < end, "the page does not show the run"
-            time.sleep(3)
-    heard("")
-
-    asked, refused = {}, set()
-    for event in events:
-        facts = event["params"]
-        if event["method"] == "Network.requestWillBeSent":
-            asked[facts["requestId"]] = facts["request"]["url"]
-        if event["method"] == "Network.loadingFailed" and facts.get("blockedReason") == "csp":
-            refused.add(facts["requestId"])
-    hosts = {
-        urlsplit(url).hostname
-        for key, url in asked.items()
-        if key not in refused and url.startswith(("http", "ws"))
-    }
-    assert hosts == {"127.0.0.1"}
-
-    # What the policy refuses is an error to the browser; nothing else may be one.
-    errors = [e["message"] for e in browser.get_log("browser") if e["level"] == "SEVERE"]
-    expected = ("Content Security Policy", "TypeError: Failed to fetch")
-    assert [e for e in errors if not any(word in e for word in expected)] == []
+    assert drawn(browser) == {"127.0.0.1"}
+    assert errors(browser) == []
 
 
 def asked(port, path, host=None):

@@ -44,7 +44,9 @@ class Shown:
             for name, value in self._facts().items()
         )
         picture = self._picture()
-        image = "" if picture is None else f'<img alt="" src="{_png(picture)}">'
+        image = (
+            "" if picture is None else f'<img alt="" src="data:image/png;base64,{png(picture)}">'
+        )
         return f"<div><table>{rows}</table>{image}</div>"
 
 
@@ -59,9 +61,10 @@ def weights(values: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.repeat(np.repeat(picture, down, axis=0), across, axis=1)
 
 
-def _png(picture: NDArray[np.uint8]) -> str:
+def png(picture: NDArray[np.uint8]) -> str:
+    """A picture as a PNG file, in base64."""
     from PIL import Image
 
     data = io.BytesIO()
     Image.fromarray(picture).save(data, "PNG")
-    return f"data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}"
+    return base64.b64encode(data.getvalue()).decode()

@@ -131,19 +131,19 @@ class Recording(Shown):
         return np.concatenate(found)
 
     def view(self, save: str | Path | None = None, *, tab: str | None = None) -> None:
-        """Show it in the Rerun viewer, until its window is closed.
+        """Show it in the Rerun viewer: in a notebook below the cell, else until a window is closed.
 
         Args:
             save: write the view to this file, *.rrd, instead.
             tab: the name of the tab that is open.
 
         Raises:
-            UsageError: it is of arrays, or of several paths.
+            UsageError: it is of arrays.
             CdmisfaError: there is no display, or the file cannot be written.
         """
-        if len(self.words) != 1:
-            raise UsageError("one recording or log is shown: of arrays, view the run")
-        view(Path(self.words[0]), save, tab=tab)
+        if not self.words:
+            raise UsageError("recordings and logs are shown: of arrays, view the run")
+        view(self, [Path(word) for word in self.words], save, tab=tab, cameras=self._options)
 
     def _facts(self) -> Mapping[str, Any]:
         spec, what = self.spec, ", ".join(self.words) or "arrays"

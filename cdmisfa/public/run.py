@@ -171,7 +171,7 @@ class Run(Shown, RecomputedRun):
         return summary_text(read_outline(self.log), self.path.name, [e.text for e in self.events])
 
     def view(self, save: str | Path | None = None, *, tab: str | None = None) -> None:
-        """Show it in the Rerun viewer, until its window is closed.
+        """Show it in the Rerun viewer: in a notebook below the cell, else until a window is closed.
 
         Args:
             save: write the view to this file, *.rrd, instead.
@@ -180,7 +180,7 @@ class Run(Shown, RecomputedRun):
         Raises:
             CdmisfaError: there is no display, or the file cannot be written.
         """
-        view(self.path, save, tab=tab)
+        view(self, [self.path], save, tab=tab)
 
     def _facts(self) -> Mapping[str, Any]:
         learned = (f"{m.index}: {m.stream}, η {m.eta[0]:.3g}" for m in self.modules)

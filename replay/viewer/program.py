@@ -77,9 +77,17 @@ class Program(subprocess.Popen[bytes]):
         arguments: of the program.
         words: a file for its output; it hangs when nobody empties a pipe.
         given: its standard input.
+        apart: an interrupt of the group of processes that we are in is not for it.
     """
 
-    def __init__(self, arguments: Sequence[str], words: BinaryIO, given: BinaryIO | None) -> None:
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        words: BinaryIO,
+        given: BinaryIO | None = None,
+        *,
+        apart: bool = False,
+    ) -> None:
         self._words = words
         super().__init__(
             [str(viewer_program()), *arguments],
@@ -88,6 +96,7 @@ class Program(subprocess.Popen[bytes]):
             stdout=words,
             stderr=words,
             preexec_fn=ends_with_parent(),
+            start_new_session=apart,
         )
 
     def last_words(self) -> str:
@@ -110,18 +119,21 @@ class Program(subprocess.Popen[bytes]):
 
 
 @contextlib.contextmanager
-def running(arguments: Sequence[str], given: BinaryIO | None = None) -> Iterator[Program]:
+def running(
+    arguments: Sequence[str], given: BinaryIO | None = None, *, apart: bool = False
+) -> Iterator[Program]:
     """The viewer, or its server, while the body runs; ended on the way out.
 
     Args:
         arguments: of the program.
         given: its standard input.
+        apart: see `Program`.
 
     Raises:
         CdmisfaError: it has ended with an error, whose last words are given.
     """
     with tempfile.TemporaryFile() as words:
-        process = Program(arguments, words, given)
+        process = Program(arguments, words, given, apart=apart)
         try:
             yield process
             code = process.poll()

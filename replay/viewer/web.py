@@ -53,6 +53,9 @@ POLICY = "; ".join(
 )
 """The content security policy: this page, and what is beside it."""
 
+FRAMED = "frame-ancestors http: https: vscode-webview:"
+"""What it says of a page that is for notebooks, whose own address nobody knows before."""
+
 TOKEN_BYTES = 24
 
 Answer = Callable[[BaseHTTPRequestHandler, str], None]
@@ -136,7 +139,11 @@ def pieces_of(view: BinaryIO) -> Iterator[bytes]:
 
 
 def page_of(
-    viewer_port: int, run: Callable[[], Iterable[bytes]] | None = None, data: str = ""
+    viewer_port: int,
+    run: Callable[[], Iterable[bytes]] | None = None,
+    data: str = "",
+    *,
+    framed: bool = False,
 ) -> Answer:
     """What is served: the files of the viewer's page, with the policy, and a run beside it.
 
@@ -144,8 +151,11 @@ def page_of(
         viewer_port: where the viewer's own server has the page, on this machine.
         run: gives the run piece by piece, to each who asks for it.
         data: where else on this machine the page may ask for data, as http://host:port.
+        framed: another page may show it in a frame.
     """
     policy = POLICY.replace("connect-src 'self'", f"connect-src 'self' {data}".rstrip())
+    if framed:
+        policy = policy.replace("frame-ancestors 'none'", FRAMED)
 
     def answer(request: BaseHTTPRequestHandler, path: str) -> None:
         if run is None or urlsplit(path).path != DATA:

@@ -1,8 +1,10 @@
-"""Showing a view: in a window, or in a browser on this machine."""
+"""Showing a view: in a window, in a browser on this machine, or in a frame of a page there."""
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import functools
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +20,7 @@ from replay.viewer.program import (
     has_display,
     private_host,
     run_program,
+    running,
     tell,
 )
 from replay.viewer.web import page_of, page_server, pieces_of, served, shown_at
@@ -41,15 +44,25 @@ def open_window(
     """
     check_limit(memory_limit)
     window = [] if size is None else ["--window-size", check_window(size)]
-    if path.exists() and not has_display():  # a wrong path is said first, below
-        raise CdmisfaError(
-            "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
-            "--screenshot"
-        )
+    if path.exists():  # a wrong path is said first, below
+        refuse_without_display()
     with _opened(path, every, all_views, tab, about) as (name, view):
         host = private_host()
         place = ("--bind", host, "--port", str(free_port(host)))
         run_program([name, *place, *window, "--memory-limit", memory_limit], view)
+
+
+def refuse_without_display() -> None:
+    """Refuse to open a window where there can be none.
+
+    Raises:
+        CdmisfaError: there is no display.
+    """
+    if not has_display():
+        raise CdmisfaError(
+            "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
+            "--screenshot"
+        )
 
 
 def serve(
@@ -79,6 +92,41 @@ def serve(
         address = opened.enter_context(served(page, port))
         tell(shown_at(address))
         run_program(page_server(viewer_port))
+
+
+def serve_frame(path: Path) -> str:
+    """Serve the viewer and a view to pages that show it in a frame, until this process ends.
+
+    Rerun's own widget for notebooks asks other hosts than this machine, also where its code is
+    served by it; this page cannot, see `POLICY`.
+
+    Args:
+        path: an .rrd file; on POSIX systems it may be removed afterwards.
+
+    Returns:
+        The address, which ends with the process.
+
+    Raises:
+        CdmisfaError: no port is free.
+    """
+    port, view = _page_port(), _until_exit.enter_context(path.open("rb"))
+    page = page_of(port, lambda: pieces_of(view), framed=True)
+    return shown_at(_until_exit.enter_context(served(page)))
+
+
+_until_exit = contextlib.ExitStack()
+atexit.register(_until_exit.close)
+
+
+@functools.cache
+def _page_port() -> int:
+    """The port of the viewer's page, which is the same in all frames of this process.
+
+    Its server is not in our group of processes, which notebooks interrupt as a whole.
+    """
+    port = free_port()
+    _until_exit.enter_context(running(page_server(port), apart=True))
+    return port
 
 
 @contextlib.contextmanager
