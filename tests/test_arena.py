@@ -373,6 +373,8 @@ def test_a_page_says_what_was_not_learned_and_of_what_there_is_a_module(tmp_path
     rows = []
     for seed, modules in enumerate(([], [module, noise])):
         result = came_to(modules=modules, wrong=seed, doubles=seed)
+        changed = {"stream": "hiss>sway", "signal": "sway", "frame": 2000, "block": 50}
+        result["targets"].append({**changed, "watched": 12 * seed, "fitted": True})
         point = {"set": "tiny", "learner": "progress"}
         row = {"id": str(seed), "status": "done", "point": point, "seed": seed, "code": "old"}
         rows.append(json.dumps(row | {"result": result}) + "\n")
@@ -381,6 +383,7 @@ def test_a_page_says_what_was_not_learned_and_of_what_there_is_a_module(tmp_path
     write_arena_page(document, draw_figure(document, tmp_path)[0], page)
     text = page.read_text("utf-8")
     assert "not learned `sway` 2/2 (1 with a module that is too fast); 1 module of `hiss`; " in text
+    assert "| tiny | `sway` | 1/2 | 1/2 | 12 |" in text
     assert "1 too many of what it had; 2 of 2 runs did not end." in text
     assert "2 trials are of an earlier version of the code." in text
 

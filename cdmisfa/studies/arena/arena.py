@@ -312,7 +312,8 @@ def _probe(row: Row, key: str) -> float | None:
 def _targets(found: Sequence[Row]) -> list[dict[str, Any]]:
     """Of everything that can be learned, with how many seeds it was, and how soon.
 
-    Where it was not there may be modules of it: "too_fast" is with how many seeds.
+    Where it was not there may be modules of it: "too_fast" is with how many seeds; where it was a
+    module of another stream may have given it before it was watched: "known".
     """
     tables = []
     for same in zip(*(row["targets"] for row in found), strict=True):
@@ -322,7 +323,9 @@ def _targets(found: Sequence[Row]) -> list[dict[str, Any]]:
         fast = sum(had and t["frame"] is None for had, t in zip(saved, same, strict=True))
         table = {"stream": same[0]["stream"], "signal": signal, "too_fast": fast}
         table |= {"learned": len(learned), "trials": len(same)}
-        tables.append(table | {k: _measure([t[k] for t in learned]) for k in ("block", "watched")})
+        watched = [t["watched"] for t in learned if t["watched"]]
+        table |= {"known": len(learned) - len(watched), "watched": _measure(watched)}
+        tables.append(table | {"block": _measure([t["block"] for t in learned])})
     return tables
 
 

@@ -37,13 +37,13 @@ def draw_figure(document: Mapping[str, Any], folder: Path) -> list[Path]:
     under = next((one for one in compared if one.condition), None)
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(3, 2, 4.4, 3.3)
-        slowness, state, told, spent, curves, costly = axes.ravel()
+        curves, costly, slowness, state, told, spent = axes.ravel()
+        _draw_curves(curves, free)
+        _draw_curves(costly, under)
         _draw_slowness(slowness, mine)
         _draw_state(state, mine)
         _draw_blocks(told, _told(mine), "blocks until noise is told")
         _draw_blocks(spent, _spent(free), "share of blocks on what cannot be learned")
-        _draw_curves(curves, free)
-        _draw_curves(costly, under)
         return save_figure(figure, folder, "arena")
 
 

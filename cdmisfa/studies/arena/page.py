@@ -12,7 +12,7 @@ import numpy as np
 from cdmisfa.experiments.documents import markdown
 from cdmisfa.studies.arena.figure import DEFAULT, Comparison, Entry, comparisons, conditions
 from cdmisfa.studies.arena.pictures import FOLLOW
-from cdmisfa.studies.arena.streams import REPORTED, SETS
+from cdmisfa.studies.arena.streams import REPORTED, SETS, chosen_sets
 from cdmisfa.studies.arena.trial import KNOWS, SLOW_ENOUGH, SLOW_ENOUGH_LOOPED, THE_SAME
 from cdmisfa.studies.pages import Page
 
@@ -42,7 +42,7 @@ OF_LEARNERS: Final = (
     "seeds", "learned", "noise learned", "in vain", "ends", "blocks", "all learned", "frames"
 )  # fmt: skip
 
-HEAD_CHANGED: Final = ("set", "after the change shows", "learned", "blocks of watching it")
+HEAD_CHANGED: Final = ("set", "after the change shows", "known", "learned", "blocks of watching it")
 
 
 def arena_table(document: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -110,7 +110,7 @@ def write_arena_page(document: Mapping[str, Any], figure: Path, path: Path) -> N
     page.add(markdown(["set", *OF_SETS], rows), "")
     if changes := [row for entry in mine for row in _changes(entry)]:
         page.add(markdown(HEAD_CHANGED, changes), "")
-    page.picture(figure, "Learning by frames, slowness, noise told, state told, blocks in vain")
+    page.picture(figure, "Learning by frames, slowness, state and noise told, blocks in vain")
     if compared := comparisons(document["entries"]):
         page.add("## Other learners, and other rules of attention", "")
     for one in compared:
@@ -167,6 +167,8 @@ def _mean(entries: Sequence[Entry], name: str, digits: int) -> str:
 def _compared(one: Comparison) -> list[str]:
     """Lines on learners that were run on the same sets."""
     sets = ", ".join(f"`{name}`" for name in one.sets)
+    if set(one.sets) == set(chosen_sets(["reported"])):
+        sets = "all reported sets"
     about = f"{'Means over' if len(one.sets) > 1 else 'On'} {sets}"
     rows = []
     for learner, entries in one.learners.items():
@@ -190,9 +192,10 @@ def _changes(entry: Entry) -> list[list[str]]:
     rows = []
     for target in entry["targets"]:
         if target["stream"].endswith(f">{target['signal']}"):
-            share = f"{target['learned']}/{target['trials']}"
+            known, of = target["known"], target["trials"]
+            shares = f"{known}/{of}", f"{target['learned'] - known}/{of}"
             watched = _interval(target["watched"], 0)
-            rows.append([entry["point"]["set"], f"`{target['signal']}`", share, watched])
+            rows.append([entry["point"]["set"], f"`{target['signal']}`", *shares, watched])
     return rows
 
 
