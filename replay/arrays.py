@@ -157,7 +157,7 @@ def are_arrays(paths: Sequence[Location]) -> bool:
 
 
 def open_arrays(
-    paths: Sequence[Path], options: CameraOptions | None = None, *, loop: bool = False
+    paths: Sequence[Location], options: CameraOptions | None = None, *, loop: bool = False
 ) -> ArrayLog:
     """Open files of NumPy, .npy with a stream each or .npz with one an array.
 
@@ -172,7 +172,8 @@ def open_arrays(
     """
     options = options or CameraOptions()
     streams: dict[str, NDArray[Any]] = {}
-    for path in paths:
+    files = list(map(Path, map(str, paths)))
+    for path in files:
         for name, array in load_numbers(path).items():
             streams[name if name not in streams else f"{path.stem}_{name}"] = array
     if options.topics:
@@ -181,7 +182,7 @@ def open_arrays(
             raise UsageError(f"{paths[0]}: it has the arrays {', '.join(streams)}: name of these")
         streams = {name: streams[name] for name in chosen}
     try:
-        return ArrayLog(streams, options, loop=loop, files=paths)
+        return ArrayLog(streams, options, loop=loop, files=files)
     except UsageError as error:
         raise UsageError(f"{', '.join(map(str, paths))}: {error}") from None
 

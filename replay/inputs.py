@@ -32,8 +32,8 @@ from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
 from replay.storage.location import Location, Url, location
 from replay.storage.opening import log_files, open_store, starts_as_log
 
-Logged = RecordedSource | ForeignSource
-"""Frames from logs."""
+Logged = RecordedSource | ForeignSource | ArrayLog
+"""Frames from logs, or from files of arrays."""
 
 About = Callable[[Logged], None]
 """Given logs that were opened to be looked at, to say what they are."""
@@ -46,7 +46,7 @@ def open_log(
     loop: bool = False,
     salvage: bool = False,
     goal: tuple[str, str] = ("learn", "RUN"),
-) -> Logged | ArrayLog:
+) -> Logged:
     """Open one of our recordings, camera logs of others, or files of NumPy's arrays.
 
     Args:
@@ -64,7 +64,7 @@ def open_log(
     for path in paths:
         refuse_what_is_no_log(path)
     if are_arrays(paths):
-        return open_arrays([path for path in paths if isinstance(path, Path)], cameras, loop=loop)
+        return open_arrays(paths, cameras, loop=loop)
     left_out: list[str] = []
     if salvage:
         paths, cameras, left_out = _readable(paths, cameras)
@@ -81,6 +81,8 @@ def open_to_look(
 ) -> Logged:
     """Open logs to view, export or play: every topic of images, aligned by time if need be.
 
+    Of files of arrays all are shown.
+
     What `cameras` choose is opened as they say. Of up to `AT_ONCE` bytes all are checked, of more
     what is read.
 
@@ -92,7 +94,7 @@ def open_to_look(
         refuse_what_is_no_log(path)
     cameras = cameras or CameraOptions()
     chosen = bool(cameras.topics or cameras.fields)
-    if not chosen and not any(map(only_foreign, paths)):
+    if not (chosen or are_arrays(paths) or any(map(only_foreign, paths))):
         with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
             return _checked(RecordedSource(paths, salvage=salvage))
     goal = ("convert", "REC")
@@ -122,12 +124,15 @@ def open_cameras(
     loop: bool = False,
     salvage: bool = False,
     goal: tuple[str, str] = ("learn", "RUN"),
-) -> ForeignSource:
-    """Open the camera logs of others as streams on one clock; see `ForeignSource`.
+) -> ForeignSource | ArrayLog:
+    """Open the camera logs of others, or files of arrays, as streams on one clock.
 
-    With `salvage` a log of several that cannot be read is left out: `left_out` of the source says
-    so, as its warnings do.
+    See `ForeignSource` and `open_arrays`. With `salvage` a log of several that cannot be read is
+    left out: `left_out` of the source says so, as its warnings do.
     """
+    places = list(map(location, paths))
+    if are_arrays(places):
+        return open_arrays(places, cameras, loop=loop)
     left_out: list[str] = []
     if salvage:
         paths, cameras, left_out = _readable(image_logs(paths), cameras)
@@ -182,7 +187,7 @@ def holds_run(path: Path) -> bool:
         UsageError: it does not exist.
         LogDamagedError: it is no log, or a damaged one.
     """
-    return not only_foreign(path) and is_run(path)
+    return not only_foreign(path) and not are_arrays([path]) and is_run(path)
 
 
 def refuse_what_is_no_log(path: Location) -> None:

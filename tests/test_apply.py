@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
-from camera_files import pictures, write_images
+from camera_files import pictures, write_images, write_pictures
 from conftest import Cdmisfa
 from mcap.reader import make_reader
 from message_files import write_table
@@ -30,6 +30,7 @@ from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
 from recorder.images.options import Reading
 from recorder.recording import record
+from replay.arrays import ArrayLog
 from replay.camera_logs.source import ForeignSource
 from replay.export.applied import written
 from replay.runs.modules import save_modules
@@ -287,6 +288,27 @@ def test_lines_come_block_by_block_and_are_those_of_what_was_recorded(
         np.testing.assert_array_equal(slowness, applied.slowness)
         assert [module["novelty"] for module in line["modules"]] == applied.novelty.tolist()
         assert [module["alive"] for module in line["modules"]] == applied.alive.tolist()
+
+
+@pytest.mark.parametrize("kind", ["npz", "npy", "recording", "folder"])
+def test_pictures_of_any_source_give_the_same(
+    kind: str, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    shown = np.stack(list(pictures(50)))
+    named = tmp_path / f"cam.{kind}"
+    if kind == "npz":
+        np.savez_compressed(named, cam=shown)
+    elif kind == "npy":
+        np.save(named, shown)
+    elif kind == "recording":
+        record(ArrayLog({"cam": shown}), named)
+    else:
+        write_pictures(named, 50)
+    rate = ("--rate", 50) if kind == "folder" else ()
+    done = cdmisfa("apply", run, named, *rate, "-o", tmp_path / "o.parquet")
+    assert done.code == 0, done.err
+    table = pq.read_table(tmp_path / "o.parquet")
+    np.testing.assert_array_equal(outputs(table, 1), Run(run).modules[0].transform(shown))
 
 
 def test_lines_of_a_log_are_its_table(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import Cdmisfa
 from folders import contents
@@ -13,7 +14,7 @@ from test_cli import assert_one_line
 LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
 
 A_RUN = "is a run, not a recording: look at it with cdmisfa view"
-NO_MCAP = "numbers.npz is no log that is read: logs are .mcap, .bag and .db3 files"
+NO_MCAP = "numbers.h5 is no log that is read: logs are .mcap, .bag and .db3 files"
 URLS = ("gs://bucket/there", "https://there.org/x")
 ONE = "is a scene, of which only one can be named"
 VAIN = "is for live scenes, and {} is none: leave it out"
@@ -94,14 +95,18 @@ CASES: dict[str, tuple[str, ...]] = {
     ),
     "sweep REC --grid scene.seed=9,10 -o sweep": ("scene.seed " + VAIN.format("REC"),),
     # a file of another kind is a wrong word and no damage
-    **{f"{command} numbers.npz": (NO_MCAP,) for command in ("info", "verify", "play")},
-    **{f"{command} numbers.npz": (NO_MCAP,) for command in ("check", "plot")},
-    "recover -o out.mcap numbers.npz": (NO_MCAP,),
-    "convert -o out numbers.npz": (NO_MCAP,),
-    "view --save out.rrd numbers.npz": (NO_MCAP,),
-    "compare numbers.npz numbers.npz": (NO_MCAP,),
-    "export --to csv -o out.csv numbers.npz": (NO_MCAP,),
-    "export --to images -o out numbers.npz": (NO_MCAP,),
+    **{f"{command} numbers.h5": (NO_MCAP,) for command in ("info", "verify", "play")},
+    **{f"{command} numbers.h5": (NO_MCAP,) for command in ("check", "plot")},
+    "recover -o out.mcap numbers.h5": (NO_MCAP,),
+    "convert -o out numbers.h5": (NO_MCAP,),
+    "view --save out.rrd numbers.h5": (NO_MCAP,),
+    "compare numbers.h5 numbers.h5": (NO_MCAP,),
+    "export --to csv -o out.csv numbers.h5": (NO_MCAP,),
+    "export --to images -o out numbers.h5": (NO_MCAP,),
+    **{
+        f"{command} arrays.npz": ("arrays.npz holds arrays: make a recording", "cdmisfa convert")
+        for command in ("verify", "recover -o out.mcap", "check", "plot")
+    },
     **{
         f"recover {name} -o out.mcap": (
             f"{name} is no MCAP file, and others are not recovered",
@@ -209,7 +214,8 @@ CASES: dict[str, tuple[str, ...]] = {
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The folder that a command runs in, which it leaves as it is."""
     monkeypatch.chdir(tmp_path)
-    Path("numbers.npz").write_bytes(b"PK" + bytes(100))
+    Path("numbers.h5").write_bytes(b"PK" + bytes(100))
+    np.savez("arrays.npz", a=np.zeros(9))
     Path("numbers.csv").write_text("a,b\n" + "1,2\n" * 200)
     Path("file").write_bytes(b"kept")
     for name in ("pictures/0.png", "taken/there"):

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pytest
 from conftest import Cdmisfa
 from PIL import Image
+from view_data import View
 
 import cdmisfa
 from cdmisfa import Recording, Run, learn
@@ -141,6 +142,31 @@ def test_what_cannot_be_learned_from_is_one_line(
 def test_a_wrong_setting_is_one_line(how: dict[str, Any], said: str) -> None:
     with pytest.raises(UsageError, match=said):
         learn(numbers(), **how)
+
+
+@pytest.mark.parametrize("show", [numbers, lambda: pictures(12, 16)])
+def test_files_of_arrays_are_looked_at_and_converted(
+    show: Any, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    shown = show()
+    np.savez_compressed(tmp_path / "x.npz", a=shown, b=shown[::-1])
+    np.save(tmp_path / "y.npy", shown)
+    told = cdmisfa("info", tmp_path / "x.npz", tmp_path / "y.npy", "--json").json
+    assert [(c["topic"], c["messages"]) for c in told["channels"]] == [
+        (name, len(shown)) for name in ("a", "b", "y")
+    ]
+    assert told["state"] == "whole"
+    done = cdmisfa("convert", tmp_path / "x.npz", "-o", tmp_path / "rec")
+    assert done.code == 0, done.err
+    recorded, held = Recording(tmp_path / "rec"), Recording(tmp_path / "x.npz")
+    for stream in ("a", "b"):
+        frames = recorded.frames(stream, 0, len(shown))
+        np.testing.assert_array_equal(frames, held.frames(stream, 0, len(shown)))
+    assert cdmisfa("view", tmp_path / "x.npz", "--save", tmp_path / "v.rrd").code == 0
+    first = View(tmp_path / "v.rrd").rows["/views/1_a"]
+    assert first["frame"][:2] == ([0, 10] if shown.ndim > 2 else [0, 1])
+    served = ("--to", "foxglove", "--port", 0, "--wait", 0, "--rate", 99)
+    assert cdmisfa("play", tmp_path / "y.npy", *served).code == 0
 
 
 def test_files_of_arrays_are_logs_that_runs_find_again(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

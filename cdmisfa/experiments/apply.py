@@ -27,6 +27,7 @@ from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, open_live
 from recorder.images.options import ImageOptions
+from replay.arrays import TAKES, are_arrays
 from replay.camera_logs.opening import ALL
 from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import UnequalError
@@ -138,9 +139,17 @@ class Application:
         return replace(live, rate=cameras.rate, **self._made(cameras))
 
     def _log(self, words: Sequence[str], cameras: CameraOptions, **how: Any) -> FrameSource:
+        places = locations(words)
+        if are_arrays(places):
+            arrays = open_logs(words, cameras=cameras, **how)
+            if not arrays.spec.images or self.recipe.size is None:
+                return arrays
+            arrays.close()
+            taken = {name: value for name, value in self._made(cameras).items() if name in TAKES}
+            return open_logs(words, cameras=replace(cameras, **taken), **how)
         if cameras == CameraOptions():
             with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
-                recorded = RecordedSource(locations(words), **how)
+                recorded = RecordedSource(places, **how)
                 if recorded.spec.frame_shape == self.recipe.shape or not recorded.spec.images:
                     return recorded
                 recorded.close()

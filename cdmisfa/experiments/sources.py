@@ -22,7 +22,7 @@ from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
     from recorder.recording import ViewRecording
-    from replay.camera_logs.source import ForeignSource
+    from replay.storage.identity import LoggedSource
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
@@ -373,7 +373,7 @@ def open_cameras_now(
     return source, configuration
 
 
-def convert(source: ForeignSource, folder: Path, **options: Any) -> list[ViewRecording]:
+def convert(source: LoggedSource, folder: Path, **options: Any) -> list[ViewRecording]:
     """Write every stream of a source as a view of a recording.
 
     The recording has the source's frames at its times and rate; the logs they came from, with

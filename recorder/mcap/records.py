@@ -54,8 +54,8 @@ class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with 
 
 KINDS: Final = (
     "logs are .mcap, .bag and .db3 files, videos (.mp4, .m4v, .mov, .mkv, .webm, .avi, .wmv, .mpg, "
-    ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, and LeRobot datasets "
-    "(.npy and .npz are for learn and sweep)"
+    ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, LeRobot datasets, and arrays "
+    "(.npy, .npz)"
 )
 """What is read, for errors; docs/logs.md says more."""
 
@@ -64,6 +64,10 @@ def no_log(path: Place) -> CdmisfaError:
     """What is wrong with a file that begins otherwise: damage, where its name is that of a log."""
     if ".mcap" in path.name:
         return LogDamagedError(f"{path}: not an MCAP file (its first bytes are not MCAP's)")
+    if path.suffix in (".npy", ".npz"):
+        return UsageError(
+            f"{path} holds arrays: make a recording of them with cdmisfa convert {path} -o REC"
+        )
     return UsageError(f"{path} is no log that is read: {KINDS}")
 
 

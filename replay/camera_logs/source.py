@@ -188,10 +188,6 @@ class ForeignSource(LoggedSource):
             said = f"{one.path}: {one.topic} is taken by number, {said}"
             yield f"{said}; convert or learn it with {way}"
 
-    def scene(self) -> Mapping[str, str]:
-        """Not stated by the log."""
-        return {}
-
     def _logs(self) -> list[Identity]:
         parts = [part for stream in self._streams for part in stream.logs]
         return [identity_of(path, parts) for path in self._files]

@@ -15,6 +15,7 @@ from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.reader import Check, LogReader
 from recorder.mcap.records import Channel, Problem
+from replay.arrays import are_arrays
 from replay.camera_logs.opening import channels_of, log_format, only_foreign
 from replay.camera_logs.pictures import FolderImages
 from replay.integrity.counting import count_messages
@@ -38,6 +39,7 @@ from replay.integrity.state import (
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_METADATA
 from replay.runs.log import SIGNALS_TOPIC, record_version
+from replay.storage.arrays import load_numbers
 from replay.storage.location import Location
 from replay.storage.opening import log_files, open_store
 
@@ -226,7 +228,7 @@ def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
     """Describe the logs at a place; of several one that cannot be read is described as such."""
     logs: list[Location] = [place]
     try:
-        if not only_foreign(place):
+        if not only_foreign(place) and not are_arrays([place]):
             logs = log_files(place)
     except CdmisfaError as error:
         if alone:
@@ -237,6 +239,8 @@ def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
         try:
             if isinstance(log, Path) and only_foreign(log):
                 yield _describe_foreign(log)
+            elif isinstance(log, Path) and are_arrays([log]):
+                yield _describe_arrays(log)
             else:
                 yield _describe_file(log)
         except CdmisfaError as error:
@@ -276,6 +280,19 @@ def _describe_foreign(place: Path) -> LogInfo:
         size=SizeInfo(_bytes_of(place)),
         notes=tuple(dict.fromkeys(line for c in known for line in c.remarks)),
     )
+
+
+def _describe_arrays(place: Path) -> LogInfo:
+    """What `numpy` saved: to open it is to find that it is all there."""
+    channels = []
+    for name, array in load_numbers(place).items():
+        shape = "x".join(map(str, array.shape[1:]))
+        kind = f"{array.dtype} {shape}".rstrip()
+        rows = len(array) if array.ndim else 1
+        channels.append(ChannelInfo(name, "numpy", kind, rows, None, None, place.name))
+    about: Any = {"complete": True, "crc": "absent", "problems": (), "metadata": {}}
+    size = SizeInfo(_bytes_of(place))
+    return LogInfo(str(place), "foreign", tuple(channels), 0, size=size, **about)
 
 
 def _bytes_of(place: Path) -> int:

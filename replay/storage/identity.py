@@ -221,11 +221,13 @@ class LoggedSource(StoredSource):
         left_out: a line for each log that could not be read, and is no part of it.
         copies: a line for each stream that shows the same as one of another log.
         notes: a line for each thing that was chosen where it was not said.
+        warnings: what the user should know.
     """
 
     left_out: tuple[str, ...] = ()
     copies: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     _identities: Sequence[Identity] | None = None
 
     @abstractmethod
@@ -235,6 +237,10 @@ class LoggedSource(StoredSource):
     @abstractmethod
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """What the source is, with what is known of each log."""
+
+    def scene(self) -> Mapping[str, str]:
+        """What was recorded, where the logs say so."""
+        return {}
 
     def describe(self, told: Told = lambda done, size: None) -> Mapping[str, Any]:
         """The logs with the SHA-256 of all their bytes, and what was taken of them.

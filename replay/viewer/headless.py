@@ -11,8 +11,8 @@ from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
-from replay.camera_logs.source import ForeignSource
 from replay.inputs import About, holds_run, open_to_look
+from replay.recordings.source import RecordedSource
 from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
 from replay.view.bindings import viewer_client
 from replay.view.build import view_of
@@ -234,6 +234,6 @@ def _last_frame(path: Path) -> int:
         ends = (int(piece.frames[-1]) + piece.tau - 1 for piece in read_columns(path))
         return max(ends, default=0)
     with contextlib.closing(open_to_look([path], salvage=True)) as source:
-        if isinstance(source, ForeignSource):
-            return source.frames - 1
-        return max(ranges[-1][1] for ranges in source.coverage().values() if ranges) - 1
+        if isinstance(source, RecordedSource):
+            return max(ranges[-1][1] for ranges in source.coverage().values() if ranges) - 1
+        return source.frames - 1
