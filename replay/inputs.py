@@ -30,7 +30,7 @@ from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
 from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
 from replay.storage.location import Location, Url, location
-from replay.storage.opening import log_files, open_store, starts_as_log
+from replay.storage.opening import log_files, no_such, open_store, starts_as_log
 
 Logged = RecordedSource | ForeignSource | ArrayLog
 """Frames from logs, or from files of arrays."""
@@ -201,7 +201,7 @@ def refuse_what_is_no_log(path: Location) -> None:
     if path.is_dir():
         run = is_run(path)
     elif not path.exists():
-        raise UsageError(f"{path}: no such file or folder")
+        raise no_such(path)
     elif starts_as_log(path):
         run = path.name.startswith(RUN_FILE) and is_run(path)
     elif only_foreign(path) or ".mcap" in path.suffixes or path.suffix.lower() in ENDINGS:

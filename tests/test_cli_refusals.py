@@ -25,7 +25,7 @@ TAKEN = "taken exists: choose another folder"
 CASES: dict[str, tuple[str, ...]] = {
     # words: what the line says. RUN, REC and LOGS are a run, a recording, and logs.
     "learn no/such.mcap": ("no/such.mcap", "icub, oscillatory"),
-    "learn oscilatory": ("oscilatory", "icub, oscillatory"),
+    "learn oscilatory": ("oscilatory", "did you mean oscillatory?"),
     "record icubs -o x": ("icubs", "did you mean icub?"),
     "record icub": ("-o",),
     "record oscillatory --scene-picture x.png": ("icub",),

@@ -213,7 +213,7 @@ def test_an_existing_view_is_kept_and_nothing_half_done_is_left(tmp_path):
         build_view(tmp_path, tmp_path / "nowhere" / "run.rrd")
     with pytest.raises(UsageError, match=r"there is no folder .*nowhere$"):
         build_view(tmp_path, tmp_path / "nowhere" / "v.rrd")
-    with pytest.raises(UsageError, match="does not exist"):
+    with pytest.raises(UsageError, match="no such file or folder"):
         build_view(tmp_path / "nothing", tmp_path / "b.rrd")
     with pytest.raises(UsageError, match="at least 1"):
         build_view(tmp_path, tmp_path / "b.rrd", every=0)

@@ -13,58 +13,89 @@ import importlib
 import io
 import os
 import sys
+import time
+import traceback
 from collections.abc import Mapping, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
 from cdmisfa.cli.interrupts import end_at_once, ignore_at_the_end, interruptible
 from cdmisfa.cli.on_demand import names_on_demand
+from cdmisfa.cli.printing import Loudness, detail
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.untrusted import printable
 
-COMMANDS: Mapping[str, tuple[str, str]] = {
-    "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
-    "learn": ("learn", "Learn slow feature modules from a scene, a recording, logs or cameras."),
-    "apply": ("apply", "Apply the modules of a run to other logs."),
-    "view": ("view", "Open a run or a recording in the Rerun viewer, or save, serve or draw it."),
-    "play": ("view", "Show a recording as it was seen, in real time."),
-    "info": ("info", "Say what is in a recording, a run, any MCAP file, or a camera log."),
-    "verify": ("logs", "Check that a log is whole: structure, checksums, nothing lost."),
-    "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
-    "convert": ("record", "Write camera logs of others as a recording."),
-    "compare": ("logs", "Check that runs' signals are the same bits, and show their curves."),
-    "check": (
-        "moments",
-        "Learn a run again from its source, and compare every signal bit for bit.",
-    ),
-    "at": ("moments", "Say what a learner was after K iterations of a run, exactly."),
-    "fork": (
-        "moments",
-        "Go on from some iteration of a run with other settings, as a run of its own.",
-    ),
-    "plot": ("logs", "Draw the figures of a run."),
-    "export": (
-        "logs",
-        "Write a run's signals as a table or arrays, a recording as images, videos or a dataset.",
-    ),
-    "upload": ("logs", "Upload a result to an S3 bucket, as `-o s3://...` does."),
-    "sweep": ("trials", "Learn from a source many times, over a grid of settings and seeds."),
-    "results": (
-        "trials",
-        "Print mean and standard deviation over seeds at each point of a sweep.",
-    ),
-    "signals": ("logs", "List every signal that a run records."),
-    "reproduce": (
-        "trials",
-        "Reproduce an experiment of the paper: numbers, tables and figures.",
-    ),
-    "arena": ("trials", "Compare learners on sets of streams: what they learn, and how soon."),
-    "demo": ("trials", "Record, learn, check and show: the whole story in minutes."),
-    "doctor": ("doctor", "Say what this machine has and what it lacks."),
+GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    "Record": {
+        "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
+        "convert": ("record", "Write camera logs of others as a recording."),
+        "play": ("view", "Show a recording as it was seen, in real time."),
+    },
+    "Learn": {
+        "learn": (
+            "learn",
+            "Learn slow feature modules from a scene, a recording, logs or cameras.",
+        ),
+        "fork": (
+            "moments",
+            "Go on from some iteration of a run with other settings, as a run of its own.",
+        ),
+        "sweep": ("trials", "Learn from a source many times, over a grid of settings and seeds."),
+        "apply": ("apply", "Apply the modules of a run to other logs."),
+    },
+    "Look": {
+        "view": (
+            "view",
+            "Open a run or a recording in the Rerun viewer, or save, serve or draw it.",
+        ),
+        "info": ("info", "Say what is in a recording, a run, any MCAP file, or a camera log."),
+        "plot": ("logs", "Draw the figures of a run."),
+        "results": (
+            "trials",
+            "Print mean and standard deviation over seeds at each point of a sweep.",
+        ),
+        "signals": ("logs", "List every signal that a run records."),
+    },
+    "Compare and check": {
+        "compare": ("logs", "Check that runs' signals are the same bits, and show their curves."),
+        "check": (
+            "moments",
+            "Learn a run again from its source, and compare every signal bit for bit.",
+        ),
+        "at": ("moments", "Say what a learner was after K iterations of a run, exactly."),
+    },
+    "Keep": {
+        "verify": ("logs", "Check that a log is whole: structure, checksums, nothing lost."),
+        "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
+        "export": (
+            "logs",
+            "Write a run's signals as a table or arrays, a recording as images, videos or a "
+            "dataset.",
+        ),
+        "upload": ("logs", "Upload a result to an S3 bucket, as `-o s3://...` does."),
+    },
+    "Studies": {
+        "reproduce": (
+            "trials",
+            "Reproduce an experiment of the paper: numbers, tables and figures.",
+        ),
+        "arena": ("trials", "Compare learners on sets of streams: what they learn, and how soon."),
+        "demo": ("trials", "Record, learn, check and show: the whole story in minutes."),
+    },
+    "This machine": {
+        "doctor": ("doctor", "Say what this machine has and what it lacks."),
+        "completion": (
+            "completion",
+            "Print what a shell needs to complete commands, scenes, presets, keys and runs.",
+        ),
+    },
 }
-"""Each command with its module in this package and its line of help."""
+"""Each command by its heading of --help, with its module in this package and its line of help."""
+
+COMMANDS = {name: told for group in GROUPS.values() for name, told in group.items()}
+"""The same without headings."""
 
 LONGEST_NAME = 255
 """Bytes of a file's name that file systems take."""
@@ -87,6 +118,8 @@ class LazyGroup(click.Group):
             return None
         module = importlib.import_module(f"cdmisfa.cli.commands.{COMMANDS[cmd_name][0]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
+        if QUIET not in command.params:
+            command.params += (QUIET, VERBOSE)
         return command
 
     def resolve_command(
@@ -99,17 +132,46 @@ class LazyGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands without importing them."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+        width = max(map(len, COMMANDS))  # one for all groups
+        for heading, commands in GROUPS.items():
+            with formatter.section(heading):
+                rows = [(name.ljust(width), text) for name, (_, text) in commands.items()]
+                formatter.write_dl(rows)
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+def _set_loudness(ctx: click.Context, param: click.Parameter, given: bool) -> None:
+    """Take -q or -v, of the program or of a command."""
+    if given and not ctx.resilient_parsing:
+        level = -1 if param is QUIET else 1
+        if Loudness.level == -level:
+            raise click.UsageError("-q says less and -v more: use one of them")
+        Loudness.level = level
+
+
+def _loudness(names: Sequence[str], about: str) -> click.Option:
+    how: dict[str, Any] = {"is_flag": True, "expose_value": False, "callback": _set_loudness}
+    return click.Option(names, help=about, **how)
+
+
+QUIET = _loudness(["-q", "--quiet"], "Say nothing on stderr but errors.")
+VERBOSE = _loudness(
+    ["-v", "--verbose"],
+    "Say more on stderr: the configuration, how long it took, where an unexpected error is.",
+)
+
+
+@click.group(
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    params=[QUIET, VERBOSE],
+)
 @click.version_option(package_name="cdmisfa", message="cdmisfa %(version)s")
 def cli() -> None:
     """Record what a curious robot sees, learn from it live or from the log, and look.
 
     cdmisfa COMMAND --help explains a command. Each that prints takes --json: one document on
-    stdout, nothing else. An error is one line on stderr, with --json too.
+    stdout, nothing else. An error is one line on stderr, with --json too. With -q it is all that
+    is said there.
 
     Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 log damaged or only partly recovered, 4 not
     reproduced or not the same, 130 interrupted (143 by SIGTERM, 129 when its terminal is closed).
@@ -145,10 +207,8 @@ def _open_standard_streams() -> None:
 
 
 def run(args: Sequence[str]) -> int:
-    """Run one command and return its exit code; no exception but SystemExit's comes out.
-
-    With CDMISFA_TRACEBACK=1 in the environment errors keep their traceback.
-    """
+    """Run one command and return its exit code; no exception but SystemExit's comes out."""
+    Loudness.level, began = 0, time.monotonic()
     with interruptible() as stop:
         try:
             try:
@@ -169,12 +229,18 @@ def run(args: Sequence[str]) -> int:
         except SystemExit as end:
             return end.code if isinstance(end.code, int) else 1
         except Exception as error:
-            if os.environ.get("CDMISFA_TRACEBACK") == "1":
-                raise
             if _was_interrupt(error):
                 return _fail("interrupted", stop.exit_code)
             return _explain(error)
+    detail(f"took {time.monotonic() - began:.1f} s, {_most_memory()} of memory at most")
     return code if isinstance(code, int) else 0
+
+
+def _most_memory() -> str:
+    """The most memory that this process had at once."""
+    import resource
+
+    return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB"
 
 
 def _was_interrupt(error: BaseException | None) -> bool:
@@ -221,11 +287,10 @@ def _explain(error: Exception) -> int:
         case MemoryError():
             return _fail("out of memory", 1)
         case _:
-            return _fail(
-                f"unexpected {type(error).__name__}: {error} "
-                "(please report it; CDMISFA_TRACEBACK=1 shows where)",
-                1,
-            )
+            if Loudness.level > 0:
+                traceback.print_exception(error)
+            said = f"unexpected {type(error).__name__}: {error} (please report it; -v shows where)"
+            return _fail(said, 1)
 
 
 def _fail(message: str, code: int) -> int:

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import click
 
+from cdmisfa.cli import completing
 from cdmisfa.cli.making import (
     Command,
     choice,
@@ -90,6 +91,7 @@ preset = word(
     "NAME",
     "Preset (icub, oscillatory, cameras) or a .toml file; by default the one of the source.",
     group="Learner",
+    shell_complete=completing.presets,
 )
 keyframes = number(
     "--keyframes",
@@ -131,7 +133,8 @@ def settings(
     unit: str = "KEY=VALUE",
 ) -> Callable[[Command], Command]:
     """`--set`."""
-    return option("--set", "settings", multiple=True, metavar=unit, help=about, group="Learner")
+    how: dict[str, Any] = {"group": "Learner", "shell_complete": completing.keys}
+    return option("--set", "settings", multiple=True, metavar=unit, help=about, **how)
 
 
 def end_after(what: str, about: str) -> Callable[[Command], Command]:
@@ -167,7 +170,7 @@ def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]
 
 def path_argument(name: str) -> Callable[[Command], Command]:
     """A path of this machine; whether it exists is for the library to say, in its own words."""
-    return click.argument(name, type=OUT)
+    return click.argument(name, type=OUT, shell_complete=completing.runs)
 
 
 def fetched_argument(name: str, *, nargs: int = 1) -> Callable[[Command], Command]:
@@ -188,7 +191,8 @@ def fetched_argument(name: str, *, nargs: int = 1) -> Callable[[Command], Comman
                 error.args = (text,)
                 raise
 
-        argument = click.argument(name, nargs=nargs, required=True, callback=_fetched)
+        how: dict[str, Any] = {"callback": _fetched, "shell_complete": completing.runs}
+        argument = click.argument(name, nargs=nargs, required=True, **how)
         return cast(Command, argument(naming_the_url))
 
     return wrapped
@@ -203,6 +207,8 @@ def is_fetched(path: Path) -> bool:
 def _fetched(
     ctx: click.Context, param: click.Parameter, value: str | tuple[str, ...]
 ) -> Path | tuple[Path, ...]:
+    if ctx.resilient_parsing:  # a shell completes what follows
+        return Path()
     if isinstance(value, tuple):
         return tuple(_copy_of(ctx, word) for word in _matched(value))
     return _copy_of(ctx, value)

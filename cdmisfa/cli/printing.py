@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import printable
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.run_folder import RunResult
+    from cdmisfa.experiments.sources import Configuration
     from replay.integrity.learned import ModuleInfo
     from replay.viewer.broadcast import Broadcast
 
@@ -169,6 +171,13 @@ def say_about(source: FrameSource) -> None:
             f"{name}: {counts['messages']} {what}, "
             f"{counts['repeated']} frames repeated, {counts['dropped']} {what} dropped"
         )
+
+
+def say_configuration(configuration: Configuration) -> None:
+    """Say on stderr every key of a configuration, to those who want to know all."""
+    tables = {"learner": section_table(configuration.learner), **configuration.tables()}
+    for name, table in tables.items():
+        detail(f"{name}: {', '.join(f'{key} {value}' for key, value in table.items())}")
 
 
 def refuse_copies(source: FrameSource, *, strict: bool) -> None:

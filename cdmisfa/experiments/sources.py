@@ -14,7 +14,7 @@ from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_setting
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from recorder.cameras.options import LiveOptions
-from recorder.cameras.words import is_live, open_live
+from recorder.cameras.words import CAMERAS, is_live, open_live
 from recorder.config import RecordConfig, SceneConfig
 from recorder.images.options import ImageOptions
 from recorder.world.scenes import SCENES, open_scene
@@ -307,6 +307,7 @@ def open_logs(
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
     from replay.inputs import locations, open_log
     from replay.storage.location import Url
+    from replay.storage.opening import no_such
 
     if live := [str(word) for word in words if is_live(str(word))]:
         raise UsageError(
@@ -316,10 +317,10 @@ def open_logs(
     paths = locations(words)
     for path in paths:
         if not isinstance(path, Url) and not path.exists() and follow is None:
-            raise UsageError(
-                f"{path}: no such file or folder, and no scene either: "
-                f"the scenes are {', '.join(SCENES)}"
-            )
+            _, colon, address = str(path).partition(":")
+            kinds = [f"{kind}:{address}" for kind in CAMERAS.names() if colon]
+            scenes = SCENES.names()
+            raise no_such(path, [*scenes, *kinds], f"the scenes are {', '.join(scenes)}")
     if follow is None:
         return open_log(paths, cameras, loop=loop, salvage=salvage, goal=goal)
     from replay.recordings.followed import FollowedSource

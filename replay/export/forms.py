@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.registry import Registry
+from cdmisfa.core.registry import Registry, did_you_mean
 from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
 from replay.camera_logs.options import CameraOptions
 from replay.export.frames import write_film, write_films, write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
 from replay.inputs import About, holds_run, open_to_look
+from replay.storage.opening import no_such
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +90,7 @@ def export(
         CdmisfaError: the file cannot be written.
     """
     if form not in FORMS:
-        raise UsageError(f"no form {form!r}: choose one of {', '.join(FORMS.names())} with --to")
+        raise UsageError(f"no form {form!r} for --to: {did_you_mean(form, FORMS.names())}")
     described = FORMS[form]
     if lossless and not described.lossy:
         lossy = " and ".join(name for name, other in FORMS.items() if other.lossy)
@@ -100,7 +101,7 @@ def export(
     paths = [path] if isinstance(path, Path) else list(path)
     for named in paths:
         if not named.exists():
-            raise UsageError(f"{named}: no such file or folder")
+            raise no_such(named)
     if form in TABLES:
         refuse_unless(out, f"{form} is written", f".{form}", "")
     elif form in ("images", "lerobot") or (form == "mp4" and out.suffix != ".mp4"):

@@ -10,6 +10,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import MAX_LIST, check_regular, read_json
 from recorder.log.files import partial_path
 from recorder.mcap.reader import LogReader
+from replay.storage.opening import no_such
 
 RUN_FILE = "run.mcap"
 """Name of the log in a run's folder."""
@@ -52,7 +53,7 @@ def run_log(path: Path) -> Path:
                 "with --force"
             )
         raise UsageError(f"{path} holds no {RUN_FILE}: name the folder of a run")
-    raise UsageError(f"{path} does not exist: name a run's folder or its {RUN_FILE}")
+    raise no_such(path, remedy=f"name a run's folder or its {RUN_FILE}")
 
 
 def is_run(path: Path) -> bool:

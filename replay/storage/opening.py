@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -43,10 +44,25 @@ def log_files(paths: str | Location | Iterable[str | Location]) -> list[Location
         elif path.exists():
             files.append(path)
         else:
-            raise UsageError(f"{path}: no such file or folder")
+            raise no_such(path)
     if not files:
         raise UsageError("no log was named")
     return files
+
+
+def no_such(path: Path, words: Iterable[str] = (), remedy: str = "") -> UsageError:
+    """The error about a path that does not exist: it names what is written nearly so.
+
+    Args:
+        path: as it was named.
+        words: what else may have been meant.
+        remedy: what is said where nothing is near.
+    """
+    beside = [path.parent / p.name for p in path.parent.iterdir()] if path.parent.is_dir() else ()
+    known = {str(name).lower(): name for name in (*beside, *words)}
+    nearest = difflib.get_close_matches(str(path).lower(), known, n=1, cutoff=0.7)
+    hint = f"did you mean {known[nearest[0]]}?" if nearest else remedy
+    return UsageError(f"{path}: no such file or folder{hint and ': '}{hint}")
 
 
 def _listed(url: Url) -> list[Location]:

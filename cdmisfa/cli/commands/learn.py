@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.agents.learners import LEARNERS
-from cdmisfa.cli import options, uploads
+from cdmisfa.cli import completing, options, uploads
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     announce,
@@ -21,6 +21,7 @@ from cdmisfa.cli.printing import (
     refuse_copies,
     say_about,
     say_changes,
+    say_configuration,
     say_counts,
     tell,
 )
@@ -38,7 +39,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 
 
 @grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
-@click.argument("source", nargs=-1)
+@click.argument("source", nargs=-1, shell_complete=completing.sources)
 @uploads.out_option("Folder of the run, or s3://...; without it nothing is written.")
 @options.seed()
 @options.preset
@@ -49,6 +50,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
     f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
     group="Learner",
+    shell_complete=completing.among(LEARNERS.names),
 )
 @option("--portable", is_flag=True, expose_value=False, hidden=True)  # of older scripts
 @options.end_after("iterations", "End after so many iterations.")
@@ -140,6 +142,7 @@ def learn_command(
         if dry_run:
             print_plan(frames, as_json=as_json)
             return
+        say_configuration(configuration)
         color = getattr(frames, "color", cameras.color)  # what auto chose stays
         with learning(frames.spec, told["max_iterations"]) as (stop, reporter):
             if hasattr(frames, "stop"):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import options, uploads
+from cdmisfa.cli import completing, options, uploads
 from cdmisfa.cli.making import flag, option
 from cdmisfa.cli.printing import (
     print_document,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @click.command("verify")
-@click.argument("path", nargs=-1, required=True)
+@click.argument("path", nargs=-1, required=True, shell_complete=completing.runs)
 @options.server_limits
 @options.as_json
 @click.pass_context
@@ -56,7 +56,7 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
 
 
 @click.command("recover")
-@click.argument("path")
+@click.argument("path", shell_complete=completing.runs)
 @options.out("The whole log to write.", required=True)
 @options.server_limits
 @options.force
@@ -206,12 +206,19 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
         tell(f"nothing is drawn of {run}: it has no iterations")
 
 
+def _forms() -> list[str]:
+    from replay.export.forms import FORMS
+
+    return FORMS.names()
+
+
 @click.command("export")
 @options.fetched_argument("path", nargs=-1)
 @option(
     "--to",
     "form",
     metavar="FORM",
+    shell_complete=completing.among(_forms),
     help="Form: parquet, npz, csv, arrow, images, mp4, lerobot, or a plugin's; by default what the "
     "file's name ends in.",
 )
@@ -266,7 +273,7 @@ def _is_film(out: Path) -> bool:
 def signals_command(markdown: bool, as_json: bool) -> None:
     """List every signal that a run records.
 
-    --json and --markdown say more of each: its type, how it is shown, since when there is one.
+    Of each there is more with --json and --markdown: its type, how it is shown, since when.
     """
     from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
 

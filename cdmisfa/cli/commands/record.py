@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from cdmisfa.cli import options, uploads
+from cdmisfa.cli import completing, options, uploads
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
@@ -43,7 +43,7 @@ LIVE = ("cameras", "gym")
 
 
 @grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
-@click.argument("source", nargs=-1)
+@click.argument("source", nargs=-1, shell_complete=completing.sources)
 @uploads.out_option("Folder of the recording, or s3://...")
 @number(
     "--frames",
@@ -262,7 +262,7 @@ def record_streams(
 
 
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
-@click.argument("source", nargs=-1, required=True)
+@click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
 @uploads.out_option("Folder of the recording, or s3://...; --dry-run needs none.")
 @options.log_options
 @options.dry_run

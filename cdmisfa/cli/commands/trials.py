@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import options, uploads
+from cdmisfa.cli import completing, options, uploads
 from cdmisfa.cli.making import flag, grouped, number, word
 from cdmisfa.cli.printing import (
     print_document,
@@ -36,7 +36,7 @@ MOST_SEEDS = 1_000_000
 
 
 @grouped("sweep", common=("out", "grid", "seeds", "settings", "max_iterations", "jobs"))
-@click.argument("source", nargs=-1, required=True)
+@click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
 @uploads.out_option(
     "Folder of the sweep, or s3://...; what is finished in it is not computed again.",
     required=True,
@@ -47,6 +47,7 @@ MOST_SEEDS = 1_000_000
     "KEY=V1,V2,...",
     "Values to try for a configuration key; several grids multiply.",
     multiple=True,
+    shell_complete=completing.keys,
 )
 @options.seeds("Seeds of every point", "0:20")
 @options.preset
@@ -170,8 +171,14 @@ def results_command(folder: Path, csv: bool, latex: bool, as_json: bool) -> None
         print_table(*results.as_table(points))
 
 
+def _experiments() -> list[str]:
+    from cdmisfa.studies.paper.reproduce import EXPERIMENTS
+
+    return [*EXPERIMENTS, ALL]
+
+
 @click.command("reproduce")
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=completing.among(_experiments))
 @options.out("Folder of the results [default: reproduction].")
 @number("--trials", "Trials per condition, instead of the paper's number.", 1)
 @options.jobs
@@ -257,8 +264,14 @@ def _reproduce(name: str, request: Request, **where: Any) -> dict[str, Any]:
     return document
 
 
+def _sets() -> list[str]:
+    from cdmisfa.studies.arena.streams import SETS
+
+    return [ALL, "tuning", "reported", *SETS]
+
+
 @click.command("arena")
-@click.argument("sets", nargs=-1, metavar="[SET]...")
+@click.argument("sets", nargs=-1, metavar="[SET]...", shell_complete=completing.among(_sets))
 @word("--learners", "NAME,...", "Which learners [default: all].")
 @options.seeds("Seeds of learners and streams", "0:10")
 @options.out("Folder of the results; what is finished in it is not computed again [default: arena]")

@@ -1,0 +1,160 @@
+"""What a shell completes, and how much is said on stderr."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa
+
+from cdmisfa.agents.learners import LEARNERS
+from cdmisfa.cli.app import COMMANDS, GROUPS
+from cdmisfa.cli.commands.learn import learn_command
+from cdmisfa.core.config import presets
+from recorder.world.scenes import SCENES
+
+ROOT = Path(__file__).parents[1]
+
+
+def completed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], line: str):
+    """What bash is told to complete at the end of a line, files as None."""
+    from cdmisfa.cli import run
+
+    words = line.split(" ")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+    monkeypatch.setenv("_CDMISFA_COMPLETE", "bash_complete")
+    run([])
+    pairs = [found.split(",", 1) for found in capsys.readouterr().out.splitlines()]
+    return [value if kind == "plain" else None for kind, value in pairs]
+
+
+def test_what_is_completed(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    oscillatory_run: Path,
+) -> None:
+    def of(line: str) -> list[str | None]:
+        return completed(monkeypatch, capsys, f"cdmisfa {line}")
+
+    assert of("") == list(COMMANDS)
+    assert of("lea") == ["learn"]
+    files, *sources = of("learn ")
+    assert files is None
+    assert {*SCENES.names(), "camera:"} <= {*sources}
+    assert of("learn osc") == [None, "oscillatory"]
+    assert of("learn x --preset ") == [None, *presets()]
+    assert of("learn x --algorithm ") == LEARNERS.names()
+    assert of("learn x --set learner.nu") == ["learner.nu="]
+    assert {"learner.attention=", "scene.seed=", "record.fps="} <= {*of("learn x --set ")}
+    assert "scene.object1.toggle_every=" in of("sweep icub --grid scene.")
+    assert of("reproduce ic") == ["icub"]
+    assert "small" in of("arena ")
+    assert of("export x --to par") == ["parquet"]
+    monkeypatch.chdir(oscillatory_run.parents[1])
+    run = str(oscillatory_run.relative_to(Path.cwd()))
+    for command in ("view", "info", "check", "compare", "apply"):
+        assert of(f"{command} {run[:-1]}") == [None, run]
+
+
+def test_a_name_is_fetched_when_its_command_runs_and_not_when_a_shell_completes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("replay.storage.opening.fetched", lambda url: pytest.fail("fetched"))
+    found = completed(monkeypatch, capsys, "cdmisfa view https://a.b/run.mcap --scr")
+    assert found == ["--screenshot"]
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_bash_completes_files_beside_names(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    program = tmp_path / "cdmisfa"
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m cdmisfa "$@"\n')
+    program.chmod(0o755)
+    (tmp_path / "oscillations.mcap").touch()
+    said = cdmisfa("completion", "bash").out
+    ask = "COMP_WORDS=(cdmisfa learn osc); COMP_CWORD=2; compopt() { :; }"
+    said += f"\n{ask}; _cdmisfa_completion cdmisfa"
+    done = subprocess.run(
+        ["bash", "--norc", "-c", f'{said}; printf "%s\\n" "${{COMPREPLY[@]}}"'],
+        env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert sorted(done.stdout.split()) == ["oscillations.mcap", "oscillatory"]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_each_shell_is_told_how_to_ask(cdmisfa: Cdmisfa, shell: str) -> None:
+    said = cdmisfa("completion", shell)
+    assert (said.code, said.err) == (0, "")
+    assert f"_CDMISFA_COMPLETE={shell}_complete" in said.out
+
+
+def test_the_programs_help_has_every_command_below_a_heading(cdmisfa: Cdmisfa) -> None:
+    lines = cdmisfa("--help").out.splitlines()
+    at = lines.index("Record:")
+    headings = [line[:-1] for line in lines[at:] if line and not line.startswith(" ")]
+    listed = [line.split()[0] for line in lines[at:] if line[:3].strip() and line.startswith("  ")]
+    assert (headings, listed) == (list(GROUPS), list(COMMANDS))
+
+
+LEARN = ("learn", "oscillatory", "--max-iterations", "500", "--max-modules", "1")
+
+
+def test_quiet_is_quiet_before_and_after_the_command(cdmisfa: Cdmisfa) -> None:
+    said = cdmisfa(*LEARN, "--json")
+    assert "module 1 saved" in said.err
+    for words in (("-q", *LEARN, "--json"), (*LEARN, "--json", "--quiet")):
+        quiet = cdmisfa(*words)
+        assert (quiet.code, quiet.err, quiet.json) == (0, "", said.json)
+    refused = cdmisfa("-q", "info", "no/such")
+    assert (refused.code, refused.err) == (2, "cdmisfa: no/such: no such file or folder\n")
+    assert "module 1 saved" in cdmisfa(*LEARN).err  # -q is of one command
+
+
+def test_verbose_says_the_configuration_and_where_an_error_is(
+    cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = cdmisfa(*LEARN[:4], "--set", "learner.nu=0.03", "-v")
+    assert "learner: algorithm 2.0, nu 0.03, tau 100, " in said.err
+    assert said.err.splitlines()[-1].startswith("took ")
+    both = cdmisfa("-q", "learn", "oscillatory", "-v")
+    assert (both.code, both.err.count("\n")) == (2, 1)
+
+    def broken(*words: object, **how: object) -> None:
+        raise RuntimeError("odd")
+
+    monkeypatch.setattr(learn_command, "callback", broken)
+    assert "Traceback" not in cdmisfa(*LEARN).err
+    shown = cdmisfa(*LEARN, "-v").err
+    assert "in broken" in shown
+    assert shown.splitlines()[-1].startswith("cdmisfa: unexpected RuntimeError: odd")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("learn oscilatory", "oscillatory"),
+        ("learn ICUB", "icub"),
+        ("learn camra:/dev/video0", "camera:/dev/video0"),
+        ("learn oscillatory --algorithm progres", "progress"),
+        ("info rec/leff.mcap", "rec/left.mcap"),
+        ("view rec/rum", "rec/run"),
+        ("export rec/run --to parqet -o x.y", "parquet"),
+        ("lern x", "learn"),
+    ],
+)
+def test_what_is_written_nearly_so_is_named(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, meant: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rec" / "run").mkdir(parents=True)
+    (tmp_path / "rec" / "left.mcap").touch()
+    done = cdmisfa(*words.split())
+    assert (done.code, f"did you mean {meant}" in done.err) == (2, True)
