@@ -176,6 +176,18 @@ def test_what_came_before_damage_is_kept(run: Path, cdmisfa: Cdmisfa, tmp_path: 
     assert cdmisfa("apply", run, log, "-o", tmp_path / "w.csv", "--salvage").code == 0
 
 
+def test_every_whole_frame_before_a_damaged_one_is_applied(
+    run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    write_pictures(tmp_path / "pngs", 90)
+    (tmp_path / "pngs" / "53.png").write_bytes(b"")
+    done = cdmisfa("apply", run, tmp_path / "pngs", "--rate", 50, "-o", tmp_path / "o.parquet")
+    assert (done.code, "53.png" in done.err) == (3, True)
+    table = pq.read_table(tmp_path / "o.parquet")
+    shown = np.stack(list(pictures(53)))
+    np.testing.assert_array_equal(outputs(table, 1), Run(run).modules[0].transform(shown))
+
+
 @pytest.mark.parametrize("form", ["parquet", "csv"])
 def test_a_full_disk_leaves_nothing_and_says_so(
     form: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -222,7 +234,15 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
     [
         ("apply RUN oscillatory", 2, r"frames of \(2,\), and the modules learned from \(6, 8\)"),
         ("apply RUN small.mcap", 2, "smaller than 8x6"),
-        ("apply RUN t.csv", 2, "t.csv"),
+        ("apply RUN t.csv --rate 9", 2, "t.csv shows numbers, and the modules learned from pict"),
+        (
+            "apply RUN n.npy",
+            2,
+            r"n.npy shows frames of \(3,\), and the modules .* \(6, 8\)",
+        ),
+        ("apply RUN nan.npy", 2, "nan: row 1, counted from 0, holds what is no finite number"),
+        ("apply RUN text.npy", 2, "its values are of type <U1, no numbers"),
+        ("apply RUN colour.npy", 2, r"colour: it has shape \(9, 3, 12, 16\), so move its colours"),
         ("apply RUN none.mcap", 2, "none.mcap: no such file"),
         ("apply RUN empty.mcap", 3, "empty.mcap"),
         ("apply a.mcap a.mcap", 2, "a.mcap"),
@@ -242,6 +262,10 @@ def test_what_cannot_be_applied_is_refused_in_a_line(
     tiny = [(20 * i, image[:4, :4]) for i, image in enumerate(pictures(30))]
     write_images(tmp_path / "small.mcap", {"/cam": tiny})
     write_table(tmp_path / "t.csv", {"x": [1.0, float("nan"), 3.0]})
+    arrays: dict[str, Any] = {"n": np.zeros((9, 3)), "nan": [[1.0], [float("nan")]]}
+    arrays |= {"text": ["a"], "colour": np.zeros((9, 3, 12, 16), np.uint8)}
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
     (tmp_path / "empty.mcap").write_bytes(b"")
     (tmp_path / "there.csv").write_text("mine")
     if "EMPTY" in words:

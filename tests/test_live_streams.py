@@ -130,6 +130,10 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
     source = ArraySource({"a": np.zeros((5, 4), float), "b": np.zeros((5, 3), float)})
     with pytest.raises(UsageError, match="b shows float64"):
         source.take(0, 2)
+    source = ArraySource({"a": iter([np.zeros(2), np.zeros(2), np.array([0, np.nan])])})
+    assert source.take(0, 2).frames.shape == (2, 2)
+    with pytest.raises(UsageError, match="a: frame 2, counted from 0, holds what is no finite"):
+        source.take(0, 1)
 
 
 def learned_twice(cdmisfa: Cdmisfa, place: Path, *words: str) -> dict[str, Any]:

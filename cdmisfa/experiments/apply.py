@@ -28,7 +28,7 @@ from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, open_live
 from recorder.images.options import ImageOptions
 from replay.arrays import TAKES, are_arrays
-from replay.camera_logs.opening import ALL
+from replay.camera_logs.opening import ALL, log_format, only_foreign
 from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import UnequalError
 from replay.export.applied import Applied, AppliedSink
@@ -147,12 +147,19 @@ class Application:
             arrays.close()
             taken = {name: value for name, value in self._made(cameras).items() if name in TAKES}
             return open_logs(words, cameras=replace(cameras, **taken), **how)
-        if cameras == CameraOptions():
+        if cameras == CameraOptions() and not any(map(only_foreign, places)):
             with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
                 recorded = RecordedSource(places, **how)
                 if recorded.spec.frame_shape == self.recipe.shape or not recorded.spec.images:
                     return recorded
                 recorded.close()
+        numbers = cameras.fields or any(log_format(place) == "table" for place in places)
+        if numbers and self.recipe.size is not None:
+            height, width = self.recipe.size
+            raise UsageError(
+                f"{words[0]} shows numbers, and the modules learned from pictures of "
+                f"{width}x{height}: choose pictures"
+            )
         cameras = replace(cameras, **self._made(cameras))
         if not cameras.topics and not cameras.fields:
             cameras = replace(cameras, topics=ALL)
@@ -252,14 +259,15 @@ def _reads(
             return
         except LogDamagedError:
             if step == tau:
+                yield _rest(source)
                 raise
-            step = tau  # up to the block that is damaged
+            step = tau  # up to the block that is damaged, and then frame by frame
 
 
 def _rest(source: FrameSource) -> Sequence[Block]:
-    """The last frames of a source that has too few for a block."""
+    """The last frames of a source that has too few for a block, or none that are whole."""
     found: dict[int, list[Block]] = {}
-    with contextlib.suppress(LogExhaustedError):
+    with contextlib.suppress(LogExhaustedError, LogDamagedError):
         while True:
             for block in source.take_all(1):
                 found.setdefault(block.stream, []).append(block)

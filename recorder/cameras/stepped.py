@@ -78,7 +78,9 @@ _ARRAYS = (
 
 
 class ArraySource(SteppedSource):
-    """Frames that the caller has, or makes, as streams.
+    """Frames that the caller makes, one after the other, as streams.
+
+    Of arrays that are all there `cdmisfa.Recording` gives a source that can go back, too.
 
     Args:
         streams: for each stream, by its name, an array (n, height, width) of uint8 or (n, I) of
@@ -87,7 +89,8 @@ class ArraySource(SteppedSource):
         start_ns: log time of frame 0, in nanoseconds.
 
     Raises:
-        UsageError: a stream is empty, or frames are of other sizes or types than pixels or values.
+        UsageError: a stream is empty, or frames are of other sizes or types than pixels or values,
+            or hold what is no finite number; as soon as such a one comes.
     """
 
     def __init__(
@@ -126,12 +129,17 @@ class ArraySource(SteppedSource):
 
 
 def _checked(name: str, frames: Iterable[Any], spec: SourceSpec) -> Iterator[Any]:
-    """The frames of a stream, all of one size and type."""
-    for frame in map(as_array, frames):
+    """The frames of a stream, all of one size and type, and of finite numbers."""
+    for t, frame in enumerate(map(as_array, frames)):
         if frame.shape != spec.frame_shape or frame.dtype != spec.dtype:
             raise UsageError(
                 f"{name} shows {frame.dtype} of shape {frame.shape}, not {spec.dtype} of "
                 f"{spec.frame_shape} as the first stream does: give frames of one size and type"
+            )
+        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
+            raise UsageError(
+                f"{name}: frame {t}, counted from 0, holds what is no finite number (NaN or "
+                "infinity): leave it out or fill it in"
             )
         yield frame
 
