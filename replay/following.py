@@ -62,6 +62,10 @@ class OutputHistory:
         Args:
             names: of the columns of truth.
         """
+        return next(iter(self.fits(names)), None)
+
+    def fits(self, names: Sequence[str]) -> list[Fit]:
+        """How the output follows each quantity, the one that it follows most first."""
         truth, y = self.truth[-KEPT:], self.y[-KEPT:]
         angles = _angles(truth) if self.angles is None else self.angles
         found = [
@@ -69,7 +73,7 @@ class OutputHistory:
             for column, name in enumerate(names[: truth.shape[1]])
             if (fit := simplest_fit(truth[:, column], y, column, name, angle=column in angles))
         ]
-        return max(found, key=lambda fit: fit.r, default=None)
+        return sorted(found, key=lambda fit: -fit.r)
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,37 +27,55 @@ KEPT = 64
 
 
 class Thinned:
-    """Rows spread evenly over all that come, at most `most`: those whose number is a multiple.
+    """Rows spread evenly over all that come, at most `most`, with no period of their own.
+
+    Every second or third row of something periodic would show one phase of it alone; so row i is
+    kept where the fraction of i times the golden ratio is small. Which rows are kept depends
+    neither on chance nor on how they come.
 
     Args:
-        most: rows; when there are more, every second one goes.
+        most: rows; when there are more, half of them go.
+
+    Attributes:
+        count: rows that came.
+        step: how many of them one that is kept stands for.
 
     Example:
         >>> rows = Thinned(4)
         >>> for start in range(0, 10, 5):
         ...     rows.add(np.arange(start, start + 5))
         >>> rows.columns[0].tolist(), rows.step
-        ([0, 4, 8], 4)
+        ([0, 2, 5], 4)
     """
 
     def __init__(self, most: int) -> None:
         self.step, self.count = 1, 0
         self._most = most
+        self._at: IntArray = np.zeros(0, np.int64)
         self._columns: tuple[NDArray[Any], ...] = ()
 
     def add(self, *columns: NDArray[Any]) -> None:
         """Take the next rows of each column, (n, ...)."""
-        kept = slice(-self.count % self.step, None, self.step)
-        self.count += len(columns[0])
-        added = tuple(column[kept] for column in columns)
+        at = np.arange(self.count, self.count + len(columns[0]))
+        self.count += len(at)
+        kept = self._kept(at)
         if self._columns:
-            pairs = zip(self._columns, added, strict=True)
-            self._columns = tuple(np.concatenate(pair) for pair in pairs)
+            pairs = zip(self._columns, columns, strict=True)
+            self._columns = tuple(np.concatenate([old, new[kept]]) for old, new in pairs)
         else:
-            self._columns = tuple(column.copy() for column in added)
-        while len(self._columns[0]) > self._most:
+            self._columns = tuple(column[kept] for column in columns)
+        self._at = np.concatenate([self._at, at[kept]])
+        while len(self._at) > self._most:
             self.step *= 2
-            self._columns = tuple(column[::2].copy() for column in self._columns)
+            kept = self._kept(self._at)
+            self._at = self._at[kept]
+            self._columns = tuple(column[kept] for column in self._columns)
+
+    def _kept(self, at: IntArray) -> NDArray[np.bool_]:
+        # 2^64 over the golden ratio; the product's low 64 bits are the fraction.
+        with np.errstate(over="ignore"):
+            fraction = at.astype(np.uint64) * np.uint64(11400714819323198485)
+        return np.asarray(fraction < np.uint64((1 << 64) // self.step - 1))
 
     @property
     def columns(self) -> tuple[NDArray[Any], ...]:

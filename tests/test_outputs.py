@@ -62,13 +62,23 @@ def test_weights_of_an_expansion_are_no_picture(tmp_path: Path) -> None:
     assert own.saliency() is None
 
 
-@given(st.lists(st.integers(0, 40)), st.integers(2, 9))
+@given(st.lists(st.integers(0, 400)), st.integers(2, 90))
 def test_rows_kept_do_not_depend_on_how_they_came(sizes: list[int], most: int) -> None:
     parts, one = Thinned(most), Thinned(most)
     numbers = np.arange(sum(sizes))
-    one.add(numbers)
+    one.add(numbers, -numbers)
     for part in np.split(numbers, np.cumsum(sizes))[:-1]:
-        parts.add(part)
+        parts.add(part, -part)
     kept = parts.columns[0].tolist() if sizes else []
-    assert kept == one.columns[0].tolist() == numbers[:: one.step].tolist()
-    assert len(kept) <= most
+    assert kept == one.columns[0].tolist() == (-one.columns[1]).tolist()
+    assert len(kept) == one.count if one.step == 1 else most // 4 <= len(kept) <= most
+    if len(kept) > 1:
+        assert max(np.diff([*kept, len(numbers)])) <= 3 * one.step
+
+
+@pytest.mark.parametrize("period", [2, 3, 4, 8, 40])
+def test_rows_kept_of_something_periodic_show_every_phase_of_it(period: int) -> None:
+    rows = Thinned(500)
+    rows.add(np.arange(20_000) % period)
+    phases = np.bincount(rows.columns[0], minlength=period)
+    assert phases.min() > 0.6 * phases.mean()

@@ -48,6 +48,8 @@ def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
         assert done.code == 0, f"cdmisfa {shlex.join(args)}: {done.err}"
     for made in (
         "live.rrd",
+        "report.html",
+        "runs/live/report.html",
         "signals.parquet",
         "left-again.mcap",
         "scene.png",

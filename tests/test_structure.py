@@ -70,6 +70,7 @@ FORBIDDEN = {
         "recorder.recording",
     ),
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),
+    "replay.report": ("replay.view.columns", "replay.export.frames", "rerun"),
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.frames", "pybullet"),

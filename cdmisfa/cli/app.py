@@ -50,6 +50,10 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "view",
             "Open a run or a recording in the Rerun viewer, or save, serve or draw it.",
         ),
+        "report": (
+            "report",
+            "Write what came of a run as one HTML page, to be read, printed or sent.",
+        ),
         "info": ("info", "Say what is in a recording, a run, any MCAP file, or a camera log."),
         "plot": ("logs", "Draw the figures of a run."),
         "results": (

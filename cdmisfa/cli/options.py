@@ -81,6 +81,7 @@ strict = flag(
 )
 force = flag("--force", "Overwrite what is already there.")
 no_rerun = flag("--no-rerun", "Do not build the Rerun view run.rrd.")
+no_report = flag("--no-report", "Do not write the report report.html.")
 retry_failed = flag("--retry-failed", "Compute trials again that failed before.")
 as_json = option(
     "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."

@@ -29,7 +29,7 @@ from recorder.log.files import (
 )
 from recorder.world.scenes import SCENES, scene_of
 from replay.recordings.source import RecordedSource
-from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
+from replay.runs.folders import MODULES_FILE, REPORT_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.modules import save_modules
 from replay.runs.run import final_record
 from replay.runs.writer import RunWriter
@@ -209,7 +209,7 @@ def opened_log(
         logs = [folder / SET_ASIDE, finished, partial_path(finished)]
         if others := [path for path in logs_in(folder) if path not in logs]:
             raise UsageError(f"{others[0]} is of no run: choose another folder")
-        stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE)]
+        stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE, REPORT_FILE)]
         stale += folder.glob("checkpoint-*.npz")  # of runs from before keyframes
         if aside is not None:
             try:

@@ -164,11 +164,25 @@ class Run(Shown, RecomputedRun):
         with Recording.of(source).source() as opened:
             return super().at(iterations, opened)
 
-    def report(self) -> str:
+    def summary(self) -> str:
         """What came of it, in words, as Markdown: what the first page of its view says."""
         from replay.view.summary import summary_text
 
         return summary_text(read_outline(self.log), self.path.name, [e.text for e in self.events])
+
+    def report(self, out: str | Path | None = None) -> Path:
+        """Write what came of it as one HTML page that needs no network and no other file.
+
+        Args:
+            out: the file, *.html; by default report.html in its folder, replaced.
+
+        Raises:
+            UsageError: the file exists.
+            LogWriteError: it cannot be written.
+        """
+        from cdmisfa.experiments.reports import write_report
+
+        return write_report([self.path], None if out is None else Path(out))
 
     def view(self, save: str | Path | None = None, *, tab: str | None = None) -> None:
         """Show it in the Rerun viewer: in a notebook below the cell, else until a window is closed.

@@ -13,6 +13,7 @@ import numpy as np
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.signals import ACTIONS
+from cdmisfa.experiments.reports import write_report
 from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
@@ -34,7 +35,7 @@ Stage = Callable[[str, str], AbstractContextManager[Any]]
 
 
 def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[str, Any]:
-    """Record the scene, learn from the recording, compare with live, draw figures.
+    """Record the scene, learn from the recording, compare with live, write the report.
 
     Args:
         out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
@@ -93,11 +94,12 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[
                 "see `cdmisfa doctor`"
             )
         bar.say(f"live and recorded signals of {most} iterations are the same, bit for bit")
-    with stage("4/4 drawing figures", "modules"), _opened(recording, seed) as source:
+    with stage("4/4 writing the report", "modules"), _opened(recording, seed) as source:
         return {
             "schema": 1,
             "recording": recording,
             "run": folder,
+            "report": write_report([folder]),
             "figures": draw_figures(folder, None, force=True),
             "iterations": result.iterations,
             "live_equals_recorded": True,

@@ -24,6 +24,9 @@ MODULES_FILE = "modules.npz"
 VIEW_FILE = "run.rrd"
 """Name of the view."""
 
+REPORT_FILE = "report.html"
+"""Name of the report."""
+
 RUN_METADATA = "cdmisfa.run"
 """Name of the metadata record that makes a log that of a run."""
 

@@ -12,6 +12,7 @@ import click
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import completing, options, uploads
+from cdmisfa.cli.commands.report import report_beside
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     announce,
@@ -65,6 +66,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 @options.strict
 @flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
+@options.no_report
 @flag("--follow", "Wait for the frames of a recording being written.", group="Source")
 @number(
     "--follow-timeout",
@@ -166,6 +168,8 @@ def learn_command(
     if resume and not reporter.told and not stop():
         tell("nothing was left to do: the run had come as far before")
     print_result(result, as_json=as_json)
+    if result.run is not None and result.ended != INTERRUPTED and not told["no_report"]:
+        report_beside(result.run, quiet=as_json)
     if result.ended == INTERRUPTED:
         if result.run is not None and not of_cameras:
             tell(f"go on with cdmisfa learn --resume -o {quoted(result.run)}")

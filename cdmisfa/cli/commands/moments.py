@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.cli.commands.report import report_beside
 from cdmisfa.cli.making import WholeRange, number, option, word
 from cdmisfa.cli.printing import (
     outcome_line,
@@ -151,6 +152,7 @@ def check_command(
 @options.end_after("modules", "End after so many modules in all; by default as the run.")
 @source
 @options.no_rerun
+@options.no_report
 @options.keyframes
 @options.fsync_every
 @options.server_limits
@@ -165,6 +167,7 @@ def fork_command(
     max_iterations: int | None,
     max_modules: int | None,
     no_rerun: bool,
+    no_report: bool,
     keyframes: int | None,
     fsync_every: float | None,
     as_json: bool,
@@ -192,6 +195,8 @@ def fork_command(
             hashing=reporter.hashing,
         )
     print_result(result, as_json=as_json)
+    if result.run is not None and result.ended != INTERRUPTED and not no_report:
+        report_beside(result.run, quiet=as_json)
     both = f"cdmisfa compare {quoted(run)} {quoted(out)} --save both.rrd"
     tell(f"both in one view: {both}")
     if result.ended == INTERRUPTED:

@@ -368,9 +368,7 @@ def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
     rows = [[told.get(key, str)(module[key]) for key in head] for module in report["modules"]]
     print_table(head, rows)
     print_line()
-    for figure in report["figures"]:
-        if figure.suffix == ".png":
-            print_line(f"figure     {figure}")
+    print_line(f"report     {report['report']}")
     print_line(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
 
 

@@ -1,0 +1,165 @@
+"""Reports of runs, sweeps and recordings: one HTML page each, which says what came of them."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.options import option_words
+from cdmisfa.experiments.recompute import Recomputation, versions_differ
+from cdmisfa.experiments.resume import read_command
+from recorder.log.files import atomic_write, refuse_taken, refuse_unless
+from replay.camera_logs.options import CameraOptions
+from replay.inputs import holds_run, locations, open_to_look
+from replay.runs.folders import REPORT_FILE, is_sweep, read_request, run_log, runs_in
+from replay.runs.log import read_header
+
+if TYPE_CHECKING:
+    from replay.report.trust import Proof
+
+
+def write_report(
+    words: Sequence[str | Path], out: Path | None = None, *, force: bool = False
+) -> Path:
+    """Write the report of a run, several runs, a sweep, a recording or other logs.
+
+    Args:
+        words: their paths.
+        out: the file; by default `report.html` in the folder of the one run, replaced.
+        force: replace an existing file.
+
+    Returns:
+        The file.
+
+    Raises:
+        UsageError: there is no such thing, or the file exists.
+        LogDamagedError: not even its head can be read.
+        LogWriteError: the file cannot be written.
+    """
+    paths = [Path(word) for word in words]
+    runs = [path for path in paths if "://" not in str(path) and _is_run(path)]
+    if out is None:
+        if len(paths) != 1 or not runs:
+            raise UsageError("name the file of the report: -o report.html")
+        out, force = run_log(paths[0]).parent / REPORT_FILE, True
+    refuse_unless(out, "a report is an HTML page", ".html", ".htm")
+    refuse_taken(out, force=force)
+    page = _page(words, paths, runs)
+    with atomic_write(out) as partial:
+        partial.write_text(page, encoding="utf-8")
+    return out
+
+
+def _page(words: Sequence[str | Path], paths: list[Path], runs: list[Path]) -> str:
+    from replay.report.page import report_of_recording, report_of_run, report_of_runs
+
+    if len(paths) == 1 and runs:
+        return report_of_run(paths[0], proof_of(paths[0]))
+    if len(paths) == 1 and "://" not in str(paths[0]) and (is_sweep(paths[0]) or runs_in(paths[0])):
+        return _of_sweep(paths[0])
+    if runs:
+        if others := [path for path in paths if path not in runs]:
+            raise UsageError(f"{others[0]} is no run: a report compares runs with runs alone")
+        return report_of_runs(paths, f"{len(paths)} runs compared")
+    with contextlib.closing(open_to_look(locations(list(map(str, words))))) as source:
+        return report_of_recording(source, ", ".join(Path(str(word)).name for word in words))
+
+
+def _is_run(path: Path) -> bool:
+    try:
+        return path.exists() and holds_run(path)
+    except CdmisfaError:
+        return path.is_dir() and (path / "run.json").is_file()
+
+
+def _of_sweep(folder: Path) -> str:
+    """The page of a sweep, or of a folder of runs."""
+    from cdmisfa.experiments.results import as_table, results, varied
+    from replay.report.page import report_of_runs
+
+    runs, name = runs_in(folder), folder.resolve().name
+    if not is_sweep(folder):
+        return report_of_runs(runs, f"{name}: {len(runs)} runs")
+    points = results(folder)
+    differ = varied(points)
+    text = "; ".join(f"{key}: {', '.join(map(str, values))}" for key, values in differ.items())
+    text = f"What differs is {text}." if text else "Its trials differ in their seeds alone."
+    head, rows = as_table(points)
+    orders = [
+        (*map(str, point.point.values()), order or "nothing", count)
+        for point in points
+        for order, count in point.orders.items()
+    ]
+    keys = [*(points[0].point if points else ()), "learned, in order", "trials"]
+    tables = [
+        {"title": "What differs, and what came of it", "text": text, "head": head, "rows": rows},
+        {"title": "In which order streams were learned", "text": "", "head": keys, "rows": orders},
+    ]
+    title = f"{name}: a sweep of {len(points)} points"
+    asked = {number: (k, point) for k, (number, point) in enumerate(read_request(folder))}
+    runs.sort(key=lambda run: asked[_trial(run)][0])
+    names = [_named(run, asked[_trial(run)][1]) for run in runs]
+    return report_of_runs(runs, title, tables, names)
+
+
+def _trial(run: Path) -> str:
+    return run.name.partition(".")[0]
+
+
+def _named(run: Path, point: Mapping[str, Any]) -> str:
+    """A trial's name: what its point and its seed are."""
+    seed = read_header(run).manifest.get("seed")
+    return ", ".join([*(f"{key}={value}" for key, value in point.items()), f"seed {seed}"])
+
+
+def proof_of(run: Path) -> Proof:
+    """Whether learning a run again can be expected to give the same bits; nothing is learned.
+
+    Asked are the version of the arithmetic, whether its source is there, and whether that is what
+    the run learned from, as far as is known without reading all of it.
+    """
+    from replay.report.trust import Proof
+
+    again = command_again(run)
+    try:
+        with Recomputation(Path(run), 0) as beginning:
+            then, now = beginning.arithmetic
+            beginning.source  # noqa: B018, it is opened when it is asked for
+            others = beginning.other_files()
+    except CdmisfaError as error:
+        return Proof(False, f"It cannot be learned again here: {error}.", again)
+    if others:
+        return Proof(False, f"{', '.join(others)}: no longer what the run learned from.", again)
+    if then != now:
+        but = versions_differ(then, now)
+        return Proof(
+            False, f"What it learned from is there, but {but}: alike, not bit for bit.", again
+        )
+    return Proof(
+        True, "What it learned from is there: learn it again, and compare every bit.", again
+    )
+
+
+def command_again(run: Path) -> str:
+    """The command that begins a run anew, for a shell; "" where the run does not say."""
+    try:
+        words, options = read_command(Path(run))
+    except CdmisfaError:
+        return ""
+    fields = {field.name for field in dataclasses.fields(CameraOptions)}
+    said = option_words(CameraOptions(**{k: v for k, v in options.items() if k in fields}))
+    for name, value in options.items():
+        if name in fields or value in (None, False, ()) or (name, value) == ("seed", 0):
+            continue
+        flag = "--set" if name == "settings" else f"--{name.replace('_', '-')}"
+        if value is True:
+            said.append(flag)
+        else:
+            for one in value if isinstance(value, tuple) else (value,):
+                said += [flag, str(one)]
+    return shlex.join(["cdmisfa", "learn", *words, *said, "-o", "RUN"])

@@ -1,0 +1,253 @@
+"""The rules by which a module is saved, as quantities with their limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray, IntArray
+from cdmisfa.core.signals import NO_STATE, STATES
+from replay.runs.log import RunHeader
+from replay.runs.run import Outline
+
+LIVELY = (0.5, 2.0)
+"""Variance of an output that the progress learner counts as alive."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A quantity that must be within limits for a module to be saved.
+
+    Attributes:
+        short: its name in a table.
+        text: what it is, in words.
+        limit: the condition, in words.
+        values: (n,) of each iteration; NaN where there is none.
+        low, high: the limits; None where there is none.
+        log: it is drawn on a logarithmic axis.
+        drawn: it has a plot of its own.
+        counts: it decides by itself; else it only follows from the others.
+        held: (n,) where it held, where the limits were others before; see `rules_of`.
+    """
+
+    short: str
+    text: str
+    limit: str
+    values: FloatArray
+    low: float | None = None
+    high: float | None = None
+    log: bool = False
+    drawn: bool = True
+    counts: bool = True
+    held: NDArray[np.bool_] | None = None
+
+    @property
+    def holds(self) -> NDArray[np.bool_]:
+        """(n,) where it holds; nowhere where there is no value."""
+        if self.held is not None:
+            return self.held
+        found = np.isfinite(self.values)
+        with np.errstate(invalid="ignore"):
+            if self.low is not None:
+                found &= self.values >= self.low
+            if self.high is not None:
+                found &= self.values < self.high
+        return found
+
+
+def rules_of(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> tuple[Rule, ...]:
+    """The rules for saving of a run's learner, as far as its log tells them.
+
+    Of a fork those of its parent hold until it parts from that.
+    """
+    header = outline.header
+    if not outline.iterations:
+        return ()
+    rules = _of_progress(outline, signals) if header.by_progress else _of_paper(outline, signals)
+    parent, at = _before(header), header.forked_at
+    if parent is not None and at is not None:
+        for place, then in enumerate(rules_of(replace(outline, header=parent), signals)):
+            held = np.concatenate([then.holds[:at], rules[place].holds[at:]])
+            rules[place] = replace(rules[place], held=held)
+    return tuple(rules)
+
+
+def _before(header: RunHeader) -> RunHeader | None:
+    """A header as that of the parent of a fork, as far as it says; None of another run."""
+    fork = header.manifest.get("fork")
+    before = fork.get("before") if isinstance(fork, Mapping) else None
+    if not isinstance(before, Mapping) or "config" not in before:
+        return None
+    rest = {key: value for key, value in header.manifest.items() if key != "fork"}
+    found = replace(header, manifest={**rest, **before})
+    return found if found.by_progress == header.by_progress else None
+
+
+def _of_paper(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[Rule]:
+    header, lines = outline.header, outline.lines
+    tabular = header.setting("learner", "algorithm") == "1.0"
+    share, variance = _number(header, "novel_share"), _number(header, "min_variance")
+    window = _number(header, "eta_dot_window")
+    if tabular:
+        error = _number(header, "roc_error")
+        first = Rule(
+            "error", "clustering error of its outputs", _below(error), signals["roc_error"],
+            high=error,
+        )  # fmt: skip
+    else:
+        change = np.abs(lines["eta_dot"].reshape(outline.iterations, -1)).max(axis=1)
+        first = Rule(
+            "η̇", "how much its slowness still changes, |η̇| per frame, the largest of its outputs",
+            f"saved only below δ = {header.delta:g}" if header.delta else "",
+            change, high=header.delta, log=True,
+        )  # fmt: skip
+    return [
+        first,
+        Rule(
+            "share", "share of recent blocks that are new to it and of the same stream as before",
+            "" if share is None else f"saved only from {share:g} on: while the learner stays",
+            lines["share"], low=share,
+        ),
+        Rule(
+            "variance", "recent variance of its output, the smallest of its outputs",
+            "" if variance is None else f"saved only from {variance:g} on: below, it is dead",
+            signals["variance"], low=variance,
+        ),
+        Rule(
+            "novel blocks", "new blocks that it has learned from",
+            "" if window is None else f"saved only after more than {window:g}",
+            _of_novel(signals), low=None if window is None else window + 1, drawn=False,
+        ),
+    ]  # fmt: skip
+
+
+def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[Rule]:
+    header, lines = outline.header, outline.lines
+    change, _ = header.settled or (None, None)
+    agreement, frames = _number(header, "agreement"), _number(header, "test_frames")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = np.abs(np.log(lines["tested"] / lines["fitted"]))
+    untested = ~np.isfinite(lines["tested"])
+    window = None if frames is None else max(frames / max(outline.tau, 1), 1.0)
+    return [
+        Rule(
+            "error", "learning error e of the stream that is watched: change plus disagreement",
+            "" if header.settled is None else f"learned below {header.settled[1]:g}, or sooner",
+            np.where(untested, np.nan, lines["learning_error"]),
+            high=None if header.settled is None else header.settled[1], log=True, counts=False,
+        ),
+        Rule(
+            "change", "change c of its slowest output with a block",
+            "" if change is None else f"learned below {change:g}",
+            np.where(untested, np.nan, lines["change"]), high=change, log=True,
+        ),
+        Rule(
+            "agreement", "disagreement |ln(tested / fitted)|: slowness on new frames against old",
+            "" if agreement is None else f"learned below {agreement:g}: else it fits accidents",
+            np.where(untested, np.nan, apart), high=agreement,
+        ),
+        Rule(
+            "variance", "variance of its slowest output on new frames",
+            f"learned between {LIVELY[0]:g} and {LIVELY[1]:g}: it is alive, and as it was",
+            signals["variance"], low=LIVELY[0], high=LIVELY[1],
+        ),
+        Rule(
+            "tests", "blocks that it learned from since it was begun",
+            "" if window is None else f"learned from {window:g} on: a whole window of tests",
+            signals["novel_blocks"].astype(float), low=window, drawn=False,
+        ),
+    ]  # fmt: skip
+
+
+def _of_novel(signals: Mapping[str, NDArray[Any]]) -> FloatArray:
+    """Novel blocks, where the block itself is novel: only then is a module saved."""
+    return np.where(signals["novel"].astype(bool), signals["novel_blocks"], np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """Blocks in which one thing was learned, and how the rules stood in them.
+
+    Attributes:
+        name: the module, or of the progress learner the stream.
+        blocks: how many.
+        shares: of the blocks, in which each rule held.
+        together: blocks in which all held.
+        came: what came of it, in words.
+        saved: it became a module.
+    """
+
+    name: str
+    blocks: int
+    shares: tuple[float, ...]
+    together: int
+    came: str
+    saved: bool
+
+
+def deciding(rules: tuple[Rule, ...]) -> tuple[Rule, ...]:
+    """Those that decide, as far as there are values of them."""
+    return tuple(r for r in rules if r.counts and np.isfinite(r.values).any())
+
+
+def attempts(
+    outline: Outline, signals: Mapping[str, NDArray[Any]], rules: tuple[Rule, ...]
+) -> list[Attempt]:
+    """What was learned, saved or not, and how the rules stood while it was."""
+    rules = deciding(rules)
+    if not rules:
+        return []
+    streams, names = outline.blocks.streams, outline.names()
+    groups: list[tuple[str, NDArray[np.bool_], Any, int]] = []
+    if outline.header.by_progress:
+        of_stream = {save.stream: save for save in outline.saved}
+        for s in outline.streams(len(names)):
+            save = of_stream.get(s)
+            own = streams == s
+            if save is not None:
+                own &= outline.blocks.iterations <= save.iteration
+            groups.append((names[s], own, save, outline.states[s]))
+    else:
+        of_module = {save.module: save for save in outline.saved}
+        for number in np.unique(signals["module"]).tolist():
+            save = of_module.get(number)
+            groups.append((f"module {number}", signals["module"] == number, save, NO_STATE))
+    every = np.all([rule.holds for rule in rules], axis=0)
+    return [
+        Attempt(
+            name,
+            int(own.sum()),
+            tuple(float(rule.holds[own].mean()) for rule in rules),
+            int(every[own].sum()),
+            _came(save, names, state),
+            save is not None,
+        )
+        for name, own, save, state in groups
+        if own.any()
+    ]
+
+
+def _came(save: Any, names: tuple[str, ...], state: int) -> str:
+    if save is None:
+        word = STATES[state].replace("_", " ") if state > 0 else ""
+        return f"no module: {word}" if word else "no module"
+    return f"module {save.module} on {names[save.stream]}, iteration {save.iteration:,}"
+
+
+def saved_rows(outline: Outline) -> IntArray:
+    """Rows of the iterations at whose end a module was saved."""
+    iterations = [save.iteration for save in outline.saved]
+    return np.searchsorted(outline.blocks.iterations, iterations)
+
+
+def _number(header: RunHeader, key: str) -> float | None:
+    value = header.setting("learner", key)
+    return float(value) if isinstance(value, int | float) else None
+
+
+def _below(limit: float | None) -> str:
+    return "" if limit is None else f"saved only below {limit:g}"
