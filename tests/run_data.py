@@ -43,7 +43,7 @@ def block_of(spec: SourceSpec, stream: int, t: int, tau: int, rng: np.random.Gen
     """A block whose frames tell which stream and frame they are."""
     shape = (tau, *spec.frame_shape)
     if spec.dtype == "uint8":
-        frames: NDArray[Any] = np.full(shape, 40 * stream + 20, dtype=np.uint8)
+        frames: NDArray[Any] = np.full(shape, (40 * stream + 20) % 250, dtype=np.uint8)
         frames[np.arange(tau), :, (t + np.arange(tau)) // 10 % spec.frame_shape[1]] = 250
     else:
         frames = rng.standard_normal(shape)

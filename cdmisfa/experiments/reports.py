@@ -15,7 +15,7 @@ from cdmisfa.experiments.recompute import Recomputation, versions_differ
 from cdmisfa.experiments.resume import read_command
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.camera_logs.options import CameraOptions
-from replay.inputs import holds_run, locations, open_to_look
+from replay.inputs import holds_run, open_to_look
 from replay.runs.folders import REPORT_FILE, is_sweep, read_request, run_log, runs_in
 from replay.runs.log import read_header
 
@@ -24,13 +24,18 @@ if TYPE_CHECKING:
 
 
 def write_report(
-    words: Sequence[str | Path], out: Path | None = None, *, force: bool = False
+    words: Sequence[str | Path],
+    out: Path | None = None,
+    *,
+    cameras: CameraOptions | None = None,
+    force: bool = False,
 ) -> Path:
     """Write the report of a run, several runs, a sweep, a recording or other logs.
 
     Args:
         words: their paths.
         out: the file; by default `report.html` in the folder of the one run, replaced.
+        cameras: what of other logs is shown, and how.
         force: replace an existing file.
 
     Returns:
@@ -42,32 +47,32 @@ def write_report(
         LogWriteError: the file cannot be written.
     """
     paths = [Path(word) for word in words]
-    runs = [path for path in paths if "://" not in str(path) and _is_run(path)]
+    runs = [path for path in paths if _is_run(path)]
     if out is None:
         if len(paths) != 1 or not runs:
             raise UsageError("name the file of the report: -o report.html")
         out, force = run_log(paths[0]).parent / REPORT_FILE, True
     refuse_unless(out, "a report is an HTML page", ".html", ".htm")
     refuse_taken(out, force=force)
-    page = _page(words, paths, runs)
+    page = _page(paths, runs, cameras or CameraOptions())
     with atomic_write(out) as partial:
         partial.write_text(page, encoding="utf-8")
     return out
 
 
-def _page(words: Sequence[str | Path], paths: list[Path], runs: list[Path]) -> str:
+def _page(paths: list[Path], runs: list[Path], cameras: CameraOptions) -> str:
     from replay.report.page import report_of_recording, report_of_run, report_of_runs
 
     if len(paths) == 1 and runs:
         return report_of_run(paths[0], proof_of(paths[0]))
-    if len(paths) == 1 and "://" not in str(paths[0]) and (is_sweep(paths[0]) or runs_in(paths[0])):
+    if len(paths) == 1 and (is_sweep(paths[0]) or runs_in(paths[0])):
         return _of_sweep(paths[0])
     if runs:
         if others := [path for path in paths if path not in runs]:
             raise UsageError(f"{others[0]} is no run: a report compares runs with runs alone")
         return report_of_runs(paths, f"{len(paths)} runs compared")
-    with contextlib.closing(open_to_look(locations(list(map(str, words))))) as source:
-        return report_of_recording(source, ", ".join(Path(str(word)).name for word in words))
+    with contextlib.closing(open_to_look(paths, cameras)) as source:
+        return report_of_recording(source, ", ".join(path.resolve().name for path in paths))
 
 
 def _is_run(path: Path) -> bool:

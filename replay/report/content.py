@@ -110,7 +110,8 @@ def ending(told: RunTold) -> str:
     said = [e.text.partition("ended:")[2].strip() for e in told.events if "ended:" in e.text[:7]]
     if told.result and said:
         return said[-1]
-    return str(told.result.get("ended", "it was broken off before its end"))
+    ended = str(told.result.get("ended", "it was broken off before its end"))
+    return ended.replace("_", " ")
 
 
 def _lead(told: RunTold) -> str:

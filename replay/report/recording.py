@@ -56,8 +56,8 @@ def recording_content(source: Any, title: str) -> dict[str, Any]:
     return {
         "kind": "recording",
         "title": title,
-        "lead": f"{len(spec.streams)} streams, {count:,} frames each at {spec.fps:g} a second "
-        f"({seconds:,.1f} s), {what}.",
+        "lead": f"{len(spec.streams)} stream{'s' * (len(spec.streams) > 1)}, {count:,} frames "
+        f"each at {spec.fps:g} a second ({seconds:,.1f} s), {what}.",
         "problems": [*problems, *source.warnings],
         "notes": list(getattr(source, "notes", ())),
         "lanes": plot,

@@ -9,15 +9,23 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.printing import print_document, print_line, quoted, warn
 from cdmisfa.core.errors import one_line
+from replay.camera_logs.options import CameraOptions
 
 
 @click.command("report")
 @options.fetched_argument("source", nargs=-1)
 @options.out("The page, *.html; by default report.html in the folder of the one run.")
+@options.look_options
 @options.server_limits
 @options.force
 @options.as_json
-def report_command(source: tuple[Path, ...], out: Path | None, force: bool, as_json: bool) -> None:
+def report_command(
+    source: tuple[Path, ...],
+    out: Path | None,
+    force: bool,
+    as_json: bool,
+    cameras: CameraOptions,
+) -> None:
     """Write what came of a run as one HTML page, to be read, printed or sent.
 
     SOURCE is the folder of a run; several runs, which are compared; a sweep or another folder of
@@ -29,7 +37,7 @@ def report_command(source: tuple[Path, ...], out: Path | None, force: bool, as_j
 
     if out is None and any(map(options.is_fetched, source)):
         raise click.UsageError("of what is behind a URL say where the report goes: -o F.html")
-    page = write_report(source, out, force=force)
+    page = write_report(source, out, cameras=cameras, force=force)
     if as_json:
         print_document(report=page, bytes=page.stat().st_size)
     else:
