@@ -46,8 +46,11 @@ PASSED_ON = 0.03
 TURNING = 4.0
 """Change over `learner.settled` from which an output has no direction at all."""
 
-FITTED_SLOW = 0.65
+SLOW_AGAIN = 0.65
 """Share of the typical slowness below which what was fitted counts as slow."""
+
+TOO_EVEN = 0.7
+"""Share of the typical slowness above which what was fitted counts as no slower than the rest."""
 
 PRESENT = (0.1, 10.0)
 """Variance of a module's output, which had 1, on a stream that shows what it encodes."""
@@ -154,7 +157,7 @@ def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
         and disagreement(candidate) < config.agreement
         and low < float(candidate.variance[0]) < high
         and gain(candidate) < config.slow
-        and flatness(candidate) < FITTED_SLOW
+        and flatness(candidate) < SLOW_AGAIN
     )
 
 
@@ -165,7 +168,7 @@ def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
     if (
         candidate.tests >= EARLY * candidate.test_window
         and gain(candidate) > config.even
-        and flatness(candidate) > FITTED_SLOW
+        and flatness(candidate) > TOO_EVEN
     ):
         return NOTHING_SLOW
     if candidate.blocks >= PATIENCE * candidate.test_window:
@@ -190,7 +193,7 @@ def promising(candidate: Candidate, config: ProgressConfig) -> bool:
         candidate.alive
         and candidate.tests >= EARLY * candidate.test_window
         and gain(candidate) < config.slow
-        and flatness(candidate) < FITTED_SLOW
+        and flatness(candidate) < SLOW_AGAIN
     )
 
 
