@@ -136,8 +136,12 @@ def add(commit: str, date: str, measured: Mapping[str, float]) -> Path:
     return path
 
 
+LINE = 4
+"""Points that make a line."""
+
+
 def curves(commits: Sequence[Mapping[str, Any]], panel: str) -> dict[str, list[tuple[int, float]]]:
-    """What a panel shows: by name the places of commits and their ratios.
+    """What a panel shows: by name the places of commits and their ratios, if they make a line.
 
     Those that are no longer measured come after those that are.
     """
@@ -151,7 +155,7 @@ def curves(commits: Sequence[Mapping[str, Any]], panel: str) -> dict[str, list[t
         ]
         for name in names
     }
-    return {name: measured for name, measured in found.items() if measured}
+    return {name: measured for name, measured in found.items() if len(measured) >= LINE}
 
 
 def _git(root: Path, *words: str) -> str:
@@ -162,7 +166,7 @@ def _git(root: Path, *words: str) -> str:
 
 
 def draw(picture: Path) -> bool:
-    """Draw the kept ratios over the commits they are of; False where there are none.
+    """Draw the kept ratios over the commits they are of; False where none makes a line.
 
     Args:
         picture: PNG to write.
@@ -170,21 +174,22 @@ def draw(picture: Path) -> bool:
     paths = (report.RESULTS / "history").glob("*.json")
     commits = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
     commits.sort(key=lambda told: (told["date"], told["commit"]))
-    if not commits:
+    shown = {panel: lines for panel in PANELS if (lines := curves(commits, panel))}
+    if not shown:
         return False
-    figure = Figure(figsize=(11.0, 6.2), layout="constrained")
+    figure = Figure(figsize=(8.0, 2.1 * len(shown)), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, panel in zip(figure.subplots(3, 2).flat, PANELS, strict=True):
-        for name, measured in curves(commits, panel).items():
+    grid = figure.subplots(len(shown), 1, squeeze=False, sharex=True)
+    for axes, (panel, lines) in zip(grid.flat, shown.items(), strict=True):
+        for name, measured in lines.items():
             axes.plot(*zip(*measured, strict=True), "o-", ms=3, lw=1, label=name)
         axes.set_title(panel, fontsize=9)
         axes.set_xlim(-0.5, len(commits) - 0.5)
         axes.set_ylim(0, 1.15 * axes.get_ylim()[1])
         axes.tick_params(labelsize=7)
         axes.set_xticks(*_days([told["date"][:10] for told in commits]))
-        if axes.lines:
-            # inside it would hide points
-            axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        # inside it would hide points
+        axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.savefig(picture, dpi=100, metadata={"Software": None})
     return True
 

@@ -139,14 +139,29 @@ def test_the_progress_learner_has_one_figure_of_its_streams(tmp_path):
     labels = [text.get_text() for text in became.get_yticklabels()]
     assert labels == ["learned by 1", "known by 2", "learning"]
     assert len(lanes.patches) == 2 + 2 + 3
-    for s, line in enumerate(error.lines[:3]):
-        own = [r for r in records if r.stream == s]
-        np.testing.assert_array_equal(line.get_xdata(), [r.iteration for r in own])
-        expected = [np.nan if np.isnan(r.tested) else r.learning_error for r in own]
+    alone = 0
+    for s, (line, dots) in enumerate(zip(error.lines[:6:2], error.lines[1:6:2], strict=True)):
+        expected = np.array(
+            [
+                r.learning_error if r.stream == s and np.isfinite(r.tested) else np.nan
+                for r in records
+            ]
+        )  # so no line crosses what was not watched
         np.testing.assert_array_equal(line.get_ydata(), expected)
+        assert np.isin(dots.get_ydata(), expected).all()
+        alone += len(dots.get_ydata())
+    assert alone > 0
     for axes in (error, slowness, watched):
         assert any(np.isfinite(line.get_ydata()).any() for line in axes.lines)
     np.testing.assert_allclose(sum(line.get_ydata() for line in watched.lines[:3]), 1)
+
+
+def test_outputs_are_on_one_scale_and_panels_have_letters(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
+    figure = modules(read_history(tmp_path))
+    assert len({axes.get_ylim() for axes in figure.axes}) == 1
+    letters = [axes.get_title("left") for axes in figure.axes if axes.axison]
+    assert letters == [f"({letter})" for letter in "abcdef"[: len(letters)]]
 
 
 def test_what_the_world_does_not_tell_takes_no_room(tmp_path):

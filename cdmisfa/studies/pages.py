@@ -28,7 +28,6 @@ STREAM_NAMES = ("$s_1$", "$s_2$", "$s_3$")
 DASHES = ("-", (0, (4, 2)), (0, (1, 1.5)))
 """Lines that stay apart where they lie on each other; one for each stream."""
 
-
 Curves = Sequence[NDArray[Any]]
 """A signal over iterations, (N, ...) a trial."""
 
@@ -145,15 +144,18 @@ def stay_to_switch(axes: Axes) -> None:
 
 
 def draw_eta_dot(axes: Axes, curves: Curves, delta: float, letter: str) -> None:
-    """Derivative of slowness, (N, J) a trial: each, their mean dashed, and delta."""
+    """Derivative of slowness, (N, J) a trial: each, the median of those that learn, and delta."""
     stacked = stack([np.max(curve, axis=-1) for curve in curves])
     for row in stacked:
-        axes.plot(row, color=COLOURS[0], alpha=0.25, linewidth=0.5)
-    axes.plot(mean_sd(stacked)[0], color="black", linestyle="--", linewidth=0.9, label="mean")
-    axes.axhline(delta, color=COLOURS[1], linewidth=0.8, label=r"$\delta$")
+        axes.plot(row, color=COLOURS[5], alpha=0.4, linewidth=0.5)
+    learning = np.isfinite(stacked).any(axis=0)
+    median = np.full(stacked.shape[1], np.nan)
+    median[learning] = np.nanmedian(stacked[:, learning], axis=0)
+    axes.plot(median, color=COLOURS[0], linewidth=1.2, label="median of trials")
+    axes.axhline(delta, color=COLOURS[1], linestyle="--", linewidth=0.9, label=r"$\delta$")
     axes.set_yscale("log")
-    axes.legend(fontsize=6)
-    letter_panel(axes, letter, "iteration", r"$|\dot\eta|$")
+    explain_above(axes)
+    letter_panel(axes, letter, "iteration", "change of slowness, 1/frame")
 
 
 def draw_rewards(axes: Axes, curves: Curves, letter: str, y: str) -> None:
@@ -182,33 +184,24 @@ def _finish_curves(axes: Axes, stacked: FloatArray, letter: str, y: str) -> None
     low, high = np.nanquantile(settled, 0.001), np.nanquantile(settled, 0.999)
     if high > low:
         axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
-    axes.legend(fontsize=6)
+    explain_above(axes)
     letter_panel(axes, letter, "iteration", y)
 
 
 def draw_policies(axes: Axes, curves: Curves, letter: str, y: str) -> None:
-    """Mean policy, of (N, S) a trial, a line a stream, and a band of one SD."""
-    mean, sd = mean_sd(stack(curves))
-    k = np.arange(len(mean))
-    for s in range(mean.shape[1]):
-        draw_band(axes, k, mean[:, s], sd[:, s], COLOURS[s], limits=(0, 1), alpha=0.15)
-        axes.plot(
-            mean[:, s],
-            color=COLOURS[s],
-            linewidth=1.4 if s else 1.8,
-            linestyle=DASHES[s],
-            label=STREAM_NAMES[s],
-        )
-    axes.legend(fontsize=6)
+    """Policies, (N, S) a trial of 0 stay and 1 switch: a lane a stream, as high as trials stay."""
+    stay = 1.0 - mean_sd(stack(curves))[0]
+    k, lanes = np.arange(len(stay)), range(stay.shape[1])
+    for s in lanes:
+        lane: dict[str, Any] = {"step": "mid", "color": COLOURS[s], "linewidth": 0}
+        axes.fill_between(k, -s, -s + 0.8 * stay[:, s], **lane)
+        axes.axhline(-s, color="0.7", linewidth=0.5)
+    axes.set_yticks([0.4 - s for s in lanes], [STREAM_NAMES[s] for s in lanes])
+    axes.tick_params(axis="y", length=0)
     letter_panel(axes, letter, "iteration", y)
-    stay_to_switch(axes)
 
 
-def draw_policy_bars(axes: Axes, words: Sequence[str], letter: str, title: str) -> None:
-    """Share of trials whose policy, as "011", leaves each stream: 0 all stay, 1 all switch."""
-    for s, height in enumerate(np.mean([[*map(int, word)] for word in words], axis=0)):
-        axes.bar(s, height, color=COLOURS[s], width=0.7)
-        axes.plot([s - 0.35, s + 0.35], [height, height], color=COLOURS[s], linewidth=2)
-    axes.set_xticks(range(len(words[0])), STREAM_NAMES)
-    stay_to_switch(axes)
-    letter_panel(axes, letter, title, "policy, mean over trials")
+def explain_above(axes: Axes) -> None:
+    """A legend above the panel, where it hides nothing."""
+    how: dict[str, Any] = {"fontsize": 6, "ncols": 4, "frameon": False, "borderaxespad": 0.2}
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), **how)

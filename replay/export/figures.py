@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any
 
 import matplotlib
@@ -13,7 +15,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullFormatter
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.signals import STATES
 from recorder.log.files import atomic_write, refuse_taken
 from replay.export.history import History, read_history
@@ -26,6 +30,9 @@ INCHES = 7.0
 
 MOST_POINTS = 4000
 """Points of a scatter plot."""
+
+FEW = 6
+"""Modules that are called so above the line where they were saved; of more there is the number."""
 
 FOLLOWS = 0.5
 """Correlation from which on a fit says something."""
@@ -72,7 +79,7 @@ def draw_figures(path: Path, out: Path | None = None, *, force: bool = False) ->
 
 
 def convergence(history: History) -> Figure | None:
-    """Slowness, its change against delta, and where modules were saved."""
+    """Slowness, its change on a logarithmic axis against delta, and where modules were saved."""
     outline, delta = history.outline, history.outline.header.delta
     if not outline.told & {"eta_dot"}:
         return None
@@ -84,17 +91,14 @@ def convergence(history: History) -> Figure | None:
         bottom.plot(k, history.eta_dot[:, j], color=_css(colour(j)), label=f"η̇{label}")
     if delta is not None:
         bottom.axhline(delta, color=_css(GREY), linestyle="--", label="δ")
-        settled = history.eta_dot[np.isfinite(history.eta_dot)]
-        if settled.size:
-            bottom.set_ylim(0, max(2.5 * delta, float(np.percentile(settled, 95))))
     for save in outline.saved:
         bottom.plot(save.iteration, save.eta_dot[0], "D", color=_css(VERMILLION), markersize=5)
-        name = f"{save.module}: {outline.names()[save.stream]}"
-        where = {"xy": (save.iteration, save.eta_dot[0]), "xytext": (-4, 8)}
-        bottom.annotate(name, textcoords="offset points", ha="right", **where)
-    top.set_ylabel("slowness η\n[cycles/frame]")
+    if (history.eta_dot > 0).any():
+        _logarithmic(bottom)
+    top.set_ylabel("slowness η\n[1/frame]")
     bottom.set_ylabel("change η̇\n[1/frame]")
-    _finish(bottom, bottom)
+    _mark_saves((top, bottom), history)
+    _finish((top, bottom), bottom)
     return figure
 
 
@@ -119,11 +123,12 @@ def decision(history: History) -> Figure | None:
     epsilon.set_ylim(0, 1.05)
     reward.set_ylabel("R for staying")
     policy.set_yticks(range(len(shown)), [names[s] for s in shown])
+    policy.set_ylim(len(shown) - 0.5, -0.5)
     policy.set_ylabel("policy: stay")
     policy.grid(False)
     epsilon.set_ylabel("random ε")
     _mark_saves((watched, reward, policy, epsilon), history)
-    _finish(epsilon, watched)
+    _finish((watched, reward, policy, epsilon), reward)
     return figure
 
 
@@ -137,23 +142,43 @@ def streams(history: History) -> Figure | None:
     _state_lanes(lanes, history)
     others = [s for s in history.lanes if s not in shown]
     for s in (*others, *shown):
-        k = np.flatnonzero(history.stream == s)
         style = {"color": _shade(history, s), "alpha": 1.0 if s in shown else 0.4}
-        error.plot(k, history.error[k], **style)
-        slowness.plot(k, history.tested[k], **style)
-        slowness.plot(k, history.fitted[k], ":", **style)
+        _plot_watched(error, history, s, history.error, "-", **style)
+        _plot_watched(slowness, history, s, history.tested, "-", **style)
+        _plot_watched(slowness, history, s, history.fitted, ":", **style)
     if outline.header.settled is not None:
         threshold = {"color": _css(GREY), "linestyle": "--", "linewidth": 0.8}
         error.axhline(outline.header.settled[1], label="settled + agreement", **threshold)
         error.legend(loc="lower left", fontsize=7)
     for axes in (error, slowness):
-        axes.set_yscale("log")
+        _logarithmic(axes)
     _share(watched, history)
     error.set_ylabel("learning error e")
     slowness.set_ylabel("slowness, tested\n(dotted: fitted)\n[1/frame]")
     _mark_saves((error, slowness, watched), history)
-    _finish(watched, watched)
+    _finish(panels, watched)
     return figure
+
+
+def _plot_watched(
+    axes: Axes, history: History, stream: int, values: FloatArray, line: str, **style: Any
+) -> None:
+    """Values, (n,), of the iterations in which a stream was watched; no line crosses the others."""
+    own = values[: len(history.stream)].copy()
+    own[history.stream != stream] = np.nan
+    known = np.isfinite(own)
+    alone = known & ~np.roll(known, 1) & ~np.roll(known, -1)
+    k = np.arange(len(own))
+    axes.plot(k, own, line, **style)
+    axes.plot(k[alone], own[alone], ".", markersize=2, **style)
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic axis whose numbers are written out."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _state_lanes(axes: Axes, history: History) -> None:
@@ -200,7 +225,7 @@ def _share(axes: Axes, history: History) -> None:
     for s in history.shown:
         watched = np.convolve(history.stream == s, np.ones(window), mode="same")
         axes.plot(np.arange(n), watched / around, color=_shade(history, s), label=names[s])
-    axes.set_ylim(0, 1.4)  # with room for the legend
+    axes.set_ylim(0, 1.05)
     axes.set_ylabel(f"share of time\n({window} iterations)")
 
 
@@ -212,20 +237,28 @@ def _shade(history: History, stream: int) -> tuple[float, float, float]:
 
 
 def _mark_saves(panels: Sequence[Axes], history: History) -> None:
-    for axes in panels:
-        for save in history.outline.saved:
+    """A line through the panels where each module was saved, with its number above the first."""
+    for save in history.outline.saved:
+        for axes in panels:
             axes.axvline(save.iteration, color=_css(VERMILLION), linewidth=0.8)
+        where = {"xy": (save.iteration, 1.0), "xycoords": panels[0].get_xaxis_transform()}
+        style = {"ha": "center", "va": "bottom", "fontsize": 7, "color": _css(VERMILLION)}
+        name = f"module {save.module}" if len(history.outline.saved) <= FEW else f"{save.module}"
+        panels[0].annotate(name, **where, **style)
 
 
 def modules(history: History) -> Figure | None:
-    """Each module's output over time, and against what the world knows about its stream."""
+    """Each module's output over time, and against what the world knows about its stream.
+
+    All outputs are on one scale.
+    """
     if not history.outputs:
         return None
     spec = history.outline.header.spec
     best = [output.best_fit(spec.truth) for output in history.outputs]
     ratios = (2, 1) if any(best) else (1,)  # one column where the world tells nothing
     figure = Figure(figsize=(INCHES, 1.7 * len(history.outputs)), layout="constrained")
-    grid = figure.subplots(len(best), len(ratios), squeeze=False, width_ratios=ratios)
+    grid = figure.subplots(len(best), len(ratios), squeeze=False, sharey=True, width_ratios=ratios)
     for row, output, found in zip(grid, history.outputs, best, strict=True):
         shade = _shade(history, output.stream)
         shown = slice(-1000, None)
@@ -242,9 +275,11 @@ def modules(history: History) -> Figure | None:
             line = np.linspace(truth.min(), truth.max(), 300)
             against.plot(line, found(line), color="black")
         against.set_xlabel(spec.truth[found.column])
-        against.set_title(f"|r| = {found.r:.2f} with {found.function}", fontsize=8)
-    grid[-1][0].set_xlabel("frame t (its stream only)")
+        said = f"|r| = {found.r:.2f} with {found.function}"
+        against.set_title(said, loc="right", fontsize=8)
+    grid[-1][0].set_xlabel("frame t, where its stream was watched")
     grid[0][0].set_title("output y", fontsize=8)
+    _letter(grid.flat)
     return figure
 
 
@@ -289,9 +324,18 @@ def _panels(*heights: float) -> tuple[Figure, list[Axes]]:
     return figure, list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
 
 
-def _finish(last: Axes, explained: Axes) -> None:
-    last.set_xlabel("iteration")
-    explained.legend(loc="upper right", ncols=4, fontsize=7)
+def _finish(panels: Sequence[Axes], explained: Axes) -> None:
+    panels[-1].set_xlabel("iteration")
+    above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+    explained.legend(ncols=4, fontsize=7, **above)
+    _letter(panels)
+
+
+def _letter(panels: Iterable[Axes]) -> None:
+    """Letter the panels that show something."""
+    shown = [axes for axes in panels if axes.axison]
+    for letter, axes in zip(itertools.cycle(ascii_lowercase), shown, strict=False):
+        axes.set_title(f"({letter})", loc="left", fontsize=8)
 
 
 def _css(rgb: Rgb) -> tuple[float, float, float]:

@@ -155,7 +155,7 @@ class Difficulty(Experiment):
                 panel.plot(at, mean, color=colour, linewidth=1, label=pages.STREAM_NAMES[stream])
             panel.axhline(THRESHOLD, color="grey", linestyle=":", linewidth=0.8)
             panel.set_xscale("log")
-            panel.legend(fontsize=6)
+            pages.explain_above(panel)
             pages.letter_panel(panel, letter, f"frames ({scene})", "|cos| with batch SFA")
         return pages.save_figure(figure, folder, "difficulty")
 

@@ -107,23 +107,23 @@ class Icub(Experiment):
         figure, axes = pages.new_figure(1, 3)
         Q, policy, eta_dot = ([t.arrays[k] for t in trials] for k in ("Q", "policy", "eta_dot"))
         pages.draw_value_gains(axes[0, 0], Q, "c")
-        pages.draw_policies(axes[0, 1], policy, "d", "policy, mean and SD")
+        pages.draw_policies(axes[0, 1], policy, "d", "share of trials that stay")
         pages.draw_eta_dot(axes[0, 2], eta_dot, paper_config("icub").delta, "e")
         paths = pages.save_figure(figure, folder, "icub")
-        outputs, axes = pages.new_figure(2, 2)
+        outputs, axes = pages.new_figure(2, 2, sharey=True)
         for i, name in enumerate(OBJECTS):
             one = next((t for t in trials if f"truth{i + 1}" in t.arrays), None)
             if one is None:
                 continue
             y, truth = one.arrays[f"y{i + 1}"], one.arrays[f"truth{i + 1}"]
             axes[i, 0].plot(y, color=pages.COLOURS[0], linewidth=0.8)
-            pages.letter_panel(axes[i, 0], f"f{2 * i + 1}", "frame", f"y, module {i + 1}")
+            pages.letter_panel(axes[i, 0], "ac"[i], "frame", f"output y of module {i + 1}")
             axes[i, 1].plot(truth, y, ".", color=pages.COLOURS[0], markersize=3)
             x = np.linspace(truth.min(), truth.max(), 100)
             degree = min(3, len(np.unique(np.round(truth, 6))) - 1)
             if degree > 0:
-                axes[i, 1].plot(x, np.polynomial.Polynomial.fit(truth, y, degree)(x), color="red")
-            pages.letter_panel(axes[i, 1], f"f{2 * i + 2}", f"{name}, m", f"y, module {i + 1}")
+                axes[i, 1].plot(x, np.polynomial.Polynomial.fit(truth, y, degree)(x), color="black")
+            pages.letter_panel(axes[i, 1], "bd"[i], f"{name}, m", "")
             axes[i, 1].locator_params(axis="x", nbins=5)
         return paths + pages.save_figure(outputs, folder, "icub-outputs")
 

@@ -297,4 +297,4 @@ def _draw_policies(panel: Any, trials: Sequence[Trial]) -> None:
         panel.axvline(point, color="grey", linestyle="-.", linewidth=1, label=r"$\epsilon^d$")
     least = max(t.settings["epsilon_c"] for t in _judged(trials))
     panel.axvspan(least, max(epsilons), color="grey", alpha=0.15, linewidth=0)
-    panel.legend(fontsize=6)
+    pages.explain_above(panel)

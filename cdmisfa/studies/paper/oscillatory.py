@@ -107,27 +107,23 @@ class Oscillatory(Experiment):
         for i, frequency in enumerate((4, 3, 2)):
             module, paper = f"module {i + 1}", f"{frequency / 500:.4f} (equation)"
             slowness = f"slowness of {module} on its stream (paper: its frequency)"
+            stays = sum(learned_order(t.row)[i : i + 1] == self.optimal[i : i + 1] for t in trials)
+            found.share(f"{module}: stays on {STREAMS[i]} alone", "all (figure)", stays, n)
             found.of_module(f"{module} saved at iteration", trials, "saved_at", i, digits=0)
             found.of_module(slowness, trials, "eta", i, paper, digits=4)
         order = "modules x1, x2, x3 in this order, policies [0,1,1], [1,0,1], [1,1,0]"
         found.claim_all(order, good, n)
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
-        """The paper's four panels, and the saved policies of each module."""
+        """The paper's four panels."""
         figure, axes = pages.new_figure(2, 2)
         names = ("eta_dot", "R", "Q", "policy")
         eta_dot, R, Q, policy = ([t.arrays[name] for t in trials] for name in names)
         pages.draw_eta_dot(axes[0, 0], eta_dot, paper_config("oscillatory").delta, "a")
         pages.draw_rewards(axes[0, 1], R, "b", "R, stay entries")
         pages.draw_value_gains(axes[1, 0], Q, "c")
-        pages.draw_policies(axes[1, 1], policy, "d", "policy, mean and SD")
-        paths = pages.save_figure(figure, folder, "oscillatory")
-        bars, axes = pages.new_figure(1, 3, width=2.3)
-        for i in range(3):
-            words = [t.row["policies"][i] for t in trials if len(t.row["policies"]) > i]
-            if words:
-                pages.draw_policy_bars(axes[0, i], words, "abc"[i], f"module {i + 1}")
-        return paths + pages.save_figure(bars, folder, "oscillatory-policies")
+        pages.draw_policies(axes[1, 1], policy, "d", "share of trials that stay")
+        return pages.save_figure(figure, folder, "oscillatory")
 
 
 class FiveStreams(Experiment):
@@ -211,7 +207,7 @@ class Stability(Experiment):
             one = groups(trials, "algorithm")[algorithm,][0]
             reward, policy = ([one.arrays[name]] for name in ("R", "policy"))
             pages.draw_rewards(axes[row, 0], reward, "ac"[row], f"{algorithm}: R, stay entries")
-            pages.draw_policies(axes[row, 1], policy, "bd"[row], f"{algorithm}: policy")
+            pages.draw_policies(axes[row, 1], policy, "bd"[row], f"{algorithm}: stays on")
             ends = {"color": "grey", "linestyle": ":", "linewidth": 0.8}
             for panel in axes[row]:
                 panel.axvline(one.row["exploration_ends"], **ends)
