@@ -60,7 +60,7 @@ def test_errors_about_a_fetched_log_name_its_url(
 def test_advice_can_be_pasted_into_a_shell(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     run = tmp_path / "my run #1"
     done = cdmisfa("learn", "oscillatory", "-o", run, "--max-iterations", 3, *SHORT)
-    advice = done.out.partition("look at it: ")[2]
+    advice = done.out.partition("look at it: ")[2].partition("\n")[0]
     assert shlex.split(advice, comments=True) == ["cdmisfa", "view", str(run)]
 
 

@@ -15,8 +15,7 @@ from cdmisfa.experiments.recompute import Recomputation, versions_differ
 from cdmisfa.experiments.resume import read_command
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.camera_logs.options import CameraOptions
-from replay.inputs import holds_run, open_to_look
-from replay.runs.folders import REPORT_FILE, is_sweep, read_request, run_log, runs_in
+from replay.runs.folders import REPORT_FILE, is_run, is_sweep, read_request, run_log, runs_in
 from replay.runs.log import read_header
 
 if TYPE_CHECKING:
@@ -71,13 +70,15 @@ def _page(paths: list[Path], runs: list[Path], cameras: CameraOptions) -> str:
         if others := [path for path in paths if path not in runs]:
             raise UsageError(f"{others[0]} is no run: a report compares runs with runs alone")
         return report_of_runs(paths, f"{len(paths)} runs compared")
+    from replay.inputs import open_to_look  # what reads logs of others takes its time
+
     with contextlib.closing(open_to_look(paths, cameras)) as source:
         return report_of_recording(source, ", ".join(path.resolve().name for path in paths))
 
 
 def _is_run(path: Path) -> bool:
     try:
-        return path.exists() and holds_run(path)
+        return path.exists() and is_run(path)
     except CdmisfaError:
         return path.is_dir() and (path / "run.json").is_file()
 
