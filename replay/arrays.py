@@ -51,7 +51,8 @@ class ArrayLog(LoggedSource):
     Args:
         streams: by its name, what each stream shows: numbers (n,) or (n, I) of any type, or
             pictures (n, height, width), or in colours (n, height, width, 3 or 4), of uint8,
-            uint16, bool, or floats of 0 to 1; arrays, lists, or tables of pandas, Polars or Arrow.
+            uint16, bool, or floats of 0 to 1; arrays, lists, or tables of pandas, Polars, Arrow
+            or DuckDB.
         options: `TAKES` are heeded: pictures become frames as images of logs do.
         loop: begin again at the end.
         files: where they are from.
@@ -208,14 +209,11 @@ def _refuse_unlike(firsts: Mapping[str, Shown]) -> None:
 
 def _checked(name: str, given: Any) -> NDArray[Any]:
     """What a stream shows as an array, (n, I) of numbers or (n, height, width[, 3])."""
-    array = _as_array(given)
+    array = _as_array(name, given)
     if np.ma.isMaskedArray(given) and np.ma.getmaskarray(given).any():
         raise UsageError(f"{name}: some of its values are masked: fill them, or leave out the rows")
     if array.dtype.kind not in "biuf":
-        raise UsageError(
-            f"{name}: its values are of type {array.dtype}, no numbers: {_WANTED}; of a table "
-            "choose the columns of numbers"
-        )
+        raise UsageError(f"{name}: its values are of type {array.dtype}, no numbers: {_WANTED}")
     array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.ndim == 1:
         array = array[:, None]
@@ -248,13 +246,43 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
     return array
 
 
-def _as_array(given: Any) -> NDArray[Any]:
-    if hasattr(given, "to_numpy") and not hasattr(given, "column_names"):  # pandas, Polars
-        return np.asarray(given.to_numpy())
-    if hasattr(given, "column_names"):  # Arrow
-        columns: NDArray[Any] = np.column_stack([column.to_numpy() for column in given.columns])
-        return columns
-    return as_array(given)
+def _as_array(name: str, given: Any) -> NDArray[Any]:
+    """What a stream shows as an array, of tables their columns side by side."""
+    if hasattr(given, "to_frame"):  # one column of pandas or Polars
+        given = given.to_frame()
+    if hasattr(given, "iloc"):  # pandas
+        columns = [(str(key), given.iloc[:, i]) for i, key in enumerate(given.columns)]
+    elif hasattr(given, "__arrow_c_stream__") and hasattr(given, "columns"):  # Arrow, Polars
+        import pyarrow
+
+        table = pyarrow.table(given)
+        columns = list(zip(table.column_names, table.columns, strict=True))
+    else:
+        return np.asarray(given.to_numpy()) if hasattr(given, "to_numpy") else as_array(given)
+    if not columns:
+        raise UsageError(f"{name}: a table without columns given")
+    stacked: NDArray[Any] = np.column_stack([_column(name, *column) for column in columns])
+    return stacked
+
+
+def _column(name: str, key: str, given: Any) -> NDArray[Any]:
+    """A column of a table as numbers, NaN where it has none."""
+    import pyarrow
+
+    try:
+        column = given if hasattr(given, "chunks") else pyarrow.array(given, from_pandas=True)
+        kinds, kind = pyarrow.types, column.type
+        if kinds.is_decimal(kind) or (kinds.is_boolean(kind) and column.null_count):
+            column = column.cast("float64")
+        numbers: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    except (pyarrow.ArrowException, NotImplementedError):  # of what Arrow has no type for
+        numbers = np.asarray(given)
+    if numbers.dtype.kind not in "biuf":
+        held = getattr(given, "dtype", getattr(given, "type", ""))
+        raise UsageError(
+            f"{name}: the column {key} is of type {held}, no numbers: choose the columns of numbers"
+        )
+    return numbers
 
 
 def _pixels(rows: NDArray[Any]) -> NDArray[Any]:

@@ -1,0 +1,110 @@
+"""Tables of pandas, Polars and DuckDB themselves: what is learned from, and what is given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+import cdmisfa
+from cdmisfa import Run
+from cdmisfa.core.errors import UsageError
+from replay.arrays import ArrayLog
+from replay.export.tables import export_signals
+
+ROWS = 60
+COLUMNS = {
+    "speed": np.sin(np.arange(ROWS) / 9),
+    "gear": np.arange(ROWS) // 20,
+    "brake": np.arange(ROWS) % 7 > 4,
+}
+
+
+def table(kind: str, columns: Any = COLUMNS) -> Any:
+    """The same table of each kind."""
+    library = pytest.importorskip(kind.partition(" ")[0])
+    made = pa.table(columns)
+    if kind in ("duckdb", "polars"):
+        return library.from_arrow(made)
+    frame = made.to_pandas()
+    if kind == "pandas nullable":
+        return frame.convert_dtypes()
+    if kind == "pandas of Arrow":
+        return frame.convert_dtypes(dtype_backend="pyarrow")
+    return frame
+
+
+KINDS = ("pandas", "pandas nullable", "pandas of Arrow", "polars", "duckdb")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_tables_of_each_library_are_the_same_frames(kind: str) -> None:
+    expected = np.column_stack(list(COLUMNS.values()))
+    given = table(kind)
+    for _ in range(2):  # a result of DuckDB is not used up
+        frames = ArrayLog({"car": given}).take(0, ROWS).frames
+        np.testing.assert_array_equal(frames, expected)
+    recording = cdmisfa.Recording({"car": given, "again": table("polars")})
+    assert recording.spec.streams == ("car", "again")
+
+
+@pytest.mark.parametrize("kind", ["pandas", "pandas nullable", "polars"])
+def test_one_column_is_one_number_a_frame(kind: str) -> None:
+    column = table(kind)["brake"]
+    np.testing.assert_array_equal(
+        ArrayLog({"x": column}).take(0, ROWS).frames, COLUMNS["brake"][:, None]
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"speed": [1.0, 2.0], "name": ["a", "b"]}, "x: the column name is of type .*, no numbers"),
+        ({"speed": [1.0, None]}, "x: row 1, counted from 0, holds what is no finite number"),
+        (
+            {"on": [True, None]},
+            "x: row 1, counted from 0, holds what is no finite number|column on",
+        ),
+    ],
+)
+def test_columns_of_no_numbers_are_one_line(kind: str, columns: Any, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        ArrayLog({"x": table(kind, columns)})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run that is rewarded in some iterations and in others not."""
+    return cdmisfa.learn("oscillatory", tmp_path_factory.mktemp("run") / "run", max_iterations=90)
+
+
+def test_signals_of_a_run_are_tables_of_each_library(run: Run) -> None:
+    pytest.importorskip("pandas")
+    pytest.importorskip("polars")
+    signals = run.signals
+    missing = np.isnan(signals["reward"])
+    assert 0 < missing.sum() < len(missing)
+    names = ("iteration", "stream", "novel", "reward", "eta")
+    pandas, polars = signals.to_pandas(*names), signals.to_polars(*names)
+    assert pandas.index.name == "iteration"
+    assert str(pandas["novel"].dtype) == str(pandas["reward"].dtype).replace("float64", "bool")
+    np.testing.assert_array_equal(pandas["reward"], signals["reward"])
+    assert polars["reward"].null_count() == missing.sum()
+    assert polars["reward"].is_nan().sum() == 0
+    assert polars["reward"].mean() == pytest.approx(np.nanmean(signals["reward"]))
+    assert [list(eta) for eta in pandas["eta"]] == polars["eta"].to_list()
+
+
+def test_the_mean_of_an_exported_signal_is_a_number(run: Run, tmp_path: Path) -> None:
+    duckdb = pytest.importorskip("duckdb")
+    signals = run.signals
+    export_signals(run.path, tmp_path / "signals.parquet", "parquet")
+    query = "SELECT avg(reward), count(reward), count(*) FROM '{}'"
+    with duckdb.connect() as database:
+        found = database.sql(query.format(tmp_path / "signals.parquet")).fetchall()
+    known = signals["reward"][~np.isnan(signals["reward"])]
+    assert found == [(pytest.approx(known.mean()), len(known), len(signals["reward"]))]
