@@ -314,19 +314,6 @@ def test_the_library_lists_what_a_user_needs_and_explains_each() -> None:
         assert "Raises:" in done.stdout
 
 
-def test_the_page_s_python_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("gymnasium")
-    page = (ROOT / "docs" / "python.md").read_text("utf-8")
-    examples = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
-    found: dict[str, Any] = {}
-    exec("\n".join(examples), found)
-    assert abs(np.corrcoef(found["slowest"][:, 0], found["frames"][:, 0])[0, 1]) > 0.9
-    assert len(found["rewards"]) == 50
-    assert found["left"].shape == (100, 48, 128)
-
-
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
 def test_modules_take_the_pictures_that_they_learned_from(kind: Any) -> None:
     t = np.arange(3000)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
-import io
 import json
 import os
-import re
 import shlex
 import signal
 import socket
@@ -496,19 +494,6 @@ def test_the_command_prints_one_document_and_says_what_failed(tmp_path: Path) ->
     shown = CliRunner().invoke(results_command, [str(tmp_path / "s"), "--json"])
     ended = json.loads(shown.stdout)["points"][0]
     assert (ended["done"], ended["measures"]["iterations"]["mean"]) == (2, 10.0)  # as the log did
-
-
-def test_the_page_s_python_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text("utf-8")
-    examples = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    monkeypatch.chdir(tmp_path)
-    words = io.StringIO()
-    with contextlib.redirect_stdout(words):
-        exec("\n".join(examples), {})
-    first, *points, claim = words.getvalue().splitlines()
-    assert first == "4 trials, which differ in {'learner.nu': [0.04, 0.05]}"
-    assert len(points) == 2
-    assert "'holds': True" in claim
 
 
 def test_grids_and_seeds_are_read_as_written() -> None:
