@@ -172,6 +172,9 @@ class WatchEnv(Env):
         self._ended = terminated or truncated
         return self._seen.copy(), reward, terminated, truncated, {"stream": learner.stream}
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self._source!r}>"
+
     def close(self) -> None:
         """Close the source."""
         self._source.close()

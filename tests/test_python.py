@@ -15,6 +15,7 @@ import pyarrow as pa
 import pytest
 from conftest import Cdmisfa
 from PIL import Image
+from rerun.chunk import RrdReader
 from view_data import View
 
 import cdmisfa
@@ -288,6 +289,37 @@ def test_what_is_shown_is_short_with_a_small_picture(given: Any) -> None:
         with Image.open(io.BytesIO(base64.b64decode(png[1]))) as picture:
             assert max(picture.size) <= 960
     assert len(repr(learn(given, **FEW).signals)) < 500
+
+
+@pytest.mark.parametrize("given", [numbers(), pictures(6, 8)])
+def test_a_source_shows_what_comes_next_and_stays_where_it_is(given: Any) -> None:
+    stored, stepped = Recording(given).source(), cdmisfa.ArraySource({"made": iter(given)})
+    with stored, stepped:
+        for source in (stored, stepped):
+            source.take(0, 30)
+            page = source._repr_html_()
+            assert ("data:image/png" in page) == (source is stored or source.spec.images)
+            assert repr(source).startswith(f"<{type(source).__name__} ")
+            assert len(repr(source)) < 200
+            np.testing.assert_array_equal(source.take(0, 40).frames, given[30:70])
+        stored.seek(400)
+        assert "data:image/png" not in stored._repr_html_()
+
+
+def test_several_logs_are_viewed_together(tmp_path: Path) -> None:
+    logs = [ROOT / "sample_logs" / "icub" / f"{name}.mcap" for name in ("left", "right")]
+    Recording(*logs).view(tmp_path / "view.rrd")
+    paths = " ".join(c.entity_path for c in RrdReader(tmp_path / "view.rrd").stream())
+    assert [view for view in ("left", "center", "right") if view in paths] == ["left", "right"]
+    with pytest.raises(UsageError, match="of arrays, view the run"):
+        Recording(numbers()).view(tmp_path / "view.rrd")
+
+
+def test_without_a_notebook_a_view_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(CdmisfaError, match="no display"):
+        Recording(ROOT / "sample_logs" / "icub").view()
 
 
 def test_a_module_shows_its_weights() -> None:

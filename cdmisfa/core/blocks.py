@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time_of, times_of
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.shown import ShownSource
 
 UINT8 = np.dtype(np.uint8)
 """The only type whose values are pixels."""
@@ -189,7 +190,7 @@ class LongSource(FrameSource, Protocol):
         """What `describe` says, with less of each file where reading all of them takes long."""
 
 
-class ForwardSource(FrameSource):
+class ForwardSource(ShownSource, FrameSource):
     """A source that holds its spec and its clock, and need not be able to go back.
 
     A class that derives from it sets `_spec`, and `_t` where its first frame is not 0.
@@ -220,9 +221,6 @@ class ForwardSource(FrameSource):
 
     def __exit__(self, kind: type[BaseException] | None, error: object, at: object, /) -> None:
         self.close()
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} of {', '.join(self.spec.streams)}>"
 
 
 class ClockedSource(ForwardSource, SeekableSource):

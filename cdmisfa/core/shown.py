@@ -7,16 +7,28 @@ import html
 import io
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cdmisfa.core.errors import LogExhaustedError
+
+if TYPE_CHECKING:
+    from cdmisfa.core.blocks import SeekableSource, SourceSpec
 
 WIDTH = 480
 """Most pixels across of a picture, as a rule."""
 
 ROW = 24
 """Pixels of the height of a row in a picture."""
+
+
+MOST = 200
+"""Frames of numbers that a picture shows."""
+
+MOST_STREAMS = 6
+"""Streams of images that it shows."""
 
 
 class Shown:
@@ -28,9 +40,9 @@ class Shown:
     def _facts(self) -> Mapping[str, Any]:
         """What is told of it, by names."""
 
-    @abstractmethod
     def _picture(self) -> NDArray[np.uint8] | None:
         """A picture (height, width) or (height, width, 3), if it has one."""
+        return None
 
     def __repr__(self) -> str:
         first, *rest = self._facts().items()
@@ -48,6 +60,66 @@ class Shown:
             "" if picture is None else f'<img alt="" src="data:image/png;base64,{png(picture)}">'
         )
         return f"<div><table>{rows}</table>{image}</div>"
+
+
+def beside(frames: list[NDArray[Any]]) -> NDArray[np.uint8]:
+    """Frames of images side by side, no wider than `WIDTH` together; one at least."""
+    wide = np.hstack(frames)
+    step = -(-wide.shape[1] // WIDTH)
+    return np.ascontiguousarray(wide[::step, ::step])
+
+
+def curves(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """Numbers (n, I) over time, each in a shade, from the least to the most of all."""
+    picture = np.full((4 * ROW, WIDTH), 255, np.uint8)
+    low, high = float(values.min()), float(values.max())
+    places = np.linspace(0, WIDTH - 1, len(values)).astype(int)
+    scale = (len(picture) - 1) / (high - low) if high > low else 0.0
+    for i, line in enumerate(values.T):
+        heights = np.rint((high - line) * scale).astype(int)
+        across = np.arange(WIDTH)
+        shade = 160 * i // values.shape[1]
+        picture[np.interp(across, places, heights).astype(int), across] = shade
+    return picture
+
+
+def facts_of(spec: SourceSpec) -> dict[str, Any]:
+    """What is told of a source, by names."""
+    return {
+        "streams": ", ".join(spec.streams),
+        "frames": "without end" if spec.length is None else spec.length,
+        "shape": "x".join(map(str, spec.frame_shape)),
+        "rate": f"{spec.fps:g} Hz",
+    }
+
+
+def next_shown(source: SeekableSource) -> NDArray[np.uint8] | None:
+    """The next image of each stream, or the next numbers of the first; the clock stays."""
+    start, spec = source.t, source.spec
+    end = None if spec.length is None else getattr(source, "first_frame", 0) + spec.length
+    count = 1 if spec.images else MOST if end is None else min(end - start, MOST)
+    blocks = []
+    try:
+        for stream in range(min(len(spec.streams), MOST_STREAMS) if spec.images else 1):
+            source.seek(start)
+            blocks.append(source.take(stream, count).frames)
+    except (LogExhaustedError, ValueError):  # nothing is left
+        return None
+    finally:
+        source.seek(start)
+    return beside([block[0] for block in blocks]) if spec.images else curves(blocks[0][:, :8])
+
+
+class ShownSource(Shown):
+    """A source of frames, with a picture of what comes next where it can go back to it."""
+
+    def _facts(self) -> Mapping[str, Any]:
+        source: Any = self
+        return facts_of(source.spec)
+
+    def _picture(self) -> NDArray[np.uint8] | None:
+        source: Any = self
+        return next_shown(source) if hasattr(source, "seek") else None
 
 
 def weights(values: NDArray[np.float64]) -> NDArray[np.uint8]:

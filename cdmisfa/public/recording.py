@@ -12,19 +12,16 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import did_you_mean
-from cdmisfa.core.shown import Shown
+from cdmisfa.core.shown import Shown, facts_of
 from cdmisfa.experiments.resume import CAMERAS
 from cdmisfa.experiments.sources import open_logs
-from cdmisfa.public.shown import beside, curves, view
+from cdmisfa.public.shown import view
 from replay.arrays import ArrayLog
 from replay.camera_logs.options import CameraOptions
 
 Given: TypeAlias = Any
 """What `learn` takes: arrays, tables, mappings of these by streams' names, paths and URLs of logs,
 names of scenes, words of live streams, or an open source."""
-
-MOST = 200
-"""Frames of numbers that a picture shows."""
 
 
 class Recording(Shown):
@@ -146,23 +143,9 @@ class Recording(Shown):
         view(self, [Path(word) for word in self.words], save, tab=tab, cameras=self._options)
 
     def _facts(self) -> Mapping[str, Any]:
-        spec, what = self.spec, ", ".join(self.words) or "arrays"
-        shape = "x".join(map(str, spec.frame_shape))
-        count = "without end" if spec.length is None else spec.length
-        streams = ", ".join(spec.streams)
-        return {
-            "recording": what,
-            "streams": streams,
-            "frames": count,
-            "shape": shape,
-            "rate": f"{spec.fps:g} Hz",
-        }
+        return {"recording": ", ".join(self.words) or "arrays", **facts_of(self.spec)}
 
     def _picture(self) -> NDArray[np.uint8] | None:
-        count = min(self.spec.length or MOST, MOST)
-        if self.spec.images:
-            first = [self.frames(stream, 0, count)[:1] for stream in self.spec.streams[:6]]
-            shown = [frames[0] for frames in first if len(frames)]
-            return beside(shown) if shown else None
-        values = self.frames(0, 0, count)
-        return curves(values[:, :8]) if len(values) else None
+        with self.source() as source:
+            found: NDArray[np.uint8] | None = source._picture()
+        return found

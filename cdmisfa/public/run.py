@@ -24,7 +24,7 @@ SCALARS = tuple(signal.name for signal in SIGNALS.values() if not signal.dims)
 """Signals of one number an iteration."""
 
 
-class Signals(Mapping[str, "NDArray[Any]"]):
+class Signals(Shown, Mapping[str, "NDArray[Any]"]):
     """The signals of a run: arrays by name, and one table of a row an iteration.
 
     `signals["reward"]` is an array (iterations, ...), NaN where a value is missing. In tables what
@@ -43,8 +43,8 @@ class Signals(Mapping[str, "NDArray[Any]"]):
     def __len__(self) -> int:
         return len(self._arrays)
 
-    def __repr__(self) -> str:
-        return f"<Signals of {self._log.parent}: {', '.join(self)}>"
+    def _facts(self) -> Mapping[str, Any]:
+        return {"run": self._log.parent, "signals": ", ".join(self)}
 
     def to_arrow(self, *names: str) -> Any:
         """A table of pyarrow, a row an iteration; what is missing is null.

@@ -39,27 +39,6 @@ def watched(streams: NDArray[Any], count: int) -> NDArray[np.uint8]:
     return np.repeat(wide, height, axis=0).astype(np.uint8)
 
 
-def beside(frames: list[NDArray[Any]]) -> NDArray[np.uint8]:
-    """Frames of images side by side, no wider than `WIDTH` together; one at least."""
-    wide = np.hstack(frames)
-    step = -(-wide.shape[1] // WIDTH)
-    return np.ascontiguousarray(wide[::step, ::step])
-
-
-def curves(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Numbers (n, I) over time, each with a colour, from the least to the most of all."""
-    picture = np.full((4 * ROW, WIDTH, 3), 255, np.uint8)
-    low, high = float(values.min()), float(values.max())
-    places = np.linspace(0, WIDTH - 1, len(values)).astype(int)
-    scale = (len(picture) - 1) / (high - low) if high > low else 0.0
-    for i, line in enumerate(values.T):
-        heights = np.rint((high - line) * scale).astype(int)
-        picture[np.interp(np.arange(WIDTH), places, heights).astype(int), np.arange(WIDTH)] = (
-            colour(i)
-        )
-    return picture
-
-
 def view(
     held: Shown,
     paths: Sequence[Path],

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
@@ -96,9 +95,6 @@ class Sweep(Shown):
             "failed": sum(point.failed for point in self.points),
             "differ": differ or "in nothing but seeds",
         }
-
-    def _picture(self) -> NDArray[np.uint8] | None:
-        return None
 
 
 _KINDS = {

@@ -13,12 +13,14 @@ from itertools import chain, islice
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, as_array, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
+from cdmisfa.core.shown import MOST_STREAMS, beside
 from recorder.images.framing import framings
 from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
 
@@ -69,6 +71,13 @@ class SteppedSource(ForwardSource):
         ]
         self._t += n
         return tuple(blocks)
+
+    def _picture(self) -> NDArray[np.uint8] | None:
+        """The next image of each stream, which is not gone then."""
+        self._ahead += islice(self._steps, 0 if self._ahead else 1)
+        if not (self._ahead and self._spec.images):
+            return None
+        return beside(list(self._ahead[0][0][:MOST_STREAMS]))
 
 
 _ARRAYS = (

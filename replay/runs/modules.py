@@ -156,6 +156,9 @@ class SlowFeatures:
     def __repr__(self) -> str:
         return f"SlowFeatures({self.module!r})"
 
+    def _repr_html_(self) -> str:
+        return self.module._repr_html_()
+
     @property
     def components_(self) -> FloatArray:
         """(J, I) weights, a row an output."""
