@@ -15,13 +15,14 @@ from cdmisfa.testing.sources import SourceContract
 from recorder.config import RecordConfig
 from recorder.recording import save_picture
 from recorder.world.icub.config import EyesConfig, IcubConfig, SphereConfig
-from recorder.world.icub.source import eye_matrix, grey, perspective
+from recorder.world.icub.matrices import eye_matrix, grey, perspective
 from recorder.world.icub.world import Motions
 from recorder.world.scenes import SCENES, open_scene
 
 pytest.importorskip("pybullet")
 
-from recorder.world.icub.source import SIZE, TRUTH, IcubSource
+from recorder.world.icub.picture import SIZE
+from recorder.world.icub.source import TRUTH, IcubSource
 from recorder.world.icub.world import World
 
 SCENE = IcubConfig(seed=1)

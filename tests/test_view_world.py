@@ -19,7 +19,8 @@ from cdmisfa.core.signals import STATES
 from recorder.log.scenery import NECK, scenery_of, turned
 from recorder.mcap.reader import LogReader
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.source import TRUTH, eye_matrix
+from recorder.world.icub.matrices import eye_matrix
+from recorder.world.icub.source import TRUTH
 from replay.following import read_outputs
 from replay.palette import colour, packed
 from replay.runs.modules import save_modules

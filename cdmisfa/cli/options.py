@@ -90,7 +90,7 @@ jobs = number("--jobs", "Parallel processes.", 1, 1024, default=1)
 preset = word(
     "--preset",
     "NAME",
-    "Preset (icub, oscillatory, cameras) or a .toml file; by default the one of the source.",
+    "Preset (icub, icub-real, oscillatory, cameras) or a .toml file; by default the source's.",
     group="Learner",
     shell_complete=completing.presets,
 )

@@ -1,8 +1,7 @@
 """Configuration: strict frozen dataclasses, filled from TOML presets and `--set` words.
 
-A key that does not exist is an error that names the nearest one that does. Each
-package owns the dataclass of its own section (`learner` here, `scene` and `record`
-in `recorder`); this module fills any of them.
+A key that does not exist is an error that names the nearest one that does. Each package owns the
+dataclass of its own section (`learner` here, `scene` and `record` in `recorder`); this fills any.
 """
 
 from __future__ import annotations
@@ -381,12 +380,13 @@ def section_table(section: Any) -> dict[str, Any]:
     table: dict[str, Any] = {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
+        if field.metadata.get("unsaid") and value == field.default:
+            continue  # tables of before it came stay as they were
         if dataclasses.is_dataclass(value):
             table[field.name] = section_table(value)
-        elif value is None:
-            table[field.name] = "auto"
         else:
-            table[field.name] = list(value) if isinstance(value, tuple) else value
+            plain = list(value) if isinstance(value, tuple) else value
+            table[field.name] = "auto" if value is None else plain
     return table
 
 

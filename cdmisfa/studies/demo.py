@@ -34,11 +34,14 @@ Stage = Callable[[str, str], AbstractContextManager[Any]]
 """Opens a stage by its title and the unit that it counts; reports to a `cli.progress.Bar`."""
 
 
-def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[str, Any]:
+def demo(
+    out: Path, *, preset: str | None = None, seed: int, frames: int, jobs: int, stage: Stage
+) -> dict[str, Any]:
     """Record the scene, learn from the recording, compare with live, write the report.
 
     Args:
         out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
+        preset: of scene and learner, instead of the scene's own.
         seed: of world and learner.
         frames: of the recording; the learner starts it again at its end.
         jobs: processes that render.
@@ -54,12 +57,12 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[
     from recorder.recording import record_scene
     from replay.export.figures import draw_figures
 
-    configuration = configure(SCENE, seed=seed)
+    configuration = configure(SCENE, preset, seed=seed)
     recording, folder = out / "recordings" / "demo-icub", out / "runs" / "demo-icub"
 
     def learn(bar: Any, word: str | Path, out: Path | None, most: int | None) -> RunResult:
         modules = MODULES if most is None else None
-        with _opened(word, seed) as source:
+        with _opened(word, preset, seed) as source:
             return run(
                 source,
                 configuration.learner,
@@ -94,7 +97,7 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[
                 "see `cdmisfa doctor`"
             )
         bar.say(f"live and recorded signals of {most} iterations are the same, bit for bit")
-    with stage("4/4 writing the report", "modules"), _opened(recording, seed) as source:
+    with stage("4/4 writing the report", "modules"), _opened(recording, preset, seed) as source:
         return {
             "schema": 1,
             "recording": recording,
@@ -107,8 +110,10 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[
         }
 
 
-def _opened(word: str | Path, seed: int) -> AbstractContextManager[SeekableSource]:
-    return contextlib.closing(open_source([word], seed=seed, loop=True)[0])
+def _opened(
+    word: str | Path, preset: str | None, seed: int
+) -> AbstractContextManager[SeekableSource]:
+    return contextlib.closing(open_source([word], preset=preset, seed=seed, loop=True)[0])
 
 
 def followed_by(module: Module, source: SeekableSource) -> dict[str, Any]:

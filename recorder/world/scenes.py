@@ -19,7 +19,8 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import Registry
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.source import IcubSource, scene_picture
+from recorder.world.icub.picture import scene_picture
+from recorder.world.icub.source import IcubSource
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
 
 if TYPE_CHECKING:

@@ -349,6 +349,7 @@ def _run_arena(
 @click.command("demo")
 @options.out("Folder of the recordings and runs; by default the one you are in.")
 @options.seed()
+@options.preset
 @number("--frames", "Frames a view.", 400, default=16000)
 @options.jobs
 @options.as_json

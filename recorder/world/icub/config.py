@@ -6,13 +6,18 @@ coordinates: x to the robot's back, y to its left.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from cdmisfa.core.config import in_range, positive
 from cdmisfa.core.errors import UsageError
 from recorder.config import SceneConfig, check_view_names
 
 Range = tuple[float, float]
+
+TABLE_FROM, TABLE_TO = (-0.95, -0.75), (-0.3, 0.75)
+"""Corners of the table of a furnished room, and of that which pictures from outside show: the plain
+one fills every eye image, and would hide the robot's legs. Root frame, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +124,25 @@ class SphereConfig:
         _range("scene.object3.y", self.y)
 
 
+def later(default: Any) -> Any:
+    """Field of a key that the plain scene does not state."""
+    return field(default=default, metadata={"unsaid": True})
+
+
 @dataclass(frozen=True, slots=True)
 class IcubConfig(SceneConfig):
-    """The iCub scene (keys `scene.*`).
+    """The iCub scene (keys `scene.*`); the plain one, unless one of the last keys is set.
 
     Attributes:
         robot: a model of the icub-models package.
+        room: the table has edges and legs, and stands in a room with floor, walls and furniture.
+        texture: wood, tiles, plaster and painted objects instead of plain greys.
+        shadow: share of the light that the lamp's shadow takes.
+        arms: the robot's arms rest on the table, and are in its sight.
+        blur: of a pixel over its neighbours, (1, 2, 1) / 4 each way.
+        vignette: share of the light that is lost in the corners of an image.
+        noise: of the sensor at middle grey, standard deviation in grey levels.
+        color: a frame shows red, green and blue beside one another.
     """
 
     kind: str = "icub"
@@ -134,6 +152,24 @@ class IcubConfig(SceneConfig):
     object1: BoxConfig = field(default_factory=BoxConfig)
     object2: CylinderConfig = field(default_factory=CylinderConfig)
     object3: SphereConfig = field(default_factory=SphereConfig)
+    room: bool = later(False)
+    texture: bool = later(False)
+    shadow: float = later(0.0)
+    arms: bool = later(False)
+    blur: bool = later(False)
+    vignette: float = later(0.0)
+    noise: float = later(0.0)
+    color: bool = later(False)
+
+    def __post_init__(self) -> None:
+        SceneConfig.__post_init__(self)
+        in_range(self, "scene", 0.0, 1.0, "shadow", "vignette")
+        in_range(self, "scene", 0.0, 64.0, "noise")
+
+    @property
+    def plain(self) -> bool:
+        """Whether objects over one endless table are all that there is."""
+        return all(getattr(self, f.name) == f.default for f in fields(self) if f.metadata)
 
 
 def _range(key: str, limits: Range) -> None:

@@ -12,7 +12,8 @@ import itertools
 import math
 import os
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
+from recorder.world.icub.room import Piece, Room
 
 CHUNK = 4096
 """Frames drawn at a time."""
@@ -116,6 +118,15 @@ def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
 NECK_YAW = b"neck_yaw"
 """The joint that turns the head to the left; the last of the neck."""
 
+ARMS = {
+    "shoulder_pitch": -30.0,
+    "shoulder_roll": 30.0,
+    "shoulder_yaw": 15.0,
+    "elbow": 50.0,
+    "wrist_prosup": 60.0,
+}
+"""Angles of the joints of both arms where they rest on the table, degrees; without l_ and r_."""
+
 _AWAY = (0.0, 0.0, -100.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
@@ -137,6 +148,9 @@ class World:
     """
 
     def __init__(self, scene: IcubConfig, *, robot_seen: bool = False) -> None:
+        self._objects: list[int] = []
+        self._pieces: list[int] = []
+        self._shown: Sequence[int] = ()
         with silenced():
             self._bullet, models = _start_simulator()
             bullet = self._bullet
@@ -185,6 +199,69 @@ class World:
         """Add a box that is only scenery; root frame, metres."""
         self._move(self._body(self._bullet.GEOM_BOX, colour, halfExtents=half), centre)
 
+    def furnish(self, room: Room, *, arms: bool) -> None:
+        """Put a furnished room's pieces and objects in place of the plain ones.
+
+        Args:
+            room: what there is.
+            arms: the robot rests its arms on the table.
+        """
+        for body in (self._table, *self._objects):
+            self._bullet.removeBody(body)
+        with silenced(), tempfile.TemporaryDirectory() as folder:
+            self._pieces = [self._piece(piece, folder) for piece in room.pieces]
+            self._objects = [self._piece(piece, folder) for piece in room.objects]
+        self._shown = range(len(room.objects))
+        if arms:
+            self._rest_arms()
+
+    def show_room(self, pieces: Collection[int], *, robot: bool) -> None:
+        """Show these of what stands still, and the robot or not; what is hidden takes no time."""
+        for number, body in enumerate(self._pieces):
+            self._show(body, -1, shown=number in pieces)
+        for body, link in self._colours:
+            if body == self._robot:
+                self._show(body, link, shown=robot)
+
+    def show_objects(self, numbers: Sequence[int]) -> None:
+        """Show these objects of a furnished room, and hide the others."""
+        for number, body in enumerate(self._objects):
+            if (number in numbers) != (number in self._shown):
+                self._show(body, -1, shown=number in numbers)
+        self._shown = numbers
+
+    def _show(self, body: int, link: int, *, shown: bool) -> None:
+        colour = self._colours[body, link] if shown else (0.0, 0.0, 0.0, 0.0)
+        self._bullet.changeVisualShape(body, link, rgbaColor=colour)
+
+    def _piece(self, piece: Piece, folder: str) -> int:
+        """Add a body with a mesh and paint of its own."""
+        bullet = self._bullet
+        colour = (*(piece.colour if piece.paint is None else (1.0, 1.0, 1.0)), 1.0)
+        visual = bullet.createVisualShape(
+            bullet.GEOM_MESH,
+            rgbaColor=colour,
+            specularColor=(piece.gloss,) * 3,
+            **piece.mesh.arguments(),
+        )
+        body: int = bullet.createMultiBody(0, baseVisualShapeIndex=visual)
+        self._move(body, piece.centre)
+        self._colours[body, -1] = colour
+        if piece.paint is not None:
+            from PIL import Image
+
+            file = f"{folder}/{body}.bmp"
+            Image.fromarray(piece.paint).save(file)
+            bullet.changeVisualShape(body, -1, textureUniqueId=bullet.loadTexture(file))
+        return body
+
+    def _rest_arms(self) -> None:
+        bullet = self._bullet
+        for joint in range(bullet.getNumJoints(self._robot)):
+            angle = ARMS.get(bullet.getJointInfo(self._robot, joint)[1].decode()[2:])
+            if angle is not None:
+                bullet.resetJointState(self._robot, joint, math.radians(angle))
+
     def render(
         self,
         view: tuple[float, ...],
@@ -192,6 +269,7 @@ class World:
         width: int,
         height: int,
         light: tuple[float, float, float],
+        **lighting: float,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """What a camera sees: (height, width, 4) colours and (height, width) depth.
 
@@ -199,7 +277,7 @@ class World:
             CdmisfaError: the simulator refuses.
         """
         try:
-            image = self._see(width, height, view, projection, lightDirection=light)
+            image = self._see(width, height, view, projection, lightDirection=light, **lighting)
         except self._bullet.error as error:
             raise CdmisfaError(f"PyBullet cannot draw: {error}") from error
         colours = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)
@@ -219,6 +297,8 @@ class World:
             flags=bullet.URDF_MERGE_FIXED_LINKS | bullet.URDF_IGNORE_COLLISION_SHAPES,
         )
         joints = range(bullet.getNumJoints(self._robot))
+        shapes = bullet.getVisualShapeData(self._robot)
+        self._colours = {(shape[0], shape[1]): tuple(shape[7]) for shape in shapes}
         if not robot_seen:
             for link in (-1, *joints):
                 bullet.changeVisualShape(self._robot, link, rgbaColor=(0, 0, 0, 0))

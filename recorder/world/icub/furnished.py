@@ -1,0 +1,249 @@
+"""What the robot's eyes see of a furnished room.
+
+All that stands still (room, table, arms, their shadows) is a plate, drawn finely once for each
+eye of a view. A frame draws the objects and their shadows on the table into it, where they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import ByteArray, FloatArray
+from recorder.world.icub.config import IcubConfig
+from recorder.world.icub.lens import SAMPLES, Lens
+from recorder.world.icub.matrices import Matrix, eye_matrix, grey, metres, perspective, rays
+from recorder.world.icub.room import room_of
+from recorder.world.icub.shadows import LAMP, TEXEL, ObjectShadow, RoomShadows
+from recorder.world.icub.world import World
+
+FINE = 2
+"""Rays of a plate along each side of one of a frame."""
+
+LIGHTING = {"lightAmbientCoeff": 0.62, "lightDiffuseCoeff": 0.68, "lightSpecularCoeff": 0.1}
+"""How much of the light comes from everywhere, how much from the lamp, and what is mirrored."""
+
+_POOL, _WIDE, _UNDER = 0.25, 0.8, (-0.55, -0.1)
+"""The share of light lost far from the lamp, how far that is, and where it is nearest, metres."""
+
+Part = tuple[slice, slice]
+"""Rows and columns of a picture."""
+
+_FLAT = 0.003
+"""Metres from the table's height within which a pixel shows the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plate:
+    """What stands still in an eye's image.
+
+    Attributes:
+        view: of the eye.
+        light: (height, width, channels) its picture.
+        depth: (height, width) of it.
+        rows: (height, width) where the ray of each pixel meets the table: y in the root frame,
+            in `TEXEL`; `columns` is x.
+        lamp: share of the light that a shadow takes there: 0 beside the table.
+    """
+
+    view: Matrix
+    light: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    rows: NDArray[np.float32]
+    columns: NDArray[np.float32]
+    lamp: NDArray[np.float32]
+
+
+class FurnishedEyes:
+    """Renders what both eyes see of a room, side by side.
+
+    Hides all that stands still for good, since it is in the plates.
+
+    Args:
+        scene: one that is not plain.
+        world: whose plain bodies are replaced.
+
+    Attributes:
+        shape: (height, width) of the joined image; of both eyes' red, green and blue beside one
+            another, where they see colours.
+    """
+
+    def __init__(self, scene: IcubConfig, world: World) -> None:
+        self._scene, self._world = scene, world
+        eyes, self._channels = scene.eyes, 3 if scene.color else 1
+        self.shape = eyes.height, 2 * eyes.width * self._channels
+        self._size = eyes.height * SAMPLES, eyes.width * SAMPLES
+        self._projection = perspective(
+            eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far
+        )
+        self._focal = self._size[0] / 2 / math.tan(math.radians(eyes.vertical_fov) / 2)
+        self._lens = Lens(scene)
+        room = room_of(scene)
+        world.furnish(room, arms=scene.arms)
+        world.show_room((), robot=False)
+        self._balls = [_ball(scene, across, height) for across, height in sizes_of(scene)]
+        self._shadows = _object_shadows(scene, world) if scene.shadow else []
+        world.show_objects(())
+        shadows = RoomShadows(world, room, robot=scene.arms) if scene.shadow else None
+        world.show_room(range(len(room.pieces)), robot=scene.arms)
+        self._plates = []
+        for yaw in eyes.yaw:
+            world.turn_head(yaw)
+            self._plates.append([self._plate(shadows, yaw, side) for side in (1, -1)])
+        world.show_room((), robot=False)
+
+    def look(self, view: int, t: int, positions: FloatArray) -> ByteArray:
+        """What a view shows from frame t on; see `Eyes.look`."""
+        height, width = self._size
+        frames = np.empty((len(positions), height, 2, width, self._channels), np.uint8)
+        for frame, places in zip(frames, positions, strict=True):
+            self._world.place(places)
+            for eye, plate in enumerate(self._plates[view]):
+                self._see(plate, places, frame[:, eye])
+        images = self._lens.through(frames, t, view)
+        return np.moveaxis(images, -1, 2).reshape(len(frames), *self.shape)
+
+    def _see(self, plate: Plate, places: FloatArray, out: ByteArray) -> None:
+        """Write an eye's image, (height, width, channels), with the objects at their places."""
+        out[...] = plate.light
+        parts = {}
+        for number, ((x, y, z), radius) in enumerate(self._balls):
+            middle = places[number, 0] + x, y - places[number, 1], z
+            if (part := self._part(plate.view, middle, radius)) is not None:
+                parts[number] = part
+        self._world.show_objects(tuple(parts))
+        for part in parts.values():
+            image = plate.light[part]
+            if self._shadows:
+                image = image * self._shade(plate, places, part, tuple(parts))[..., None]
+            colours, depth = self._draw_part(plate.view, part)
+            seen = depth < plate.depth[part]
+            out[part] = np.where(seen[..., None], self._toned(colours), image)
+
+    def _shade(
+        self, plate: Plate, places: FloatArray, part: Part, objects: Sequence[int]
+    ) -> NDArray[np.float32]:
+        """Share of the light that the shadows of objects leave to a part of an image."""
+        rows, columns, left = plate.rows[part], plate.columns[part], np.ones(1, np.float32)
+        for number in objects:
+            x, y = places[number, :2] / TEXEL
+            hidden = self._shadows[number].hidden(rows + np.float32(y), columns - np.float32(x))
+            left = left * (1 - hidden)
+        return np.asarray(1 - (1 - left) * plate.lamp[part])
+
+    def _part(self, view: Matrix, middle: tuple[float, float, float], radius: float) -> Part | None:
+        """Rows and columns of the pixels that a ball may cover, or none."""
+        x, y, z = (
+            view[i] * middle[0] + view[4 + i] * middle[1] + view[8 + i] * middle[2] + view[12 + i]
+            for i in range(3)
+        )
+        if -z <= radius + self._scene.eyes.near:
+            return None
+        found = []
+        for at, size in ((y / z, self._size[0]), (-x / z, self._size[1])):
+            # Far from the middle a ball is seen as a longer shape.
+            reach = radius * self._focal / -z * math.sqrt(1 + at * at) * 1.1 + 1
+            centre = size / 2 + self._focal * at
+            low, high = max(0, int(centre - reach)), min(size, int(centre + reach) + 1)
+            if low >= high:
+                return None
+            found.append(slice(low, high))
+        return found[0], found[1]
+
+    def _draw_part(self, view: Matrix, part: Part) -> tuple[ByteArray, NDArray[np.float32]]:
+        """Colours and depth of a part of an image."""
+        (height, width), (rows, columns) = self._size, part
+        down, across = rows.stop - rows.start, columns.stop - columns.start
+        whole = list(self._projection)
+        whole[0] *= width / across
+        whole[5] *= height / down
+        whole[8] = (columns.start + columns.stop - width) / across
+        whole[9] = (height - rows.start - rows.stop) / down
+        return self._world.render(view, tuple(whole), across, down, LAMP, **LIGHTING)
+
+    def _toned(self, colours: ByteArray) -> ByteArray:
+        """Colours, (..., 3 or 4), in as many channels as the eyes see."""
+        return colours[..., :3] if self._channels == 3 else grey(colours)[..., None]
+
+    def _plate(self, room: RoomShadows | None, yaw: float, side: int) -> Plate:
+        scene, fine = self._scene, (self._size[0] * FINE, self._size[1] * FINE)
+        view = eye_matrix(scene.eyes, self._world.neck, yaw, side)
+        colours, depth = self._world.render(
+            view, self._projection, fine[1], fine[0], LAMP, **LIGHTING
+        )
+        places, hidden = seen_at(view, self._projection, depth, room)
+        light = light_at(scene, places, hidden)[..., None]
+        picture = averaged(colours[..., :3] * light, FINE)
+        on_table = abs(places[2] - scene.table.top) < _FLAT
+        eye, ray = rays(view, self._projection, *self._size)
+        x, y, _ = eye + ray * ((scene.table.top - eye[2]) / np.minimum(ray[2], -1e-3))
+        return Plate(
+            view=view,
+            light=self._toned(np.rint(picture).astype(np.uint8)).astype(np.float32),
+            depth=averaged(depth, FINE).astype(np.float32),
+            rows=(y / TEXEL).astype(np.float32),
+            columns=(x / TEXEL).astype(np.float32),
+            lamp=averaged(on_table * (1 - hidden) * scene.shadow, FINE).astype(np.float32),
+        )
+
+
+def sizes_of(scene: IcubConfig) -> list[tuple[float, float]]:
+    """Of each object the radius of what it covers on the table, and its height."""
+    return [
+        (scene.object1.half_size * math.sqrt(2), 2 * scene.object1.half_size),
+        (scene.object2.radius, scene.object2.height),
+        (scene.object3.radius, 2 * scene.object3.radius),
+    ]
+
+
+def _fall(scene: IcubConfig, height: float) -> tuple[float, float]:
+    """How far the shadow of a point so high over the table is from it, x and y."""
+    share = height / LAMP[2] if scene.shadow else 0.0
+    return -share * LAMP[0], -share * LAMP[1]
+
+
+def _ball(scene: IcubConfig, across: float, height: float) -> tuple[tuple[float, ...], float]:
+    """A ball around an object and its shadow: its middle, from the object's place, and radius."""
+    x, y = _fall(scene, height)
+    middle = x / 2, y / 2, scene.table.top + height / 2
+    return middle, math.hypot(across + math.hypot(x, y) / 2, height / 2)
+
+
+def _object_shadows(scene: IcubConfig, world: World) -> list[ObjectShadow]:
+    return [
+        ObjectShadow(
+            world, number, scene.table.top, across + 1.2 * math.hypot(*_fall(scene, height))
+        )
+        for number, (across, height) in enumerate(sizes_of(scene))
+    ]
+
+
+def seen_at(
+    view: Matrix, projection: Matrix, depth: NDArray[Any], shadows: RoomShadows | None
+) -> tuple[FloatArray, FloatArray]:
+    """Where the pixels of a picture are, (3, height, width), and what share of light they lack."""
+    eye, ray = rays(view, projection, *depth.shape)
+    places = eye + metres(depth, projection) * ray
+    return places, np.zeros(depth.shape) if shadows is None else shadows.hidden(places)
+
+
+def light_at(scene: IcubConfig, places: FloatArray, hidden: FloatArray) -> FloatArray:
+    """(...) factor of the colours at (3, ...) places: shadows, and less light far from the lamp."""
+    if not scene.shadow:
+        return np.ones(hidden.shape)
+    x, y, _ = places
+    away = ((x - _UNDER[0]) ** 2 + (y - _UNDER[1]) ** 2) / _WIDE**2
+    return np.asarray((1 - scene.shadow * hidden) * (1 - _POOL * away / (1 + away)))
+
+
+def averaged(image: NDArray[Any], n: int) -> FloatArray:
+    """(n h, n w, ...) as (h, w, ...), the mean of each n x n pixels."""
+    total = np.zeros((image.shape[0] // n, image.shape[1] // n, *image.shape[2:]))
+    for i in range(n * n):
+        total += image[i // n :: n, i % n :: n]
+    return total / (n * n)

@@ -1,0 +1,88 @@
+"""What optics and the sensor do to an image, the same at every frame t of a seed.
+
+A frame's noise has numbers of its own, so that none before has to be drawn. It is a sum of random
+bytes, which is the same on every machine.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import ByteArray
+from recorder.world.icub.config import IcubConfig
+
+SAMPLES = 2
+"""Rays of a pixel along each side, which are averaged."""
+
+_NOISE = 0x4015E
+_BYTES = 4
+_SPREAD = np.float32(1 / np.sqrt(_BYTES * (256**2 - 1) / 12))
+
+
+class Lens:
+    """From images of `SAMPLES` rays a pixel each way to those that are learned.
+
+    Args:
+        scene: what is done.
+    """
+
+    def __init__(self, scene: IcubConfig) -> None:
+        self._scene, eyes = scene, scene.eyes
+        y, x = ((np.arange(n) * 2 - (n - 1)) / eyes.width for n in (eyes.height, eyes.width))
+        away = (y * y)[:, None] + x * x
+        gain = (1 - scene.vignette * away / away.max()) / SAMPLES**2
+        if scene.blur:
+            gain /= 16
+        self._gain = gain.astype(np.float32)[:, None, :, None]
+
+    def through(self, rays: ByteArray, t: int, view: int) -> ByteArray:
+        """Images of a view's eyes from frame t on.
+
+        Args:
+            rays: (n, SAMPLES height, eyes, SAMPLES width, channels).
+            t: frame of the first.
+            view: number of the view.
+
+        Returns:
+            (n, height, eyes, width, channels).
+        """
+        total: Any = rays[:, ::SAMPLES].astype(np.uint16)
+        for i in range(1, SAMPLES):
+            total += rays[:, i::SAMPLES]
+        total = (
+            sum(total[:, :, :, i::SAMPLES] for i in range(1, SAMPLES)) + total[:, :, :, ::SAMPLES]
+        )
+        if self._scene.blur:
+            total = _spread(_spread(total, 1), 3)
+        image = total * self._gain
+        if self._scene.noise:
+            # Half of its variance is the same everywhere, half grows with the light.
+            image += self._noise(t, view, image.shape) * np.sqrt(
+                image * np.float32(1 / 256) + np.float32(0.5)
+            )
+        return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
+
+    def _noise(self, t: int, view: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        """Noise of n images from frame t on."""
+        words = -(-int(np.prod(shape[1:])) * _BYTES // 32) * 4  # Philox gives four at a time
+        seed = np.array([self._scene.seed or 0, _NOISE + view], np.uint64)
+        bits = np.random.Philox(key=seed)
+        bits.advance(t * words // 4)
+        raw = bits.random_raw(shape[0] * words).view(np.uint8).reshape(shape[0], _BYTES, -1)
+        total = np.add.reduce(raw, axis=1, dtype=np.int16)[:, : int(np.prod(shape[1:]))]
+        centred = total.reshape(shape) - np.float32(255 * _BYTES / 2)
+        return np.asarray(centred * (_SPREAD * np.float32(self._scene.noise)))
+
+
+def _spread(image: Any, axis: int) -> Any:
+    """(1, 2, 1) along an axis of an image whose first and last pixels go on beyond it."""
+    image = image.swapaxes(0, axis)
+    wide = 2 * image
+    wide[1:] += image[:-1]
+    wide[:-1] += image[1:]
+    wide[0] += image[0]
+    wide[-1] += image[-1]
+    return wide.swapaxes(0, axis)

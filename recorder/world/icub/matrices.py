@@ -1,0 +1,119 @@
+"""Cameras as matrices, column by column as OpenGL has them, and colours as grey."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import ByteArray, FloatArray
+from recorder.world.icub.config import EyesConfig
+
+LUMA = (299, 587, 114)
+"""Thousandths of red, green and blue in grey (ITU-R BT.601); whole numbers round exactly."""
+
+Matrix = tuple[float, ...]
+
+
+def eye_matrix(eyes: EyesConfig, neck: FloatArray, yaw: float, side: int) -> Matrix:
+    """View matrix of an eye, column by column as OpenGL has it.
+
+    Args:
+        eyes: the head's measures.
+        neck: (3,) origin of the neck yaw joint, root frame (x back, y right, z up).
+        yaw: of the head, degrees to the left.
+        side: +1 the left eye, -1 the right one.
+    """
+    turn, tilt = math.radians(yaw), math.radians(eyes.tilt)
+    forward = np.array([-math.cos(turn), -math.sin(turn), 0.0])
+    left = np.array([math.sin(turn), -math.cos(turn), 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    place = neck + eyes.forward * forward + side * eyes.half_distance * left + eyes.up * up
+    gaze = math.cos(tilt) * forward + math.sin(tilt) * up
+    return look(place, place + gaze)
+
+
+def look(place: FloatArray, target: FloatArray) -> Matrix:
+    """View matrix of an upright camera at `place` that looks at `target`."""
+    gaze = (target - place) / np.linalg.norm(target - place)
+    right = np.cross(gaze, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, gaze)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, up, -gaze])
+    matrix[:3, 3] = -matrix[:3, :3] @ place
+    return tuple(matrix.T.ravel().tolist())
+
+
+def perspective(vertical_fov: float, aspect: float, near: float, far: float) -> Matrix:
+    """Projection matrix of a camera, column by column; degrees and metres."""
+    scale = 1.0 / math.tan(math.radians(vertical_fov) / 2)
+    depth = near - far
+    columns = (
+        (scale / aspect, 0.0, 0.0, 0.0),
+        (0.0, scale, 0.0, 0.0),
+        (0.0, 0.0, (near + far) / depth, -1.0),
+        (0.0, 0.0, 2 * near * far / depth, 0.0),
+    )
+    return tuple(value for column in columns for value in column)
+
+
+def grey(colours: ByteArray) -> ByteArray:
+    """Colours, (..., 3 or 4), as grey, (...): BT.601, rounded."""
+    red, green, blue = (colours[..., i].astype(np.uint32) for i in range(3))
+    mixed = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+    return ((mixed + 500) // 1000).astype(np.uint8)
+
+
+def from_afar(half: float) -> Matrix:
+    """Projection matrix of a camera `AFAR` metres away that sees so many metres to each side.
+
+    The renderer knows no camera without perspective.
+    """
+    scale = AFAR / half
+    near, far = AFAR - 5.0, AFAR + 5.0
+    return (
+        *(scale, 0.0, 0.0, 0.0),
+        *(0.0, scale, 0.0, 0.0),
+        *(0.0, 0.0, (near + far) / (near - far), -1.0),
+        *(0.0, 0.0, 2 * near * far / (near - far), 0.0),
+    )
+
+
+AFAR = 100.0
+"""Metres from which light is as good as parallel."""
+
+
+def seen_from(view: Matrix, places: FloatArray) -> FloatArray:
+    """(3, ...) places, root frame, in a camera's frame: to its right, up, and behind it.
+
+    Element by element, so that the sums are the same on every processor.
+    """
+    x, y, z = places
+    return np.stack(
+        [view[i] * x + view[4 + i] * y + view[8 + i] * z + view[12 + i] for i in range(3)]
+    )
+
+
+def rays(
+    view: Matrix, projection: Matrix, height: int, width: int
+) -> tuple[FloatArray, FloatArray]:
+    """The place of a camera, (3, 1, 1), and what its pixels look at, root frame.
+
+    Returns:
+        That place, and for each pixel, (3, height, width), what is to be added for a metre's depth.
+    """
+    across = ((np.arange(width) + 0.5) / width * 2 - 1) / projection[0]
+    up = (1 - (np.arange(height) + 0.5) / height * 2) / projection[5]
+    x, y = np.broadcast_arrays(across[None, :], up[:, None])
+    turn = [view[4 * k : 4 * k + 3] for k in range(3)]
+    a, b, c = view[12:15]
+    place = np.array([-(r * a + u * b + back * c) for r, u, back in turn])
+    return place[:, None, None], np.stack([r * x + u * y - back for r, u, back in turn])
+
+
+def metres(depth: NDArray[Any], projection: Matrix) -> FloatArray:
+    """Depth of a picture, 0 to 1, as metres in front of a camera."""
+    return projection[14] / (2 * np.asarray(depth, np.float64) - 1 + projection[10])

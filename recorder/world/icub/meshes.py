@@ -1,0 +1,92 @@
+"""Meshes of few triangles with textures in their true size: Bullet's own shapes show a quarter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+PERIOD = 1.6
+"""Metres after which the texture of a box repeats."""
+
+AROUND = 16
+"""Corners of a circle."""
+
+
+@dataclass(slots=True)
+class Mesh:
+    """What Bullet takes of a mesh: triangles by their corners, each with normal and texture."""
+
+    vertices: list[list[float]] = field(default_factory=list)
+    normals: list[list[float]] = field(default_factory=list)
+    uvs: list[list[float]] = field(default_factory=list)
+    indices: list[int] = field(default_factory=list)
+
+    def arguments(self) -> dict[str, Any]:
+        """For `createVisualShape`."""
+        return asdict(self)
+
+
+def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) -> Mesh:
+    """A box around the origin, fibres of its texture along an axis.
+
+    Args:
+        half: of its three sides, metres.
+        along: "x", "y" or "z".
+        period: metres of a texture; 0 shows a whole one on each side.
+    """
+    mesh, fibres = Mesh(), "xyz".index(along)
+    for axis in range(3):
+        others = [i for i in range(3) if i != axis]
+        u, v = sorted(others, key=lambda i: i == fibres)
+        for side in (-1, 1):
+            first = len(mesh.vertices)
+            for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+                corner, normal = [0.0] * 3, [0.0] * 3
+                corner[axis], corner[u], corner[v] = side * half[axis], a * half[u], b * half[v]
+                normal[axis] = float(side)
+                mesh.vertices.append(corner)
+                mesh.normals.append(normal)
+                size = (period / 2 / half[u], period / 2 / half[v]) if period else (1, 1)
+                mesh.uvs.append([(a + 1) / 2 / size[0], (b + 1) / 2 / size[1]])
+            # Seen from outside, corners go round against the clock.
+            straight = side * (1 if (v - u) % 3 == 1 else -1) > 0
+            turns = (0, 1, 2, 0, 2, 3) if straight else (0, 2, 1, 0, 3, 2)
+            mesh.indices += [first + i for i in turns]
+    return mesh
+
+
+def round_mesh(rings: Sequence[tuple[float, float, float, float, float]]) -> Mesh:
+    """A body of revolution about z, from the bottom up, its texture once around.
+
+    Args:
+        rings: radius, height, the normal's parts outward and upward, and the place in the texture.
+    """
+    mesh = Mesh()
+    for i, (radius, height, out, up, v) in enumerate(rings):
+        for j in range(AROUND + 1):
+            turn = 2 * math.pi * (j % AROUND) / AROUND
+            c, s = round(math.cos(turn), 9), round(math.sin(turn), 9)
+            mesh.vertices.append([radius * c, radius * s, height])
+            mesh.normals.append([out * c, out * s, up])
+            mesh.uvs.append([j / AROUND, v])
+            if i and j:
+                a = i * (AROUND + 1) + j
+                b = a - AROUND - 1
+                mesh.indices += [b - 1, b, a, b - 1, a, a - 1]
+    return mesh
+
+
+def can_mesh(radius: float, height: float) -> Mesh:
+    """A can: its side, and its lid; the bottom is never seen."""
+    half = height / 2
+    side = [(radius, -half, 1.0, 0.0, 0.0), (radius, half, 1.0, 0.0, 0.9)]
+    return round_mesh([*side, (radius, half, 0.0, 1.0, 0.95), (0.0, half, 0.0, 1.0, 1.0)])
+
+
+def ball_mesh(radius: float) -> Mesh:
+    """A ball of eight rings."""
+    turns = [math.pi * (i / 8 - 0.5) for i in range(9)]
+    sides = [(round(math.cos(turn), 9), round(math.sin(turn), 9)) for turn in turns]
+    return round_mesh([(radius * c, radius * s, c, s, i / 8) for i, (c, s) in enumerate(sides)])

@@ -1,0 +1,116 @@
+"""The lamp of the furnished room, and where its light does not reach.
+
+Shadows come from pictures drawn as the lamp would see the world, with soft edges.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray
+from recorder.world.icub.matrices import AFAR, Matrix, from_afar, look, metres, seen_from
+from recorder.world.icub.room import Room
+from recorder.world.icub.world import World
+
+LAMP = (-0.45, -0.6, 1.0)
+"""Direction to the lamp, root frame."""
+
+_WIDTH = 0.09
+"""Half the lamp's size, as a share of its height."""
+
+_ROUND = [(i / 2, j / 2) for i in range(-2, 3) for j in range(-2, 3) if i * i + j * j <= 5]
+"""Points of a lamp of half size 1."""
+
+_SIDE, _REACH, _MIDDLE = 1024, 2.6, (-0.5, 0.0, -0.3)
+"""Pixels, half size and middle of the lamp's picture of the room, metres."""
+
+_SLACK, _BLUR = 0.02, 0.01
+"""Metres that something must be behind what it is shaded by, and of a shadow's edge."""
+
+
+class RoomShadows:
+    """Shadows of all that stands still, wherever they fall.
+
+    Args:
+        world: which shows no object.
+        room: what stands in it.
+        robot: it is in the light, too.
+    """
+
+    def __init__(self, world: World, room: Room, *, robot: bool) -> None:
+        casting = [i for i, piece in enumerate(room.pieces) if piece.casts]
+        world.show_room(casting, robot=robot)
+        middle = np.array(_MIDDLE)
+        self._view = look(middle + np.array(LAMP) * (AFAR / math.hypot(*LAMP)), middle)
+        picture = from_afar(_REACH)
+        _, depth = world.render(self._view, picture, _SIDE, _SIDE, LAMP)
+        self._depth = metres(depth, picture)
+
+    def hidden(self, places: FloatArray) -> FloatArray:
+        """(...) share of the lamp's light that (3, ...) places do not get."""
+        x, y, z = seen_from(self._view, places)
+        x, y, depth = x * (-AFAR / z), y * (-AFAR / z), -z - _SLACK
+        total = np.zeros(x.shape)
+        for dx, dy in _ROUND:
+            column = np.floor(((x + dx * _BLUR) / _REACH + 1) * (_SIDE / 2))
+            row = np.floor((1 - (y + dy * _BLUR) / _REACH) * (_SIDE / 2))
+            inside = (abs(column - _SIDE / 2) < _SIDE / 2) & (abs(row - _SIDE / 2) < _SIDE / 2)
+            i, j = (np.where(inside, at, 0).astype(np.int64) for at in (row, column))
+            total += inside & (self._depth[i, j] < depth)
+        return np.asarray(total / len(_ROUND))
+
+
+class ObjectShadow:
+    """The shadow that an object casts on the table, wherever on it the object stands.
+
+    Args:
+        world: which shows nothing else; the object is put over the root's origin.
+        number: of the object.
+        height: of the table.
+        reach: how far from the object the shadow is drawn, metres.
+    """
+
+    def __init__(self, world: World, number: int, height: float, reach: float) -> None:
+        world.place(np.zeros((3, 2)))
+        world.show_objects([number])
+        self._size = 2 * math.ceil(reach / TEXEL)
+        half = self._size * TEXEL / 2
+        picture = from_afar(half)
+        total = np.zeros((self._size, self._size))
+        for dx, dy in _ROUND:
+            lamp = LAMP[0] + dx * _WIDTH, LAMP[1] + dy * _WIDTH, LAMP[2]
+            view = _flattened(lamp, height)
+            total += world.render(view, picture, self._size, self._size, LAMP)[1] < _NOTHING
+        self._share = np.pad((total / len(_ROUND))[::-1], 1).astype(np.float32)
+
+    def hidden(
+        self, rows: NDArray[np.float32], columns: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Share of the lamp's light that is lost so many `TEXEL` from the object."""
+        middle, last = np.float32(self._size / 2 + 1), np.float32(self._size + 1)
+        i, j = (
+            np.minimum(np.maximum(at + middle, np.float32(0)), last).astype(np.int32)
+            for at in (rows, columns)
+        )
+        return np.asarray(self._share[i, j])
+
+
+TEXEL = 0.004
+"""Metres of a pixel of an object's shadow."""
+
+_NOTHING = np.float32(0.9999)
+"""Depth of a pixel where nothing is."""
+
+
+def _flattened(lamp: tuple[float, float, float], height: float) -> Matrix:
+    """View from above, `AFAR` over a plane, onto which all is moved along the light."""
+    x, y = lamp[0] / lamp[2], lamp[1] / lamp[2]
+    return (
+        *(1.0, 0.0, 0.0, 0.0),
+        *(0.0, 1.0, 0.0, 0.0),
+        *(-x, -y, 0.0, 0.0),
+        *(x * height, y * height, -AFAR, 1.0),
+    )

@@ -1,0 +1,116 @@
+"""Textures of the furnished room and its objects, drawn from whole numbers alone.
+
+Every value comes from hashing a place in a lattice, so a texture is the same bytes on every
+machine and needs no file. A texture is (SIDE, SIDE, 3) in [0, 1] and repeats seamlessly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import ByteArray
+
+SIDE = 512
+"""Pixels of a texture along each side."""
+
+Pixels = NDArray[np.float32]
+Colour = Sequence[float]
+
+
+def hashed(rows: int, columns: int, seed: int) -> Pixels:
+    """(rows, columns) values in [0, 1) that depend on their place alone."""
+    i, j = np.indices((rows, columns), dtype=np.uint64)
+    mixed = i * np.uint64(0x9E3779B97F4A7C15) + j * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(seed)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    return ((mixed >> np.uint64(40)) / np.float32(1 << 24)).astype(np.float32)
+
+
+def cloud(rows: int, columns: int, seed: int) -> Pixels:
+    """(SIDE, SIDE) smooth noise in [0, 1) with so many bumps each way."""
+    grid = hashed(rows, columns, seed)
+    (i, u), (j, v) = (_steps(n) for n in (rows, columns))
+    above, below = grid[i], grid[(i + 1) % rows]
+    lines = above + (below - above) * u[:, None]
+    left, right = lines[:, j], lines[:, (j + 1) % columns]
+    return left + (right - left) * v
+
+
+def _steps(n: int) -> tuple[NDArray[np.int64], Pixels]:
+    """Of each pixel the bump before it, and how far it is on the way to the next one."""
+    at = np.arange(SIDE, dtype=np.float32) * np.float32(n) / np.float32(SIDE)
+    low = at.astype(np.int64)
+    u = at - low
+    return low, u * u * (3 - 2 * u)
+
+
+def wood(base: Colour, seed: int, boards: int) -> Pixels:
+    """Boards beside one another, their fibres along the rows: tone, grain and joints."""
+    at = np.arange(SIDE) * boards // SIDE
+    fibres = (
+        0.5 * cloud(3, 170, seed) + 0.3 * cloud(9, 256, seed + 1) + 0.35 * cloud(2, 23, seed + 2)
+    )
+    value = 0.7 + 0.36 * fibres + 0.2 * hashed(1, boards, seed + 3)[0][at]
+    joint = np.arange(SIDE) * boards % SIDE < 3 * boards
+    value[:, joint] *= 0.62
+    return _painted(base, value)
+
+
+def tiles(base: Colour, seed: int, across: int) -> Pixels:
+    """Square tiles, each of its own tone, with joints."""
+    at = np.arange(SIDE) * across // SIDE
+    value = 0.8 + 0.16 * hashed(across, across, seed)[at][:, at] + 0.1 * cloud(64, 64, seed + 1)
+    joint = np.arange(SIDE) * across % SIDE < 5 * across
+    value[joint] = value[:, joint] = 0.6
+    return _painted(base, value)
+
+
+def plaster(base: Colour, seed: int, bumps: int) -> Pixels:
+    """A wall, a little uneven."""
+    return _painted(
+        base, 0.88 + 0.06 * cloud(bumps, bumps, seed) + 0.08 * cloud(120, 120, seed + 1)
+    )
+
+
+def die(base: Colour, seed: int, spots: int) -> Pixels:
+    """A painted cube's side: a darker frame and so many light spots along the diagonal."""
+    image = _painted(base, 0.85 + 0.25 * cloud(9, 9, seed))
+    i, j = np.indices((SIDE, SIDE))
+    image[np.minimum(np.minimum(i, j), SIDE - 1 - np.maximum(i, j)) < SIDE // 12] *= 0.55
+    for k in range(spots):
+        middle = SIDE * (2 * k + 2) // (2 * spots + 2)
+        image[(i - middle) ** 2 + (j - middle) ** 2 < (SIDE // 10) ** 2] = (0.95, 0.93, 0.86)
+    return image
+
+
+def label(base: Colour, seed: int, bands: int) -> Pixels:
+    """Bands around a can or a ball, every other one light."""
+    image = _painted(base, 0.85 + 0.25 * cloud(12, 12, seed))
+    light = (np.arange(SIDE) * (2 * bands + 1) // SIDE) % 2 == 1
+    image[light] = _painted((0.93, 0.91, 0.84), 0.9 + 0.1 * cloud(12, 40, seed + 1))[light]
+    return image
+
+
+def _painted(base: Colour, value: Pixels) -> Pixels:
+    return np.clip(value[..., None] * np.array(base, np.float32), 0.0, 1.0)
+
+
+TEXTURES: dict[str, Callable[[Colour, int, int], Pixels]] = {
+    "wood": wood,
+    "tiles": tiles,
+    "plaster": plaster,
+    "die": die,
+    "label": label,
+}
+"""By name: of a colour, a seed, and a count of what it has."""
+
+
+@cache
+def texture(name: str, colour: tuple[float, ...], count: int) -> ByteArray:
+    """(SIDE, SIDE, 3) a texture of `TEXTURES` as bytes; drawn once in a process."""
+    seed = sum(round(1000 * part) for part in colour) + count
+    return np.rint(TEXTURES[name](colour, seed, count) * 255).astype(np.uint8)

@@ -1,0 +1,180 @@
+"""The furnished iCub scene: what is seen, which bytes, and that the plain one is as it was."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+
+import numpy as np
+import pytest
+
+from cdmisfa.core.config import build, load_preset, section_table
+from cdmisfa.core.errors import UsageError
+from cdmisfa.experiments.sources import configure
+from recorder.config import RecordConfig
+from recorder.recording import save_picture
+from recorder.world.icub.config import EyesConfig, IcubConfig
+from recorder.world.icub.lens import SAMPLES, Lens
+from recorder.world.icub.textures import SIDE, TEXTURES, texture
+
+pytest.importorskip("pybullet")
+
+from recorder.world.icub.picture import SIZE
+from recorder.world.icub.source import IcubSource
+
+REAL = build(IcubConfig, "scene", load_preset("icub-real")["scene"], {"seed": 1})
+SMALL = IcubConfig(
+    seed=1,
+    eyes=EyesConfig(views=("left", "right"), yaw=(45.0, -45.0), width=24, height=18),
+    room=True,
+    shadow=0.5,
+    noise=2.0,
+)
+"""A quick one: neither arms nor textures are drawn."""
+
+
+def seen_in(scene: IcubConfig, *blocks: tuple[int, int, int]) -> list[np.ndarray]:
+    """Frames of (view, first, n) of a scene."""
+    with contextlib.closing(IcubSource(scene, RecordConfig())) as source:
+        found = []
+        for view, first, n in blocks:
+            source.seek(first)
+            found.append(source.take(view, n).frames)
+    return found
+
+
+def test_what_came_later_is_off_and_unsaid_in_the_plain_scene():
+    plain = IcubConfig()
+    keys = [field.name for field in dataclasses.fields(plain) if field.metadata]
+    assert plain.plain
+    assert not set(keys) & set(section_table(plain))
+    for key in keys:
+        value = type(getattr(plain, key))(1)
+        changed = dataclasses.replace(plain, **{key: value})
+        assert not changed.plain
+        assert section_table(changed)[key] == value
+        assert build(IcubConfig, "scene", section_table(changed)) == changed
+
+
+def test_the_preset_is_for_the_progress_learner():
+    assert configure("icub", "icub-real").learner.algorithm == "progress"
+    assert configure("icub").scene.plain
+    with pytest.raises(UsageError, match=r"scene\.noise is 100\.0"):
+        configure("icub", "icub-real", ["scene.noise=100"])
+
+
+def test_every_view_shows_a_room_and_its_moving_object():
+    for view in seen_in(REAL, *((view, 0, 40) for view in range(3))):
+        assert view.shape == (40, 48, 128)
+        assert all(len(np.unique(frame)) >= 150 for frame in view)
+        assert 90 < view.mean() < 170
+        moved = np.abs(view.astype(int) - np.median(view, axis=0)) > 25
+        share = moved.mean(axis=(1, 2))
+        assert 0.005 < share.mean() < 0.1  # where the object is, and its shadow; no more
+
+
+def test_bytes_depend_on_view_and_frame_alone():
+    whole_left, whole_right = seen_in(SMALL, (0, 0, 70), (1, 0, 70))
+    parts = seen_in(SMALL, (1, 60, 10), (0, 0, 1), (0, 1, 33), (1, 3, 2), (0, 34, 36))
+    np.testing.assert_array_equal(np.concatenate([parts[1], parts[2], parts[4]]), whole_left)
+    np.testing.assert_array_equal(parts[0], whole_right[60:])
+    np.testing.assert_array_equal(parts[3], whole_right[3:5])
+    assert (whole_left[0] != seen_in(dataclasses.replace(SMALL, seed=2), (0, 0, 1))[0]).any()
+
+
+QUIET = dataclasses.replace(SMALL, noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def quiet() -> np.ndarray:
+    """Frames of the right view without noise."""
+    return seen_in(QUIET, (1, 0, 20))[0]
+
+
+def test_a_shadow_falls_beside_its_object(quiet):
+    (bright,) = seen_in(dataclasses.replace(QUIET, shadow=0.01), (1, 0, 20))
+    lost = bright.astype(float) - quiet
+    still = np.median(lost, axis=0)
+    cast = lost - still > 12  # by what moves
+    assert 0.003 < cast.mean() < 0.1
+    ratio = (quiet + 1.0) / (bright + 1.0)
+    assert ratio[cast].min() > 0.4
+    assert (ratio[cast] > 0.7).any()  # its edge is soft
+    assert still.max() > 20  # the table shades the floor
+
+
+def test_colours_beside_one_another_are_what_is_seen_in_grey(quiet):
+    (colours,) = seen_in(dataclasses.replace(QUIET, color=True), (1, 0, 3))
+    assert colours.shape == (3, 18, 3 * 48)
+    red, green, blue = (colours[..., i * 48 : (i + 1) * 48].astype(float) for i in range(3))
+    mixed = 0.299 * red + 0.587 * green + 0.114 * blue
+    assert np.abs(mixed - quiet[:3]).max() <= 2
+    assert (red > blue + 5).any()
+
+
+def rays_of(level: int, frames: int) -> np.ndarray:
+    eyes = EyesConfig()
+    size = (frames, eyes.height * SAMPLES, 2, eyes.width * SAMPLES, 1)
+    return np.full(size, level, np.uint8)
+
+
+def test_noise_is_that_of_the_key_and_new_in_every_frame_and_view():
+    lens = Lens(IcubConfig(noise=4.0))
+    images = lens.through(rays_of(128, 30), 0, 0).astype(float)
+    assert abs(images.mean() - 128) < 0.1
+    assert abs(images.std() - 4.0) < 0.1
+    dark = lens.through(rays_of(20, 10), 0, 0).astype(float)
+    assert 2.7 < dark.std() < 3.3
+    first, second = (images[i].ravel() for i in (0, 1))
+    other = lens.through(rays_of(128, 1), 0, 1).astype(float).ravel()
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
+    assert abs(np.corrcoef(first, other)[0, 1]) < 0.05
+    np.testing.assert_array_equal(lens.through(rays_of(128, 1), 7, 0)[0], images[7])
+
+
+def test_blur_and_vignette_by_hand():
+    rays = rays_of(0, 1)
+    rays[0, 20:22, 1, 40:42] = 160
+    image = Lens(IcubConfig(blur=True)).through(rays, 0, 0)[0, :, :, :, 0]
+    np.testing.assert_array_equal(image[9:12, 1, 19:22], [[10, 20, 10], [20, 40, 20], [10, 20, 10]])
+    assert image.sum() == 160
+    edge = Lens(IcubConfig(blur=True, vignette=0.5)).through(rays_of(200, 1), 0, 0)[0, ..., 0]
+    assert edge[0, 0, 0] == edge[-1, 1, -1] == 100
+    assert edge[23:25, :, 31:33].min() >= 199
+
+
+@pytest.mark.parametrize("name", sorted(TEXTURES))
+def test_textures_are_the_same_bytes_everywhere(name):
+    drawn = texture(name, (0.6, 0.4, 0.2), 3)
+    assert drawn.shape == (SIDE, SIDE, 3)
+    assert hashlib.sha256(drawn.tobytes()).hexdigest()[:8] == BYTES[name]
+    assert len(np.unique(drawn)) > 40
+
+
+BYTES = {
+    "die": "97bb2fbc",
+    "label": "ac9aecb4",
+    "plaster": "b56c3154",
+    "tiles": "6a00a743",
+    "wood": "ee711189",
+}
+
+
+def test_the_picture_shows_the_room_and_below_it_every_view(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "room.png"
+    save_picture("icub", REAL, path)
+    with Image.open(path) as image:
+        assert image.size == (SIZE[0], SIZE[1] + 240)
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    red, green, blue = np.moveaxis(pixels, -1, 0)
+    wooden = (red > green + 20) & (green > blue + 20)
+    assert wooden[: SIZE[1]].mean() > 0.1
+    below = wooden[SIZE[1] :].reshape(240, 3, 320).mean(axis=(0, 2))
+    assert below.min() > 0.2
+    assert (blue > red + 50).sum() > 1500
+    assert (green > red + 40).sum() > 500
+    robot = (red > 100) & (green < 40)
+    assert robot[: SIZE[1]].sum() > 5000
