@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 from PIL import Image
-from report_data import HOSTILE, Page, pictured_run
+from report_data import HOSTILE, RULES, Page, pictured_run
 from run_data import IMAGE, PROGRESS, VECTOR, by_progress, module_of, write_run
 
 import cdmisfa as library
@@ -76,6 +76,7 @@ def test_a_fork_is_judged_by_its_parents_rules_until_it_parts(
     page = Page(fork / "report.html")
     assert f"A fork of ../run after {at} iterations: learner.delta 0.02 became 1e-09." in page.text
     assert "the fork begins" in page.text
+    assert f"cdmisfa compare {run} {fork}" in page.text
 
 
 def test_what_is_displayed_is_what_the_data_are(run: Path) -> None:
@@ -120,8 +121,12 @@ def test_what_one_points_at_is_what_was_watched(tmp_path: Path) -> None:
     assert len(shown["t"]) == len(shown["x"]) == len(shown["text"]) > 100
     starts, end = found.signals["t"], int(found.signals["t"][-1]) + 40
     for t, x, text in zip(shown["t"], shown["x"], shown["text"], strict=True):
-        stream = found.signals["stream"][np.searchsorted(starts, t, side="right") - 1]
-        assert text == f"frame {t:,}: {HOSTILE[stream]}"
+        row = int(np.searchsorted(starts, t, side="right")) - 1
+        start = f"frame {t:,}, iteration {row}: {HOSTILE[found.signals['stream'][row]]}; "
+        assert text.startswith(start)
+        shares = found.signals["share"][row] >= RULES["novel_share"]
+        held = text.removeprefix(start).partition("not: ")[0]
+        assert ("share" in held) == shares
         assert x == pytest.approx(1000 * t / end, abs=0.06)
     for module in found.modules:
         own = page.frames[f"module{module.index}"]
@@ -187,7 +192,9 @@ def test_a_run_that_was_killed_says_what_is_missing(tmp_path: Path, run: Path) -
     data = (run / "run.mcap").read_bytes()
     (killed / "run.mcap.partial").write_bytes(data[: len(data) * 2 // 3])
     page = Page(write_report([killed]))
-    assert "The run was broken off before its end" in page.text
+    assert (
+        "The run was broken off before its end, or still learns: there is no run.json" in page.text
+    )
     assert "cdmisfa learn --resume" in page.text
     assert "Why was it saved" not in page.text
     assert "Share of recent blocks" in page.text
@@ -270,7 +277,7 @@ def test_several_runs_a_folder_of_them_and_a_sweep(cdmisfa: Cdmisfa, tmp_path: P
     page = Page(write_report([trials[0], twin], tmp_path / "same.html"))
     assert "All 2 runs are identical, bit for bit." in page.text
     page = Page(write_report([*trials, twin], tmp_path / "all.html"))
-    assert "5 runs: they learned nothing; 1 are identical to the first" in page.text
+    assert "5 runs: they learned nothing; 2 are identical, bit for bit." in page.text
     assert cdmisfa("report", sweep / "trials", "-o", tmp_path / "folder.html").code == 0
 
 

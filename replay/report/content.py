@@ -36,11 +36,8 @@ from replay.report.told import ModuleTold, RunTold
 from replay.report.trust import Proof, command, facts, provenance
 from replay.runs.run import Save
 
-CARDS = 64
-"""Streams that have a card, the most watched; a picture only the first of them."""
-
-PICTURED = 24
-"""Cards with a picture."""
+CARDS, FIRST = 64, 12
+"""Streams that have a card, the most watched, and those of them that are shown at once."""
 
 MODULES = 12
 """Modules that are shown in full; others have a line in a table."""
@@ -62,7 +59,8 @@ def run_content(told: RunTold, proof: Proof | None) -> dict[str, Any]:
     frames: dict[str, Frames] = {}
     lanes = timeline(told, "timeline") if len(told) else None
     if lanes is not None:
-        _put(frames, lanes, frames_of_run(told, lanes))
+        _put(frames, lanes, frames_of_run(told, counted, lanes))
+    pointed = "" if lanes is None else lanes.frames
     return {
         "kind": "run",
         "title": told.name,
@@ -70,12 +68,13 @@ def run_content(told: RunTold, proof: Proof | None) -> dict[str, Any]:
         "answers": _answers(told, proof),
         "problems": told.problems,
         "cards": _cards(told),
+        "carded": FIRST,
         "more_streams": max(len(told.streams) - CARDS, 0),
         "progress": told.header.by_progress,
         "states": [(f"state{k}", state_words(k)) for k in _codes(told)],
         "timeline": lanes,
         "rules": [
-            (rule, rule_plot(told, rule, by_stream=told.header.by_progress))
+            (rule, rule_plot(told, rule, pointed, by_stream=told.header.by_progress))
             for rule in rules
             if rule.drawn and np.isfinite(rule.values).any()
         ],
@@ -170,10 +169,13 @@ def _cards(told: RunTold) -> list[dict[str, Any]]:
     outcomes = told.result.get("streams", ())
     found = {str(q.get("stream")): q for q in outcomes if isinstance(q, Mapping)}
     cards = []
-    for place, s in enumerate(outline.streams(CARDS)):
+    shown = outline.streams(CARDS)
+    if len(shown) > FIRST:  # of many what was learned comes first
+        shown.sort(key=lambda s: (s not in {save.stream for save in outline.saved}, s))
+    for place, s in enumerate(shown):
         name, visits = told.streams[s], int(outline.visits[s])
         verdict, kind, why = _verdict(told, s, found.get(name))
-        seen = told.last.get(s) if place < PICTURED else None
+        seen = told.last.get(s) if place < 2 * FIRST else None
         cards.append(
             {
                 "name": name,

@@ -89,7 +89,7 @@ def timeline(told: RunTold, frames: str) -> Plot:
         plot.marks([save.t + outline.tau])
         if save.stream in row and len(outline.saved) <= NAMED:
             y = LANE * row[save.stream] + LANE - ROOM - 3
-            plot.word(save.t + outline.tau, y, f"module {save.module} saved", "back strong")
+            plot.word(save.t + outline.tau, y, f"module {save.module}", "back strong")
     if (at := told.header.forked_at) is not None and at < outline.iterations:
         t = int(outline.blocks.starts[at])
         plot.marks([t], "fork")
@@ -142,7 +142,7 @@ def _attention(plot: Plot, told: RunTold, stream: int, row: int) -> str:
     )
 
 
-def rule_plot(told: RunTold, rule: Rule, *, by_stream: bool) -> Plot:
+def rule_plot(told: RunTold, rule: Rule, frames: str, *, by_stream: bool) -> Plot:
     """A quantity that decides over the run, its limits, and where they held."""
     outline = told.outline
     limits = (rule.low, rule.high)
@@ -156,6 +156,7 @@ def rule_plot(told: RunTold, rule: Rule, *, by_stream: bool) -> Plot:
         Axis(told.start, max(outline.end, told.start + 1), WIDE),
         Axis(low, high, FLAT, rule.log, turned=True),
         f"{rule.text}; {rule.limit}",
+        frames=frames,
     )
     t = outline.blocks.starts.astype(np.float64)
     _held(plot, t, rule.holds, float(outline.end))
@@ -171,7 +172,7 @@ def rule_plot(told: RunTold, rule: Rule, *, by_stream: bool) -> Plot:
         plot.line("plain", t, values)
     for value in limits:
         if value is not None:
-            plot.limit(value, "")
+            plot.limit(value, f"{rule.symbol}{value:g}")
     plot.marks(save.t for save in outline.saved)
     rows = saved_rows(outline)
     rows = rows[rows < len(values)]
@@ -312,13 +313,21 @@ def saved_frame(told: RunTold, module: ModuleTold) -> int:
     return found[0] if found else outline.end
 
 
-def frames_of_run(told: RunTold, plot: Plot) -> Frames | None:
-    """What was watched, to be shown where one points at the timeline."""
+def frames_of_run(told: RunTold, rules: Sequence[Rule], plot: Plot) -> Frames | None:
+    """What was watched, to be shown where one points at the timeline, and which rules held."""
     if not told.seen.columns:
         return None
     t, frames = told.seen.columns
-    streams = told.outline.blocks.streams[told.outline.blocks.places(t)]
-    said = [f"frame {k:,}: {told.streams[s]}" for k, s in zip(t.tolist(), streams, strict=True)]
+    blocks = told.outline.blocks
+    held = [(rule.short, rule.holds) for rule in rules]
+    said = []
+    for frame, row in zip(t.tolist(), blocks.places(t).tolist(), strict=True):
+        text = f"frame {frame:,}, iteration {blocks.iterations[row]:,}: "
+        text += told.streams[blocks.streams[row]]
+        for word, kept in (("held", True), ("not", False)):
+            if names := [name for name, holds in held if holds[row] == kept]:
+                text += f"; {word}: {', '.join(names)}"
+        said.append(text)
     return frames_at(plot, t, frames, said, images=told.header.spec.images)
 
 

@@ -30,6 +30,7 @@ class Rule:
         low, high: the limits; None where there is none.
         log: it is drawn on a logarithmic axis.
         drawn: it has a plot of its own.
+        symbol: what stands before the limit where that is drawn.
         counts: it decides by itself; else it only follows from the others.
         held: (n,) where it held, where the limits were others before; see `rules_of`.
     """
@@ -42,6 +43,7 @@ class Rule:
     high: float | None = None
     log: bool = False
     drawn: bool = True
+    symbol: str = ""
     counts: bool = True
     held: NDArray[np.bool_] | None = None
 
@@ -103,7 +105,7 @@ def _of_paper(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[Rul
         first = Rule(
             "η̇", "how much its slowness still changes, |η̇| per frame, the largest of its outputs",
             f"saved only below δ = {header.delta:g}" if header.delta else "",
-            change, high=header.delta, log=True,
+            change, high=header.delta, log=True, symbol="δ = ",
         )  # fmt: skip
     return [
         first,

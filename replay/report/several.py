@@ -82,7 +82,7 @@ def _lead(rows: Sequence[Row], outcomes: int, same: int) -> str:
         what = "learned the same streams in the same order"
         if not rows[0].outline.saved:
             what = "learned nothing"
-    as_first = f"; {same - 1} are identical to the first, bit for bit" if same > 1 else ""
+    as_first = f"; {same} are identical, bit for bit" if same > 1 else ""
     return f"{n} runs: they {what}{as_first}."
 
 

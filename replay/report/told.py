@@ -156,7 +156,7 @@ def read_told(path: Path, *, frames: int) -> RunTold:
         problems.append(f"The log is damaged; what follows is what could be read: {error}")
     outline = gathered.tally.outline()
     if len(modules) < len(outline.saved) or not run.result:
-        problems += _missing(run, outline, len(modules))
+        problems += _missing(run, outline, modules)
     if run.header.missing:
         lacks = ", ".join(run.header.missing)
         problems.append(f"The log is of an earlier version, without the signals {lacks}.")
@@ -185,14 +185,15 @@ def _modules(run: Run, problems: list[str]) -> tuple[Module, ...]:
         return ()
 
 
-def _missing(run: Run, outline: Outline, modules: int) -> Iterator[str]:
+def _missing(run: Run, outline: Outline, modules: Sequence[Module]) -> Iterator[str]:
     if not run.result:
+        lacks = "no run.json" if modules else "no run.json and no modules.npz"
         yield (
-            "The run was broken off before its end: there is no run.json and no modules.npz. "
+            f"The run was broken off before its end, or still learns: there is {lacks}. "
             "cdmisfa learn --resume goes on with it."
         )
-    elif modules < len(outline.saved):
-        yield f"The log tells of {len(outline.saved)} modules, modules.npz holds {modules}."
+    elif len(modules) < len(outline.saved):
+        yield f"The log tells of {len(outline.saved)} modules, modules.npz holds {len(modules)}."
 
 
 class _Gathering:

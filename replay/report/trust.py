@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -53,6 +54,11 @@ def facts(told: RunTold, proof: Proof | None) -> list[Fact]:
     if proof is not None:
         kind = "good" if proof.holds else "bad"
         found.append(Fact(kind, proof.text, command("check", told.path)))
+    fork = told.header.manifest.get("fork")
+    if isinstance(fork, Mapping):
+        parent = os.path.normpath(told.path / str(fork.get("parent")))
+        text = "It goes on from another run: both side by side."
+        found.append(Fact("told", text, command("compare", parent, told.path)))
     found += _of_modules(told)
     found += _of_gaps(told)
     return found
