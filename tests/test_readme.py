@@ -1,4 +1,4 @@
-"""Every command of the README and the tour works, on a machine with nothing prepared."""
+"""Every command of the pages that lead through the program works, with nothing prepared."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import Cdmisfa
 
 ROOT = Path(__file__).parents[1]
-README, TOUR = ((ROOT / name).read_text("utf-8") for name in ("README.md", "docs/tour.md"))
+PAGES = ("README.md", "docs/tour.md", "docs/applying.md")
+README, TOUR, APPLYING = ((ROOT / name).read_text("utf-8") for name in PAGES)
 HAS_SIMULATOR = importlib.util.find_spec("pybullet") is not None
 
 
@@ -22,7 +24,7 @@ def blocks(language: str, page: str = README) -> list[str]:
 
 
 def commands() -> list[list[str]]:
-    lines = "".join(blocks("sh") + blocks("sh", TOUR)).splitlines()
+    lines = "".join(blocks("sh") + blocks("sh", TOUR) + blocks("sh", APPLYING)).splitlines()
     return [shlex.split(line, comments=True) for line in lines]
 
 
@@ -54,9 +56,14 @@ def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
         "left-again.mcap",
         "scene.png",
         "runs/icub/run.rrd",
+        "applied/view.rrd",
+        "applied/each/left.csv",
     ):
         assert (elsewhere / made).stat().st_size > 0
     assert list((elsewhere / "figures").glob("*.png"))
+    found: dict[str, Any] = {}
+    exec("".join(blocks("python", APPLYING)), found)
+    assert found["outputs"].shape == (200, 8)
 
 
 def test_python_example_works(elsewhere: Path) -> None:
