@@ -6,6 +6,7 @@ With names of pictures, only those; runs that are in build/pictures already are 
 from __future__ import annotations
 
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -66,6 +67,9 @@ FIGURES = {
 }
 """Pictures that `plot` draws: the run, and the name of the figure."""
 
+REPORTS = {"report": ("icub", "1180,1150")}
+"""Pictures of reports: the run, and the size of the browser's window."""
+
 
 def must(*words: str) -> None:
     """Run a command that succeeds."""
@@ -94,11 +98,16 @@ def draw_view(name: str) -> None:
     opened = ("--tab", tab) if tab else ()
     drawn = BUILD / f"{name}.png"
     must("view", str(shown), "--screenshot", str(drawn), "--force", *opened, *options)
+    fewer_colours(drawn)
+
+
+def fewer_colours(drawn: Path) -> None:
+    """Keep a picture with fewer colours."""
     with Image.open(drawn) as picture:
         few = picture.convert("RGB").quantize(
             COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
-        few.save(IMAGES / f"{name}.png", optimize=True)
+        few.save(IMAGES / drawn.name, optimize=True)
 
 
 def draw_figure(name: str) -> None:
@@ -109,11 +118,26 @@ def draw_figure(name: str) -> None:
     shutil.copyfile(folder / f"{figure}.png", IMAGES / f"{name}.png")
 
 
+def draw_report(name: str) -> None:
+    """Draw the top of a report, in Chromium."""
+    source, size = REPORTS[name]
+    page, drawn = BUILD / f"{name}.html", BUILD / f"{name}.png"
+    must("report", str(learned(source)), "-o", str(page), "--force")
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        raise SystemExit("no browser: apt-get install chromium")
+    flags = ("--headless", "--no-sandbox", "--hide-scrollbars", f"--window-size={size}")
+    words = [browser, *flags, f"--screenshot={drawn}", page.resolve().as_uri()]
+    subprocess.run(words, check=True, capture_output=True)
+    fewer_colours(drawn)
+
+
 def main() -> None:
     """Draw the pictures that are named, by default all."""
     BUILD.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[1:] or [*VIEWS, *FIGURES]:
-        draw_figure(name) if name in FIGURES else draw_view(name)
+    for name in sys.argv[1:] or [*VIEWS, *FIGURES, *REPORTS]:
+        draw = draw_figure if name in FIGURES else draw_report if name in REPORTS else draw_view
+        draw(name)
 
 
 if __name__ == "__main__":

@@ -66,6 +66,10 @@ for (const plot of document.querySelectorAll("[data-frames]")) {
   });
 }
 
+addEventListener("beforeprint", () => {
+  for (const folded of document.querySelectorAll("details")) folded.open = true;
+});
+
 for (const code of document.querySelectorAll("code.copy")) {
   const button = document.createElement("button");
   button.textContent = "copy";
