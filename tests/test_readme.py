@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,13 @@ def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
     ):
         assert (elsewhere / made).stat().st_size > 0
     assert list((elsewhere / "figures").glob("*.png"))
+    if shutil.which("git") is None:
+        return
+    (elsewhere / ".gitignore").write_text((ROOT / ".gitignore").read_text("utf-8"))
+    subprocess.run(["git", "init", "-q"], cwd=elsewhere, check=True)
+    status = ["git", "status", "--porcelain", "--untracked-files=all"]
+    left = subprocess.run(status, cwd=elsewhere, capture_output=True, text=True, check=True)
+    assert left.stdout.split() == ["??", ".gitignore", "??", "sample_logs"]
     found: dict[str, Any] = {}
     exec("".join(blocks("python", APPLYING)), found)
     assert found["outputs"].shape == (200, 8)

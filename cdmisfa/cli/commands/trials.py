@@ -369,7 +369,7 @@ def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
     rows = [[told.get(key, str)(module[key]) for key in head] for module in report["modules"]]
     print_table(head, rows)
     print_line()
-    print_line(f"report     {report['report']}")
+    print_line(f"report     {report['report'].resolve().as_uri()}")
     print_line(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
 
 
