@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Rgb = tuple[int, int, int]
+Rgba = tuple[int, int, int, int]
+Colour = Rgb | Rgba
 
 ORANGE: Rgb = (230, 159, 0)
 SKY: Rgb = (86, 180, 233)
@@ -27,7 +29,6 @@ CYCLE: tuple[Rgb, ...] = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
 """Colours of streams, and of what belongs to one."""
 
 SAND: Rgb = (190, 180, 130)
-WHITE: Rgb = (240, 240, 240)
 MIST: Rgb = (165, 180, 195)
 DARK: Rgb = (85, 85, 85)
 
@@ -41,7 +42,7 @@ CLAY: Rgb = (195, 140, 130)
 BRICK: Rgb = (190, 95, 90)
 BROWN: Rgb = (140, 115, 95)
 
-STATES: tuple[Rgb, ...] = (SAND, WHITE, MIST, DARK)
+STATES: tuple[Rgb, ...] = (SAND, PLUM, MIST, DARK)
 """Colours of what became of a stream: learning, learned, known, given up; none is a stream's."""
 
 PALE: tuple[Rgb, ...] = (STEEL, KHAKI, PLUM, MOSS, CLAY, BROWN)
@@ -64,19 +65,18 @@ def pale(index: int) -> Rgb:
     return PALE[index % len(PALE)]
 
 
-def darker(rgb: Rgb) -> Rgb:
-    """A colour at half its brightness."""
-    red, green, blue = (value // 2 for value in rgb)
-    return red, green, blue
+def faint(rgb: Rgb) -> Rgba:
+    """A colour through which half of what is behind it shows, be that black or white."""
+    return (*rgb, 0x80)
 
 
-def packed(rgb: Rgb) -> int:
-    """A colour as 0xRRGGBBAA, opaque."""
-    red, green, blue = rgb
-    return red << 24 | green << 16 | blue << 8 | 0xFF
+def packed(rgb: Colour) -> int:
+    """A colour as 0xRRGGBBAA."""
+    red, green, blue, *opacity = rgb
+    return red << 24 | green << 16 | blue << 8 | (opacity[0] if opacity else 0xFF)
 
 
-def packed_all(colours: Sequence[Rgb]) -> NDArray[np.uint32]:
+def packed_all(colours: Sequence[Colour]) -> NDArray[np.uint32]:
     """Colours, (n,), as the viewer takes several of them without doubt."""
     return np.array([packed(rgb) for rgb in colours], dtype=np.uint32)
 

@@ -76,8 +76,9 @@ def test_the_progress_learner_is_shown_by_its_streams(sent):
         feed(view, VECTOR)
     records = [signals for signals, _ in run_of(VECTOR, 30, saves=True)]
     for s, name in enumerate(VECTOR.streams):
-        found = np.concatenate(sent[f"streams/learning_error/{s + 1}_{name}"])
-        np.testing.assert_array_equal(found, [r.learning_error for r in records if r.stream == s])
+        found = np.concatenate(sent[f"streams/log_learning_error/{s + 1}_{name}"])
+        expected = [np.log10(r.learning_error) for r in records if r.stream == s]
+        np.testing.assert_array_equal(found[np.isfinite(found)], expected)
     assert not any(path.startswith("policy/") for path in sent)
 
 
@@ -243,7 +244,7 @@ def test_a_viewer_that_connects_shows_it(tmp_path):
 
         def connected(client):
             views = client.get_state().views
-            return views if any(v.name == "What it sees" for v in views) else None
+            return views if any(v.name == "Summary" for v in views) else None
 
         viewer = opened.ask(lambda client: client)
 

@@ -8,14 +8,14 @@ import dataclasses
 import numpy as np
 import pytest
 import rerun as rr
-from run_data import IMAGE, block_of, having, module_of, run_of
+from run_data import IMAGE, block_of, having, module_of, parts_of, run_of
 from view_data import View
 
 from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.recordings.source import RecordedSource
-from replay.runs.modules import save_modules
+from replay.runs.modules import load_modules, save_modules
 from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view
@@ -79,9 +79,10 @@ def at(records, frame):
 )
 def test_what_was_watched_stands_at_its_iteration(shown, entity):
     _, records, rows = shown
-    frames = rows[entity]["frame"]
-    assert max(frames) >= records[-1].t
-    assert rows[entity]["iteration"] == [at(records, t).iteration for t in frames]
+    found = zip(rows[entity]["frame"], rows[entity]["iteration"], strict=True)
+    shown = [(t, k) for t, k in found if t != GAP_AFTER * TAU]  # where lines end
+    assert max(shown)[0] >= records[-1].t
+    assert shown == [(t, at(records, t).iteration) for t, _ in shown]
 
 
 def test_modules_stand_where_they_were_saved(shown):
@@ -138,16 +139,41 @@ def test_a_line_of_every_frame_ends_where_a_gap_begins(shown, entity):
         assert np.isfinite([values[here - 1], values[here + 1]]).all()
 
 
-def test_a_line_of_blocks_leads_from_one_to_the_next(shown):
+def test_a_line_of_blocks_ends_where_a_gap_begins_and_a_table_has_each_value(shown):
     _, records, rows = shown
-    assert rows["/signals/eta"]["frame"] == [record.t for record in records]
+    eta = rows["/signals/eta"]
+    starts, iterations = [r.t for r in records], [r.iteration for r in records]
+    starts.insert(GAP_AFTER, GAP_AFTER * TAU)
+    iterations.insert(GAP_AFTER, GAP_AFTER)  # the row behind it is the last of that iteration
+    assert (eta["frame"], eta["iteration"]) == (starts, iterations)
+    assert np.isnan(eta["Scalars:scalars"][GAP_AFTER]).all()
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_an_output_is_there_on_all_frames_of_its_own_stream_alone(shown, number):
+    folder, records, rows = shown
+    module = load_modules(folder)[number - 1]
+    stream = module.stream_index
+    output = rows[f"/modules/{number}/output"]
+    y = dict(zip(output["frame"], output["Scalars:scalars"], strict=True))
+    watched = parts_of(folder, "watched")
+    frames = {t: image for part in watched for t, image in zip(*part, strict=True)}
+    own = {t for r in records if r.stream == stream for t in range(r.t, r.t + TAU)}
+    said = {t: value for t, (value,) in y.items() if np.isfinite(value)}
+    kept = [t for t in frames if t in own and t % EVERY == 0]
+    assert min(kept) < next(r.t for r in records if r.saved and r.module == number)
+    assert sorted(said) == sorted(kept)
+    for t, value in said.items():
+        assert value == pytest.approx(module.transform(frames[t][None])[0, 0])
+    for end in (t for t in y if t not in said):  # a line ends where another stream was watched
+        assert end not in own
 
 
 def test_a_gap_between_two_handfuls_of_rows_ends_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     sent = []
     monkeypatch.setattr(Column, "send", lambda self, times, values: sent.append(values[:, 0]))
     with rr.RecordingStream("test") as recording:
-        column = Target(recording, IMAGE).lines("a", ["a"], every_frame=True)
+        column = Target(recording, IMAGE).lines("a", ["a"], within=1)
         for frames in ([0, 1], [2], [5, 6, 9]):
             column.add(np.array(frames), None, np.array(frames)[:, None])
             column.flush()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
+import itertools
 
 import numpy as np
 import pytest
@@ -60,12 +61,13 @@ def test_each_stream_has_its_learning_error_where_it_was_watched(shown):
         tested = np.array([np.isfinite(r.tested) for r in own])
         assert 0 < tested.sum() < len(own) or s == 2
         for signal in ("learning_error", "tested", "fitted", "change"):
-            entity = "log_change" if signal == "change" else signal
-            rows = view.rows[f"/streams/{entity}/{s + 1}_{name}"]
-            assert rows["frame"] == [r.t for r in own]
+            rows = view.rows[f"/streams/log_{signal}/{s + 1}_{name}"]
             expected = np.where(tested, [getattr(r, signal) for r in own], np.nan)
-            expected = np.log10(expected) if signal == "change" else expected
-            np.testing.assert_array_equal(scalars(rows)[:, 0], expected)
+            found = dict(zip(rows["frame"], scalars(rows)[:, 0], strict=True))
+            np.testing.assert_array_equal([found.pop(r.t) for r in own], np.log10(expected))
+            ends = [a.t + TAU for a, b in itertools.pairwise(own) if b.t > a.t + TAU]
+            assert list(found) == ends  # where the line ends: another stream is watched
+            assert np.isnan(list(found.values())).all()
         found = view.numbers(f"/streams/interest/{s + 1}_{name}")
         np.testing.assert_array_equal(found, [r.interest[s] for r in records])
 
@@ -74,8 +76,8 @@ def test_saves_and_thresholds_are_marked(shown):
     records, _, view = shown
     saved = [r for r in records if r.saved]
     assert view.rows["/streams/saved"]["frame"] == [r.t for r in saved]
-    assert view.numbers("/streams/saved").tolist() == [r.learning_error for r in saved]
-    assert set(view.numbers("/streams/threshold")) == {0.05 + 0.25}
+    assert view.numbers("/streams/saved").tolist() == [np.log10(r.learning_error) for r in saved]
+    assert set(view.numbers("/streams/threshold")) == {np.log10(0.05 + 0.25)}
     assert set(view.numbers("/streams/settled")) == {np.log10(0.05)}
 
 
@@ -134,7 +136,7 @@ def check_no_view_is_empty(run):
 
 def test_the_gate_and_the_decision_have_no_tab(shown):
     _, folder, _ = shown
-    assert list(tabs_of(folder)) == ["World", "Overview", "Candidate", "Modules", "Table"]
+    assert list(tabs_of(folder)) == ["Overview", "Candidate", "Modules", "Table"]
 
 
 @pytest.mark.parametrize("algorithm", ["2.0", "1.0", "progress"])

@@ -141,7 +141,7 @@ def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
         assert len(followed) == len(records) * TAU
         r = np.corrcoef(followed[np.isin(frames, output.t)], output.y)[0, 1]
         assert r == pytest.approx(found.r)
-        assert [n for n in names if f"module {number} has learned" in n and f"{found.r:.2f}" in n]
+        assert [n for n in names if n.startswith(f"Module {number} on") and f"{found.r:.2f}" in n]
 
 
 def test_a_module_that_said_nothing_later_is_asked_itself(tmp_path):

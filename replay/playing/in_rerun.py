@@ -53,7 +53,7 @@ def play_in_rerun(
         target = Target(recording, spec)
         columns = [target.frames(entity) for entity in view_entities(spec)]
         if spec.truth:
-            columns.append(target.lines("world/truth", spec.truth, every_frame=True))
+            columns.append(target.lines("world/truth", spec.truth, within=1))
         broadcast.hand_over()
         announce(broadcast)
         next_time = 0.0

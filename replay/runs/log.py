@@ -66,8 +66,7 @@ class RunHeader:
     @property
     def delta(self) -> float | None:
         """Threshold of eta-dot, where the configuration names it."""
-        value = self.setting("learner", "delta")
-        return float(value) if isinstance(value, int | float) else None
+        return self.number("delta")
 
     @property
     def by_progress(self) -> bool:
@@ -77,11 +76,13 @@ class RunHeader:
     @property
     def settled(self) -> tuple[float, float] | None:
         """Change and learning error below which a stream is learned, of the progress learner."""
-        change = self.setting("learner", "settled")
-        agreement = self.setting("learner", "agreement")
-        if not isinstance(change, int | float) or not isinstance(agreement, int | float):
-            return None
-        return float(change), float(change + agreement)
+        change, agreement = self.number("settled"), self.number("agreement")
+        return None if change is None or agreement is None else (change, change + agreement)
+
+    @property
+    def clusters(self) -> bool:
+        """Whether its learner is CD-MISFA 1.0, which knows and saves by a clustering error."""
+        return bool(self.setting("learner", "algorithm") == "1.0")
 
     @property
     def arithmetic(self) -> int:
@@ -95,6 +96,11 @@ class RunHeader:
         fork = self.manifest.get("fork")
         at = fork.get("at") if isinstance(fork, Mapping) else None
         return at if isinstance(at, int) and at >= 0 else None
+
+    def number(self, key: str) -> float | None:
+        """A number of the learner's configuration, as `number("delta")`, or None."""
+        value = self.setting("learner", key)
+        return float(value) if isinstance(value, int | float) else None
 
     def setting(self, section: str, key: str) -> Any:
         """A value of the run's configuration, as `setting("learner", "delta")`, or None."""

@@ -62,7 +62,7 @@ class ViewSink:
                 line(
                     f"outputs/{stream}/{name}",
                     [f"y{j + 1}" for j in range(own.stop - own.start)],
-                    every_frame=True,
+                    within=1,
                 )
                 for name, (_, own) in zip(self._names, self._modules, strict=True)
             ]

@@ -31,6 +31,7 @@ from replay.runs.run import Outline, Tally, read_outline, stated_source, states_
 from replay.view.columns import FRAME, MOST_STREAMS, Target
 from replay.view.labels import label, part
 from replay.view.layouts import blueprint, lines, time_axis
+from replay.view.modules import ModulesView
 from replay.view.panels import run_layout
 from replay.view.properties import APPLICATION, properties_of, property_chunks, recording_id
 from replay.view.run import RunView
@@ -173,6 +174,8 @@ def _write_run(
     if len(streams) > MOST_STREAMS:  # which are watched most is known at the end only
         streams = read_outline(log).streams(MOST_STREAMS)
     tally, view = Tally(header), RunView(recording, header, streams, every)
+    known = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
+    modules = ModulesView(Target(recording, header.spec), known)
     world = WorldView(recording, header, folder, streams, every, all_views, body=body)
     truth: list[Frames] = []
     for note in world.notes:
@@ -182,11 +185,15 @@ def _write_run(
         for columns in batch.signals:
             tally.add(columns)
         view.take(batch)
+        modules.take(batch)
         world.take(batch)
         truth += batch.truth
         events += [event.text for event in batch.events]
     outline = tally.outline()
-    view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
+    view.finish(outline)
+    modules.finish(outline)
+    for note in modules.notes:
+        view.event(outline.end, outline.iterations, note, "WARN")
     # Not as `AnyValues`, which lose a value of another type than the process's first of its name.
     recording.send_chunks([Chunk(c) for c in property_chunks(properties_of(outline, folder))])
     text = label(summary_text(outline, _name(log), events))
@@ -195,7 +202,14 @@ def _write_run(
     world.flush()
     first = world.tab(write_learned(recording, log, outline, truth))
     recording.send_blueprint(
-        run_layout(outline, first, all_views=all_views is not None, head=head, tab=tab)
+        run_layout(
+            outline,
+            first,
+            sheets=modules.sheets(),
+            all_views=all_views is not None,
+            head=head,
+            tab=tab,
+        )
     )
 
 
@@ -265,7 +279,7 @@ def write_views(
     """
     first, spec = source.t, source.spec
     columns = [target.frames(view) for view in view_entities(spec)]
-    truth = target.lines("world/truth", spec.truth, every_frame=True)
+    truth = target.lines("world/truth", spec.truth, within=1)
     has_truth = spec.truth and blocks is None
     for t in range(first, first + count, BLOCK):
         stop = min(t + BLOCK, first + count)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import times_of
-from replay.palette import Rgb, packed_all, pale
+from replay.palette import Colour, packed_all, pale
 from replay.view.labels import label
 
 FRAME = "frame"
@@ -76,8 +76,8 @@ class Column:
         path: the entity.
         style: what is said of it once.
         encode: how values are handed over.
-        every_frame: its rows are of every frame that there is, so that where frames are missing
-            there is a gap; a row of NaN there ends lines, which would lead across.
+        within: frames from a row to the next one, at most: where more lie between them, a row of
+            NaN ends lines, which would lead across what was not watched; 0: they lead across.
     """
 
     def __init__(
@@ -87,12 +87,12 @@ class Column:
         style: Any = None,
         encode: Encode = scalars,
         *,
-        every_frame: bool = False,
+        within: int = 0,
     ) -> None:
         self.path, self._target = path, target
-        self._style, self._encode, self._every_frame = style, encode, every_frame
+        self._style, self._encode, self._within = style, encode, within
         self._begun = False
-        self._last: tuple[IntArray, IntArray | None] | None = None
+        self._last: IntArray | None = None
         self._clear()
 
     def _clear(self) -> None:
@@ -124,7 +124,7 @@ class Column:
             self._begun = True
             frames = _joined(self._frames)
             iterations = _joined(self._iterations) if self._iterations else None
-            if self._every_frame:
+            if self._within:
                 frames, iterations, values = self._ended_at_gaps(frames, iterations, values)
             rows = max(MAX_BYTES // max(values[:1].nbytes, 1), 1)
             for part in (slice(i, i + rows) for i in range(0, len(values), rows)):
@@ -135,18 +135,20 @@ class Column:
     def _ended_at_gaps(
         self, frames: IntArray, iterations: IntArray | None, values: NDArray[Any]
     ) -> tuple[IntArray, IntArray | None, NDArray[Any]]:
-        """Rows with one more of NaN where each gap begins, at the iteration before."""
-        last, last_iteration = self._last or (frames[:1], iterations)
-        self._last = frames[-1:], None if iterations is None else iterations[-1:]
+        """Rows with one more of NaN where each gap begins.
+
+        Of its iteration, the next one, the row behind it is the last: a table shows that.
+        """
+        last = frames[:1] if self._last is None else self._last
+        self._last = frames[-1:]
         before = np.concatenate([last, frames[:-1]])
-        gaps = np.flatnonzero(frames - before > 1)
+        gaps = np.flatnonzero(frames - before > self._within)
         if not len(gaps):
             return frames, iterations, values
-        if iterations is not None and last_iteration is not None:
-            of_before = np.concatenate([last_iteration[:1], iterations[:-1]])
-            iterations = np.insert(iterations, gaps, of_before[gaps])
+        if iterations is not None:
+            iterations = np.insert(iterations, gaps, iterations[gaps])
         values = np.insert(values.astype(np.float64), gaps, np.nan, axis=0)
-        return np.insert(frames, gaps, before[gaps] + 1), iterations, values
+        return np.insert(frames, gaps, before[gaps] + self._within), iterations, values
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         """Hand (n, ...) values over as rows."""
@@ -195,11 +197,11 @@ class Target:
         self,
         path: str,
         names: Sequence[str],
-        rgbs: Sequence[Rgb] | None = None,
+        rgbs: Sequence[Colour] | None = None,
         width: float | None = None,
         *,
         steps: bool = False,
-        every_frame: bool = False,
+        within: int = 0,
     ) -> Column:
         """A column that is drawn as lines, whose names and colours are said once.
 
@@ -209,7 +211,7 @@ class Target:
             rgbs: their colours.
             width: of a line.
             steps: a value holds until the next one; there is nothing between two values.
-            every_frame: see `Column`.
+            within: see `Column`.
         """
         modes = rr.components.InterpolationMode
         style = rr.SeriesLines(
@@ -219,14 +221,14 @@ class Target:
             aggregation_policy=AGGREGATION,
             interpolation_mode=modes.StepAfter if steps else modes.Linear,
         )
-        return Column(self, path, style, every_frame=every_frame)
+        return Column(self, path, style, within=within)
 
     def frames(self, path: str, width: float | None = None) -> Column:
         """A column of the source's frames: images, or lines of values."""
         if self.spec.images:
             return self.images(path)
         names = [f"value {i + 1}" for i in range(int(np.prod(self.spec.frame_shape)))]
-        return self.lines(path, names, width=width, every_frame=True)
+        return self.lines(path, names, width=width, within=1)
 
     def images(self, path: str) -> Column:
         """A column of images of the source, (n, height, width) grey."""

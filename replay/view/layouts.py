@@ -15,10 +15,12 @@ import rerun.blueprint as rrb
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import UsageError
-from replay.view.columns import FRAME
+from replay.view.columns import FRAME, ITERATION
 
 Span = tuple[float, float]
 """Least and most value of an axis."""
+
+Views = list[rrb.View | rrb.Container]
 
 Bounds = tuple[Span, Span]
 """Ranges of x and y."""
@@ -33,11 +35,14 @@ MARGIN = 0.018
 PLAY_SECONDS = 60
 """Time in which a run is played."""
 
-LANE = 35
-"""Height of a lane, beside plots of 100 to 200."""
+ROW, LANE = 55, 40
+"""Height of a panel of lanes without them, and of each, in points."""
 
 MOST_LANES = 9
 """Lanes that get their full height; more are scrolled."""
+
+HEIGHT, LEAST = 624, 60
+"""Height of a tab on a screen of 1280 x 720, in points, and least one of a row of plots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +55,7 @@ class Range:
         powers: they are drawn as powers of ten.
         tested: of their values those where the candidate was tested are drawn.
         watched: of their values those of streams that were hardly watched are not drawn.
-        also: the threshold that it holds too.
+        also: the line that it holds too.
     """
 
     signals: tuple[str, ...]
@@ -58,7 +63,7 @@ class Range:
     powers: bool = False
     tested: bool = False
     watched: bool = False
-    also: Literal["", "delta", "settled"] = ""
+    also: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +75,7 @@ class Panel:
         entities: what it shows; curves that the run does not have are left out.
         kind: curves, or lanes; of all of the run, or of the last blocks.
         height: of curves, beside other panels; lanes have what they need.
+        beside: it stands on the right of the one before.
         lanes: how many there are; `per_stream` besides one for each stream.
         span: of the values; `few` only where there are few streams.
         range: holds the values instead.
@@ -82,6 +88,7 @@ class Panel:
     entities: tuple[str, ...]
     kind: Literal["lines", "lanes", "near lanes"] = "lines"
     height: float = 130
+    beside: bool = False
     lanes: int = 0
     per_stream: bool = False
     span: Span | None = None
@@ -284,4 +291,36 @@ def lines(
 
 def heights(lanes: int) -> int:
     """Height of a panel of lanes, with its title and axis."""
-    return 60 + LANE * min(lanes, MOST_LANES)
+    return ROW + LANE * min(lanes, MOST_LANES)
+
+
+def shares(lanes: Sequence[int], plots: Sequence[float]) -> list[float]:
+    """Heights of the rows of a tab, so that a small screen shows each lane.
+
+    Args:
+        lanes: of each row, how many it has; 0: it has plots.
+        plots: height of rows of plots, beside one another.
+    """
+    found = [float(heights(n)) if n else 0.0 for n in lanes]
+    whole = sum(height for n, height in zip(lanes, plots, strict=True) if not n)
+    left = max(HEIGHT - sum(found), LEAST * lanes.count(0))
+    rows = zip(found, lanes, plots, strict=True)
+    return [own if n else left * height / whole for own, n, height in rows]
+
+
+def wall(origin: str, name: str, bounds: Bounds) -> rrb.View:
+    """Pictures in 2D, of which those within some bounds are in view."""
+    across, down = bounds
+    shown = rrb.VisualBounds2D(x_range=across, y_range=down)
+    return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=shown)
+
+
+def beside(views: Views) -> rrb.View | rrb.Container:
+    """Views beside one another."""
+    return views[0] if len(views) == 1 else rrb.Horizontal(*views)
+
+
+def events(name: str) -> rrb.View:
+    """Events in words, with their iterations."""
+    columns = rrb.archetypes.TextLogColumns(timeline_columns=[ITERATION], text_log_columns=["body"])
+    return rrb.TextLogView(origin="/events", name=name, columns=columns)

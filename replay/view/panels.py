@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,27 +15,34 @@ from replay.view.columns import FRAME, ITERATION, TIMELINE_SIGNALS, power_of_ten
 from replay.view.labels import label, part
 from replay.view.lanes import ATTENDS, MOSTLY
 from replay.view.layouts import (
-    Lesson,
     Panel,
     Range,
     Span,
     Tab,
+    Views,
     WorldTab,
+    beside,
     blueprint,
-    heights,
+    events,
     holding,
     lines,
     near,
     near_axis,
+    shares,
     tabs_of,
     time_axis,
+    wall,
 )
-from replay.view.run import HARDLY_WATCHED
+from replay.view.modules import sheet_size
+from replay.view.run import HARDLY_WATCHED, lines_of
 from replay.view.scene import gaze_view, scene_view
-from replay.view.world import WALL
+from replay.view.world import WALL, bounds
 
-MOST_MODULES = 6
-"""Modules that stand on one page."""
+PAGES, MOST_MODULES = 12, 6
+"""Modules that have a page each; of more, those that stand on one page."""
+
+ACROSS = 3
+"""Modules that stand beside one another in the gate."""
 
 NEAR = 300
 """Frames of a window in which the inside of a block can be seen, up to the time cursor."""
@@ -47,38 +53,43 @@ NEAR_BLOCKS = 50
 MANY = 6
 """With more streams than this the share of each is small, and drawn larger."""
 
-TWO_COLUMNS = 4
-"""Modules from which on what they learned stands in two columns."""
-
-MOST_WEIGHTS = 3
-"""Modules whose weights stand beside one another."""
+CROSSED = (
+    *("/abstraction/delta", "/abstraction/min_variance", "/gate/novel_share"),
+    *("/gate/clustering", "/streams/settled", "/streams/threshold"),
+)
+"""Lines that are crossed where something is learned; a learner has some of them."""
 
 SHOWS = {
     "/decision/R_stay/**": "R",
     "/decision/advantage/**": "Q",
     "/abstraction/delta": "eta_dot",
+    "/abstraction/min_variance": "variance",
+    "/gate/novel_share": "share",
+    "/gate/clustering": "roc_error",
     "/abstraction/saved": "eta_dot",
     "/abstraction/log_eta_dot": "eta_dot",
     "/abstraction/log_xi": "xi",
 }
 """Signal that an entity is made of, where its name does not say so."""
 
-Views = list[rrb.View | rrb.Container]
-
 
 def run_layout(
     outline: Outline,
     world: WorldTab,
     *,
+    sheets: int = 0,
     all_views: bool = False,
     head: bool = False,
     tab: str | None = None,
 ) -> rrb.Blueprint:
     """The layout of a run, ready to be sent.
 
+    Where there is a world, or something is known of it, it comes first.
+
     Args:
         outline: the run in short.
-        world: what the first tab shows of the world.
+        world: what is shown of the world.
+        sheets: modules whose pictures of least to greatest output are there.
         all_views: what was not watched is there too.
         head: where the head was turned is there too.
         tab: name of the tab that is open; by default the first.
@@ -86,9 +97,10 @@ def run_layout(
     Raises:
         UsageError: there is no such tab.
     """
-    panels = Panels(outline)
+    panels = Panels(outline, world)
     own = tabs_of("progress" if outline.header.by_progress else "paper")
-    tabs = [panels.world(world), *map(panels.tab, own), panels.modules()]
+    tabs = [panels.world()] if world.scene or world.lessons else []
+    tabs += [*map(panels.tab, own), panels.modules(sheets)]
     tabs += [panels.all_views(head=head)] if all_views else []
     return blueprint(*tabs, panels.table(), name="Run", length=outline.end, tab=tab)
 
@@ -96,14 +108,15 @@ def run_layout(
 class Panels:
     """The panels of a run; they adapt to its streams and modules, and to the signals it has.
 
-    Titles may name `clustering`, the threshold of CD-MISFA 1.0, and `promised`, why there may be
-    no line.
+    Titles may name thresholds of CD-MISFA, and `promised`, why there may be no line.
 
     Args:
         outline: the run in short.
+        world: what is shown of the world.
     """
 
-    def __init__(self, outline: Outline) -> None:
+    def __init__(self, outline: Outline, world: WorldTab) -> None:
+        self._world = world
         self._outline, self._header = outline, outline.header
         self._spec, self._lines = outline.header.spec, outline.lines
         self._axis = time_axis(outline.end) if outline.end else None
@@ -112,16 +125,12 @@ class Panels:
         promised = "no line where it was hardly watched"
         if outline.iterations and not (interest < HARDLY_WATCHED).any():
             promised = "no line yet: none was watched long enough"
-        self._facts = {"clustering": self._clustering(), "promised": promised}
-
-    def _clustering(self) -> float | None:
-        """The clustering error below which CD-MISFA 1.0 saves and knows; None of 2.0."""
-        value = self._header.setting("learner", "roc_error")
-        is_old = self._header.setting("learner", "algorithm") == "1.0"
-        return float(value) if is_old and isinstance(value, int | float) else None
+        keys = ("roc_error", "delta", "novel_share", "min_variance")
+        facts = {key: f"{self._header.number(key) or 0.0:g}" for key in keys}
+        self._facts = {**facts, "promised": promised}
 
     def _is_wanted(self, panel: Panel) -> bool:
-        clusters = self._facts["clustering"] is not None
+        clusters = self._header.clusters
         several = self._outline.outputs > 1
         return {"bands": not clusters, "clusters": clusters, "outputs": several, "": True}[
             panel.when
@@ -129,9 +138,17 @@ class Panels:
 
     def tab(self, tab: Tab) -> rrb.Container:
         """A tab of a table."""
-        rows = [(view, panel) for panel in tab.panels for view in self._views(panel)]
-        shares = [self._height(panel) for _, panel in rows]
-        column = rrb.Vertical(*(view for view, _ in rows), row_shares=shares, name=tab.name)
+        rows: list[tuple[Panel, Views]] = []
+        for panel in tab.panels:
+            if views := Views(self._views(panel)):
+                if panel.beside and rows:
+                    rows[-1][1].extend(views)
+                else:
+                    rows += [(panel, views[i : i + ACROSS]) for i in range(0, len(views), ACROSS)]
+        heights = shares([self._count(p) for p, _ in rows], [p.height for p, _ in rows])
+        column = rrb.Vertical(
+            *(beside(views) for _, views in rows), row_shares=heights, name=tab.name
+        )
         if tab.left:
             left = self._sees() if tab.left == "sees" else self._now()
             return rrb.Horizontal(left, column, column_shares=[2, 5], name=tab.name)
@@ -141,10 +158,9 @@ class Panels:
             return rrb.Horizontal(column, table, column_shares=[5, 2], name=tab.name)
         return column
 
-    def _height(self, panel: Panel) -> float:
-        if panel.kind == "lines":
-            return panel.height
-        return heights(panel.lanes + (len(self._spec.streams) if panel.per_stream else 0))
+    def _count(self, panel: Panel) -> int:
+        """Lanes of a panel."""
+        return panel.lanes + (len(self._spec.streams) if panel.per_stream else 0)
 
     def _views(self, panel: Panel) -> list[rrb.View]:
         if not self._is_wanted(panel):
@@ -169,9 +185,7 @@ class Panels:
         values = np.concatenate(parts)
         if span.watched:
             values = values[values < HARDLY_WATCHED]
-        settled = (self._header.settled or (None,))[0]
-        threshold = {"delta": self._header.delta, "settled": settled}.get(span.also)
-        also = [math.log10(threshold)] if threshold else []
+        also = [value for path, _, value in lines_of(self._header) if path == span.also]
         return holding(power_of_ten(values) if span.powers else values, span.low, also=also)
 
     def _curves(
@@ -202,6 +216,10 @@ class Panels:
     def _is_told(self, entity: str) -> bool:
         if entity.endswith("/saved") and self._outline.iterations and not self._outline.saved:
             return False
+        if entity in CROSSED and entity.lstrip("/") not in (
+            at for at, *_ in lines_of(self._header)
+        ):
+            return False
         return (name := _signal(entity)) not in SIGNALS or name in self._outline.told
 
     def _several(self, contents: Sequence[str]) -> bool:
@@ -216,70 +234,76 @@ class Panels:
         signal = SIGNALS.get(_signal(first))
         return signal is None or ("J" in signal.dims and self._outline.outputs > 1)
 
-    def world(self, world: WorldTab) -> rrb.Container:
-        """The first tab: the world, what the learner sees and learned of it, and what happened."""
-        shown: Views = [scene_view()] if world.scene else []
-        if world.wall is not None:
-            across, down = world.wall
-            bounds = rrb.VisualBounds2D(x_range=across, y_range=down)
-            name = "What each stream showed last; the watched one is framed"
-            shown.append(rrb.Spatial2DView(origin=f"/{WALL}", name=name, visual_bounds=bounds))
-        sees = self._watched("What it sees now")
+    def world(self) -> rrb.Container:
+        """The world, what the learner sees and learned of it, and what happened."""
         summary = rrb.TextDocumentView(origin="/summary", name="What came of it")
-        beside: Views = [*([sees] if shown else []), summary, _events("What happened when")]
-        above = rrb.Horizontal(
-            rrb.Vertical(*shown) if shown else sees,
-            rrb.Vertical(*beside, row_shares=[2, 3, 2][-len(beside) :]),
-            column_shares=[5, 3],
-        )
-        rows = self._lessons(world.lessons)
-        shares = [max(5, 2 * len(rows)), *(2 for _ in rows)]
-        return rrb.Vertical(above, *rows, row_shares=shares, name="World")
-
-    def _lessons(self, lessons: Sequence[Lesson]) -> Views:
-        """A panel for each module: its output over what it follows."""
-        views: Views = []
-        for lesson in lessons:
-            span = holding(np.array(lesson.span), margin=0.1)
-            title, axis = f"{lesson.title}: the last {NEAR} frames", near_axis(NEAR)
-            views.append(lines(title, [*lesson.entities], axis, span, within=near(NEAR)))
-        if len(views) < TWO_COLUMNS:
-            return views
-        return [rrb.Horizontal(*views[i : i + 2]) for i in range(0, len(views), 2)]
-
-    def modules(self) -> rrb.Container:
-        """Every module; many stand on pages."""
-        count = max(self._outline.modules, len(self._outline.saved))
-        rows = [self._module(i) for i in range(1, count + 1)]
-        truth = self._near("What the world knows", ["/world/truth"]) if self._spec.truth else []
-        if count <= MOST_MODULES:
-            return rrb.Vertical(*rows, *truth, _events("Events"), name="Modules")
-        pages = []
-        for start in range(0, count, MOST_MODULES):
-            page = rows[start : start + MOST_MODULES]
-            pages.append(rrb.Vertical(*page, name=f"{start + 1} to {start + len(page)}"))
-        events = rrb.Vertical(*truth, _events("Events"), name="Events")
-        return rrb.Tabs(*pages, events, name="Modules")
-
-    def _module(self, i: int) -> rrb.Container:
-        """A module's weights and output; of one that was saved last of all, until its save."""
-        saves = [save for save in self._outline.saved if save.module == i]
-        stream = f" ({label(self._spec.streams[saves[0].stream])})" if saves else ""
-        weights = self._weights(f"/modules/{i}/weights", f"Weights of module {i}{stream}")
-        said = f"Output of module {i}{stream}"
-        if i <= self._outline.modules:
-            entity = [f"/signals/y_frozen/{i}"]
-            output = [
-                *self._curves(f"{said} on what was watched", entity),
-                *self._near(said, entity),
-            ]
+        told = rrb.Tabs(summary, events("What happened when"))
+        if self._world.scene:
+            right = rrb.Vertical(self._watched("What it sees now"), told, row_shares=[2, 4])
+            above = rrb.Horizontal(scene_view(), right, column_shares=[5, 3])
         else:
-            end = saves[0].t + self._outline.tau
-            axis, legend = time_axis(end, end - NEAR), self._outline.outputs > 1
-            title = f"{said}: the last {NEAR} frames until it was saved"
-            output = [lines(title, ["/signals/y"], axis, legend=legend)]
-        shares = [2, 3, 2] if len(output) > 1 else [2, 5]
-        return rrb.Horizontal(weights, *output, column_shares=shares[: 1 + len(output)])
+            above = rrb.Horizontal(self._pictures(), told, column_shares=[5, 3])
+        lessons = self._lessons()
+        return rrb.Vertical(above, *lessons, row_shares=[5, *(2 for _ in lessons)], name="World")
+
+    def _lessons(self) -> Views:
+        """A panel for each module, two beside one another: its output over what it follows."""
+        views: Views = []
+        for lesson in self._world.lessons:
+            span = holding(np.array(lesson.span), margin=0.1)
+            title, how = f"{lesson.title}, the last {NEAR} frames", {"within": near(NEAR)}
+            entities, axis = [*lesson.entities], near_axis(NEAR, room=False)
+            views.append(lines(title, entities, axis, span, legend=False, **how))
+        return [beside(views[i : i + 2]) for i in range(0, len(views), 2)]
+
+    def modules(self, sheets: int) -> rrb.Container:
+        """Every module on a page of its own; many stand on pages together."""
+        count = max(self._outline.modules, len(self._outline.saved))
+        truth = self._near("What the world knows", ["/world/truth"]) if self._spec.truth else []
+        told: Views = [*truth, events("Events")]
+        if not count:
+            return rrb.Vertical(*told, name="Modules")
+        pages: Views = [rrb.Vertical(*told, name="Events")]
+        for start in reversed(range(1, count + 1, MOST_MODULES if count > PAGES else 1)):
+            page = range(start, min(start + MOST_MODULES, count + 1))
+            rows = (rrb.Horizontal(self._weights_of(i), self._output(i)) for i in page)
+            many = rrb.Vertical(*rows, name=f"{page[0]} to {page[-1]}")
+            pages.insert(0, many if count > PAGES else self._module(start, sheet=start <= sheets))
+        return rrb.Tabs(*pages, name="Modules")
+
+    def _module(self, i: int, *, sheet: bool) -> rrb.Container:
+        """A module's page: weights, frames, and its output, also around its save."""
+        left, output, name = Views([self._weights_of(i)]), Views([self._output(i)]), f"Module {i}"
+        if sheet:
+            title = "Frames of least, middle and greatest output 1, and its values"
+            width, height = sheet_size(*self._spec.frame_shape)
+            left.append(wall(f"/modules/{i}/sheet", title, bounds(3, height, width, columns=1)))
+        for save in (save for save in self._outline.saved if save.module == i):
+            name += f": {label(self._spec.streams[save.stream])}"
+            blocks, saved = self._outline.blocks, save.t + self._outline.tau
+            later = blocks.starts[(blocks.streams == save.stream) & (blocks.starts >= saved)]
+            ends = {"until it was saved": saved}
+            if len(later):
+                ends["of its stream"] = int(later[-1]) + self._outline.tau
+            windows: Views = [
+                self._output(i, f"The last {NEAR} frames {words}", time_axis(end, end - NEAR))
+                for words, end in ends.items()
+            ]
+            output.append(beside(windows))
+        columns = (rrb.Vertical(*views) for views in (left, output))
+        return rrb.Horizontal(*columns, column_shares=[3, 4], name=name)
+
+    def _weights_of(self, i: int) -> rrb.View:
+        colours = " (blue below 0, red above), each by its largest" if self._spec.images else ""
+        return self._weights(f"/modules/{i}/weights", f"Weights of module {i}{colours}")
+
+    def _output(
+        self, i: int, title: str = "", axis: rrb.archetypes.TimeAxis | None = None
+    ) -> rrb.View:
+        """A module's output where its own stream was watched."""
+        title = title or f"Output of module {i} wherever its own stream was watched"
+        entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
+        return lines(title, entities, axis or self._axis)
 
     def all_views(self, *, head: bool) -> rrb.Container:
         """All streams, watched or not."""
@@ -299,33 +323,27 @@ class Panels:
             rows.append(rrb.Horizontal(*turned, gaze_view("Where it looks"), column_shares=[2, 1]))
         return rrb.Vertical(*rows, row_shares=[3, 1, 2][: len(rows)], name="All views")
 
-    def _sees(self) -> rrb.Container:
-        """Input of the learner, summary of the run, and weights.
+    def _pictures(self) -> rrb.View | rrb.Container:
+        """What each stream showed last, or of numbers what is watched now."""
+        if self._world.wall is None:
+            return self._watched("What it sees")
+        return wall(f"/{WALL}", "What each stream showed last", self._world.wall)
 
-        The weights are those of now, or of the first modules of the progress learner.
-        """
-        colours = " (blue below 0, red above)" if self._spec.images else ""
-        now = self._weights("/abstraction/phi", f"What it looks for: weights φ{colours}")
-        streams = self._spec.streams
-        saved = [
-            self._weights(
-                f"/modules/{s.module}/weights", f"φ {s.module}: {label(streams[s.stream])}"
-            )
-            for s in (self._outline.saved[:MOST_WEIGHTS] if self._header.by_progress else ())
-        ]
-        return rrb.Vertical(
-            self._watched("What it sees"),
-            rrb.TextDocumentView(origin="/summary", name="What happened"),
-            rrb.Horizontal(*saved) if saved else now,
-            row_shares=[3, 6, 3],
-        )
+    def _sees(self) -> rrb.Container:
+        """Input of the learner, what came of it, and weights; of many candidates they are apart."""
+        shown: Views = [self._pictures(), rrb.TextDocumentView(origin="/summary", name="Summary")]
+        if not self._header.by_progress:
+            colours = " (blue below 0, red above)" if self._spec.images else ""
+            shown.append(self._weights("/abstraction/phi", f"Weights φ{colours}"))
+        return rrb.Vertical(*shown, row_shares=[3, 4, 2][: len(shown)])
 
     def _now(self) -> rrb.Container:
         """Input, output and weights."""
         output = self._near("Output y", ["/signals/y"])
         kept = f", every {PHI_EVERY} blocks" if self._outline.iterations else ""
         colours = " (blue < 0 < red)" if self._spec.images else ""
-        weights = self._weights("/abstraction/phi", f"Weights φ{kept}{colours}")
+        whose = " of this stream" if self._header.by_progress else ""
+        weights = self._weights("/abstraction/phi", f"Weights φ{whose}{kept}{colours}")
         shares = [3, 2, 3] if output else [3, 3]
         return rrb.Vertical(self._watched("Input x"), *output, weights, row_shares=shares)
 
@@ -334,8 +352,7 @@ class Panels:
         if self._spec.images:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
-            bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height + 0.2 * height))
-            return rrb.Spatial2DView(origin="/world/watched", name=name, visual_bounds=bounds)
+            return wall("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
         axis = near_axis(NEAR, room=False)
         values = rrb.TimeSeriesView(
             origin="/world/watched",
@@ -350,6 +367,8 @@ class Panels:
         return rrb.Vertical(values, whose, row_shares=[3, 2])
 
     def _weights(self, path: str, name: str) -> rrb.View:
+        if self._spec.images and self._outline.outputs > 1:
+            return wall(path, name, bounds(self._outline.outputs, *self._spec.frame_shape))
         if self._spec.images:
             return rrb.Spatial2DView(origin=path, name=name)
         return rrb.BarChartView(origin=path, name=name, plot_legend=rrb.PlotLegend(visible=False))
@@ -374,12 +393,6 @@ class Panels:
                 entity_order=entities,
             ),
         )
-
-
-def _events(name: str) -> rrb.View:
-    """Events in words, with their iterations."""
-    columns = rrb.archetypes.TextLogColumns(timeline_columns=[ITERATION], text_log_columns=["body"])
-    return rrb.TextLogView(origin="/events", name=name, columns=columns)
 
 
 def _signal(entity: str) -> str:

@@ -1,8 +1,8 @@
 """A run as rows of a Rerun recording: every signal as it is, and curves and lanes for people.
 
 `/signals/<name>` holds each signal's values for every iteration, those of run.mcap; a signal that
-the run never has gets no entity. Where frames are missing, lines with a value per frame have a row
-of NaN.
+the run never has gets no entity. Where frames were not watched, or not of a line's stream, lines
+have a row of NaN.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.signals import SIGNALS
-from cdmisfa.modules import Module
-from replay.palette import BRICK, GREY, MIST, Rgb, colour, darker, packed, packed_all, pale, shade
+from replay.palette import GREY, Colour, colour, faint, packed_all, pale
 from replay.runs.columns import Blocks, SignalColumns, has_values
 from replay.runs.log import Batch, RunHeader
+from replay.runs.rules import rules_of
 from replay.runs.run import Outline
-from replay.view.columns import TIMELINE_SIGNALS, Column, Target, power_of_ten, tensors
+from replay.view.columns import TIMELINE_SIGNALS, Column, Target, power_of_ten
 from replay.view.labels import label, line_labels, part
 from replay.view.lanes import Lanes
+from replay.view.modules import SAVED, hang_weights, write_weights
 from replay.view.summary import decision_text
 
 AXES = {"S": "stream", "A": "action", "J": "output"}
@@ -38,16 +39,11 @@ BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2, "roc_error": 1
 POWERS = {"eta_dot": "abstraction/log_eta_dot", "xi": "abstraction/log_xi"}
 """Entities of signals drawn as powers of ten: they fall through several."""
 
-OF_STREAM = {
-    "learning_error": "streams/learning_error",
-    "tested": "streams/tested",
-    "fitted": "streams/fitted",
-    "change": "streams/log_change",
-}
-"""Signals of the watched stream, and where each stream has its line through its own blocks.
+OF_STREAM = ("learning_error", "tested", "fitted", "change")
+"""Signals of the watched stream: each has its line, of powers of ten, through its own blocks."""
 
-Those at a `log_` entity are drawn as powers of ten.
-"""
+RULES = "rules"
+"""Parent entity of how far each rule to save a module is met, as powers of ten: above 0."""
 
 HARDLY_WATCHED = 1000.0
 """Interest from which on a stream promises most because it was hardly watched: it has no line."""
@@ -61,6 +57,7 @@ SPARSE = 10
 MOST_IN_TABLE = 6
 """Streams of these tables."""
 
+PHI = "abstraction/phi"
 WATCHED_NAME = "world/watched/name"
 DECISION_TABLE = "decision/table"
 
@@ -76,16 +73,18 @@ class Curve:
         rgbs: colours of the lines; by default pale ones from `number` on.
         rows: which records the values are of; by default all.
         every_frame: there is a row for each frame of a record.
+        leads_on: it does not end where nothing was watched.
     """
 
     path: str
     labels: Sequence[str]
     values: NDArray[Any]
-    rgbs: Sequence[Rgb] = ()
+    rgbs: Sequence[Colour] = ()
     number: int = 0
     width: float = 1.5
     rows: NDArray[Any] | None = None
     every_frame: bool = False
+    leads_on: bool = False
 
 
 class RunView:
@@ -109,14 +108,16 @@ class RunView:
         piece: int | None = None,
     ) -> None:
         self._target, self._spec = Target(recording, header.spec), header.spec
-        self._every = every
+        self._every, self._tau = every, 0
         self._streams, self._by_progress = list(streams), header.by_progress
-        self._thresholds = _thresholds(header)
+        self._rules, self._thresholds = rules_of(header), list(lines_of(header))
         self._columns: dict[str, Column] = {}
         self._blocks = Blocks.concatenated(())
         self._recent = np.zeros((0, len(streams)), dtype=bool)
         self._stream_of: dict[int, int] = {}
         self._named = -1
+        self._phi: dict[int, FloatArray] = {}
+        self._of_now = -1
         self._lanes = Lanes(self._target, streams, by_progress=header.by_progress, piece=piece)
 
     def take(self, batch: Batch) -> None:
@@ -129,18 +130,12 @@ class RunView:
         for frames, truth in batch.truth if self._spec.truth else ():
             curve = Curve("world/truth", self._spec.truth, truth, every_frame=True)
             self._draw(curve, frames, batch.blocks.iteration(frames))
-        for t, phi in batch.phi:
-            (iteration,) = batch.blocks.iteration(np.array([t])).tolist()
-            self.weights("abstraction/phi", t, iteration, phi)
+        self._weights(batch)
         for event in batch.events:
             self.event(event.t, event.iteration, event.text, event.level)
 
-    def finish(self, outline: Outline, modules: Sequence[Module]) -> None:
-        """Write weights of the frozen modules and thresholds, and hand over what waits."""
-        saved = {save.module: save.t for save in outline.saved}
-        for module in modules:
-            t = saved.get(module.index, outline.end)
-            self.weights(f"modules/{module.index}/weights", t, module.iteration, module.phi)
+    def finish(self, outline: Outline) -> None:
+        """Write thresholds and the end of lanes, and hand over what waits."""
         starts, iterations = outline.blocks.starts, outline.blocks.iterations
         if outline.iterations:
             self.threshold(starts[[0, -1]], iterations[[0, -1]])
@@ -149,11 +144,12 @@ class RunView:
 
     def _add(self, columns: SignalColumns) -> None:
         """Take the records of consecutive iterations."""
+        self._tau = columns.tau
         saved = np.flatnonzero(columns["saved"])
         modules, streams = columns["module"][saved].tolist(), columns["stream"][saved].tolist()
         self._stream_of |= zip(modules, streams, strict=True)
         curves = [self._signals, self._powers, self._decision, self._gate, self._attention]
-        for made in [*curves, self._of_streams] if self._by_progress else curves:
+        for made in [*curves, self._of_streams if self._by_progress else self._met]:
             for curve in made(columns):
                 rows = slice(None) if curve.rows is None else curve.rows
                 self._draw(curve, *(times[rows] for times in columns.times(curve.every_frame)))
@@ -165,12 +161,13 @@ class RunView:
         self._lanes.add(columns)
 
     def _draw(self, curve: Curve, frames: IntArray, iterations: IntArray) -> None:
-        rgbs = curve.rgbs
+        rgbs: list[Colour] = list(curve.rgbs)
         if not rgbs:
             one = len(set(curve.labels)) == 1
             rgbs = [pale(curve.number + (0 if one else i)) for i in range(len(curve.labels))]
         how = curve.labels, rgbs, curve.width
-        line = self._column(curve.path, self._target.lines, *how, every_frame=curve.every_frame)
+        within = 0 if curve.leads_on else 1 if curve.every_frame else self._tau
+        line = self._column(curve.path, self._target.lines, *how, within=within)
         line.add(frames, iterations, curve.values.reshape(len(frames), -1))
 
     def _watched(self, at: IntArray, frames: NDArray[Any]) -> None:
@@ -183,17 +180,30 @@ class RunView:
             column = self._column("world/watched", self._target.frames, 1.5)
             column.add(at, self._blocks.iteration(at), frames)
 
-    def weights(self, path: str, t: int, iteration: int, phi: FloatArray) -> None:
-        """Show (J, I) weights at an entity: as images below one another, bars, or a tensor."""
-        shape = self._spec.frame_shape
-        shown: Any
-        if self._spec.images and phi.shape[1] == shape[0] * shape[1]:
-            shown = rr.Image(shade(phi.reshape(-1, shape[1])))
-        elif phi.size <= 256:
-            shown = rr.BarChart(tensors(phi.reshape(1, -1)), color=packed(MIST))
-        else:
-            shown = rr.Tensor(phi.copy(), dim_names=("output", "input"))
-        self._target.log_at(path, t, iteration, shown)
+    def _weights(self, batch: Batch) -> None:
+        """Show the weights of what learns from the watched stream, as far as the log has them.
+
+        Of the progress learner each stream has its candidate, and the log the weights of the one
+        that comes next. They are shown once its stream is; until then those that the watched one
+        had last, or none (white).
+        """
+        kept = dict(batch.phi)
+        for columns in batch.signals:
+            now = columns["stream"]
+            then = np.where(columns["saved"], now, columns["next_stream"])
+            rows = (columns.frames, columns.iterations, now, then if self._by_progress else now)
+            for t, iteration, s, owner in zip(*(row.tolist() for row in rows), strict=True):
+                phi, shown = kept.get(t), None
+                if self._by_progress and s != self._of_now and self._phi:
+                    shown = self._phi.get(s, 0 * next(iter(self._phi.values())))
+                self._of_now = s
+                if phi is not None:
+                    if not self._phi:
+                        hang_weights(self._target, PHI, len(phi))
+                    self._phi[owner] = phi
+                    shown = phi if owner == s else shown
+                if shown is not None:
+                    write_weights(self._target, PHI, t, iteration, shown)
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Say in words what happened."""
@@ -202,8 +212,8 @@ class RunView:
 
     def threshold(self, frames: IntArray, iterations: IntArray) -> None:
         """Draw the lines below which something is learned, through frames, (n,)."""
-        for path, (name, value) in self._thresholds.items():
-            curve = Curve(path, [name], np.full(len(frames), value), [GREY])
+        for path, name, value in self._thresholds:
+            curve = Curve(path, [name], np.full(len(frames), value), [GREY], leads_on=True)
             self._draw(curve, frames, iterations)
 
     def flush(self) -> None:
@@ -223,7 +233,7 @@ class RunView:
                 continue
             every_frame = "T" in signal.dims
             if signal.dims == "S":
-                rgbs = [colour(s) for s in range(len(self._spec.streams))]
+                rgbs: list[Colour] = [colour(s) for s in range(len(self._spec.streams))]
                 yield Curve(path, self._spec.streams, value, rgbs)
             elif signal.dims.startswith("M"):
                 for i in range(value.shape[1]):
@@ -234,13 +244,13 @@ class RunView:
                 labels, number = line_labels(signal, 0, outputs), BESIDE.get(signal.name, 0)
                 yield Curve(path, labels, value, number=number, every_frame=every_frame)
 
-    def _of_module(self, module: int, labels: Sequence[str]) -> list[Rgb]:
-        """The colours of a module's lines: that of its stream, of further outputs darker."""
+    def _of_module(self, module: int, labels: Sequence[str]) -> list[Colour]:
+        """The colours of a module's lines: that of its stream, of further outputs faint."""
         if module not in self._stream_of:
             return []
         rgb = colour(self._stream_of[module])
         one = len(set(labels)) == 1
-        return [rgb if one or i == 0 else darker(rgb) for i in range(len(labels))]
+        return [rgb if one or i == 0 else faint(rgb) for i in range(len(labels))]
 
     def _powers(self, columns: SignalColumns) -> Iterator[Curve]:
         """Signals that fall through several powers of ten."""
@@ -268,6 +278,13 @@ class RunView:
             labels = [f"band of module {i + 1}"] * edges.shape[2]
             yield Curve(f"gate/band/{i + 1}", labels, edges[:, i], [GREY] * len(labels), width=1.0)
 
+    def _met(self, columns: SignalColumns) -> Iterator[Curve]:
+        """How far each rule to save a module is met."""
+        for i, rule in enumerate(self._rules):
+            yield Curve(
+                f"{RULES}/{rule.signal}", [rule.ratio], power_of_ten(rule.met(columns)), number=i
+            )
+
     def _attention(self, columns: SignalColumns) -> Iterator[Curve]:
         """Share of the recent blocks in which each shown stream was watched."""
         watched = columns["stream"][:, None] == np.array(self._streams)
@@ -291,12 +308,11 @@ class RunView:
             own, name = columns["stream"] == s, self._spec.streams[s]
             place, rgb = part(self._spec.streams, s), colour(s)
             untested = np.isnan(columns["tested"][own])
-            for signal, path in OF_STREAM.items() if own.any() else ():
-                values = np.where(untested, np.nan, columns[signal][own])
-                values = power_of_ten(values) if "log_" in path else values
-                rgbs = [darker(rgb) if signal == "fitted" else rgb]
+            for signal in OF_STREAM if own.any() else ():
+                values = power_of_ten(np.where(untested, np.nan, columns[signal][own]))
+                rgbs = [faint(rgb) if signal == "fitted" else rgb]
                 labels = [f"{SIGNALS[signal].symbol} {name}"]
-                yield Curve(f"{path}/{place}", labels, values, rgbs, rows=own)
+                yield Curve(f"streams/log_{signal}/{place}", labels, values, rgbs, rows=own)
             interest = columns["interest"][:, s]
             promised = np.where(interest < HARDLY_WATCHED, interest, np.nan)
             yield Curve(f"streams/interest/{place}", [name], promised, [rgb])
@@ -346,33 +362,38 @@ class RunView:
 
     def _saved(self, columns: SignalColumns, saved: IntArray) -> None:
         """Mark the value of the signal that must come down where a module was saved."""
-        path, values = "abstraction/saved", power_of_ten(columns["eta_dot"])
-        if self._by_progress:
-            path, values = "streams/saved", columns["learning_error"]
-        stood = values.reshape(len(columns), -1)[saved, :1]
-        style = rr.SeriesPoints(
-            colors=[packed(BRICK)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
-        )
-        column = self._column(path, partial(Column, self._target), style)
+        name = "learning_error" if self._by_progress else "eta_dot"
+        path = "streams/saved" if self._by_progress else "abstraction/saved"
+        stood = power_of_ten(columns[name]).reshape(len(columns), -1)[saved, :1]
+        column = self._column(path, partial(Column, self._target), SAVED)
         column.add(columns.frames[saved], columns.iterations[saved], stood)
 
     def _send(self, columns: SignalColumns, rows: IntArray, path: str, values: Any) -> None:
         self._target.send(path, columns.frames[rows], columns.iterations[rows], values)
 
-    def _column(self, path: str, make: Callable[..., Column], *how: Any, **more: bool) -> Column:
+    def _column(self, path: str, make: Callable[..., Column], *how: Any, **more: int) -> Column:
         """The column of an entity, made when it is first needed."""
         if path not in self._columns:
             self._columns[path] = make(path, *how, **more)
         return self._columns[path]
 
 
-def _thresholds(header: RunHeader) -> dict[str, tuple[str, float]]:
-    """Label and value of the lines below which something is learned, by entity."""
-    found = {}
+def lines_of(header: RunHeader) -> Iterator[tuple[str, str, float]]:
+    """Entity, label and value of each line that is crossed where something is learned."""
     if header.by_progress and header.settled is not None:
         change, error = header.settled
-        found["streams/settled"] = "settled below", math.log10(change)
-        found["streams/threshold"] = "learned below", error
-    if header.delta is not None and header.delta > 0:
-        found["abstraction/delta"] = "δ", math.log10(header.delta)
-    return found
+        yield "streams/settled", "settled below", math.log10(change)
+        yield "streams/threshold", "learned below", math.log10(error)
+    places = {
+        "eta_dot": "abstraction/delta",
+        "roc_error": "gate/clustering",
+        "share": "gate/novel_share",
+        "variance": "abstraction/min_variance",
+    }
+    rules = rules_of(header)
+    for rule in rules:
+        value = math.log10(rule.threshold) if rule.signal == "eta_dot" else rule.threshold
+        name = "δ" if rule.signal == "eta_dot" else f"{rule.threshold:g}"
+        yield places[rule.signal], f"{name}: saved {rule.side}", value
+    if rules:
+        yield f"{RULES}/met", "saved above", 0.0

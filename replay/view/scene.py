@@ -23,7 +23,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import CdmisfaError
 from recorder.log.scenery import Eye, Gaze, Scenery, Thing
-from replay.palette import Rgb, colour, packed_all, pale
+from replay.palette import GREY, Rgb, colour, packed_all, pale
 from replay.recordings.source import yaw_of
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
@@ -302,8 +302,7 @@ def write_gaze(target: Target, outline: Outline, poses: Mapping[str, HeadPose]) 
         )
         target.send(GAZE, blocks.starts[turns], blocks.iterations[turns], turned)
     column.flush()
-    white = packed_all([(255, 255, 255)])
-    arrow = rr.Arrows3D(vectors=[[-1.4 * ARROW, 0, 0]], radii=[0.003], colors=white)
+    arrow = rr.Arrows3D(vectors=[[-1.4 * ARROW, 0, 0]], radii=[0.003], colors=packed_all([GREY]))
     target.log(GAZE, arrow)
 
 

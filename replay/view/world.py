@@ -37,7 +37,7 @@ FRAME = f"{WALL}/frame"
 SHAPE = 1.7
 """Width of the wall over its height, as near as whole pictures allow."""
 
-ROOM, BETWEEN = 0.3, 0.06
+ROOM, BETWEEN = 0.5, 0.06
 """Room below a picture for its words, and between two, in heights of a picture."""
 
 
@@ -140,21 +140,24 @@ class WallView:
         return learned if self._said[s] else [(0, name), *learned]
 
 
-def bounds(count: int, height: int, width: int) -> Bounds:
-    """Ranges of x and y that hold a wall of so many pictures of a size."""
-    x, y = (max(place[i] for place in places_of(count, width, height)) for i in (0, 1))
+def bounds(count: int, height: int, width: int, columns: int | None = None) -> Bounds:
+    """Ranges of x and y that hold a wall of so many pictures of a size; see `places_of`."""
+    places = places_of(count, width, height, columns)
+    x, y = (max(place[i] for place in places) for i in (0, 1))
     margin = BETWEEN * height
     return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
 
 
-def places_of(count: int, width: int, height: int) -> list[tuple[float, float]]:
-    """Corners (x, y) of so many pictures of a size on a wall, in rows."""
+def places_of(
+    count: int, width: int, height: int, columns: int | None = None
+) -> list[tuple[float, float]]:
+    """Corners (x, y) of so many pictures of a size on a wall, in rows of so many, or as fit."""
     across, down = width + BETWEEN * height, (1 + ROOM) * height
 
     def badness(columns: int) -> float:
         return abs(math.log(columns * across / (math.ceil(count / columns) * down) / SHAPE))
 
-    columns = min(range(1, count + 1), key=badness)
+    columns = columns or min(range(1, count + 1), key=badness)
     return [(i % columns * across, i // columns * down) for i in range(count)]
 
 
@@ -344,17 +347,17 @@ def write_learned(
         stream, root = names[output.stream], f"{LEARNED}/{output.module}"
         whose = f"module {output.module} on {stream}"
         for path, name, rgb, width, line in (
-            ("followed", found.function, GREY, BROAD, followed),
+            ("followed", f"{found.function}, fitted to it", GREY, BROAD, followed),
             ("output", whose, colour(output.stream), NARROW, said),
         ):
             place, how = f"{root}/{path}", ([name], [rgb], width)
-            column = target.lines(place, *how, every_frame=True)
+            column = target.lines(place, *how, within=1)
             column.add(frames, iterations, line)
             column.flush()
         both = np.concatenate([followed, output.y])
         title = (
-            f"What module {output.module} has learned: where {label(stream)} is watched, "
-            f"its output over {label(found.function)}, |r| = {found.r:.2f}"
+            f"Module {output.module} on {label(stream)} has learned {label(found.function)} "
+            f"(grey): |r| = {found.r:.2f}"
         )
         entities = (f"/{root}/followed", f"/{root}/output")
         lessons.append(Lesson(title, entities, (float(both.min()), float(both.max()))))

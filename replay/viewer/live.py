@@ -23,7 +23,8 @@ from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
 from replay.runs.log import Batch, Frames, RunHeader, read_batches
 from replay.runs.run import LINES, Outline
-from replay.view.columns import MOST_STREAMS
+from replay.view.columns import MOST_STREAMS, Target
+from replay.view.modules import ModulesView
 from replay.view.panels import MOST_MODULES, run_layout
 from replay.view.run import RunView
 from replay.view.world import WorldView
@@ -84,6 +85,7 @@ class LiveView(Sink):
         self._recording.send_blueprint(run_layout(outline, self._world.tab()))
         # No image is left out here: of each block only the first is taken.
         self._view = RunView(self._recording, outline.header, streams, every=1, piece=PIECE)
+        self._modules = ModulesView(Target(self._recording, spec))
         for note in self._world.notes:
             self._view.event(0, 0, note, "WARN")
         self._images = spec.images
@@ -151,14 +153,10 @@ class LiveView(Sink):
     def _show(self, batch: Batch) -> None:
         self._view.take(batch)
         self._world.take(batch)
-        weights = dict(batch.phi)
         for columns in batch.signals:
             self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
-            for i in np.flatnonzero(columns["saved"]).tolist():
-                t, iteration = int(columns.frames[i]), int(columns.iterations[i])
-                if t in weights:
-                    place = f"modules/{int(columns['module'][i])}/weights"
-                    self._view.weights(place, t, iteration, weights[t])
+        self._modules.take(batch)
+        self._modules.flush()
         self._view.flush()
         self._world.flush()
         self.broadcast.hand_over()
