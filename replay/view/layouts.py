@@ -45,6 +45,13 @@ HEIGHT, LEAST = 624, 60
 """Height of a tab on a screen of 1280 x 720, in points, and least one of a row of plots."""
 
 
+CROSSED = (
+    *("/abstraction/delta", "/abstraction/min_variance", "/gate/novel_share"),
+    *("/gate/clustering", "/streams/settled", "/streams/threshold"),
+)
+"""Lines that are crossed where something is learned; a learner has some of them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Range:
     """An axis that holds every value of some signals.

@@ -15,6 +15,7 @@ from replay.view.columns import FRAME, ITERATION, TIMELINE_SIGNALS, power_of_ten
 from replay.view.labels import label, part
 from replay.view.lanes import ATTENDS, MOSTLY
 from replay.view.layouts import (
+    CROSSED,
     Panel,
     Range,
     Span,
@@ -52,12 +53,6 @@ NEAR_BLOCKS = 50
 
 MANY = 6
 """With more streams than this the share of each is small, and drawn larger."""
-
-CROSSED = (
-    *("/abstraction/delta", "/abstraction/min_variance", "/gate/novel_share"),
-    *("/gate/clustering", "/streams/settled", "/streams/threshold"),
-)
-"""Lines that are crossed where something is learned; a learner has some of them."""
 
 SHOWS = {
     "/decision/R_stay/**": "R",
