@@ -287,7 +287,8 @@ def test_a_recording_shows_its_streams_and_what_the_world_knew(
     page = Page(write_report([oscillatory_recording], tmp_path / "r.html"))
     for text in ("3 streams, 2,000 frames each at 50 a second (40.0 s)", "No stream has a gap."):
         assert text in page.text
-    assert "theta" in page.text
+    for text in ("theta", f"cdmisfa verify {oscillatory_recording}"):
+        assert text in page.text
 
 
 def test_gaps_of_other_logs_are_counted(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def _page(paths: list[Path], runs: list[Path], cameras: CameraOptions) -> str:
     from replay.inputs import open_to_look  # what reads logs of others takes its time
 
     with contextlib.closing(open_to_look(paths, cameras)) as source:
-        return report_of_recording(source, ", ".join(path.resolve().name for path in paths))
+        return report_of_recording(source, paths)
 
 
 def _is_run(path: Path) -> bool:
@@ -138,7 +138,8 @@ def proof_of(run: Path) -> Proof:
             beginning.source  # noqa: B018, it is opened when it is asked for
             others = beginning.other_files()
     except CdmisfaError as error:
-        return Proof(False, f"It cannot be learned again here: {error}.", again)
+        why = error.__cause__ if isinstance(error.__cause__, CdmisfaError) else error
+        return Proof(False, f"It cannot be learned again here: {why}.", again)
     if others:
         return Proof(False, f"{', '.join(others)}: no longer what the run learned from.", again)
     if then != now:

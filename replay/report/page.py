@@ -67,14 +67,14 @@ def report_of_runs(
     return _rendered(runs_content(paths, title, tables, names))
 
 
-def report_of_recording(source: Any, title: str) -> str:
+def report_of_recording(source: Any, paths: Sequence[Path]) -> str:
     """The page of a recording or of other logs.
 
     Args:
         source: a `StoredSource`, open.
-        title: of the page.
+        paths: what it reads.
     """
-    return _rendered(recording_content(source, title))
+    return _rendered(recording_content(source, paths))
 
 
 def _rendered(content: Mapping[str, Any]) -> str:

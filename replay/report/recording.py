@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from replay.report.drawing import (
     sheet,
 )
 from replay.report.panels import LANE, NEAR, PIXELS, ROOM, Frames, frames_at, numbers_plot
+from replay.report.trust import command
 
 SAMPLES = 48
 """Frames of each stream that are shown where one points."""
@@ -37,7 +40,7 @@ TRUTH = 400
 """Frames of what the world knew that are drawn."""
 
 
-def recording_content(source: Any, title: str) -> dict[str, Any]:
+def recording_content(source: Any, paths: Sequence[Path]) -> dict[str, Any]:
     """What the page of a recording is made of; see recording.html."""
     spec = source.spec
     first, count = source.first_frame, source.frames
@@ -55,7 +58,7 @@ def recording_content(source: Any, title: str) -> dict[str, Any]:
     what = f"pictures of {size}" if spec.images else f"frames of {size} numbers"
     return {
         "kind": "recording",
-        "title": title,
+        "title": ", ".join(path.resolve().name for path in paths),
         "lead": f"{len(spec.streams)} stream{'s' * (len(spec.streams) > 1)}, {count:,} frames "
         f"each at {spec.fps:g} a second ({seconds:,.1f} s), {what}.",
         "problems": [*problems, *source.warnings],
@@ -65,6 +68,14 @@ def recording_content(source: Any, title: str) -> dict[str, Any]:
         "streams": streams,
         "more": max(len(spec.streams) - STREAMS, 0),
         "truth": _truth(source),
+        "commands": [
+            (text, command(name, *paths))
+            for text, name in (
+                ("Check that it is whole", "verify"),
+                ("See every frame", "view"),
+                ("Learn from it", "learn"),
+            )
+        ],
         "first": f"{first:,}",
         "frames": {key: asdict(value) for key, value in frames.items()},
     }
