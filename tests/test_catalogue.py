@@ -20,6 +20,8 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import runs_in
 from replay.runs.run import read_outline
 from replay.view.properties import (
+    DIFFERS,
+    differing,
     properties_of,
     property_chunks,
     read_properties,
@@ -207,3 +209,17 @@ def test_a_server_that_has_ended_is_not_waited_for(sweep, tmp_path, monkeypatch)
     monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: program)
     with pytest.raises(CdmisfaError, match="code 3: no luck"), served_table(sweep) as table:
         assert table is None
+
+
+def test_a_table_s_first_columns_say_what_differs_and_which_runs_are_identical():
+    rows = [
+        {"learner": {"nu": nu, "tau": 40}, "result": {"seed": seed, "signals_sha256": sha}}
+        for nu, seed, sha in ((0.05, 0, "a"), (0.1, 0, "b"), (0.05, 1, "a"))
+    ]
+    found = differing(["x", "y", "z"], rows)
+    assert found == [
+        {"identical_to": "", "learner_nu": 0.05, "seed": 0},
+        {"identical_to": "", "learner_nu": 0.1, "seed": 0},
+        {"identical_to": "x", "learner_nu": 0.05, "seed": 1},
+    ]
+    assert min("learner", "result", "scene") > DIFFERS

@@ -83,6 +83,25 @@ def test_where_a_fork_begins_is_marked_on_each_curve(batch, three, tmp_path, mon
         assert (mark["iteration"], scalars(mark).tolist()) == ([first], [[value]])
 
 
+def test_the_table_begins_with_what_runs_were_told_otherwise_and_says_which_are_identical(three):
+    runs, _ = three
+    first, equal, other = side_by_side(runs)
+    other = dataclasses.replace(other, told=(("seed", 3, 4), ("learner.nu", 0.05, 0.1)))
+    text = overlay.table_text((first, equal, other))
+    same, told, head, _, *lines = [line for line in text.splitlines() if line]
+    assert same == f"Identical to {first.name}, bit for bit: {equal.name}."
+    assert told == "What they were told otherwise: seed, learner.nu."
+    assert head.startswith("| run | seed | learner.nu | modules |")
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert [row[:3] for row in cells] == [
+        [first.name, "3", "0.05"],
+        [equal.name, "3", "0.05"],
+        ["c", "4", "0.1"],
+    ]
+    assert [row[-1] for row in cells[:2]] == ["-", "identical"]
+    assert overlay.table_text((first, equal, equal)).startswith("All 3 runs are identical")
+
+
 def test_runs_that_are_the_same_until_one_ends_are_said_to_be():
     found = Difference(5, "", (), "ended after 5 iterations", "goes on")
     assert overlay._shortly(found) == "identical as far as both go, 5 iterations"

@@ -215,6 +215,6 @@ def _hang(
     rgbs = packed_all([rgb])
     frame = rr.Boxes2D(mins=[[0, 0]], sizes=[size], colors=rgbs, show_labels=False)
     target.log(f"{path}/frame", frame)
-    place = [[width / 2, (1 + ROOM / 2) * height]]
+    place = [[width / 2, (1 + ROOM / 8) * height]]
     said = rr.Points2D(place, labels=[label(words)], colors=rgbs, radii=[0.0], show_labels=True)
     target.log(f"{path}/words", said)

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from cdmisfa.core.arrays import FloatArray, IntArray
 from replay.palette import Rgb, colour
 from replay.runs.columns import SignalColumns
-from replay.runs.compare import HEAD, Difference, Row
+from replay.runs.compare import Difference, Row
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
 from replay.view.columns import ITERATION, MOST_STREAMS, Column, Target, power_of_ten
@@ -46,6 +46,9 @@ FORKED = "forked"
 
 FIRST = 3
 """Streams of the first tab."""
+
+MOST_KEYS = 4
+"""Keys that runs were told otherwise and that have a column."""
 
 Curve = tuple[str, IntArray, FloatArray]
 """Entity of a curve, which records it has values in, and these."""
@@ -85,11 +88,27 @@ def build_overlay(
 
 
 def table_text(rows: Sequence[Row]) -> str:
-    """The rows as a Markdown table."""
-    short = [(*row.cells()[:-1], _shortly(row.difference)) for row in rows]
-    cells = [[cell.replace("|", "/") for cell in line] for line in short]
+    """What runs were told otherwise, by name, and what came of it, as a Markdown table.
+
+    A sentence above says which of them are identical to the first one.
+    """
+    keys = list(dict.fromkeys(key for row in rows for key, *_ in row.told))[:MOST_KEYS]
+    of_first = {key: first for row in rows for key, first, _ in row.told}
+    cells = []
+    for row in rows:
+        told = of_first | {key: own for key, _, own in row.told}
+        name, _, iterations, learned, _ = row.cells()
+        compared = _shortly(row.difference) if row is not rows[0] else "-"
+        said = (name, *(str(told[key]) for key in keys), learned, iterations, compared)
+        cells.append([cell.replace("|", "/") for cell in said])
+    same = [row.name for row in rows[1:] if row.difference is None]
+    lines = [f"Identical to {rows[0].name}, bit for bit: {', '.join(same)}."] if same else []
+    if len(same) == len(rows) - 1 > 1:
+        lines = [f"All {len(rows)} runs are identical, bit for bit."]
+    lines += [f"What they were told otherwise: {', '.join(keys)}."] if keys else []
     forks = [line for row in rows if (line := _fork(row))]
-    return "\n".join(["## Runs compared", "", *text_table(HEAD, cells), *forks])
+    head = "run", *keys, "modules", "iterations", "against the first run"
+    return "\n\n".join([*lines, "\n".join(text_table(head, cells)), *forks])
 
 
 def _fork(row: Row) -> str:
@@ -205,7 +224,7 @@ def _layout(rows: Sequence[Row], tab: str | None) -> rrb.Blueprint:
     first = curves(FIRST_TAB) if "eta_dot" in told else by_stream(ERROR_OF, OF_STREAM, FIRST)
     table = rrb.TextDocumentView(origin="/summary", name="Runs")
     tabs: list[rrb.Container] = [
-        rrb.Horizontal(table, rrb.Vertical(*first), column_shares=[2, 4], name="Overview")
+        rrb.Vertical(table, rrb.Horizontal(*first), row_shares=[2, 3], name="Overview")
     ]
     if "R" in told:
         tabs.append(rrb.Vertical(*by_stream("R for staying on", R_STAY), name="Rewards"))

@@ -25,8 +25,11 @@ if TYPE_CHECKING:
 APPLICATION = "cdmisfa"
 """Rerun's application id: one layout is remembered for it."""
 
+RESULT, DIFFERS = "result", "differs"
+"""Sections of what runs came to, and of what they differ in: the table's first columns."""
+
 Sections = dict[str, dict[str, Any]]
-"""Values by section of the configuration; those of `result` are what the run came to."""
+"""Values by section of the configuration; those of `RESULT` are what the run came to."""
 
 
 def recording_id(name: str, source: Path) -> str:
@@ -98,6 +101,10 @@ def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
         CdmisfaError: a row cannot be written.
     """
     rows = [read_properties(run) for run in runs]
+    for row, differs in zip(
+        rows, differing([run.resolve().name for run in runs], rows), strict=True
+    ):
+        row[DIFFERS] = differs
     types: dict[tuple[str, str], set[type]] = {}
     for row in rows:
         for section, values in row.items():
@@ -117,6 +124,33 @@ def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
             raise CdmisfaError(f"{out} cannot be written: {error}") from error
         files.append(out)
     return files
+
+
+def differing(names: Sequence[str], rows: Sequence[Sections]) -> list[dict[str, Any]]:
+    """Of each run what it was told otherwise than others, and which one it is identical to.
+
+    Args:
+        names: of the runs.
+        rows: their properties.
+
+    Returns:
+        Values by key, and `identical_to`: the first run with the same signals, bit for bit.
+    """
+    told = [
+        {f"{section}_{key}": v for section, table in row.items() for key, v in table.items()}
+        for row in rows
+    ]
+    outcome = {f"{RESULT}_{key}" for key in rows[0][RESULT] if key != "seed"} if rows else set()
+    keys = dict.fromkeys(key for run in told for key in run if key not in outcome)
+    others = [key for key in keys if len({repr(run.get(key)) for run in told}) > 1]
+    firsts: dict[Any, str] = {}
+    found = []
+    for name, row, run in zip(names, rows, told, strict=True):
+        first = firsts.setdefault(row[RESULT].get("signals_sha256", name), name)
+        same = {"identical_to": "" if first == name else label(first)}
+        mine = {key.removeprefix(f"{RESULT}_"): run[key] for key in others if key in run}
+        found.append(same | mine)
+    return found
 
 
 def property_chunks(sections: Sections) -> list[Chunk]:
