@@ -23,9 +23,8 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments import reports
 from cdmisfa.experiments.reports import command_again, write_report
 from replay.camera_logs.options import CameraOptions
-from replay.report.drawing import Axis, Plot
+from replay.report.conditions import LIVELY, attempts, conditions_of, deciding
 from replay.report.page import MOST_BYTES
-from replay.report.rules import LIVELY, attempts, deciding, rules_of
 from replay.report.told import read_told
 from replay.runs.modules import save_modules
 
@@ -51,7 +50,7 @@ def run(cdmisfa: Cdmisfa, tmp_path: Path) -> Path:
 
 def test_a_module_is_saved_where_all_rules_hold_and_nowhere_else(run: Path) -> None:
     told = read_told(run, frames=10)
-    rules = deciding(rules_of(told.outline, told.signals))
+    rules = deciding(conditions_of(told.outline, told.signals))
     assert [rule.short for rule in rules] == ["η̇", "share", "variance", "novel blocks"]
     every = np.all([rule.holds for rule in rules], axis=0)
     saves = [save.iteration for save in told.outline.saved]
@@ -71,7 +70,7 @@ def test_a_fork_is_judged_by_its_parents_rules_until_it_parts(
     words = ("--at", at, "--set", "learner.delta=1e-9", "-o", fork, "--no-rerun")
     assert cdmisfa("fork", run, *words, "--max-iterations", at + 40).code == 0
     told = read_told(fork, frames=1)
-    rules = deciding(rules_of(told.outline, told.signals))
+    rules = deciding(conditions_of(told.outline, told.signals))
     assert np.flatnonzero(np.all([r.holds for r in rules], axis=0)).tolist() == [first]
     page = Page(fork / "report.html")
     assert f"A fork of ../run after {at} iterations: learner.delta 0.02 became 1e-09." in page.text
@@ -253,7 +252,7 @@ def test_the_progress_learner_is_shown_with_its_own_rules(tmp_path: Path) -> Non
     ):
         assert text in page.text
     told = read_told(tmp_path, frames=5)
-    rules = {rule.short: rule for rule in rules_of(told.outline, told.signals)}
+    rules = {rule.short: rule for rule in conditions_of(told.outline, told.signals)}
     tested, fitted = (told.outline.lines[name] for name in ("tested", "fitted"))
     apart = np.abs(np.log(tested / fitted))
     np.testing.assert_array_equal(rules["agreement"].holds, apart < 0.25)
@@ -387,34 +386,3 @@ def test_what_is_read_does_not_grow_with_the_run(tmp_path: Path) -> None:
         kept.append((rows, max(len(rows) for rows in told.last.values()), len(module.near)))
         assert json.loads(json.dumps(rows)) <= [50, 2000, 96]
     assert kept[1][1] == kept[0][1]
-
-
-@pytest.mark.parametrize(
-    ("start", "stop", "log", "most", "expected"),
-    [
-        (0, 100, False, 5, [0, 20, 40, 60, 80, 100]),
-        (0.0003, 0.05, True, 4, [0.001, 0.01]),
-        (-1.2, 1.3, False, 3, [-1, 0, 1]),
-        (3, 3, False, 3, [3]),
-    ],
-)
-def test_ticks_are_round(
-    start: float, stop: float, log: bool, most: int, expected: list[float]
-) -> None:
-    ticks = Axis(start, stop, 100, log).ticks(most)
-    assert ticks == pytest.approx(expected)
-
-
-def test_a_curve_keeps_its_extremes_and_its_gaps() -> None:
-    t = np.arange(50_000, dtype=float)
-    values = np.sin(t / 40)
-    values[777], values[30_000] = 9.0, -9.0
-    values[20_000:21_000] = np.nan
-    plot = Plot(Axis(0, 50_000, 1000), Axis(-9, 9, 90, turned=True), "a curve")
-    plot.line("plain", t, values)
-    (path,) = plot.parts
-    points = [tuple(map(float, p.split())) for p in re.findall(r"[\d.]+ [\d.]+", path)]
-    assert len(points) < 2200
-    assert {0.0, 90.0} <= {y for _, y in points}
-    assert path.count("M") == 2
-    assert not [x for x, _ in points if 400.5 < x < 419.5]

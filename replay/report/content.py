@@ -10,6 +10,7 @@ import numpy as np
 
 from cdmisfa.core.signals import STATES
 from replay.outputs import Pick
+from replay.report.conditions import attempts, conditions_of, deciding
 from replay.report.drawing import Plot, colour_class
 from replay.report.panels import (
     FEW,
@@ -31,7 +32,6 @@ from replay.report.panels import (
     weights_picture,
     world_plot,
 )
-from replay.report.rules import attempts, deciding, rules_of
 from replay.report.told import ModuleTold, RunTold
 from replay.report.trust import Proof, command, facts, provenance
 from replay.runs.run import Save
@@ -54,7 +54,7 @@ FOLLOWS = 0.5
 
 def run_content(told: RunTold, proof: Proof | None) -> dict[str, Any]:
     """What the page of a run is made of; see page.html."""
-    rules = rules_of(told.outline, told.signals)
+    rules = conditions_of(told.outline, told.signals)
     counted = deciding(rules)
     frames: dict[str, Frames] = {}
     lanes = timeline(told, "timeline") if len(told) else None

@@ -15,6 +15,7 @@ from cdmisfa.core.signals import STATES
 from replay.following import Fit
 from replay.outputs import Pick
 from replay.palette import shade
+from replay.report.conditions import Condition, saved_rows
 from replay.report.drawing import (
     BINS,
     WIDE,
@@ -28,7 +29,6 @@ from replay.report.drawing import (
     reduced,
     sheet,
 )
-from replay.report.rules import Rule, saved_rows
 from replay.report.told import ModuleTold, RunTold
 
 LANE, ROOM = 22, 6
@@ -142,7 +142,7 @@ def _attention(plot: Plot, told: RunTold, stream: int, row: int) -> str:
     )
 
 
-def rule_plot(told: RunTold, rule: Rule, frames: str, *, by_stream: bool) -> Plot:
+def rule_plot(told: RunTold, rule: Condition, frames: str, *, by_stream: bool) -> Plot:
     """A quantity that decides over the run, its limits, and where they held."""
     outline = told.outline
     limits = (rule.low, rule.high)
@@ -313,7 +313,7 @@ def saved_frame(told: RunTold, module: ModuleTold) -> int:
     return found[0] if found else outline.end
 
 
-def frames_of_run(told: RunTold, rules: Sequence[Rule], plot: Plot) -> Frames | None:
+def frames_of_run(told: RunTold, rules: Sequence[Condition], plot: Plot) -> Frames | None:
     """What was watched, to be shown where one points at the timeline, and which rules held."""
     if not told.seen.columns:
         return None

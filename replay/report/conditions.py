@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.signals import NO_STATE, STATES
 from replay.runs.log import RunHeader
+from replay.runs.rules import rules_of
 from replay.runs.run import Outline
 
 LIVELY = (0.5, 2.0)
@@ -19,7 +20,7 @@ LIVELY = (0.5, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class Condition:
     """A quantity that must be within limits for a module to be saved.
 
     Attributes:
@@ -32,7 +33,7 @@ class Rule:
         drawn: it has a plot of its own.
         symbol: what stands before the limit where that is drawn.
         counts: it decides by itself; else it only follows from the others.
-        held: (n,) where it held, where the limits were others before; see `rules_of`.
+        held: (n,) where it held, where the limits were others before; see `conditions_of`.
     """
 
     short: str
@@ -61,7 +62,7 @@ class Rule:
         return found
 
 
-def rules_of(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> tuple[Rule, ...]:
+def conditions_of(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> tuple[Condition, ...]:
     """The rules for saving of a run's learner, as far as its log tells them.
 
     Of a fork those of its parent hold until it parts from that.
@@ -72,9 +73,13 @@ def rules_of(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> tuple[Rul
     rules = _of_progress(outline, signals) if header.by_progress else _of_paper(outline, signals)
     parent, at = _before(header), header.forked_at
     if parent is not None and at is not None:
-        for place, then in enumerate(rules_of(replace(outline, header=parent), signals)):
-            held = np.concatenate([then.holds[:at], rules[place].holds[at:]])
-            rules[place] = replace(rules[place], held=held)
+        before = {r.short: r for r in conditions_of(replace(outline, header=parent), signals)}
+        rules = [
+            replace(rule, held=np.concatenate([before[rule.short].holds[:at], rule.holds[at:]]))
+            if rule.short in before
+            else rule
+            for rule in rules
+        ]
     return tuple(rules)
 
 
@@ -89,85 +94,93 @@ def _before(header: RunHeader) -> RunHeader | None:
     return found if found.by_progress == header.by_progress else None
 
 
-def _of_paper(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[Rule]:
-    header, lines = outline.header, outline.lines
-    tabular = header.setting("learner", "algorithm") == "1.0"
-    share, variance = _number(header, "novel_share"), _number(header, "min_variance")
-    window = _number(header, "eta_dot_window")
-    if tabular:
-        error = _number(header, "roc_error")
-        first = Rule(
-            "error", "clustering error of its outputs", _below(error), signals["roc_error"],
-            high=error,
-        )  # fmt: skip
-    else:
-        change = np.abs(lines["eta_dot"].reshape(outline.iterations, -1)).max(axis=1)
-        first = Rule(
-            "η̇", "how much its slowness still changes, |η̇| per frame, the largest of its outputs",
-            f"saved only below δ = {header.delta:g}" if header.delta else "",
-            change, high=header.delta, log=True, symbol="δ = ",
-        )  # fmt: skip
-    return [
-        first,
-        Rule(
-            "share", "share of recent blocks that are new to it and of the same stream as before",
-            "" if share is None else f"saved only from {share:g} on: while the learner stays",
-            lines["share"], low=share,
-        ),
-        Rule(
-            "variance", "recent variance of its output, the smallest of its outputs",
-            "" if variance is None else f"saved only from {variance:g} on: below, it is dead",
-            signals["variance"], low=variance,
-        ),
-        Rule(
-            "novel blocks", "new blocks that it has learned from",
-            "" if window is None else f"saved only after more than {window:g}",
-            _of_novel(signals), low=None if window is None else window + 1, drawn=False,
-        ),
-    ]  # fmt: skip
+TOLD = {
+    "eta_dot": (
+        "η̇",
+        "how much its slowness still changes, |η̇| per frame, the largest of its outputs",
+        "saved only below δ = {:g}",
+    ),
+    "roc_error": ("error", "clustering error of its outputs", "saved only below {:g}"),
+    "share": (
+        "share",
+        "share of recent blocks that are new to it and of the same stream as before",
+        "saved only from {:g} on: while the learner stays",
+    ),
+    "variance": (
+        "variance",
+        "recent variance of its output, the smallest of its outputs",
+        "saved only from {:g} on: below, it is dead",
+    ),
+}
+"""Of the signals by which the paper's learners save: name in a table, what it is, the rule."""
 
 
-def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[Rule]:
+def _of_paper(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[Condition]:
+    header, found = outline.header, list[Condition]()
+    for rule in rules_of(header):
+        short, text, limit = TOLD[rule.signal]
+        values = signals.get(rule.signal, outline.lines.get(rule.signal, np.empty(0)))
+        values = np.abs(values.reshape(outline.iterations, -1)).max(axis=1)
+        change, below = rule.signal == "eta_dot", rule.side == "below"
+        found.append(
+            Condition(
+                short,
+                text,
+                limit.format(rule.threshold),
+                values,
+                low=None if below else rule.threshold,
+                high=rule.threshold if below else None,
+                log=change,
+                symbol="δ = " if change else "",
+            )
+        )
+    if (window := header.number("eta_dot_window")) is not None:
+        # Where the block itself is novel: only then is a module saved.
+        blocks = np.where(signals["novel"].astype(bool), signals["novel_blocks"], np.nan)
+        text, limit = (
+            "new blocks that it has learned from",
+            f"saved only after more than {window:g}",
+        )
+        found.append(Condition("novel blocks", text, limit, blocks, low=window + 1, drawn=False))
+    return found
+
+
+def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[Condition]:
     header, lines = outline.header, outline.lines
     change, _ = header.settled or (None, None)
-    agreement, frames = _number(header, "agreement"), _number(header, "test_frames")
+    agreement, frames = header.number("agreement"), header.number("test_frames")
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.abs(np.log(lines["tested"] / lines["fitted"]))
     untested = ~np.isfinite(lines["tested"])
     window = None if frames is None else max(frames / max(outline.tau, 1), 1.0)
     return [
-        Rule(
+        Condition(
             "error", "learning error e of the stream that is watched: change plus disagreement",
             "" if header.settled is None else f"learned below {header.settled[1]:g}, or sooner",
             np.where(untested, np.nan, lines["learning_error"]),
             high=None if header.settled is None else header.settled[1], log=True, counts=False,
         ),
-        Rule(
+        Condition(
             "change", "change c of its slowest output with a block",
             "" if change is None else f"learned below {change:g}",
             np.where(untested, np.nan, lines["change"]), high=change, log=True,
         ),
-        Rule(
+        Condition(
             "agreement", "disagreement |ln(tested / fitted)|: slowness on new frames against old",
             "" if agreement is None else f"learned below {agreement:g}: else it fits accidents",
             np.where(untested, np.nan, apart), high=agreement,
         ),
-        Rule(
+        Condition(
             "variance", "variance of its slowest output on new frames",
             f"learned between {LIVELY[0]:g} and {LIVELY[1]:g}: it is alive, and as it was",
             signals["variance"], low=LIVELY[0], high=LIVELY[1],
         ),
-        Rule(
+        Condition(
             "tests", "blocks that it learned from since it was begun",
             "" if window is None else f"learned from {window:g} on: a whole window of tests",
             signals["novel_blocks"].astype(float), low=window, drawn=False,
         ),
     ]  # fmt: skip
-
-
-def _of_novel(signals: Mapping[str, NDArray[Any]]) -> FloatArray:
-    """Novel blocks, where the block itself is novel: only then is a module saved."""
-    return np.where(signals["novel"].astype(bool), signals["novel_blocks"], np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,13 +204,13 @@ class Attempt:
     saved: bool
 
 
-def deciding(rules: tuple[Rule, ...]) -> tuple[Rule, ...]:
+def deciding(rules: tuple[Condition, ...]) -> tuple[Condition, ...]:
     """Those that decide, as far as there are values of them."""
     return tuple(r for r in rules if r.counts and np.isfinite(r.values).any())
 
 
 def attempts(
-    outline: Outline, signals: Mapping[str, NDArray[Any]], rules: tuple[Rule, ...]
+    outline: Outline, signals: Mapping[str, NDArray[Any]], rules: tuple[Condition, ...]
 ) -> list[Attempt]:
     """What was learned, saved or not, and how the rules stood while it was."""
     rules = deciding(rules)
@@ -244,12 +257,3 @@ def saved_rows(outline: Outline) -> IntArray:
     """Rows of the iterations at whose end a module was saved."""
     iterations = [save.iteration for save in outline.saved]
     return np.searchsorted(outline.blocks.iterations, iterations)
-
-
-def _number(header: RunHeader, key: str) -> float | None:
-    value = header.setting("learner", key)
-    return float(value) if isinstance(value, int | float) else None
-
-
-def _below(limit: float | None) -> str:
-    return "" if limit is None else f"saved only below {limit:g}"

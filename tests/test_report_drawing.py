@@ -1,0 +1,41 @@
+"""Plots of reports: round ticks, and curves that keep what matters."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from replay.report.drawing import Axis, Plot
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "log", "most", "expected"),
+    [
+        (0, 100, False, 5, [0, 20, 40, 60, 80, 100]),
+        (0.0003, 0.05, True, 4, [0.001, 0.01]),
+        (-1.2, 1.3, False, 3, [-1, 0, 1]),
+        (3, 3, False, 3, [3]),
+    ],
+)
+def test_ticks_are_round(
+    start: float, stop: float, log: bool, most: int, expected: list[float]
+) -> None:
+    ticks = Axis(start, stop, 100, log).ticks(most)
+    assert ticks == pytest.approx(expected)
+
+
+def test_a_curve_keeps_its_extremes_and_its_gaps() -> None:
+    t = np.arange(50_000, dtype=float)
+    values = np.sin(t / 40)
+    values[777], values[30_000] = 9.0, -9.0
+    values[20_000:21_000] = np.nan
+    plot = Plot(Axis(0, 50_000, 1000), Axis(-9, 9, 90, turned=True), "a curve")
+    plot.line("plain", t, values)
+    (path,) = plot.parts
+    points = [tuple(map(float, p.split())) for p in re.findall(r"[\d.]+ [\d.]+", path)]
+    assert len(points) < 2200
+    assert {0.0, 90.0} <= {y for _, y in points}
+    assert path.count("M") == 2
+    assert not [x for x, _ in points if 400.5 < x < 419.5]
