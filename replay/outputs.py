@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.modules import Module
+from cdmisfa.modules import CHUNK, Module
 from replay.runs.log import Batch
 
 EACH = 5
@@ -142,9 +142,10 @@ class OwnStream:
 
     def _keep(self, blocks: IntArray, t: IntArray, frames: NDArray[Any], y: FloatArray) -> None:
         self.count += len(t)
-        rows = frames.reshape(len(t), -1).astype(np.float64)
-        self._sum += rows.sum(axis=0)
-        self._squares += np.einsum("ni,ni->i", rows, rows)
+        for start in range(0, len(t), CHUNK):
+            rows = frames[start : start + CHUNK].reshape(-1, self._sum.size).astype(np.float64)
+            self._sum += rows.sum(axis=0)
+            self._squares += np.einsum("ni,ni->i", rows, rows)
         self._some.add(t, frames, y)
         # At most one frame of a block: its neighbours look alike.
         starts = np.flatnonzero(np.diff(blocks, prepend=-1))

@@ -10,10 +10,20 @@ import numpy as np
 import pytest
 import rerun.blueprint as rrb
 from conftest import Cdmisfa
-from run_data import IMAGE, PROGRESS, UNTOLD, VECTOR, by_progress, parts_of, write_run
+from run_data import (
+    IMAGE,
+    PROGRESS,
+    UNTOLD,
+    VECTOR,
+    by_progress,
+    module_of,
+    parts_of,
+    write_run,
+)
 from view_data import View, scalars, tabs_of, views_of
 
 from cdmisfa.core.signals import NO_STATE
+from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view.build import build_view
 from replay.view.summary import summary_text
@@ -179,3 +189,43 @@ def test_the_summary_says_what_became_of_each_stream(shown):
     assert f"- **{second}**: known by module 2 (of {first}) after 8 blocks" in text
     assert f"- **{third}**: being learned" in text
     assert "It ended: nothing was left." in text
+
+
+def test_weights_are_those_of_the_stream_that_is_shown(tmp_path):
+    """The log has at the end of each block those of the stream that comes next."""
+
+    def turn(record):
+        turned = by_progress(record)
+        return dataclasses.replace(turned, next_stream=(record.iteration + 1) % 3, action=1)
+
+    write_run(tmp_path / "run.mcap", VECTOR, 12, learner=PROGRESS, edit=turn)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    shown = View(tmp_path / "run.rrd").rows["/abstraction/phi"]
+    bars = [set(values["buffer"]) for (values,) in shown["BarChart:values"]]
+    assert shown["iteration"] == list(range(1, 12))
+    assert bars == [{float(k - 1)} for k in shown["iteration"]]
+
+
+def test_a_module_hangs_its_weights_with_what_is_slow_and_frames_by_output(tmp_path):
+    records = write_run(
+        tmp_path / "run.mcap", IMAGE, ITERATIONS, learner=PROGRESS, edit=by_progress
+    )
+    rng, size = np.random.default_rng(0), 12 * 16
+    module = module_of(1, 8, rng.standard_normal((2, size)))
+    module = dataclasses.replace(module, slow=np.array([1, 0]), eta=np.ones(2))
+    save_modules(
+        tmp_path / "modules.npz",
+        [dataclasses.replace(module, band_mean=np.ones(2), band_sd=np.ones(2))],
+    )
+    build_view(tmp_path, tmp_path / "run.rrd")
+    view = View(tmp_path / "run.rrd")
+    words = [view.static[f"/modules/1/weights/{j}/words"]["Points2D:labels"] for j in (1, 2)]
+    assert words == [["1 slow"], ["2 not slow"]]
+    assert view.static["/modules/1/output"]["SeriesLines:names"] == ["left, output 1"]
+    rows = [f"/modules/1/sheet/{row}" for row in ("1_least", "2_middle", "3_greatest")]
+    said = [view.static[f"{row}/words"]["Points2D:labels"][0] for row in rows]
+    ends = [[float(x) for x in text.split(": ")[1].split(" to ")] for text in said]
+    assert ends == sorted(ends)
+    y = view.numbers("/modules/1/output")
+    assert (ends[0][0], ends[-1][-1]) == (round(y.min(), 2), round(y.max(), 2))
+    assert {r.stream for r in records} == {0, 1, 2}
