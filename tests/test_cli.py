@@ -72,6 +72,13 @@ class TestJson:
         assert "ended after 15 iterations of 100 frames: the asked number of iter" in done.out
         assert "learner 2.0, 3 streams: x1, x2, x3" in done.out
         assert "2016-01-01 00:00:00.000Z" in done.out
+        killed = tmp_path / "killed"
+        killed.mkdir()
+        log = (oscillatory_run / "run.mcap").read_bytes()
+        (killed / "run.mcap.partial").write_bytes(log[: len(log) // 2])
+        done = cdmisfa("info", killed)
+        assert (done.code, "no module" in done.out) == (3, False)
+        assert re.search(r"^not ended: \d+ iterations of 100 frames so far", done.out, re.MULTILINE)
         torn = tmp_path / "x1.mcap"
         data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())
         data[len(data) // 2] ^= 0xFF

@@ -85,14 +85,17 @@ def _print_run(found: LogInfo, run: RunInfo) -> None:
     more = len(run.streams) - MOST_NAMED
     named = ", ".join(run.streams[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
     print_line(f"learner {run.algorithm}, {len(run.streams)} streams: {named}")
-    print_modules(found.modules, policies=not run.outcomes)
+    if found.modules or found.ended is not None:  # else they are in its log alone
+        print_modules(found.modules, policies=not run.outcomes)
     for outcome in run.outcomes:
         print_line(outcome_line(outcome))
     if found.held_out is not None:
         print_held_out(found.held_out)
     done = f"{run.iterations} iterations of {run.tau} frames"
     if found.ended is None:
-        print_line(f"not ended: {done} so far, it learns or was stopped")
+        print_line(
+            f"not ended: {done} so far; it learns, or was stopped before its modules were kept"
+        )
     else:
         print_line(f"ended after {done}: {ENDINGS.get(found.ended, found.ended)}")
 
