@@ -71,6 +71,7 @@ def run_content(told: RunTold, proof: Proof | None) -> dict[str, Any]:
         "carded": FIRST,
         "more_streams": max(len(told.streams) - CARDS, 0),
         "progress": told.header.by_progress,
+        "forked": told.header.forked_at is not None,
         "states": [(f"state{k}", state_words(k)) for k in _codes(told)],
         "timeline": lanes,
         "rules": [
