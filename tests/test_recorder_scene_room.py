@@ -20,8 +20,10 @@ from recorder.world.icub.textures import SIDE, TEXTURES, texture
 
 pytest.importorskip("pybullet")
 
+from recorder.world.icub.physics import PhysicalMotions
 from recorder.world.icub.picture import SIZE
-from recorder.world.icub.source import IcubSource
+from recorder.world.icub.source import HEIGHTS, TRUTH, IcubSource
+from recorder.world.icub.world import Motions
 
 REAL = build(IcubConfig, "scene", load_preset("icub-real")["scene"], {"seed": 1})
 SMALL = IcubConfig(
@@ -111,6 +113,28 @@ def test_colours_beside_one_another_are_what_is_seen_in_grey(quiet):
     mixed = 0.299 * red + 0.587 * green + 0.114 * blue
     assert np.abs(mixed - quiet[:3]).max() <= 2
     assert (red > blue + 5).any()
+
+
+def test_physics_moves_objects_after_the_paper_s_motions_upright_on_the_table():
+    pushed = dataclasses.replace(SMALL, physics=True, shadow=0.0)
+    with contextlib.closing(PhysicalMotions(pushed, 1)) as motions:
+        later = motions.positions(100, 30)
+        poses = motions.positions(0, 130)
+    np.testing.assert_array_equal(poses[100:], later)
+    np.testing.assert_array_equal(np.round(poses, 5), poses)
+    away = np.abs(poses[..., :2] - Motions(pushed, 1).positions(0, 130))
+    assert away.mean(axis=(0, 2)).max() < 0.01
+    assert away[:, :2].max() > 0.003  # they follow, and are not put there
+    standing = np.array([pushed.object1.half_size, 0.045, pushed.object3.radius])
+    assert np.abs(poses[..., 2] - pushed.table.top - standing).max() < 0.001
+    np.testing.assert_array_equal(poses[:, :2, 3:], np.tile([0, 0, 0, 1], (130, 2, 1)))
+    assert np.abs(poses[:, 2, 3:6]).max() > 0.3  # the ball rolls
+    with contextlib.closing(IcubSource(pushed, RecordConfig())) as source:
+        source.seek(5)
+        block = source.take(0, 3)
+    assert source.spec.truth == (*TRUTH, *HEIGHTS)
+    np.testing.assert_array_equal(block.truth[:, :6], poses[5:8, :, :2].reshape(3, 6))
+    np.testing.assert_array_equal(block.truth[:, 6:], poses[5:8, :, 2])
 
 
 def rays_of(level: int, frames: int) -> np.ndarray:

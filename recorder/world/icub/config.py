@@ -143,6 +143,7 @@ class IcubConfig(SceneConfig):
         vignette: share of the light that is lost in the corners of an image.
         noise: of the sensor at middle grey, standard deviation in grey levels.
         color: a frame shows red, green and blue beside one another.
+        physics: objects slide and roll after where they are to be, instead of being put there.
     """
 
     kind: str = "icub"
@@ -160,6 +161,7 @@ class IcubConfig(SceneConfig):
     vignette: float = later(0.0)
     noise: float = later(0.0)
     color: bool = later(False)
+    physics: bool = later(False)
 
     def __post_init__(self) -> None:
         SceneConfig.__post_init__(self)

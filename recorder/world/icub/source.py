@@ -6,16 +6,22 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from cdmisfa.core.blocks import Block, ClockedSource, HeadPose, SourceSpec, check_request, freeze
 from cdmisfa.core.config import section_table
 from recorder.config import RecordConfig
 from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.eyes import Eyes
 from recorder.world.icub.furnished import FurnishedEyes
+from recorder.world.icub.physics import PhysicalMotions
 from recorder.world.icub.world import Motions, World
 
 TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
 """Columns of ground truth: the objects' positions in the paper's coordinates, metres."""
+
+HEIGHTS = tuple(f"object{i}_z" for i in (1, 2, 3))
+"""More of them where physics moves the objects: heights of their middles, root frame, metres."""
 
 
 class IcubSource(ClockedSource):
@@ -29,13 +35,16 @@ class IcubSource(ClockedSource):
     def __init__(self, scene: IcubConfig, record: RecordConfig) -> None:
         self._scene = scene
         self._seed = scene.seed or 0
-        self._motions = Motions(scene, self._seed)
+        self._motions: Motions | PhysicalMotions = (
+            PhysicalMotions(scene, self._seed) if scene.physics else Motions(scene, self._seed)
+        )
         self._world = World(scene)
         self._eyes = (
             Eyes(scene.eyes, self._world) if scene.plain else FurnishedEyes(scene, self._world)
         )
+        truth = TRUTH + HEIGHTS if scene.physics else TRUTH
         self._spec = SourceSpec(
-            scene.eyes.views, self._eyes.shape, "uint8", TRUTH, record.fps, record.start_ns
+            scene.eyes.views, self._eyes.shape, "uint8", truth, record.fps, record.start_ns
         )
 
     @property
@@ -50,7 +59,8 @@ class IcubSource(ClockedSource):
         check_request(self._spec, stream, n)
         positions = self._motions.positions(self._t, n)
         frames = self._eyes.look(stream, self._t, positions)
-        block = Block(stream, self._t, freeze(frames), freeze(positions.reshape(n, -1)))
+        truth = [positions[..., :2].reshape(n, -1), positions[..., 2:3].reshape(n, -1)]
+        block = Block(stream, self._t, freeze(frames), freeze(np.concatenate(truth, axis=1)))
         self._t += n
         return block
 
@@ -61,3 +71,5 @@ class IcubSource(ClockedSource):
     def close(self) -> None:
         """End the simulator."""
         self._world.close()
+        if isinstance(self._motions, PhysicalMotions):
+            self._motions.close()

@@ -152,7 +152,7 @@ class World:
         self._pieces: list[int] = []
         self._shown: Sequence[int] = ()
         with silenced():
-            self._bullet, models = _start_simulator()
+            self._bullet, models = start_simulator()
             bullet = self._bullet
             # Looked up once: they are called for every frame.
             self._move = partial(bullet.resetBasePositionAndOrientation, ornObj=_UPRIGHT)
@@ -175,12 +175,16 @@ class World:
     def place(self, positions: NDArray[np.float64]) -> None:
         """Put the objects at (objects, 2) positions, x and y in the paper's coordinates.
 
-        Its y is to the robot's left, the root frame's to its right.
+        Its y is to the robot's left, the root frame's to its right. Positions of (objects, 7) go
+        on with z and a quaternion, root frame.
         """
-        for body, height, (x, y) in zip(
+        for body, height, (x, y, *pose) in zip(
             self._objects, self._heights, positions.tolist(), strict=True
         ):
-            self._move(body, (x, -y, height))
+            if pose:
+                self._move(body, (x, -y, pose[0]), ornObj=pose[1:])
+            else:
+                self._move(body, (x, -y, height))
 
     def turn_head(self, yaw: float) -> None:
         """Turn the robot's head; degrees, to the left. Only pictures from outside show it."""
@@ -373,7 +377,7 @@ def _flush() -> None:
     ctypes.CDLL(None).fflush(None)
 
 
-def _start_simulator() -> tuple[Any, Any]:
+def start_simulator() -> tuple[Any, Any]:
     """A PyBullet server without a window, and the package of the robots' models."""
     try:
         import icub_models
