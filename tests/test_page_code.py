@@ -81,11 +81,23 @@ def test_moments(ran: Callable[..., Ran]) -> None:
     assert ran("moments.md")["learner"].iteration == 25
 
 
-def test_viewing(ran: Callable[..., Ran]) -> None:
+def of_a_box(out: str) -> cdmisfa.Run:
+    """A run on a shade that comes and goes."""
     drift = 128 + 100 * np.sin(np.arange(3000) / 60)[:, None, None] * np.linspace(0, 1, 128)
-    pictures = np.repeat(drift.astype(np.uint8), 48, axis=1)
-    (box,) = cdmisfa.learn(pictures, "runs/icub", max_modules=1).modules
+    return cdmisfa.learn(np.repeat(drift.astype(np.uint8), 48, axis=1), out, max_modules=1)
+
+
+def test_viewing(ran: Callable[..., Ran]) -> None:
+    (box,) = of_a_box("runs/icub").modules
     save_modules(Path("runs/icub/modules.npz"), [box, replace(box, index=2)])
-    found = ran("viewing.md", frames=pictures)
-    np.testing.assert_array_equal(found["y"], box.transform(pictures))
-    assert len(found["run"].modules) == 2
+    assert len(ran("viewing.md")["run"].modules) == 2
+
+
+def test_applying(ran: Callable[..., Ran]) -> None:
+    pytest.importorskip("sklearn")
+    (module,) = of_a_box("runs/cameras").modules
+    found = ran("applying.md")
+    assert module.recipe is not None
+    frames = np.stack([cdmisfa.make_frame(each, module.recipe) for each in found["pictures"]])
+    np.testing.assert_array_equal(found["outputs"], module.transform(frames))
+    assert found["model"].predict(found["left"]).shape == (500,)

@@ -38,7 +38,7 @@ def drawn(code: dict[str, Any], *sources: str) -> set[str]:
 def test_every_tab_of_a_run_is_drawn(code: dict[str, Any], tmp_path: Path) -> None:
     nothing = WorldTab()
     for algorithm, sources in {
-        "2.0": ("icub", "seed0"),
+        "2.0": ("icub", "seed0", "progress"),
         "progress": ("progress", "cameras", "icub", "seed0"),
     }.items():
         folder = tmp_path / algorithm
@@ -59,4 +59,4 @@ def test_every_tab_of_a_recording_and_of_a_comparison_is_drawn(
 
 def test_what_is_drawn_is_there(code: dict[str, Any]) -> None:
     names = {path.stem for path in IMAGES.glob("*.png")}
-    assert names == {*code["VIEWS"], *code["FIGURES"], "scene", "benchmarks"}
+    assert names == {*code["VIEWS"], *code["FIGURES"], *code["REPORTS"], "scene", "benchmarks"}
