@@ -77,7 +77,7 @@ def test_a_view_is_written_without_most_of_rerun(tmp_path: Path) -> None:
         "def tell():\n"
         "    wanted = ('rerun', 'rerun.archetypes.capsules3d')\n"
         "    compute = 'pyarrow.compute' in sys.modules\n"
-        "    by_us = compute and 'pandas' not in sys.modules\n"  # pyarrow imports pandas, it compute
+        "    by_us = compute and 'pandas' not in sys.modules\n"  # pandas imports it
         "    print(*(name in sys.modules for name in wanted), by_us, file=sys.stderr)\n"
         "atexit.register(tell)\n"
         "from cdmisfa.cli import main\n"
