@@ -48,8 +48,11 @@ def first_picture(path: Path) -> None:
         source.take(0, 1)
 
 
-class FirstBlockError(Exception):
-    """A block was learned: bytes that the learning thread had read by then."""
+class FirstBlock(BaseException):
+    """A block was learned: bytes that the learning thread had read by then.
+
+    No `Exception`, because learning goes on where a sink raises one.
+    """
 
 
 class UntilFirst(Sink):
@@ -57,7 +60,7 @@ class UntilFirst(Sink):
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
-        raise FirstBlockError(bytes_read("thread-self"))
+        raise FirstBlock(bytes_read("thread-self"))
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """See `Sink`."""
@@ -80,7 +83,7 @@ def first_block(path: Path) -> int:
                     sections=configuration.tables(),
                     sinks=[UntilFirst()],
                 )
-            except FirstBlockError as reached:
+            except FirstBlock as reached:
                 return int(reached.args[0]) - before
     raise SystemExit(f"{path} is too short for a block")
 

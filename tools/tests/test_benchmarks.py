@@ -116,16 +116,25 @@ def test_the_ratios_of_each_commit_are_kept_and_drawn(results: Path, tmp_path: P
     history.add("b" * 40, "2026-02-01T00:00:00+00:00", {name: 1.1})
     path = history.add("b" * 40, "2026-02-01T00:00:00+00:00", {"other": 2.0})
     assert json.loads(path.read_text())["ratios"] == {name: 1.1, "other": 2.0}
+    assert not history.draw(tmp_path / "few.png")
+    for place in range(1, history.LINE):
+        history.add(str(place) * 40, f"2026-02-0{1 + place}T00:00:00+00:00", {name: 1.1})
     assert history.draw(tmp_path / "some.png")
     assert (tmp_path / "some.png").stat().st_size > 1000
 
 
 def test_ratios_of_before_are_drawn_under_their_own_names() -> None:
     panel, kept = next(iter(history.PANELS.items()))
-    ratios = [{f"{panel}: vs another": 2.0, "Other: a": 1.0}, {}, {f"{panel}: {kept[0].name}": 3.0}]
-    commits = [{"ratios": told} for told in ratios]
-    found = history.curves(commits, panel)
-    assert list(found.items()) == [(kept[0].name, [(2, 3.0)]), ("vs another", [(0, 2.0)])]
+    own, before = f"{panel}: {kept[0].name}", f"{panel}: vs another"
+    some = [{"ratios": {before: 2.0, "Other: a": 1.0}}] * history.LINE + [{"ratios": {}}]
+    more = [{"ratios": {own: 3.0}}] * history.LINE
+    found = history.curves(some + more, panel)
+    places = range(history.LINE)
+    assert list(found.items()) == [
+        (kept[0].name, [(len(some) + place, 3.0) for place in places]),
+        ("vs another", [(place, 2.0) for place in places]),
+    ]
+    assert history.curves(some[1:] + more[1:], panel) == {}
 
 
 def test_what_the_history_holds_is_drawn() -> None:
