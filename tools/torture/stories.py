@@ -246,7 +246,7 @@ def cut_short(folder: Path, words: str, name: str, writes: int) -> None:
 
 RECORD = f"record oscillatory -o {OUT} --frames {FRAMES}"
 LEARN = f"learn {GIVEN} -o {OUT} --loop --set learner.tau=10"
-LONG = f"{LEARN} --max-iterations {ITERATIONS} --no-rerun"
+LONG = f"{LEARN} --max-iterations {ITERATIONS} --no-rerun --no-report"
 TORN = f"{GIVEN}/x1.mcap.partial"
 
 
@@ -322,21 +322,28 @@ STORIES = {
         Story(
             "learn",
             LONG,
-            (f"learn -o {OUT} --resume --no-rerun", f"{LONG} --resume", f"{LONG} --force"),
+            (
+                f"learn -o {OUT} --resume --no-rerun --no-report",
+                f"{LONG} --resume",
+                f"{LONG} --force",
+            ),
             learned,
             _recording,
         ),
         Story(
             "learn with a view",
-            f"{LEARN} --max-iterations 30",
-            (f"learn -o {OUT} --resume", f"{LEARN} --max-iterations 30 --force"),
+            f"{LEARN} --max-iterations 30 --no-report",
+            (
+                f"learn -o {OUT} --resume --no-report",
+                f"{LEARN} --max-iterations 30 --no-report --force",
+            ),
             learned,
             _recording,
         ),
         Story(
             "learn --resume",
-            f"learn -o {OUT} --resume --no-rerun",
-            (f"learn -o {OUT} --resume --no-rerun",),
+            f"learn -o {OUT} --resume --no-rerun --no-report",
+            (f"learn -o {OUT} --resume --no-rerun --no-report",),
             learned,
             _learning,
             iterations,
@@ -346,7 +353,7 @@ STORIES = {
             f"{LONG} --resume",
             (f"{LONG} --resume",),
             learned,
-            lambda folder: _learned(folder, f"{LEARN} --max-iterations 250 --no-rerun"),
+            lambda folder: _learned(folder, f"{LEARN} --max-iterations 250 --no-rerun --no-report"),
             iterations,
         ),
         Story(
