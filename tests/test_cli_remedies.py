@@ -141,8 +141,6 @@ def test_demo_replaces_an_earlier_one(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     first, second = report["modules"]
     assert (first["view"], first["follows"]) == ("left", "object1_y")
     assert (second["view"], second["follows"]) == ("right", "object3_y")
-    assert first["policy"] == ["stay", "switch", "switch"]
-    assert second["policy"] == ["switch", "switch", "stay"]
     assert min(first["correlation"], second["correlation"]) > 0.9
     for file in (*report["figures"], Path(report["run"]) / "run.rrd"):
         assert Path(file).stat().st_size > 0

@@ -1,4 +1,4 @@
-"""The demonstration: record the iCub scene, learn from the log, check, and show."""
+"""The demonstration: record the furnished iCub scene, learn from the log, check, and show."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure, open_source
 from cdmisfa.modules import Module
 
-SCENE = "icub"
-MODULES = 2
-"""Views whose object has something slow about it: the one in the centre is pure noise."""
+SCENE, PRESET = "icub", "icub-real"
 
 CHECKED_ITERATIONS = 200
 """Length of the stretch on which live and recorded signals are compared."""
@@ -41,7 +39,7 @@ def demo(
 
     Args:
         out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
-        preset: of scene and learner, instead of the scene's own.
+        preset: of scene and learner; by default `PRESET`.
         seed: of world and learner.
         frames: of the recording; the learner starts it again at its end.
         jobs: processes that render.
@@ -57,11 +55,11 @@ def demo(
     from recorder.recording import record_scene
     from replay.export.figures import draw_figures
 
+    preset = preset or PRESET
     configuration = configure(SCENE, preset, seed=seed)
     recording, folder = out / "recordings" / "demo-icub", out / "runs" / "demo-icub"
 
     def learn(bar: Any, word: str | Path, out: Path | None, most: int | None) -> RunResult:
-        modules = MODULES if most is None else None
         with _opened(word, preset, seed) as source:
             return run(
                 source,
@@ -72,7 +70,6 @@ def demo(
                 force=True,
                 sinks=(bar.sink(source.spec, most),),
                 max_iterations=most,
-                max_modules=modules,
             )
 
     with stage(f"1/4 recording three views, {frames} frames each", "frames") as bar:
@@ -110,9 +107,7 @@ def demo(
         }
 
 
-def _opened(
-    word: str | Path, preset: str | None, seed: int
-) -> AbstractContextManager[SeekableSource]:
+def _opened(word: str | Path, preset: str, seed: int) -> AbstractContextManager[SeekableSource]:
     return contextlib.closing(open_source([word], preset=preset, seed=seed, loop=True)[0])
 
 

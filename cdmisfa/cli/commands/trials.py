@@ -350,7 +350,7 @@ def _run_arena(
 @options.out("Folder of the recordings and runs; by default the one you are in.")
 @options.seed()
 @options.preset
-@number("--frames", "Frames a view.", 400, default=16000)
+@number("--frames", "Frames a view.", 400, default=8000)
 @options.jobs
 @options.as_json
 def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
