@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
-from cdmisfa.core.blocks import PIXEL, UINT8, as_array
+from cdmisfa.core.arrays import as_array, without_table
+from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.shown import Shown, weights
@@ -77,9 +78,9 @@ class Module(Shown):
         """Outputs on frames or raw pictures, y = phi (x - mean), the same bits on every machine.
 
         Args:
-            frames: (n, *frame_shape), or these as rows (n, I), uint8 or values; it scales the
-                former and expands both as it learned them. Where it has a recipe, pictures of any
-                size as the source gave them, too; see `make_frame`.
+            frames: (n, *frame_shape), or these as rows (n, I), uint8 or values, tables too; it
+                scales the former and expands both as it learned them. Where it has a recipe,
+                pictures of any size as the source gave them, too; see `make_frame`.
             outputs: which of the outputs, from 0, the slowest first: a number of one, a slice, or
                 a list of some; all where it is not given.
 
@@ -136,7 +137,7 @@ class Module(Shown):
         """Frames as they were given, or made of raw pictures."""
         if self.recipe is None:
             return as_array(given)
-        own = self.frame_shape
+        own, given = self.frame_shape, without_table(given)
         try:
             array = np.asarray(given)
         except ValueError:  # of several sizes

@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import Block, SourceSpec, as_array, freeze
+from cdmisfa.core.arrays import as_array
+from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, are_for
 from recorder.images.framing import Framing, framings
@@ -59,6 +60,7 @@ class ArrayLog(LoggedSource):
 
     Attributes:
         arrays: of each stream by its name, what it shows as it was given, frames first.
+        framings: for each stream how a picture becomes a frame.
 
     Raises:
         UsageError: they are no such arrays, or hold what is no finite number.
@@ -82,18 +84,17 @@ class ArrayLog(LoggedSource):
         firsts = [_pixels(array[:1])[0] for array in shown]
         _refuse_unlike(dict(zip(self.arrays, firsts, strict=True)))
         self._color = options.color is True
-        self._framings = framings(firsts, options.size, options.fit, color=self._color)
+        self.framings = framings(firsts, options.size, options.fit, color=self._color)
         self._count = min(map(len, shown))
         self._about = {
-            "size": list(self._framings[0].shape),
+            "size": list(self.framings[0].shape),
             "fit": options.fit,
             **({"color": "red, green and blue beside one another"} if self._color else {}),
             "recipe": RECIPE,
         }
-        self.shapes = dict(zip(self.arrays, map(str, self._framings), strict=True))
-        kind = "uint8" if isinstance(self._framings[0], Framing) else "float64"
+        kind = "uint8" if isinstance(self.framings[0], Framing) else "float64"
         length, fps = None if loop else self._count, options.rate or FPS
-        shape = self._framings[0].shape
+        shape = self.framings[0].shape
         self._spec = SourceSpec(tuple(self.arrays), shape, kind, (), fps, START_NS, length)
         for stream in range(len(shown)):  # refused before anything is written
             self._block(stream, 0, 1)
@@ -125,7 +126,7 @@ class ArrayLog(LoggedSource):
         return found
 
     def _block(self, stream: int, t: int, n: int) -> Block:
-        array, framing = list(self.arrays.values())[stream], self._framings[stream]
+        array, framing = list(self.arrays.values())[stream], self.framings[stream]
         rows = array[(t + np.arange(n)) % self._count]
         if isinstance(framing, Framing):
             frames = np.stack([framing.frame(self._image(picture)) for picture in _pixels(rows)])
@@ -209,9 +210,7 @@ def _refuse_unlike(firsts: Mapping[str, Shown]) -> None:
 
 def _checked(name: str, given: Any) -> NDArray[Any]:
     """What a stream shows as an array, (n, I) of numbers or (n, height, width[, 3])."""
-    array = _as_array(name, given)
-    if np.ma.isMaskedArray(given) and np.ma.getmaskarray(given).any():
-        raise UsageError(f"{name}: some of its values are masked: fill them, or leave out the rows")
+    array = as_array(given, name)
     if array.dtype.kind not in "biuf":
         raise UsageError(f"{name}: its values are of type {array.dtype}, no numbers: {_WANTED}")
     array = array.astype(array.dtype.newbyteorder("="), copy=False)
@@ -244,45 +243,6 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
                 "as x.reshape(len(x), -1)"
             )
     return array
-
-
-def _as_array(name: str, given: Any) -> NDArray[Any]:
-    """What a stream shows as an array, of tables their columns side by side."""
-    if hasattr(given, "to_frame"):  # one column of pandas or Polars
-        given = given.to_frame()
-    if hasattr(given, "iloc"):  # pandas
-        columns = [(str(key), given.iloc[:, i]) for i, key in enumerate(given.columns)]
-    elif hasattr(given, "__arrow_c_stream__") and hasattr(given, "columns"):  # Arrow, Polars
-        import pyarrow
-
-        table = pyarrow.table(given)
-        columns = list(zip(table.column_names, table.columns, strict=True))
-    else:
-        return np.asarray(given.to_numpy()) if hasattr(given, "to_numpy") else as_array(given)
-    if not columns:
-        raise UsageError(f"{name}: a table without columns given")
-    stacked: NDArray[Any] = np.column_stack([_column(name, *column) for column in columns])
-    return stacked
-
-
-def _column(name: str, key: str, given: Any) -> NDArray[Any]:
-    """A column of a table as numbers, NaN where it has none."""
-    import pyarrow
-
-    try:
-        column = given if hasattr(given, "chunks") else pyarrow.array(given, from_pandas=True)
-        kinds, kind = pyarrow.types, column.type
-        if kinds.is_decimal(kind) or (kinds.is_boolean(kind) and column.null_count):
-            column = column.cast("float64")
-        numbers: NDArray[Any] = column.to_numpy(zero_copy_only=False)
-    except (pyarrow.ArrowException, NotImplementedError):  # of what Arrow has no type for
-        numbers = np.asarray(given)
-    if numbers.dtype.kind not in "biuf":
-        held = getattr(given, "dtype", getattr(given, "type", ""))
-        raise UsageError(
-            f"{name}: the column {key} is of type {held}, no numbers: choose the columns of numbers"
-        )
-    return numbers
 
 
 def _pixels(rows: NDArray[Any]) -> NDArray[Any]:

@@ -51,6 +51,25 @@ def test_tables_of_each_library_are_the_same_frames(kind: str) -> None:
     assert recording.spec.streams == ("car", "again")
 
 
+@pytest.fixture(scope="module")
+def module() -> Any:
+    """What was learned from the columns."""
+    rows = 100 * ROWS
+    frames = np.resize(np.column_stack(list(COLUMNS.values())), (rows, len(COLUMNS)))
+    frames[:, 0] = np.sin(np.arange(rows) / 90)
+    return cdmisfa.learn(frames, tau=20, max_modules=1).modules[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_module_takes_tables_of_each_library(kind: str, module: Any) -> None:
+    expected = module.transform(np.column_stack(list(COLUMNS.values())))
+    np.testing.assert_array_equal(module.transform(table(kind)), expected)
+    with pytest.raises(UsageError, match=r"no finite number|column speed"):
+        module.transform(table(kind, COLUMNS | {"speed": [None] * ROWS}))
+    with pytest.raises(UsageError, match=r"the column name is of type .*, no numbers"):
+        module.transform(table(kind, COLUMNS | {"name": ["a"] * ROWS}))
+
+
 @pytest.mark.parametrize("kind", ["pandas", "pandas nullable", "polars"])
 def test_one_column_is_one_number_a_frame(kind: str) -> None:
     column = table(kind)["brake"]

@@ -95,9 +95,11 @@ def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) 
     assert done.code == 0, done.err
     said = {"shape": [8, 8], "fit": "stretch", "color": False, "range": None, "fields": []}
     stated = json.loads((out / "run.json").read_text())["result"]["modules"]
-    assert [module["recipe"] for module in stated] == [{**said, "pixels": ""}] * len(stated)
+    assert [module["recipe"] for module in stated] == [
+        {**said, "pixels": "", "raw": [12, 16]}
+    ] * len(stated)
     module = Run(out).modules[0]
-    assert module.recipe == load_modules(out)[0].recipe == Recipe((8, 8), "stretch")
+    assert module.recipe == load_modules(out)[0].recipe == Recipe((8, 8), "stretch", raw=(12, 16))
     frames = ForeignSource(log, size=(8, 8), fit="stretch").take(0, 50).frames
     y = module.transform(pictures[:50, :, :, ::-1])  # red first
     np.testing.assert_array_equal(y, module.transform(frames))
@@ -106,7 +108,7 @@ def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) 
     arrays = dict(np.load(out / "modules.npz"))
     np.savez(out / "modules.npz", **{k: v for k, v in arrays.items() if "recipe" not in k})
     assert load_modules(out)[0].recipe is None
-    assert Run(out).modules[0].recipe == module.recipe
+    assert Run(out).modules[0].recipe == Recipe((8, 8), "stretch")
 
 
 def test_a_recording_of_a_log_keeps_its_recipe(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
@@ -135,6 +137,7 @@ def test_a_jpeg_is_turned_as_its_exif_says(tmp_path: Path) -> None:
     ("recipe", "given", "why"),
     [
         (Recipe((8, 16)), np.zeros((4, 7, 20), np.uint8), "20x7 is smaller than the .* 16x8"),
+        (Recipe((8, 16), raw=(20, 40)), np.zeros((4, 40, 20), np.uint8), "20x40 .* 40x20: turn it"),
         (Recipe((8, 16)), np.full((4, 20, 40), 1.5), "pictures of float64 .*: give .n, height"),
         (Recipe((8, 16)), np.zeros((4, 20, 40, 2), np.uint8), r"uint8 \(20, 40, 2\) given"),
         (Recipe((8, 16)), np.zeros((20, 40), np.uint8), r"pictures of uint8 \(40,\) given"),
@@ -171,7 +174,8 @@ def test_numbers_of_any_type_are_taken_and_kept_in_their_range() -> None:
 @pytest.mark.parametrize(
     "text",
     ["x", "[]", "{}", '{"shape": 3}', '{"shape": [2], "fit": "no"}', '{"shape": ["a"]}',
-     '{"shape": [2], "range": [1]}', '{"shape": [2], "range": 3}', '{"shape": [2], "fields": 3}'],
+     '{"shape": [2], "raw": [3]}', '{"shape": [2], "range": [1]}',
+     '{"shape": [2], "range": 3}', '{"shape": [2], "fields": 3}'],
 )  # fmt: skip
 def test_a_recipe_that_is_none_is_damage(text: str, tmp_path: Path) -> None:
     save_modules(tmp_path / "modules.npz", [module_of(Recipe((2,)), (2,))])

@@ -162,9 +162,9 @@ def say_about(source: FrameSource) -> None:
         warn(warning)
     for note in getattr(source, "notes", ()):
         tell(note)
-    for name, shape in getattr(source, "shapes", {}).items():
-        if "," in shape:  # not the image itself
-            tell(f"{name}: {shape}")
+    for name, framing in zip(source.spec.streams, getattr(source, "framings", ()), strict=False):
+        if "," in str(framing):  # not the image itself
+            tell(f"{name}: {framing}")
     what = "images" if source.spec.images else "messages"
     for name, counts in getattr(source, "alignment", {}).items():
         tell(

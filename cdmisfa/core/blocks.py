@@ -16,6 +16,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import as_array
 from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time_of, times_of
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.shown import ShownSource
@@ -384,15 +385,3 @@ def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
         return array
     array.setflags(write=False)
     return array
-
-
-def as_array(frames: Any) -> NDArray[Any]:
-    """What a user gave as frames, as an array.
-
-    Raises:
-        UsageError: its rows differ in length.
-    """
-    try:
-        return np.asarray(frames)
-    except ValueError as error:
-        raise UsageError("frames of unequal length given: give an array of them") from error

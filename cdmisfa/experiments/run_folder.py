@@ -121,9 +121,12 @@ def with_recipes(
         described = source.origin()
 
     def recipe(stream: int) -> Recipe:
+        from replay.arrays import ArrayLog
         from replay.camera_logs.source import ForeignSource
 
         own = Recipe.of(described, source.spec.frame_shape, stream)
+        if isinstance(source, ForeignSource | ArrayLog):
+            own = replace(own, raw=getattr(source.framings[stream], "first", ()))
         stated = source.pixels(stream) if isinstance(source, ForeignSource) else ""
         return replace(own, pixels=stated) if stated.startswith("bayer_") else own
 

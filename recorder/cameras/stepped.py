@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from cdmisfa.core.arrays import ByteArray, FloatArray
-from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, as_array, check_request, freeze
+from cdmisfa.core.arrays import ByteArray, FloatArray, as_array
+from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.shown import MOST_STREAMS, beside

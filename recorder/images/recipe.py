@@ -39,6 +39,7 @@ class Recipe:
         range: distances in metres that are black and white, or what numbers are kept within.
         fields: the numbers that were taken, by the names that they had.
         pixels: the format of one colour a pixel that the source has, as bayer_rggb8; "" of others.
+        raw: (height, width) of the source's pictures; empty where it did not say.
     """
 
     shape: tuple[int, ...]
@@ -47,6 +48,7 @@ class Recipe:
     range: Depth | None = None
     fields: tuple[str, ...] = ()
     pixels: str = ""
+    raw: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, described: Mapping[str, Any], shape: tuple[int, ...], stream: int = 0) -> Self:
@@ -89,7 +91,9 @@ class Recipe:
         bounds = recipe.range or ()
         whole = (
             isinstance(recipe.shape, tuple)
-            and all(type(side) is int and side > 0 for side in recipe.shape)
+            and isinstance(recipe.raw, tuple)
+            and len(recipe.raw) in (0, 2)
+            and all(type(side) is int and side > 0 for side in (*recipe.shape, *recipe.raw))
             and recipe.fit in get_args(Fit)
             and isinstance(recipe.color, bool)
             and (recipe.range is None or len(bounds) == 2)
@@ -123,11 +127,11 @@ class Recipe:
         Raises:
             UsageError: these are no such pictures.
         """
+        if self.size is None:
+            return _numbers(pictures, self)
         single = isinstance(pictures, bytes) or not isinstance(pictures, Iterable)
         if single or (isinstance(pictures, np.ndarray) and pictures.ndim < 2):
             raise UsageError(f"one picture or none given: {_PICTURES}")
-        if self.size is None:
-            return _numbers(pictures, self)
         made = [make_frame(picture, self) for picture in pictures]
         return np.stack(made) if made else np.empty((0, *self.shape), np.uint8)
 
@@ -149,7 +153,8 @@ def make_frame(picture: Any, recipe: Recipe) -> Shown:
         The frame, of `recipe.shape`: uint8, or float64 where it is numbers.
 
     Raises:
-        UsageError: it is no such picture, or smaller than a frame.
+        UsageError: it is no such picture, smaller than a frame, or upright where the source's were
+            not.
     """
     if recipe.size is None:
         row: Shown = _numbers([picture], recipe)[0]
@@ -198,6 +203,11 @@ def _image(array: NDArray[Any], recipe: Recipe) -> Shown:
     if known is None or array.ndim not in (2, 3):
         raise UsageError(f"pictures of {array.dtype} {array.shape} given: {_PICTURES}")
     height, width = array.shape[:2]
+    if recipe.raw and (height - width) * (recipe.raw[0] - recipe.raw[1]) < 0:
+        raise UsageError(
+            f"a picture of {width}x{height} given, and those learned from were of "
+            f"{recipe.raw[1]}x{recipe.raw[0]}: turn it, as by np.swapaxes(x, 0, 1), or crop it"
+        )
     little = "<f4" if known == "32FC1" else f"<{kind}"
     data = np.ascontiguousarray(array, little).tobytes()
     return raw_image(data, height, width, known, depth=recipe.range, color=recipe.color)
@@ -210,6 +220,8 @@ def _numbers(rows: Any, recipe: Recipe) -> NDArray[np.float64]:
         numbers = np.asarray(rows)
     except ValueError:  # of several lengths
         numbers = np.asarray("")
+    if numbers.ndim == 1 and recipe.shape == (1,):
+        numbers = numbers[:, None]
     if numbers.shape[1:] != recipe.shape or numbers.dtype.kind not in "biuf":
         names = f" ({', '.join(recipe.fields)})" if recipe.fields else ""
         raise UsageError(

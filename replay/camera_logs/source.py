@@ -74,7 +74,7 @@ class ForeignSource(LoggedSource):
             dropped messages.
         gaps: whether streams lack frames: then `take` gives the next n that follow one another.
         pauses: for each stream the frames [start, stop) of its gaps.
-        shapes: for each stream how an image becomes a frame, in words.
+        framings: for each stream how an image becomes a frame.
         changes: for each stream whose images change their size, or whose numbers are held
             rounded, a line that says so; as soon as one was shown.
         color: whether frames show colours; see `shows_hue` of "auto".
@@ -123,7 +123,7 @@ class ForeignSource(LoggedSource):
                 raise UsageError(
                     f"{self._files[0]}: it holds no distances (16UC1, 32FC1): --range is for these"
                 )
-            self._framings = framings(firsts, options.size, options.fit, color=self.color)
+            self.framings = framings(firsts, options.size, options.fit, color=self.color)
             for stream, rows in enumerate(self._rows):  # refused before anything is written
                 self._frame(stream, int(rows[0]))
         except BaseException:
@@ -131,14 +131,13 @@ class ForeignSource(LoggedSource):
             raise
         self._count = len(self._rows[0])
         names, length = names_of(self._streams), None if loop else self._count
-        shape, dtype = self._framings[0].shape, str(firsts[0].dtype)
+        shape, dtype = self.framings[0].shape, str(firsts[0].dtype)
         self._spec = SourceSpec(names, shape, dtype, (), self._fps, start_ns, length)
         self.gaps = options.gaps == "skip" and any(self._gaps)
         left_out = self._gaps if self.gaps else [[] for _ in self._gaps]
         counted = map(counts, self._times, self._rows, left_out)
         self.alignment = dict(zip(names, counted, strict=True))
         self.pauses = dict(zip(names, self._gaps, strict=True))
-        self.shapes = dict(zip(names, map(str, self._framings), strict=True))
         self._held = [outside(own, self._count) for own in self._gaps]
         self.copies = tuple(copies(self._streams))
         self.warnings = tuple(dict.fromkeys(self._warned()))
@@ -221,7 +220,7 @@ class ForeignSource(LoggedSource):
             step = step_of(times)
             row: dict[str, Any] = {"stream": name, "log": str(images.path), "topic": images.topic}
             row |= {"images": images.count, "rate": 1 / step if step > 0 else None}
-            row |= {"shape": self.shapes[name], "missing": missing(times)}
+            row |= {"shape": str(self.framings[len(rows)]), "missing": missing(times)}
             row |= {"size_changes": self._changes_size(len(rows))}
             row |= {"gaps": [list(gap) for gap in self.pauses[name]], **self.alignment[name]}
             rows.append(row)
@@ -236,7 +235,7 @@ class ForeignSource(LoggedSource):
         """Whether a stream's images change their size; None where only decoding would tell."""
         if not self._spec.images:
             return False
-        images, framing = self._streams[stream], self._framings[stream]
+        images, framing = self._streams[stream], self.framings[stream]
         for row in np.unique(self._rows[stream]).tolist():
             size = images.stated_size(row)
             if size is None:
@@ -253,7 +252,7 @@ class ForeignSource(LoggedSource):
         if any(self._gaps):
             chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
-        if options.fit != "crop" or any(framing.lossy for framing in self._framings):
+        if options.fit != "crop" or any(framing.lossy for framing in self.framings):
             chosen["fit"] = options.fit
         if options.depth is not None:
             chosen["range_metres" if self._spec.images else "range"] = list(options.depth)
@@ -288,7 +287,7 @@ class ForeignSource(LoggedSource):
         if shown is not None and shown[0] == row:
             return shown[1]
         image = self._image(stream, row)
-        framing = self._framings[stream]
+        framing = self.framings[stream]
         if stream not in self.changes:
             images = self._streams[stream]
             change = framing.change(image.shape)
