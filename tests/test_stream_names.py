@@ -13,7 +13,7 @@ from conftest import Cdmisfa
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.core.blocks import stream_name, stream_names
+from cdmisfa.core.names import stream_name, stream_names
 from recorder.cameras.words import live_names
 from replay.runs.modules import load_modules
 

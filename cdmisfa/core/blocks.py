@@ -6,10 +6,7 @@ whichever is watched, as the channels of a television do.
 
 from __future__ import annotations
 
-import itertools
-import re
-import unicodedata
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -18,17 +15,14 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import as_array
 from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time_of, times_of
-from cdmisfa.core.errors import UsageError
-from cdmisfa.core.shown import ShownSource
+from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.shown import MOST, MOST_STREAMS, Shown, beside, curves
 
 UINT8 = np.dtype(np.uint8)
 """The only type whose values are pixels."""
 
 PIXEL = 1.0 / 255.0
 """What one step of a uint8 pixel counts."""
-
-_OF_VIEWS = re.compile(r"(/view/|observation\.images\.)+(?=.)")
-_LONGEST = 64
 
 _TYPES = (np.dtype(np.float64), UINT8)
 
@@ -103,6 +97,15 @@ class SourceSpec:
     def frames_at(self, times: NDArray[Any]) -> Times:
         """The frames nearest to log times, (n,) nanoseconds."""
         return nearest_frames(times, self.fps, self.start_ns)
+
+    def facts(self) -> dict[str, Any]:
+        """What is told of a source in a notebook, by names."""
+        return {
+            "streams": ", ".join(self.streams),
+            "frames": "without end" if self.length is None else self.length,
+            "shape": "x".join(map(str, self.frame_shape)),
+            "rate": f"{self.fps:g} Hz",
+        }
 
 
 @runtime_checkable
@@ -191,7 +194,7 @@ class LongSource(FrameSource, Protocol):
         """What `describe` says, with less of each file where reading all of them takes long."""
 
 
-class ForwardSource(ShownSource, FrameSource):
+class ForwardSource(Shown, FrameSource):
     """A source that holds its spec and its clock, and need not be able to go back.
 
     A class that derives from it sets `_spec`, and `_t` where its first frame is not 0.
@@ -223,6 +226,9 @@ class ForwardSource(ShownSource, FrameSource):
     def __exit__(self, kind: type[BaseException] | None, error: object, at: object, /) -> None:
         self.close()
 
+    def _facts(self) -> Mapping[str, Any]:
+        return self._spec.facts()
+
 
 class ClockedSource(ForwardSource, SeekableSource):
     """A source of which any frame can be shown again, and so needs `take` and `describe` alone."""
@@ -231,6 +237,22 @@ class ClockedSource(ForwardSource, SeekableSource):
         """Move the clock to frame t; see `SeekableSource.seek`."""
         check_frame(t)
         self._t = t
+
+    def _picture(self) -> NDArray[np.uint8] | None:
+        """The next image of each stream, or the next numbers of the first; the clock stays."""
+        start, spec = self._t, self._spec
+        end = None if spec.length is None else getattr(self, "first_frame", 0) + spec.length
+        count = 1 if spec.images else MOST if end is None else min(end - start, MOST)
+        blocks = []
+        try:
+            for stream in range(min(len(spec.streams), MOST_STREAMS) if spec.images else 1):
+                self.seek(start)
+                blocks.append(self.take(stream, count).frames)
+        except (LogExhaustedError, ValueError):  # nothing is left
+            return None
+        finally:
+            self.seek(start)
+        return beside([block[0] for block in blocks]) if spec.images else curves(blocks[0][:, :8])
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,31 +294,6 @@ def description(
             f"{type(source).__name__} does not state what it is: give its describe() a kind, a text"
         )
     return described
-
-
-def stream_name(said: str) -> str:
-    """The name of a stream, valid as one of a file, from what a log or a camera calls it.
-
-    The topic /cam/left is cam_left. A view has its own name also where it is a topic (/view/left)
-    or a column of a dataset (observation.images.left). Letters lose their accents, those of other
-    scripts stay.
-    """
-    letters = unicodedata.normalize("NFKD", _OF_VIEWS.sub("", said))
-    bare = "".join(c for c in letters if not unicodedata.combining(c))
-    return re.sub(r"[^\w.-]+", "_", bare).strip("._-")[:_LONGEST].rstrip("._-") or "stream"
-
-
-def stream_names(said: Iterable[str]) -> tuple[str, ...]:
-    """`stream_name` of each stream, distinct: a number behind those like an earlier one, as cam-2.
-
-    One with which an earlier one begins, as cam after cam-left, counts as like it.
-    """
-    found: list[str] = []
-    for name in map(stream_name, said):
-        like = sum(other == name or other.startswith(f"{name}-") for other in found)
-        numbered = (f"{name}-{number}" for number in itertools.count(like + 1))
-        found.append(next(n for n in numbered if n not in found) if like else name)
-    return tuple(found)
 
 
 def check_request(spec: SourceSpec, stream: int, n: int) -> None:

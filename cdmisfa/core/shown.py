@@ -7,22 +7,16 @@ import html
 import io
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from cdmisfa.core.errors import LogExhaustedError
-
-if TYPE_CHECKING:
-    from cdmisfa.core.blocks import SeekableSource, SourceSpec
 
 WIDTH = 480
 """Most pixels across of a picture, as a rule."""
 
 ROW = 24
 """Pixels of the height of a row in a picture."""
-
 
 MOST = 200
 """Frames of numbers that a picture shows."""
@@ -81,45 +75,6 @@ def curves(values: NDArray[Any]) -> NDArray[np.uint8]:
         shade = 160 * i // values.shape[1]
         picture[np.interp(across, places, heights).astype(int), across] = shade
     return picture
-
-
-def facts_of(spec: SourceSpec) -> dict[str, Any]:
-    """What is told of a source, by names."""
-    return {
-        "streams": ", ".join(spec.streams),
-        "frames": "without end" if spec.length is None else spec.length,
-        "shape": "x".join(map(str, spec.frame_shape)),
-        "rate": f"{spec.fps:g} Hz",
-    }
-
-
-def next_shown(source: SeekableSource) -> NDArray[np.uint8] | None:
-    """The next image of each stream, or the next numbers of the first; the clock stays."""
-    start, spec = source.t, source.spec
-    end = None if spec.length is None else getattr(source, "first_frame", 0) + spec.length
-    count = 1 if spec.images else MOST if end is None else min(end - start, MOST)
-    blocks = []
-    try:
-        for stream in range(min(len(spec.streams), MOST_STREAMS) if spec.images else 1):
-            source.seek(start)
-            blocks.append(source.take(stream, count).frames)
-    except (LogExhaustedError, ValueError):  # nothing is left
-        return None
-    finally:
-        source.seek(start)
-    return beside([block[0] for block in blocks]) if spec.images else curves(blocks[0][:, :8])
-
-
-class ShownSource(Shown):
-    """A source of frames, with a picture of what comes next where it can go back to it."""
-
-    def _facts(self) -> Mapping[str, Any]:
-        source: Any = self
-        return facts_of(source.spec)
-
-    def _picture(self) -> NDArray[np.uint8] | None:
-        source: Any = self
-        return next_shown(source) if hasattr(source, "seek") else None
 
 
 def weights(values: NDArray[np.float64]) -> NDArray[np.uint8]:

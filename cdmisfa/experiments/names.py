@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from cdmisfa.core.blocks import SourceSpec, stream_names
+from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.learning import LearnerState
+from cdmisfa.core.names import stream_names
 
 
 def same_names(then: Sequence[str], now: Sequence[str]) -> bool:

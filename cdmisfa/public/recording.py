@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import did_you_mean
-from cdmisfa.core.shown import Shown, facts_of
+from cdmisfa.core.shown import Shown
 from cdmisfa.experiments.resume import CAMERAS
 from cdmisfa.experiments.sources import open_logs
 from cdmisfa.public.shown import view
@@ -143,7 +143,7 @@ class Recording(Shown):
         view(self, [Path(word) for word in self.words], save, tab=tab, cameras=self._options)
 
     def _facts(self) -> Mapping[str, Any]:
-        return {"recording": ", ".join(self.words) or "arrays", **facts_of(self.spec)}
+        return {"recording": ", ".join(self.words) or "arrays", **self.spec.facts()}
 
     def _picture(self) -> NDArray[np.uint8] | None:
         with self.source() as source:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
-from cdmisfa.core.blocks import FrameSource, stream_names
+from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import stream_names
 from cdmisfa.core.registry import Registry
 from recorder.cameras.options import LiveOptions
 from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, Reading

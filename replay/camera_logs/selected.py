@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import IntArray
-from cdmisfa.core.blocks import stream_name, stream_names
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.names import stream_name, stream_names
 from recorder.images.options import VIDEO_RECIPE, Size
 from recorder.images.pixels import DISTANCES, Shown
 from recorder.images.videos import VideoPackets

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from cdmisfa.core.blocks import Block, stream_names
+from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.names import stream_names
 from recorder.images.videos import pyav
 from replay.inputs import Logged
 from replay.recordings.view_file import intersection

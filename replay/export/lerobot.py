@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import stream_names
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import stream_names
 from replay.export.frames import pieces, pixel_format, shared_spans, write_film
 from replay.inputs import Logged
 from replay.stored import Span

@@ -270,7 +270,7 @@ def places(
 
 
 def _named(out: Path, form: str | None, logs: Sequence[str]) -> list[Path]:
-    from cdmisfa.core.blocks import stream_name
+    from cdmisfa.core.names import stream_name
 
     ending = out.suffix.lower().removeprefix(".")
     if ending in OF_FILES and not out.is_dir():
