@@ -43,7 +43,7 @@ _TRIES: Final = 5
 _AGAIN: Final = 0.2
 """Seconds before each."""
 
-_HEADER: Final = struct.Struct("<BIQ")
+HEADER: Final = struct.Struct("<BIQ")
 """Header of a message: opcode, subscription, log time in nanoseconds."""
 
 # What its threads meet is also raised here: nobody reads it twice, with a traceback.
@@ -123,14 +123,14 @@ class FoxgloveCamera:
                     tries -= 1
                     time.sleep(_AGAIN)
                     connection.send(subscribe)
-                if not isinstance(message, bytes) or len(message) < _HEADER.size:
+                if not isinstance(message, bytes) or len(message) < HEADER.size:
                     continue
-                what, subscription, log_time = _HEADER.unpack_from(message)
+                what, subscription, log_time = HEADER.unpack_from(message)
                 if (what, subscription) != (_DATA, _SUBSCRIPTION):
                     continue
                 tries = 0
                 age = steady.age(time.monotonic(), log_time / NANOSECONDS if log_time else None)
-                data = message[_HEADER.size :]
+                data = message[HEADER.size :]
                 if self.distances is None and not self._reading.fields:
                     stated = stated_format(kind.schema, kind.encoding, data)
                     self.distances = stated in DISTANCES
