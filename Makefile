@@ -7,7 +7,7 @@ KERNELS := $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/kernels/b*.py)
 SANITIZED := build/sanitized
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
 
-.PHONY: demo test suite lint bench pictures fuzz torture attacks sanitized clean install
+.PHONY: demo test suite lint bench docs pictures fuzz torture attacks sanitized clean install
 
 demo: $(INSTALLED)
 	$(BIN)/cdmisfa demo --jobs 2
@@ -25,6 +25,10 @@ lint: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python -m benchmarks
+
+# The site, in build/site: its tutorials are executed, and nothing is fetched.
+docs: $(INSTALLED)
+	$(BIN)/sphinx-build -W -b html docs build/site
 
 pictures: $(INSTALLED)
 	$(BIN)/python docs/images/draw.py

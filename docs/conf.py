@@ -1,0 +1,116 @@
+"""How Sphinx makes the site of the pages in this folder: `make docs`."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import socket
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import cdmisfa
+from replay.viewer.program import running
+from replay.viewer.web import HOST, POLICY, page_server
+
+project = "cdmisfa"
+author = copyright = "the maintainers of cdmisfa"
+version = release = metadata.version("cdmisfa")
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_click",
+    "sphinx_copybutton",
+]
+html_theme = "furo"
+html_favicon = "images/icon.svg"
+html_title = f"cdmisfa {release}"
+html_show_sourcelink = False
+smartquotes = False
+myst_heading_anchors = 4
+napoleon_use_ivar = True
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+
+# Tutorials run `cdmisfa` as a shell does, in a folder of their own beside the sample logs.
+_folder = tempfile.TemporaryDirectory()
+(Path(_folder.name) / "sample_logs").symlink_to(Path(__file__).parents[1] / "sample_logs")
+os.environ["CDMISFA_TUTORIALS"] = _folder.name
+os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+
+VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
+
+
+def words_as_written(*event: Any) -> None:
+    """Docstrings and help are text, not reStructuredText: stars and underscores are themselves."""
+    lines, code = event[-1], False
+    for at, line in enumerate(lines):
+        code = code and (not line or line[0] == " ")
+        if code:
+            continue
+        words = re.split(r"(`+[^`]+`+)", line)
+        words[::2] = [re.sub(r"\*|_(?=\W|$)", r"\\\g<0>", word) for word in words[::2]]
+        words[1::2] = [f"``{word.strip('`')}``" for word in words[1::2]]
+        lines[at] = "".join(words)
+        if line.endswith(":") and lines[at + 1 : at + 2] == [""] and lines[at + 2][:1] == " ":
+            lines[at], code = lines[at] + ":", True
+
+
+def readme_is_the_first_page(app: Any, name: str, text: list[str]) -> None:
+    text[0] = text[0].replace("](../README.md)", "](index.md)")
+
+
+def add_the_viewer(app: Any, failure: Exception | None) -> None:
+    """Put Rerun's page beside the runs, with a policy by which it asks nobody else."""
+    folder = Path(app.outdir) / "_static" / "viewer"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    with socket.socket() as free:
+        free.bind((HOST, 0))
+        port = free.getsockname()[1]
+    with running(page_server(port)):
+        for file in VIEWER:
+            (folder / file).write_bytes(
+                _fetched(f"http://{HOST}:{port}/{file.replace('index.html', '')}")
+            )
+    page = (folder / "index.html").read_text("utf-8")
+    opened = (
+        'location.search || history.replaceState(null, "", "?url=" + '
+        'encodeURIComponent(new URL("run.rrd", location)))'
+    )
+    policy = (
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}"><script>{opened}</script>'
+    )
+    (folder / "index.html").write_text(page.replace("<head>", f"<head>{policy}", 1), "utf-8")
+    run = cdmisfa.learn(_folder.name + "/sample_logs/icub", algorithm="progress", loop=True)
+    run.view(folder / "run.rrd")
+    run.report(folder / "report.html")
+
+
+def _fetched(address: str) -> bytes:
+    for _ in range(200):
+        try:
+            with urllib.request.urlopen(address) as answer:
+                return bytes(answer.read())
+        except ConnectionError:
+            time.sleep(0.1)
+        except urllib.error.URLError:
+            time.sleep(0.1)
+    raise OSError(f"{address} does not answer")
+
+
+def setup(app: Any) -> None:
+    app.connect("autodoc-process-docstring", words_as_written, priority=100)
+    for part in ("description", "arguments", "options", "epilog"):
+        app.connect(f"sphinx-click-process-{part}", words_as_written)
+    app.connect("source-read", readme_is_the_first_page)
+    app.connect("build-finished", add_the_viewer)
