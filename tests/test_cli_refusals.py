@@ -82,7 +82,7 @@ CASES: dict[str, tuple[str, ...]] = {
         f"{words} -o x.mcap": ("x.mcap: a folder is written, name it without .mcap",)
         for words in ("record oscillatory", "learn oscillatory", "convert LOGS", "sweep REC")
     },
-    "view x --at 3": ("--screenshot",),
+    "view x --at 3 --save x.rrd": ("--at without --save",),
     # a scene is one, and has no options of cameras
     "learn oscillatory icub": (ONE,),
     "learn here oscillatory": (ONE,),

@@ -20,7 +20,7 @@ from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view
 from replay.view.columns import Column, Target
-from replay.viewer.headless import frame_at
+from replay.viewer.moments import frame_at
 
 ITERATIONS, TAU, EVERY = 15, 40, 20
 GAP_AFTER, GAP = 4, 95

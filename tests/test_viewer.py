@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
@@ -23,7 +24,8 @@ from replay.view import panels
 from replay.view.bindings import viewer_program
 from replay.view.build import build_view, view_of
 from replay.viewer import headless, program, window
-from replay.viewer.headless import frame_at
+from replay.viewer.catalogue import served_moment
+from replay.viewer.moments import frame_at
 from replay.viewer.program import (
     check_limit,
     environment,
@@ -31,6 +33,7 @@ from replay.viewer.program import (
     private_host,
     run_program,
 )
+from replay.viewer.steered import Steered, is_painted
 
 ITERATIONS = 24
 
@@ -136,7 +139,7 @@ def test_a_screenshot_of_a_tab_at_an_event(tmp_path, monkeypatch):
         opened = viewer.ask(lambda client: client.get_blueprint()).blueprint
         seen.append((state.recordings[0].current_time, opened))
 
-    monkeypatch.setattr(headless.HeadlessViewer, "draw", look)
+    monkeypatch.setattr(headless.Steered, "draw", look)
     monkeypatch.setattr(headless, "SETTLE", 0.5)
     headless.screenshot(tmp_path, tmp_path / "s.png", at="iteration 5", tab="gate")
     ((time_then, blueprint),) = seen
@@ -146,6 +149,44 @@ def test_a_screenshot_of_a_tab_at_an_event(tmp_path, monkeypatch):
     tabs = max(kinds, key=lambda part: len(part["contents"]) * (part["container_kind"] == "Tabs"))
     opened = blueprint[f"/{tabs['active_tab']}"]["ContainerBlueprint"]["display_name"]
     assert (time_then, opened) == (records[5].t, "Gate")
+
+
+@needs_driver
+def test_a_window_opens_at_a_moment(tmp_path, monkeypatch):
+    """A window without a screen; it ends once it has said where its cursor stands."""
+    records = write_run(tmp_path / "run.mcap", VECTOR, 12)
+    run, go_to, seen = window.run_program, window._go_to, []
+
+    def without_a_screen(words, *more):
+        run(["--headless", *words], *more)
+
+    def look(frame, viewer, place):
+        go_to(frame, viewer, place)
+        seen.append(Steered(viewer, place).ask(lambda client: client.get_state()))
+        viewer.terminate()
+
+    monkeypatch.setattr(window, "has_display", lambda: True)
+    monkeypatch.setattr(window, "run_program", without_a_screen)
+    monkeypatch.setattr(window, "_go_to", look)
+    with pytest.raises(CdmisfaError, match="ended with code -15"):
+        window.open_window(tmp_path, at="iteration 5")
+    assert seen[0].recordings[0].current_time == records[5].t
+
+
+@needs_driver
+def test_a_page_opens_at_a_moment(tmp_path):
+    """Its link, in a viewer without a browser, with the tabs of the view."""
+    records = write_run(tmp_path / "run.mcap", VECTOR, 12)
+    with (
+        view_of(tmp_path, 10, None, "Gate") as view,
+        served_moment(view, records[5].t) as (_, page),
+        headless.headless_viewer() as viewer,
+    ):
+        (link,) = parse_qs(urlsplit(page).query)["url"]
+        viewer.ask(lambda client: client.open(link))
+        shown = viewer.ask(lambda client: is_painted(client.get_state()) and client.get_state())
+        assert shown.recordings[0].current_time == records[5].t
+        assert "Verdict on each block: the last 50 blocks" in {one.name for one in shown.views}
 
 
 def test_a_moment_is_a_frame_an_iteration_or_an_event(cdmisfa: Cdmisfa, tmp_path):

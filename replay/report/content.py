@@ -350,4 +350,4 @@ def _events(told: RunTold) -> Iterator[dict[str, str]]:
 
 def _look(told: RunTold, when: str) -> str:
     """The command that shows a moment."""
-    return command("view", told.path, "--screenshot", "moment.png", "--at", when)
+    return command("view", told.path, "--at", when)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import VIEW_FILE, run_log, runs_in
@@ -108,12 +108,9 @@ def served_table(folder: Path, port: int | None = None) -> Iterator[Table | None
     runs = runs_in(folder)
     if not runs:
         raise UsageError(f"{folder} holds no runs: sweep with --keep-logs")
-    host = private_host()
-    port = free_port(host, port or 0)  # else whoever has it might be asked instead of the server
-    address = f"rerun+http://{host}:{port}"
     with (
         tempfile.TemporaryDirectory(prefix="cdmisfa-runs-") as place,
-        running(["server", "--host", host, "--port", str(port)]) as server,
+        _server(port) as (server, address),
     ):
         files = write_rows(runs, Path(place))  # while the server starts
         dataset = _created(address, _dataset_name(folder), server)
@@ -158,7 +155,7 @@ def serve_catalogue(
             return
         shown = f"{table.rows} runs at {table.address}    look at them: rerun {table.address}"
         if web:
-            page = opened.enter_context(_served_page(table.address, port))
+            page = opened.enter_context(_page_that_shows(table.address, port))
             shown = f"{table.rows} runs at {page}"
         tell(shown)
         if has_display() and not web:
@@ -176,14 +173,55 @@ def serve_catalogue(
 
 
 @contextlib.contextmanager
-def _served_page(table: str, port: int | None) -> Iterator[str]:
-    """Serve the viewer's page to show a table in it, and give its address."""
-    viewer_port, place = free_port(), table.removeprefix("rerun+").partition("/entry/")[0]
+def served_moment(view: Path, frame: int, port: int | None = None) -> Iterator[tuple[Program, str]]:
+    """Serve a view to a browser that opens it at a frame, while the body runs.
+
+    A file of Rerun's has no place for a moment; a link to what its server has, does.
+
+    Args:
+        view: an .rrd file, which stays there.
+        frame: where the time cursor stands.
+        port: where the page is served; by default at a free one.
+
+    Yields:
+        The server, and the address of the page.
+
+    Raises:
+        CdmisfaError: the port is taken, or the server refuses the view or ended.
+    """
+    from replay.view.columns import FRAME  # imports the package
+
+    with _server() as (server, address):
+        dataset = _created(address, _dataset_name(view.with_suffix("")), server)
+        refused = {} if dataset is None else _register(dataset, [view], ROWS)
+        if dataset is None or refused:
+            why = server.last_words() if dataset is None else refused[view]
+            raise CdmisfaError(f"{view} is not served: {why}")
+        _set_layout(dataset, view)
+        shown = f"dataset/{dataset.entry_details().id}?segment_id={quote(_identity(view))}"
+        link = f"{address}/{shown}#when={FRAME}@{frame}"
+        with _page_that_shows(link, port) as page:
+            yield server, page
+
+
+@contextlib.contextmanager
+def _server(port: int | None = None) -> Iterator[tuple[Program, str]]:
+    """A server of runs, and its address, while the body runs."""
+    host = private_host()
+    port = free_port(host, port or 0)  # else whoever has it might be asked instead of the server
+    with running(["server", "--host", host, "--port", str(port)]) as server:
+        yield server, f"rerun+http://{host}:{port}"
+
+
+@contextlib.contextmanager
+def _page_that_shows(link: str, port: int | None) -> Iterator[str]:
+    """Serve the viewer's page to show what a server of runs has, and give its address."""
+    viewer_port, place = free_port(), f"http://{urlsplit(link).netloc}"
     with (
         running(page_server(viewer_port)),
         served(page_of(viewer_port, data=place), port) as address,
     ):
-        yield f"{address}?url={quote(table, safe='')}"
+        yield f"{address}?url={quote(link, safe='')}"
 
 
 def _created(address: str, name: str, server: Program) -> Any:
@@ -231,8 +269,15 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
     streams, file = outline.streams(MOST_STREAMS), place / "layout.rbl"
     shown = world_tab(outline.header, world_of_run(outline.header, runs[most])[0], streams)
     run_layout(outline, shown, tab=tab).save(APPLICATION, str(file))
+    _set_layout(dataset, file)
+
+
+def _set_layout(dataset: Any, file: Path) -> None:
+    """Make the layout in a file that in which every run opens."""
     layouts = dataset.blueprint_dataset()
-    (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
+    (segment,) = layouts.register([file.resolve().as_uri()], [ROWS], "replace").wait(
+        REGISTER_SECONDS
+    )
     dataset.set_default_blueprint_segment_id(segment)
 
 

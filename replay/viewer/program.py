@@ -143,17 +143,23 @@ def running(
             raise CdmisfaError(f"the viewer ended with code {code}: {process.last_words()}")
 
 
-def run_program(arguments: Sequence[str], given: BinaryIO | None = None) -> None:
+def run_program(
+    arguments: Sequence[str],
+    given: BinaryIO | None = None,
+    begun: Callable[[Program], None] = lambda process: None,
+) -> None:
     """Run the viewer, or its server, until it ends; an interrupt ends it and is passed on.
 
     Args:
         arguments: of the program.
         given: its standard input.
+        begun: called with it once it runs.
 
     Raises:
         CdmisfaError: it ended with an error, whose last words are given.
     """
     with running(arguments, given) as process:
+        begun(process)
         process.wait()
 
 

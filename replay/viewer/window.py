@@ -13,7 +13,10 @@ from typing import BinaryIO
 from cdmisfa.core.errors import CdmisfaError
 from replay.inputs import About
 from replay.view.build import view_of
+from replay.viewer.catalogue import served_moment
+from replay.viewer.moments import frame_at
 from replay.viewer.program import (
+    Program,
     check_limit,
     check_window,
     free_port,
@@ -23,12 +26,14 @@ from replay.viewer.program import (
     running,
     tell,
 )
+from replay.viewer.steered import Steered
 from replay.viewer.web import page_of, page_server, pieces_of, served, shown_at
 
 
 def open_window(
     path: Path,
     *,
+    at: str | None = None,
     every: int = 10,
     all_views: Path | None = None,
     tab: str | None = None,
@@ -36,20 +41,35 @@ def open_window(
     size: str | None = None,
     about: About = lambda source: None,
 ) -> None:
-    """Show a run or recording in the viewer, until its window is closed.
+    """Show a run or recording in the viewer, at a moment (`frame_at`), until its window is closed.
 
     Raises:
-        UsageError: no such limit of memory, size or tab.
+        UsageError: no such limit of memory, size, tab or moment.
         CdmisfaError: there is no display, or the viewer ended with an error.
     """
     check_limit(memory_limit)
     window = [] if size is None else ["--window-size", check_window(size)]
     if path.exists():  # a wrong path is said first, below
         refuse_without_display()
+    frame = None if at is None else frame_at(path, at)
     with _opened(path, every, all_views, tab, about) as (name, view):
         host = private_host()
-        place = ("--bind", host, "--port", str(free_port(host)))
-        run_program([name, *place, *window, "--memory-limit", memory_limit], view)
+        port = str(free_port(host))
+        place = ("--bind", host, "--port", port)
+        arguments = [name, *place, *window, "--memory-limit", memory_limit]
+        if frame is None:
+            run_program(arguments, view)
+        else:
+            run_program(arguments, view, lambda viewer: _go_to(frame, viewer, f"{host}:{port}"))
+
+
+def _go_to(frame: int, viewer: Program, place: str) -> None:
+    """Put the time cursor of a window on a frame; that it was closed meanwhile is no error."""
+    try:
+        Steered(viewer, place).go_to(frame)
+    except CdmisfaError as error:
+        if viewer.poll() is None:
+            tell(f"frame {frame} is not shown: {error}")
 
 
 def refuse_without_display() -> None:
@@ -68,6 +88,7 @@ def refuse_without_display() -> None:
 def serve(
     path: Path,
     *,
+    at: str | None = None,
     every: int = 10,
     all_views: Path | None = None,
     tab: str | None = None,
@@ -77,15 +98,22 @@ def serve(
 ) -> None:
     """Serve the viewer and a run to browsers on this machine, until interrupted.
 
-    Prints the address on stderr.
+    Prints the address on stderr. With a moment (`frame_at`) it opens there.
 
     Raises:
-        UsageError: no such limit of memory.
+        UsageError: no such limit of memory or moment.
         CdmisfaError: the server ended with an error.
     """
     check_limit(memory_limit)
     viewer_port = free_port()
     with contextlib.ExitStack() as opened:
+        if at is not None:
+            frame = frame_at(path, at)
+            moment = opened.enter_context(view_of(path, every, all_views, tab, about))
+            server, address = opened.enter_context(served_moment(moment, frame, port))
+            tell(address)
+            server.wait()
+            return
         name, file = opened.enter_context(_opened(path, every, all_views, tab, about))
         view = file or opened.enter_context(open(name, "rb"))
         page = page_of(viewer_port, lambda: pieces_of(view))

@@ -26,7 +26,7 @@ from replay.camera_logs.options import CameraOptions
 @word(
     "--at",
     "WHEN",
-    'Moment of the screenshot: a frame, "iteration 500", or words of an event, as "module 2".',
+    'Moment to open it at: a frame, "iteration 500", or words of an event, as "module 2".',
 )
 @word("--tab", "NAME", "Name of the open tab; by default the first.")
 @word("--size", "WxH", "Size of the window or screenshot, as 1600x1000.")
@@ -73,8 +73,8 @@ def view_command(
     """
     if sum((save is not None, web, screenshot is not None)) > 1:
         raise click.UsageError("choose one of --save, --web and --screenshot")
-    if at is not None and screenshot is None:
-        raise click.UsageError("--at goes with --screenshot")
+    if at is not None and save is not None:
+        raise click.UsageError("a file of Rerun has no place for a moment: --at without --save")
     if size is not None and (web or save is not None):
         raise click.UsageError("--size goes with a window or --screenshot")
     from replay.runs.folders import is_sweep, runs_in
@@ -115,9 +115,9 @@ def view_command(
             draw(path, screenshot, at=at, force=force, window=size or WINDOW, **shown)
             tell(f"picture {screenshot}")
         elif web:
-            serve(path, memory_limit=memory_limit, port=port, **shown)
+            serve(path, at=at, memory_limit=memory_limit, port=port, **shown)
         else:
-            open_window(path, memory_limit=memory_limit, size=size, **shown)
+            open_window(path, at=at, memory_limit=memory_limit, size=size, **shown)
 
 
 def _view_sweep(
