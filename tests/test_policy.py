@@ -100,6 +100,36 @@ def test_where_it_starts_does_not_matter(
     )
 
 
+def lstd_q(
+    samples: list[tuple[int, int, float, int]], policy: np.ndarray, gamma: float
+) -> np.ndarray:
+    """LSTD-Q (Lagoudakis and Parr 2003) with an indicator feature of each pair (s, a), (n, 2)."""
+    features = np.eye(ACTIONS * len(policy)).reshape(len(policy), ACTIONS, -1)
+    A, b = np.zeros((ACTIONS * len(policy),) * 2), np.zeros(ACTIONS * len(policy))
+    for s, a, reward, to in samples:
+        A += np.outer(features[s, a], features[s, a] - gamma * features[to, policy[to]])
+        b += features[s, a] * reward
+    return np.linalg.solve(A, b).reshape(-1, ACTIONS)
+
+
+@settings(deadline=None)
+@given(st.integers(2, 7), st.sampled_from([0.5, 0.9, 0.99]), st.integers(0, 2**32 - 1))
+def test_policy_iteration_is_lspi_with_indicator_features(n: int, gamma: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R = rng.standard_normal((n, ACTIONS, n))
+    ways = [(s, int(s != to), to) for s in range(n) for to in range(n)]
+    times = {(s, a): rng.integers(1, 4) for s in range(n) for a in range(ACTIONS)}
+    samples = [(s, a, R[s, a, to], to) for s, a, to in ways for _ in range(times[s, a])]
+    stay, switch = np.diagonal(R[:, 0]).copy(), R[:, 1].sum(axis=1) - np.diagonal(R[:, 1])
+    start = rng.integers(0, 2, n)
+    policy, Q = solve(stay, switch, 1, gamma, start)
+    expected = lstd_q(samples, policy, gamma)
+    np.testing.assert_allclose(Q, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    for _ in range(20):
+        start = lstd_q(samples, start, gamma).argmax(axis=1)
+    assert policy.tolist() == start.tolist()
+
+
 def test_one_stream_stays() -> None:
     policy, Q = solve(np.array([3.0]), np.array([9.0]), 2, 0.5, np.array([1]))
     assert policy.tolist() == [0]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -11,14 +13,16 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 
+from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import versions
+from cdmisfa.experiments.results import mean_interval
 from cdmisfa.experiments.trial import run_trial
-from cdmisfa.studies.paper import difficulty, icub, nonstationary, oscillatory
-from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Trial
+from cdmisfa.studies.paper import ablation, difficulty, icub, nonstationary, oscillatory, scenes
+from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Trial, groups
 from cdmisfa.studies.paper.oscillatory import Oscillatory, paper_config
-from cdmisfa.studies.paper.reproduce import markdown_table, reproduce
+from cdmisfa.studies.paper.reproduce import reproduce
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
 
@@ -45,7 +49,9 @@ def judged(experiment: Experiment, trials: list[Trial]) -> Findings:
     return found
 
 
-@pytest.mark.parametrize("name", ["oscillatory", "five", "stability", "costs", "difficulty"])
+@pytest.mark.parametrize(
+    "name", ["oscillatory", "five", "stability", "costs", "ablation", "difficulty"]
+)
 def test_quick_runs_reproduce_the_claim_and_write_everything(
     name: str, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
@@ -56,8 +62,8 @@ def test_quick_runs_reproduce_the_claim_and_write_everything(
     assert document["reproduced"] is True
     assert json.loads((folder / "results.json").read_text()) == document
     assert document["versions"] == versions()
-    assert (folder / "table.md").read_text().startswith("| quantity | paper | ours |")
-    drawn = set() if name in ("five", "costs") else {".png", ".svg"}
+    assert (folder / "table.md").read_text().startswith("| ")
+    drawn = set() if name in ("five", "costs", "ablation") else {".png", ".svg"}
     assert {Path(f).suffix for f in document["figures"]} == drawn
     assert all((folder / figure).stat().st_size > 1000 for figure in document["figures"])
     parquet = pytest.importorskip("pyarrow.parquet")
@@ -65,8 +71,10 @@ def test_quick_runs_reproduce_the_claim_and_write_everything(
 
 
 def test_a_change_is_followed_early_and_not_late(tmp_path: Path) -> None:
-    document = reproduce("nonstationary", Request(1, True, None, tmp_path))
-    assert [claim["holds"] for claim in document["claims"][:2]] == [True, True]
+    document = reproduce("nonstationary", Request(2, True, None, tmp_path))
+    assert document["claims"][1]["holds"]
+    by_sigma = [row[2] for row in document["tables"][0]["rows"]]
+    assert by_sigma[0] == "above 0.86"
 
 
 def test_finished_trials_are_kept_and_the_page_shows_table_and_figures(
@@ -142,91 +150,139 @@ def test_a_trial_that_breaks_or_is_damaged_is_named(
     monkeypatch.setattr(oscillatory.Stability, "run", broken)
     done = cdmisfa("reproduce", "stability", "--trials", 1, "-o", tmp_path / "other")
     assert done.code == 1
-    assert "'seed': 0}: it broke; the others are kept" in done.err
+    assert "'seed': 28000}: it broke; the others are kept" in done.err
+
+
+OTHERS: dict[str, Any] = {
+    "nu": 0.03, "tau": 50, "sigma": 0.005, "delta": 1e-5, "beta": 0.1, "components": 4,
+    "outputs": 2, "expansion": "none",
+    "epsilon_start": 0.9, "epsilon_decay": 0.99, "epsilon_knee": 0.9,
+    "epsilon_tail_decay": 0.9, "gamma": 0.3, "mean_window": 100, "slowness_window": 60,
+    "eta_dot_window": 20, "gate_window": 5, "warm_up": 40, "min_variance": 10.0,
+    "novel_share": 0.0, "patience": 100, "alpha": 0.5, "roc_centres": 3, "roc_radius": 1.0,
+    "roc_memory": 10, "roc_error": 0.01,
+}  # fmt: skip
+"""Another value of every key."""
 
 
 @pytest.mark.parametrize("algorithm", ["1.0", "2.0"])
-def test_a_key_that_is_not_counted_for_an_algorithm_changes_nothing(algorithm: str) -> None:
-    def learned(*others: str) -> Any:
-        keys = {key: other[key] for key in others}
-        config = paper_config("oscillatory", algorithm=algorithm, warm_up=2, **keys)
-        result = run_trial(config, seed=1, max_iterations=1200, max_modules=2)
-        return [(m.iteration, m.phi.tolist()) for m in result.modules], result.iterations
+def test_the_counted_keys_are_those_that_change_something(algorithm: str) -> None:
+    def learned(**keys: Any) -> Any:
+        config = paper_config("oscillatory", **({"algorithm": algorithm, "warm_up": 2} | keys))
+        result = run_trial(config, seed=1, max_iterations=4000, max_modules=4, curves=True)
+        curves: Any = result.curves
+        modules = [(m.iteration, m.phi.tolist()) for m in result.modules]
+        return modules, {name: curve.tobytes() for name, curve in curves.items()}
 
-    other = {"delta": 1e-5, "gate_window": 5, "alpha": 0.5, "roc_centres": 3, "roc_radius": 1.0}
-    other |= {"roc_memory": 10, "roc_error": 0.01}
+    assert {f.name for f in dataclasses.fields(LearnerConfig)} == {*OTHERS, "algorithm"}
     unchanged = learned()
     assert unchanged[0]
-    assert learned(*set(other) - set(oscillatory.used_keys(algorithm))) == unchanged
-    assert learned(*set(other) & set(oscillatory.used_keys(algorithm))) != unchanged
+    fewer = {"expansion": {"components": 2}}  # there are only two inputs then
+    changing = {
+        key
+        for key, value in OTHERS.items()
+        if learned(**{key: value, **fewer.get(key, {})}) != unchanged
+    }
+    assert changing == set(oscillatory.used_keys(algorithm))
 
 
-def trials_with(midpoints: dict[float, float], rewarded: int = 100) -> list[Trial]:
-    """Ten trials a sigma and epsilon^c, with blocks rewarded before a change at .86 and later."""
+def trials_with(midpoints: dict[float, float], spread: float = 0.0) -> list[Trial]:
+    """A trial a sigma, epsilon^c and each of ten seeds, which turn one after the other."""
     return [
         Trial(
-            {"key": "sigma", "value": sigma, "start": start, "epsilon_c": e, "seed": 0},
+            {"key": "sigma", "value": sigma, "epsilon_c": e, "seed": seed},
             {
-                "policy": nonstationary.NEW if e > midpoint else nonstationary.OLD,
-                "rewarded": rewarded if e <= 0.86 else 0,
+                "policy": nonstationary.NEW
+                if e > midpoint + spread * (seed - 4.5)
+                else nonstationary.OLD,
+                "rewarded": 100 if e <= 0.86 else 0,
             },
             {},
         )
-        for start in nonstationary.STARTS
         for sigma, midpoint in midpoints.items()
         for e in nonstationary.CHANGES
-        for _ in range(10)
+        for seed in range(10)
     ]
 
 
 @pytest.mark.parametrize(
     ("midpoints", "holds"),
     [
-        ({0.008: 2.0, 0.0009: 0.85, 0.0: 0.7}, [True, True, True]),
-        ({0.008: 0.7, 0.0009: 0.85, 0.0: 0.9}, [False, True, False]),
+        ({0.008: 2.0, 0.0009: 0.82, 0.0: 0.7}, [True, True, True, True]),
+        ({0.008: 0.7, 0.0009: 0.82, 0.0: 0.9}, [False, True, True, False]),
+        ({0.008: 0.95, 0.0: 0.88}, [False, True, True, False]),
     ],
 )
-def test_the_order_of_table_1_is_judged(midpoints: dict[float, float], holds: list[bool]) -> None:
+def test_the_order_of_table_1_is_judged_where_enough_was_rewarded(
+    midpoints: dict[float, float], holds: list[bool]
+) -> None:
     found = judged(nonstationary.NonStationary(), trials_with(midpoints))
     assert [claim["holds"] for claim in found.claims] == holds
+    assert "Above 0.86 they are fewer than 30" in found.notes[0]
+    (table,) = found.tables
+    above = [row[2] == "above 0.86" for row in table["rows"]]
+    assert above == [midpoint > 0.86 for midpoint in midpoints.values()]
 
 
-def test_a_change_is_judged_only_after_enough_rewarded_blocks() -> None:
-    experiment = nonstationary.NonStationary()
-    followed = judged(experiment, trials_with({0.008: 0.9, 0.0: 0.7})).claims[0]
-    assert followed["holds"]  # not 1, where 0 came before
-    assert followed["detail"] == "10 of 10 trials with epsilon^c = 0.86"
-    assert not judged(experiment, trials_with({0.008: 0.95, 0.0: 0.88})).claims[0]["holds"]
-    notes = judged(experiment, trials_with({0.008: 0.95, 0.0: 0.7})).notes
-    assert "Above 0.86 they are fewer than 30" in notes[1]
-    assert notes[1].endswith("Epsilon^d lies there at sigma = 0.008.")
+def test_intervals_of_epsilon_d_are_by_seeds() -> None:
+    def interval(spread: float) -> tuple[float, float]:
+        (turn,) = (
+            nonstationary._turn(group)
+            for (sigma,), group in groups(trials_with({0.0: 0.66}, spread), "value").items()
+        )
+        low, high = mean_interval(turn.of_seeds)
+        assert low <= turn.value <= high
+        return low, high
+
+    low, high = interval(0.0)
+    assert high - low < 1e-9
+    low, high = interval(0.02)
+    answers = trials_with({0.0: 0.66}, 0.02)
+    turns = [
+        nonstationary.point_of_no_return([t for t in answers if t.settings["seed"] == seed])
+        for seed in range(10)
+    ]
+    assert high - low == pytest.approx(np.diff(mean_interval(turns))[0], rel=0.35)
 
 
-def test_the_other_start_of_epsilon_has_a_column_of_its_own() -> None:
-    starts = zip(
-        nonstationary.STARTS, ({0.008: 0.9, 0.0: 0.7}, {0.008: 0.8, 0.0: 0.5}), strict=True
-    )
-    trials = [t for s, midpoints in starts for t in trials_with(midpoints) if _start(t) == s]
-    lines = judged(nonstationary.NonStationary(), trials).lines
-    head, _, first, share, *_ = markdown_table(lines).splitlines()
-    assert head.endswith("| n | epsilon from 1.0 |")
-    ours, other = (float(first.split(" | ")[k].split()[0]) for k in (2, 6))
-    assert ours == pytest.approx(0.915, abs=0.02)
-    assert other == pytest.approx(0.815, abs=0.02)
-    assert share.endswith("| - |")
+@pytest.mark.skipif(not SAMPLE.exists(), reason="the sample recording is not there")
+def test_the_icub_trial_keeps_what_its_figures_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(icub, "HELD_OUT", 400)
+    with contextlib.closing(RecordedSource(SAMPLE)) as source:
+        row, arrays = icub.learn_curves(source, paper_config("icub"), seed=0)
+        frames = source.frames - 400
+    assert row["iterations"] == frames // 40
+    assert arrays["eta_dot"].shape == (row["iterations"], 1)
+    assert arrays["shown"].shape == (3, 48, 128)
+    assert not row["streams"]
 
 
-def _start(trial: Trial) -> float:
-    return float(trial.settings["start"])
+def test_a_module_is_judged_by_frames_after_those_it_learned_from() -> None:
+    class Moving(OscillatorySource):
+        @property
+        def spec(self) -> SourceSpec:
+            return dataclasses.replace(super().spec, truth=icub.OBJECTS)
+
+        def take(self, stream: int, n: int) -> Block:
+            block = super().take(stream, n)
+            return dataclasses.replace(block, truth=block.frames[:, ::-1])
+
+    source = Moving()
+    module = run_trial(LearnerConfig(), seed=0, max_modules=1).modules[0]
+    first = dataclasses.replace(module, phi=np.eye(5)[:1])
+    assert icub.follows(first, source, 5000) == [pytest.approx(0, abs=0.2), pytest.approx(1)]
 
 
-def test_the_icub_trial_keeps_what_its_figures_show() -> None:
-    source = OscillatorySource()
-    row, arrays = icub.learn_curves(source, LearnerConfig(), seed=0, iterations=1600)
-    assert row["streams"] == [0, 1, 2]
-    assert row["policies"] == ["011", "101", "110"]
-    assert arrays["eta_dot"].shape == (1600, 1)
-    assert arrays["y1"].shape == (icub.DRAWN,)
+GOOD = {
+    "streams": [0, 2],
+    "policies": ["011", "110"],
+    "saved_at": [600, 1100],
+    "follows": [[0.99, 0.01], [0.02, 0.97]],
+    "curiosity": [0.003, 0.0, 0.001],
+    "reward": [0.004, 0.0, 0.002],
+    "iterations": 1400,
+}
+"""A trial on the iCub as it should be."""
 
 
 def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
@@ -235,31 +291,73 @@ def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
         "Q": np.zeros((50, 3, 2), np.float32),
         "policy": np.zeros((50, 3), np.float32),
         "eta_dot": np.full((50, 1), 0.001, np.float32),
+        "shown": np.zeros((3, 48, 128), np.uint8),
         **{f"{kind}{i}": truth for kind in ("y", "truth") for i in (1, 2)},
     }
-    good = {
-        "streams": [0, 2],
-        "policies": ["011", "110"],
-        "saved_at": [600, 1100],
-        "correlation": [0.99, 0.97],
-        "iterations": 1400,
-    }
-    wrong = good | {"streams": [0, 2, 1], "policies": ["011", "110", "101"]}
+    wrong = GOOD | {"streams": [0, 2, 1], "policies": ["011", "110", "101"]}
+    vain = GOOD | {"follows": [[0.2, 0.01], [0.02, 0.97]]}
     new, old, loose = ({"algorithm": a, "roc_error": error} for a, error in icub.LEARNERS)
-    one = good | {"streams": [0], "policies": ["011"]}
-    trials = [Trial(new, good, arrays), Trial(new, good, arrays)]
-    trials += [Trial(old, one, arrays), Trial(loose, good, arrays)]
+    trials = [Trial(new, GOOD, arrays), Trial(new, GOOD, arrays)]
+    trials += [Trial(old, vain, arrays), Trial(loose, vain, arrays)]
 
     def holds(*more: Trial) -> list[bool]:
         return [c["holds"] for c in judged(icub.Icub(), [*trials, *more]).claims]
 
-    assert holds() == [True, True, True]
-    assert holds(Trial(new, wrong, arrays)) == [True, False, True]
-    assert holds(Trial(old, good, arrays)) == [True, True, False]
-    lines = [x for x in judged(icub.Icub(), trials).lines if x["quantity"].startswith("1.0")]
-    learned = [line["mean"] for line in lines if "correlation" not in line["quantity"]]
-    assert learned == [1.0, 0.0, 2.0, 1.0]  # modules and both in order, of each threshold
-    assert len(icub.Icub().draw(trials, tmp_path)) == 4
+    assert holds() == [True] * 6
+    assert holds(Trial(new, wrong, arrays)) == [True, True, False, True, True, True]
+    assert holds(Trial(new, vain, arrays)) == [True, False, True, True, True, True]
+    assert not holds(Trial(old, GOOD, arrays), Trial(old, GOOD, arrays))[5]
+    rows = judged(icub.Icub(), trials).tables[0]["rows"]
+    assert [row[1:3] for row in rows[1:]] == [["1 of 1", "**0 of 1**"]] * 2
+    if importlib.util.find_spec("pybullet"):
+        assert len(icub.Icub().draw(trials, tmp_path)) == 6
+
+
+def test_what_is_taken_out_and_where_it_still_comes_out() -> None:
+    experiment, request = ablation.Ablation(), Request(None, True, SAMPLE, Path("x"))
+    right = {"streams": [0, 1, 2], "policies": ["011", "101", "110"], "saved_at": [1, 2, 3]}
+    alone = ablation.WITHOUT[ablation.ALONE]
+    conditions = experiment.conditions(dataclasses.replace(request, quick=False))
+    trials = [
+        Trial(
+            c,
+            {"streams": [], "policies": [], "saved_at": [], "follows": []}
+            if c["keys"] == alone
+            else GOOD
+            if c["scene"] == "icub"
+            else right,
+            {},
+        )
+        for c in conditions
+    ]
+    found = judged(experiment, trials)
+    assert [claim["holds"] for claim in found.claims] == [True]
+    assert "0 of 1 oscillatory trials and 0 of 1 on the iCub" in found.short
+    readings, components = (table["rows"] for table in found.tables)
+    failed = [row[0] for row in readings if row[2] != "1 of 1"]
+    assert failed == [ablation.ALONE]
+    assert len(components) == 12
+    assert [row[0] for row in components if row[1] != "1 of 1"] == ["8, neither"]
+
+
+def test_scenes_are_told_by_who_learns_which_object() -> None:
+    experiment = scenes.Scenes()
+    conditions = experiment.conditions(Request(None, True, None, Path("x")))
+    one = GOOD | {"streams": [0], "policies": ["011"], "follows": [[0.99, 0.0]], "saved_at": [600]}
+    trials = [
+        Trial(
+            c,
+            (GOOD if c["learner"] == "progress" or c["scene"] == "plain" else one)
+            | {"iterations": 300 if c["learner"] == "progress" else 1400},
+            {},
+        )
+        for c in conditions
+    ]
+    found = judged(experiment, trials)
+    (table,) = found.tables
+    assert table["rows"][0] == ["plain", "1 of 1", "1, 1", "1 of 1", "1, 1", "1 of 1", "300"]
+    assert table["rows"][-1][1:4] == ["**0 of 1**", "1, 0", "1 of 1"]
+    assert "scene.room=True" in conditions[-1]["keys"]
 
 
 @pytest.mark.skipif(not SAMPLE.exists(), reason="the sample recording is not there")

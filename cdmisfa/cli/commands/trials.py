@@ -202,7 +202,8 @@ def reproduce_command(
 ) -> None:
     """Reproduce an experiment of the paper: numbers, tables and figures.
 
-    NAME is oscillatory, five, stability, costs, nonstationary, icub, difficulty or all.
+    NAME is oscillatory, five, stability, costs, nonstationary, icub, ablation, scenes, difficulty
+    or all.
     Finished trials are kept and not run again; results of more or other trials than are asked
     for now are not replaced without --force. Exit code 4 says that a claim of the paper did
     not come out. Without NAME, --page makes the page from the results that are there.
@@ -210,8 +211,9 @@ def reproduce_command(
     from cdmisfa.studies.paper.experiment import Request
     from cdmisfa.studies.paper.reproduce import (
         EXPERIMENTS,
+        VERDICTS,
         check_claims,
-        markdown_table,
+        markdown_tables,
         write_paper_page,
     )
 
@@ -221,8 +223,8 @@ def reproduce_command(
     names = tuple(EXPERIMENTS) if name == ALL else (name,) if name else ()
     documents: list[dict[str, Any]] = []
     for each in names:
-        if each == "icub" and recording is None:
-            tell(f"icub: records the scene into {root}/icub-recording first")
+        if each in ("icub", "ablation") and recording is None:
+            tell(f"{each}: records the scene into {root}/icub-recording, unless it is there")
         request = Request(trials, quick, recording, root / each, jobs, force)
         documents.append(_reproduce(each, request, **where))
     if page is not None:
@@ -232,9 +234,9 @@ def reproduce_command(
         print_document(experiments=documents)
     lines: list[str] = []
     for document in documents:
-        lines += [document["title"], "", markdown_table(document["table"])]
+        lines += [document["title"], "", markdown_tables(document)]
         for claim in document["claims"]:
-            holds = "yes" if claim["holds"] else "NO "
+            holds = VERDICTS[claim["holds"]]
             lines.append(f"{holds}  {claim['claim']}: {claim['detail']}")
         lines.append("")
     if not as_json:

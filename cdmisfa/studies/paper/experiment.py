@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +15,9 @@ from cdmisfa.experiments.results import MeanSd, summary, wilson
 from cdmisfa.modules import Module
 
 Settings = Mapping[str, Any]
+FIRST_SEED = 28_000
+"""Seed of an experiment's first trials: no reading was chosen on these, see docs/decisions."""
+
 Output = tuple[dict[str, Any], Mapping[str, NDArray[Any]]]
 """A trial's row, in plain values, and its arrays: curves and the like, for the figures."""
 
@@ -58,16 +62,20 @@ class Findings:
     Attributes:
         lines: of its table, as results.json has them: what was measured, the paper's value as
             text ("-" where it has none), mean, SD and number of trials, the 95 % interval where
-            one was computed, decimals to print, and other readings by the headings of their
-            columns, each with mean and interval.
-        claims: qualitative statements of the paper, and whether they came out.
+            one was computed, and decimals to print.
+        tables: others, each its head and rows of texts.
+        claims: statements of the paper, and whether they came out: true, false, or None where
+            that cannot be judged.
         notes: what is to be said besides.
+        short: its line at the top of the page; "" where it has none.
     """
 
     def __init__(self) -> None:
         self.lines: list[dict[str, Any]] = []
+        self.tables: list[dict[str, Any]] = []
         self.claims: list[dict[str, Any]] = []
         self.notes: list[str] = []
+        self.short = ""
 
     def line(
         self,
@@ -77,11 +85,14 @@ class Findings:
         interval: tuple[float, float] | None = None,
         *,
         digits: int = 3,
-        others: Mapping[str, Any] | None = None,
     ) -> None:
         """Add a line to the table."""
         known = {"quantity": quantity, "paper": paper, **asdict(found), "interval": interval}
-        self.lines.append({**known, "digits": digits, "others": others or {}})
+        self.lines.append({**known, "digits": digits})
+
+    def table(self, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """Add a table of its own."""
+        self.tables.append({"head": [*head], "rows": [[*row] for row in rows]})
 
     def measured(
         self, quantity: str, values: ArrayLike, paper: str = "-", *, digits: int = 3
@@ -107,13 +118,18 @@ class Findings:
         """How many of n trials did what is named."""
         self.line(quantity, paper, summary([1.0] * good + [0.0] * (n - good)), wilson(good, n))
 
-    def claim(self, claim: str, holds: bool, detail: str) -> None:
-        """Whether a statement of the paper came out."""
+    def claim(self, claim: str, holds: bool | None, detail: str) -> None:
+        """Whether a statement of the paper came out; None where that cannot be judged."""
         self.claims.append({"claim": claim, "holds": holds, "detail": detail})
 
     def claim_all(self, claim: str, good: int, n: int) -> None:
         """That all of n trials did what is named."""
         self.claim(claim, good == n, f"{good} of {n} trials")
+
+    def sum_up(self, topic: str, words: str) -> None:
+        """The line at the top of the page, once every statement is judged."""
+        whole = all(claim["holds"] for claim in self.claims)
+        self.short = f"**{topic} comes out{'' if whole else ' in part'}**: {words}"
 
 
 class Experiment(ABC):
@@ -134,7 +150,8 @@ class Experiment(ABC):
     def plan(self, request: Request) -> list[Settings]:
         """Settings of every trial, seeds innermost."""
         count = request.trials or self.trials[request.quick]
-        return [{**c, "seed": seed} for c in self.conditions(request) for seed in range(count)]
+        seeds = range(FIRST_SEED, FIRST_SEED + count)
+        return [{**c, "seed": seed} for c in self.conditions(request) for seed in seeds]
 
     @abstractmethod
     def run(self, settings: Settings) -> Output:
@@ -155,6 +172,18 @@ def groups(trials: Sequence[Trial], *keys: str) -> dict[tuple[Any, ...], list[Tr
     for trial in trials:
         found.setdefault(tuple(trial.settings[key] for key in keys), []).append(trial)
     return found
+
+
+def of_all(good: int, n: int) -> str:
+    """How many of n trials did what they should, bold where some did not."""
+    return f"{good} of {n}" if good == n else f"**{good} of {n}**"
+
+
+def mean_of(values: ArrayLike, digits: int) -> str:
+    """Mean and SD as a table has them; "-" where there is no value."""
+    found = summary(values)
+    spread = "" if math.isnan(found.sd) else f" ± {found.sd:.{digits}f}"
+    return f"{found.mean:.{digits}f}{spread}" if found.n else "-"
 
 
 def module_row(modules: Sequence[Module]) -> dict[str, list[Any]]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cdmisfa.experiments.results import MeanSd, Midpoint, logistic_midpoint
+from cdmisfa.core.arrays import FloatArray
+from cdmisfa.experiments.results import logistic_midpoint, mean_interval
 from cdmisfa.experiments.trial import Swap, run_trial
 from cdmisfa.studies import pages
 from cdmisfa.studies.paper.experiment import (
@@ -42,12 +43,6 @@ QUICK_COLUMNS = {"sigma": {sigma: SIGMAS[sigma] for sigma in (0.008, 0.0009, 0.0
 DECAY = 0.998
 """Multiplier of epsilon throughout; the text leaves it open, decision 0013."""
 
-STARTS = (1.2, 1.0)
-"""Epsilon at first: the paper's, and the one that comes nearer to its tables, decision 0013."""
-
-OTHER = f"epsilon from {STARTS[1]}"
-"""Heading of the column for the second of them."""
-
 REWARDED = 30
 """Rewarded blocks before a change from which on one can speak of following it.
 
@@ -61,9 +56,6 @@ CONTRADICTION = (
     "all three."
 )
 
-NOISE = 0.02
-"""Rise of epsilon^d from a sigma to a smaller one that is no more than its uncertainty."""
-
 OLD, NEW = "101", "011"
 
 PICTURED = (0.008, 0.0001)
@@ -72,8 +64,24 @@ PICTURED = (0.008, 0.0001)
 MARKERS = (("o", 7), ("s", 5), ("^", 3))
 """Marks and their sizes that stay apart where they lie on each other; one for each stream."""
 
-Points = Mapping[tuple[str, float], Midpoint]
-"""Epsilon^d by key and value."""
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """Epsilon^d at one value of a key, from the trials that are judged.
+
+    Attributes:
+        value: the midpoint of "converged to the new optimum"; NaN where no trial did, or each.
+        of_seeds: (seeds,) pseudo-values of the jackknife over seeds, whose mean is `value` and
+            whose spread tells how certain it is: trials of a seed are not independent.
+        followed, neither: trials that ended with the new optimum, and with none of the two.
+        n: trials.
+    """
+
+    value: float
+    of_seeds: FloatArray
+    followed: int
+    neither: int
+    n: int
 
 
 class NonStationary(Experiment):
@@ -81,13 +89,12 @@ class NonStationary(Experiment):
 
     title = "Non-stationary environments"
 
-    trials = (10, 3)
+    trials = (30, 3)
 
     def conditions(self, request: Request) -> list[Settings]:
-        """Tables 1 and 2, twice: every epsilon^c for every value of a key."""
+        """Tables 1 and 2: every epsilon^c for every value of a key."""
         return [
-            {"key": key, "value": value, "start": start, "epsilon_c": epsilon}
-            for start in STARTS
+            {"key": key, "value": value, "epsilon_c": epsilon}
             for key, values in (QUICK_COLUMNS if request.quick else COLUMNS).items()
             for value in values
             for epsilon in (QUICK_CHANGES if request.quick else CHANGES)
@@ -95,7 +102,7 @@ class NonStationary(Experiment):
 
     def run(self, settings: Settings) -> Output:
         """Streams zero, x2, x3; the first becomes x1 when epsilon falls below epsilon^c."""
-        keys = {settings["key"]: settings["value"], "epsilon_start": settings["start"]}
+        keys = {settings["key"]: settings["value"]}
         decays = dict.fromkeys(("epsilon_decay", "epsilon_tail_decay"), DECAY)
         result = run_trial(
             paper_config("oscillatory", **keys, **decays, patience=1),
@@ -118,32 +125,38 @@ class NonStationary(Experiment):
         return row, {}
 
     def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
-        """What of both tables comes out, and what of the text."""
-        by_start = {start: group for (start,), group in groups(trials, "start").items()}
-        points = {
-            start: {at: point_of_no_return(of) for at, of in groups(group, "key", "value").items()}
-            for start, group in by_start.items()
-        }
-        first, second = (points[start] for start in STARTS)
-        for (key, value), group in groups(by_start[STARTS[0]], "key", "value").items():
-            _add_lines(found, group, key, value, first[key, value], second[key, value])
-        _claim_about_changes(found, _judged(by_start[STARTS[0]]))
-        _claim_about_order(found, first)
-        found.notes = [
-            "A line without value: at no epsilon^c did most trials reach the new optimum, so "
-            "epsilon^d lies above 1.",
-            *(_unjudged(start, by_start[start], points[start]) for start in STARTS),
-            *(_differences(start, points[start]) for start in STARTS),
-        ]
-        if any(key == "nu" for key, _ in first):
-            found.notes.append(CONTRADICTION)
+        """What of both tables comes out, and what of the text, where it can be judged."""
+        judged = _judged(trials)
+        limit = max(t.settings["epsilon_c"] for t in judged)
+        turns = {at: _turn(of) for at, of in groups(judged, "key", "value").items()}
+        rows = []
+        for (key, value), turn in turns.items():
+            low, high = mean_interval(turn.of_seeds)
+            between = f"{low:.3f} .. {high:.3f}" if turn.value <= limit else "-"
+            paper, neither = f"{COLUMNS[key][value]:g}", f"{turn.n - turn.neither} of {turn.n}"
+            rows.append([f"{key} = {value:g}", paper, _in_words(turn, limit), between, neither])
+        head = ("at", "paper's epsilon^d", "ours", "95 % interval, by seeds", "old or new optimum")
+        found.table(head, rows)
+        _claim_about_changes(found, judged, turns)
+        _claim_about_order(found, turns, limit)
+        seeds = len({t.settings["seed"] for t in trials})
+        found.notes = [_unjudged(trials, limit), CONTRADICTION]
+        of_sigma = {value: turn for (key, value), turn in turns.items() if key == "sigma"}
+        smallest = min(of_sigma)
+        found.sum_up(
+            "The point of no return",
+            f"late changes are ignored and epsilon^d falls with sigma, to "
+            f"{_in_words(of_sigma[smallest], limit)} instead of {SIGMAS[smallest]:g} "
+            f"({seeds} seeds), but {sum(turn.neither for turn in turns.values())} of "
+            f"{len(judged)} trials end in neither optimum.",
+        )
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
         """Policy against epsilon^c for two values of sigma, grey where it is not judged."""
         by_sigma = {
             value: group
-            for (key, value, start), group in groups(trials, "key", "value", "start").items()
-            if key == "sigma" and start == STARTS[0]
+            for (key, value), group in groups(trials, "key", "value").items()
+            if key == "sigma"
         }
         smallest = PICTURED[1] if PICTURED[1] in by_sigma else min(by_sigma)
         figure, axes = pages.new_figure(1, 2)
@@ -155,40 +168,37 @@ class NonStationary(Experiment):
         return pages.save_figure(figure, folder, "nonstationary")
 
 
-def point_of_no_return(trials: Sequence[Trial]) -> Midpoint:
+def point_of_no_return(trials: Sequence[Trial]) -> float:
     """Epsilon^d: the midpoint of "converged to the new optimum" against epsilon^c."""
     changes = [t.settings["epsilon_c"] for t in trials]
-    return logistic_midpoint(changes, [_is_new(t) for t in trials])
+    return logistic_midpoint(changes, [_is_new(t) for t in trials]).value
+
+
+def _turn(trials: Sequence[Trial]) -> Turn:
+    """Epsilon^d of trials at one value of a key, and what it is without each seed."""
+    value, seeds = point_of_no_return(trials), {t.settings["seed"] for t in trials}
+    without = [
+        point_of_no_return([t for t in trials if t.settings["seed"] != seed])
+        for seed in sorted(seeds)
+    ]
+    return Turn(
+        value,
+        value + (len(seeds) - 1) * (np.mean(without) - np.array(without)),
+        sum(_is_new(t) for t in trials),
+        sum(t.row["policy"] not in (OLD, NEW) for t in trials),
+        len(trials),
+    )
 
 
 def _is_new(trial: Trial) -> bool:
     return bool(trial.row["policy"] == NEW)
 
 
-def _add_lines(
-    found: Findings, group: Sequence[Trial], key: str, value: float, *points: Midpoint
+def _claim_about_changes(
+    found: Findings, judged: Sequence[Trial], turns: Mapping[tuple[str, float], Turn]
 ) -> None:
-    """Epsilon^d, and how many of the trials from the first start end in neither optimum."""
-    neither = float(np.mean([t.row["policy"] not in (OLD, NEW) for t in group]))
-    told = "0 (figure)" if key == "sigma" and value in PICTURED else "0 (text)"
-    at = f"at {key} = {value:g}"
-    mean, other = map(_within_changes, points)
-    interval, of_other = ((point.low, point.high) for point in points)
-    ours = MeanSd(mean, math.nan, points[0].n)
-    others = {OTHER: {"mean": other, "interval": of_other}}
-    found.line(f"epsilon^d {at}", f"{COLUMNS[key][value]:g}", ours, interval, others=others)
-    share = MeanSd(neither, math.nan, len(group))
-    found.line(f"share of trials in neither optimum {at}", told, share)
-
-
-def _within_changes(point: Midpoint) -> float:
-    """Epsilon^d where it lies between the values of epsilon^c, else NaN."""
-    return point.value if CHANGES[-1] <= point.value <= CHANGES[0] else math.nan
-
-
-def _claim_about_changes(found: Findings, judged: Sequence[Trial]) -> None:
-    """Whether changes are followed early, and not late, among the trials that are judged."""
-    smallest = min(t.settings["value"] for t in judged if t.settings["key"] == "sigma")
+    """Whether changes are followed early, and not late, and where the others end."""
+    smallest = min(value for key, value in turns if key == "sigma")
     changes = groups(judged, "key", "value", "epsilon_c")
     largest = max(c for key, value, c in changes if (key, value) == ("sigma", smallest))
     early = changes["sigma", smallest, largest]
@@ -196,31 +206,52 @@ def _claim_about_changes(found: Findings, judged: Sequence[Trial]) -> None:
     late = groups(judged, "key", "epsilon_c")["sigma", last]
     followed, kept = sum(map(_is_new, early)), sum(not _is_new(t) for t in late)
     found.claim(
-        f"a change after {REWARDED} rewarded blocks and more is followed while epsilon is "
-        "large, at the smallest sigma",
+        "a change above epsilon^d is followed (smallest sigma, largest epsilon^c judged)",
         followed >= 0.8 * len(early),
         f"{followed} of {len(early)} trials with epsilon^c = {largest:g}",
     )
-    found.claim(
-        "a change while epsilon is small is not followed",
-        kept == len(late),
-        f"{kept} of {len(late)} trials with epsilon^c = {last:g}",
-    )
+    detail = f"{kept} of {len(late)} trials with epsilon^c = {last:g}"
+    found.claim("a change while epsilon is small is not followed", kept == len(late), detail)
+    lost, n = (sum(getattr(t, name) for t in turns.values()) for name in ("neither", "n"))
+    (key, value), worst = max(turns.items(), key=lambda item: item[1].neither / item[1].n)
+    most = f", most at {key} = {value:g} ({worst.neither} of {worst.n})" if lost else ""
+    ends = "the policy ends in the old or in the new optimum"
+    found.claim(ends, lost == 0, f"{lost} of {n} trials in neither{most}")
 
 
-def _claim_about_order(found: Findings, points: Points) -> None:
-    """How epsilon^d depends on sigma and, where it was asked, on tau."""
-    of_sigma = {value: _rank(point) for (key, value), point in points.items() if key == "sigma"}
-    of_tau = {value: _rank(point) for (key, value), point in points.items() if key == "tau"}
-    order = [of_sigma[sigma] for sigma in sorted(of_sigma, reverse=True)]
-    falls = all(a >= b - NOISE for a, b in itertools.pairwise(order)) and order[0] > order[-1]
-    lower = "epsilon^d is lower at the smallest sigma than at the largest, and nowhere rises"
-    found.claim(lower, falls, _in_words(order))
-    if of_tau:
-        shortest, *others = (of_tau[tau] for tau in sorted(of_tau))
-        higher = f"epsilon^d is higher at tau = {min(of_tau):g} than at the others"
-        holds = all(shortest > other for other in others)
-        found.claim(higher, holds, _in_words([shortest, *others]))
+def _claim_about_order(
+    found: Findings, turns: Mapping[tuple[str, float], Turn], limit: float
+) -> None:
+    """How epsilon^d depends on sigma and, where they were asked, on nu and tau."""
+    columns: dict[str, dict[float, Turn]] = {}
+    for (key, value), turn in turns.items():
+        columns.setdefault(key, {})[value] = turn
+    of_sigma = [columns["sigma"][sigma] for sigma in sorted(columns["sigma"], reverse=True)]
+    order = [min(_rank(turn), limit) for turn in of_sigma]
+    falls = order == sorted(order, reverse=True) and order[0] > order[-1]
+    words = ", ".join(_in_words(turn, limit) for turn in of_sigma)
+    found.claim("epsilon^d falls with sigma, and nowhere rises", falls, words)
+    for key, reference, claim in (
+        ("nu", 0.05, "nu has no significant effect on epsilon^d"),
+        ("tau", 100, "tau of 30 and more has none"),
+    ):
+        others = [v for v in columns.get(key, ()) if v != reference and (key, v) != ("tau", 10)]
+        if others:
+            differ = {v: _difference(columns[key][v], columns[key][reference]) for v in others}
+            words = ", ".join(
+                f"{v:g}: {low:+.3f} .. {high:+.3f}" for v, (low, high) in differ.items()
+            )
+            same = all(low <= 0 <= high for low, high in differ.values())
+            found.claim(claim, same, f"against {reference:g}, 95 % intervals: {words}")
+    if "tau" in columns:
+        shortest, *others = (_rank(columns["tau"][tau]) for tau in sorted(columns["tau"]))
+        words = ", ".join(_in_words(columns["tau"][tau], limit) for tau in sorted(columns["tau"]))
+        found.claim("epsilon^d is higher at tau = 10", shortest > max(others), words)
+
+
+def _difference(one: Turn, other: Turn) -> tuple[float, float]:
+    """95 % interval of the difference of two epsilon^d, seed by seed."""
+    return mean_interval(one.of_seeds - other.of_seeds)
 
 
 def _judged(trials: Sequence[Trial]) -> list[Trial]:
@@ -233,47 +264,29 @@ def _rewarded(trials: Sequence[Trial]) -> float:
     return float(np.mean([t.row["rewarded"] for t in trials]))
 
 
-def _unjudged(start: float, trials: Sequence[Trial], points: Points) -> str:
+def _unjudged(trials: Sequence[Trial], limit: float) -> str:
     """From which epsilon^c on there was little to follow a change from, in words."""
-    least = max(t.settings["epsilon_c"] for t in _judged(trials))
-    above = [f"{key} = {v:g}" for (key, v), point in points.items() if _rank(point) > least]
     words = ", ".join(
         f"{epsilon:g}: {_rewarded(group):.0f}"
         for (epsilon,), group in groups(trials, "epsilon_c").items()
         if epsilon >= 0.7
     )
     return (
-        f"Blocks rewarded before the change, epsilon from {start:g}, by epsilon^c: {words}. Above "
-        f"{least:g} they are fewer than {REWARDED}, and the agent has hardly an optimum to leave: "
-        f"a change there is not judged. Epsilon^d lies there at {', '.join(above) or 'none'}."
+        f"Blocks rewarded before the change, by epsilon^c: {words}. Above {limit:g} they are fewer "
+        f"than {REWARDED}, and the agent has hardly an optimum to leave: changes there are left "
+        f"out, and where epsilon^d lies there it is only said to be above {limit:g}."
     )
 
 
-def _differences(start: float, points: Points) -> str:
-    """How far from the paper's values ours are, and where our interval does not hold them."""
-    distances: dict[str, list[float]] = {}
-    beyond = []
-    for (key, value), point in points.items():
-        paper = COLUMNS[key][value]
-        distances.setdefault(key, []).append(abs(min(_rank(point), 1.0) - paper))
-        if not point.low <= paper <= point.high:
-            beyond.append(f"{key} = {value:g} ({_in_words([_rank(point)])} against {paper:g})")
-    words = ", ".join(f"{np.mean(found):.3f} over {key}" for key, found in distances.items())
-    return (
-        f"Epsilon from {start:g}: mean distance from the paper's values {words}, where above 1 "
-        f"counts as 1. Beyond the 95 % interval: {', '.join(beyond) or 'none'}."
-    )
+def _in_words(turn: Turn, limit: float) -> str:
+    return f"{turn.value:.3f}" if _rank(turn) <= limit else f"above {limit:g}"
 
 
-def _in_words(values: Sequence[float]) -> str:
-    return ", ".join("above 1" if v == 2.0 else f"{v:.3f}" for v in values)
-
-
-def _rank(point: Midpoint) -> float:
+def _rank(turn: Turn) -> float:
     """Epsilon^d for comparison; 2 where it lies above every epsilon^c, 0 where below."""
-    if math.isnan(point.value):
-        return 2.0 if point.low == CHANGES[0] else 0.0
-    return 2.0 if point.value > CHANGES[0] else point.value
+    if math.isnan(turn.value):
+        return 0.0 if turn.followed else 2.0
+    return turn.value
 
 
 def _draw_policies(panel: Any, trials: Sequence[Trial]) -> None:
@@ -292,7 +305,7 @@ def _draw_policies(panel: Any, trials: Sequence[Trial]) -> None:
             color=pages.COLOURS[s],
             label=pages.STREAM_NAMES[s],
         )
-    point = point_of_no_return(trials).value
+    point = point_of_no_return(_judged(trials))
     if math.isfinite(point):
         panel.axvline(point, color="grey", linestyle="-.", linewidth=1, label=r"$\epsilon^d$")
     least = max(t.settings["epsilon_c"] for t in _judged(trials))

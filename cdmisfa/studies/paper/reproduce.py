@@ -24,11 +24,13 @@ from cdmisfa.core.untrusted import MAX_LIST, read_json
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
 from cdmisfa.experiments.store import StoredTrial, answer, code, read_rows, run_trials, trial_id
 from cdmisfa.studies.pages import Page
+from cdmisfa.studies.paper.ablation import Ablation
 from cdmisfa.studies.paper.difficulty import Difficulty
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Settings, Trial
 from cdmisfa.studies.paper.icub import Icub
 from cdmisfa.studies.paper.nonstationary import NonStationary
 from cdmisfa.studies.paper.oscillatory import Costs, FiveStreams, Oscillatory, Stability
+from cdmisfa.studies.paper.scenes import Scenes
 from recorder.log.files import atomic_write
 
 EXPERIMENTS: Mapping[str, Experiment] = {
@@ -38,6 +40,8 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "costs": Costs(),
     "nonstationary": NonStationary(),
     "icub": Icub(),
+    "ablation": Ablation(),
+    "scenes": Scenes(),
     "difficulty": Difficulty(),
 }
 """The experiments, in the order of their page."""
@@ -145,9 +149,11 @@ def _write_results(
             "title": EXPERIMENTS[name].title,
             "quick": request.quick,
             "trials": trials,
-            "reproduced": all(claim["holds"] for claim in found.claims),
+            "reproduced": all(claim["holds"] is not False for claim in found.claims),
+            "short": found.short,
             "claims": found.claims,
             "table": found.lines,
+            "tables": found.tables,
             "notes": found.notes,
             "figures": [figure.name for figure in figures],
             "code": code(),
@@ -156,7 +162,7 @@ def _write_results(
     )
     write_json(request.folder / "results.json", document)
     with atomic_write(request.folder / "table.md") as partial:
-        partial.write_text(markdown_table(document["table"]), encoding="utf-8")
+        partial.write_text(markdown_tables(document), encoding="utf-8")
     return document
 
 
@@ -191,7 +197,7 @@ def check_claims(document: Mapping[str, Any]) -> None:
     Raises:
         NotReproducedError: one did not.
     """
-    failed = [c for c in document["claims"] if not c["holds"]]
+    failed = [c for c in document["claims"] if c["holds"] is False]
     if failed:
         words = "; ".join(f"{c['claim']} ({c['detail']})" for c in failed)
         raise NotReproducedError(f"{document['experiment']} did not come out: {words}")
@@ -200,26 +206,21 @@ def check_claims(document: Mapping[str, Any]) -> None:
 HEAD = ("quantity", "paper", "ours", "SD", "95 % interval", "n")
 
 
-def markdown_table(lines: Sequence[Mapping[str, Any]]) -> str:
-    """The table of results.json as Markdown, with a column for every other reading."""
-    others = list(dict.fromkeys(name for line in lines for name in line["others"]))
+def markdown_tables(document: Mapping[str, Any]) -> str:
+    """The tables of results.json as Markdown."""
     rows = []
-    for line in lines:
-        mean, sd, *bounds = _numbers(line, "mean", "sd")
+    for line in document["table"]:
+        values = (line["mean"], line["sd"], *(line["interval"] or ()))
+        mean, sd, *bounds = ("-" if v is None else f"{v:.{line['digits']}f}" for v in values)
         interval = " .. ".join(bounds) or "-"
-        row = [line["quantity"], line["paper"], mean, sd, interval, line["n"]]
-        for name in others:
-            other = line["others"].get(name)
-            value, *bounds = _numbers({**line, **other}, "mean") if other else ("-",)
-            row.append(f"{value} ({' .. '.join(bounds)})" if bounds else value)
-        rows.append(row)
-    return markdown((*HEAD, *others), rows) + "\n"
+        rows.append([line["quantity"], line["paper"], mean, sd, interval, line["n"]])
+    tables = [markdown(HEAD, rows)] if rows else []
+    tables += [markdown(table["head"], table["rows"]) for table in document["tables"]]
+    return "\n\n".join(tables) + "\n"
 
 
-def _numbers(line: Mapping[str, Any], *names: str) -> list[str]:
-    """Values of a line, then the bounds of its interval, as they are printed."""
-    values = (*(line[name] for name in names), *(line["interval"] or ()))
-    return ["-" if v is None else f"{v:.{line['digits']}f}" for v in values]
+VERDICTS = {True: "yes", False: "**no**", None: "*not judged*"}
+"""Whether a statement came out, in words."""
 
 
 def write_paper_page(root: Path, path: Path) -> None:
@@ -233,16 +234,21 @@ def write_paper_page(root: Path, path: Path) -> None:
     if not documents:
         raise UsageError(f"{root} has no results: run cdmisfa reproduce all -o {root} first")
     page = Page(path)
-    page.add(Path(__file__).with_name("introduction.md").read_text("utf-8").rstrip())
+    page.add("# The paper, reproduced", "")
+    page.add(*(f"- {d['short']}" for d in documents if d["short"]), "")
+    page.add(Path(__file__).with_name("introduction.md").read_text("utf-8"))
+    page.add("## What the paper says, judged", "")
+    claims = [
+        (c["claim"], VERDICTS[c["holds"]], c["detail"], f"`{d['experiment']}`")
+        for d in documents
+        for c in d["claims"]
+    ]
+    page.add(markdown(("statement", "so here", "measured", "by"), claims), "")
     for document in documents:
         name = document["experiment"]
         command = f"cdmisfa reproduce {name}{' --quick' if document['quick'] else ''}"
-        page.add("", f"## {document['title']}", "")
-        page.add(f"`{command}`, {document['trials']} trials.", "")
-        for claim in document["claims"]:
-            holds = "Yes" if claim["holds"] else "**No**"
-            page.add(f"- {holds}: {claim['claim']} ({claim['detail']})")
-        page.add("", markdown_table(document["table"]))
+        page.add(f"## {document['title']}", "", f"`{command}`, {document['trials']} trials.", "")
+        page.add(markdown_tables(document))
         page.add(*(f"{note}\n" for note in document["notes"]))
         for figure in document["figures"]:
             if figure.endswith(".png"):
