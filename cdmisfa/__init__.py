@@ -10,6 +10,8 @@ docs/python.md shows more. `cdmisfa.experiments` has the loop of every run, `rec
 sources, `replay` reads and shows what was logged.
 """
 
+import os
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.core.exports import exports
@@ -42,6 +44,13 @@ if TYPE_CHECKING:
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
 
     __version__: str
+
+_home = os.path.dirname(os.path.dirname(__file__))
+for _name in ("recorder", "replay"):  # another project's package of that name has none of ours
+    if (_spec := find_spec(_name)) and os.path.dirname(_spec.origin or "") != f"{_home}/{_name}":
+        raise ImportError(
+            f"{_name} is not cdmisfa's: {_spec.origin}; give cdmisfa an environment of its own"
+        )
 
 _load, __dir__, __all__ = exports(
     __name__,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import shlex
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -155,3 +157,38 @@ def test_a_scheduler_without_an_address_is_one_line_to_the_end_of_the_process(
     )
     said = "cdmisfa: no dask scheduler answers at nope: missing port number in address 'nope'\n"
     assert (ended.returncode, ended.stderr) == (1, said)
+
+
+def test_another_package_of_the_name_of_ours_is_named(tmp_path: Path) -> None:
+    other = tmp_path / "replay" / "__init__.py"
+    other.parent.mkdir()
+    other.touch()
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import cdmisfa"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    said = f"replay is not cdmisfa's: {other}; give cdmisfa an environment of its own"
+    assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
+
+
+def test_doctor_names_whose_package_has_the_name_of_ours(
+    cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owners = {"replay": ["cdmisfa", "other"], "recorder": ["cdmisfa"]}
+    monkeypatch.setattr("importlib.metadata.packages_distributions", lambda: owners)
+    done = cdmisfa("doctor", "--json")
+    assert done.code == 1
+    (check,) = (c for c in json.loads(done.out)["checks"] if c["what"].startswith("name "))
+    assert (check["what"], "also of other" in check["detail"]) == ("name replay", True)
+
+
+def test_what_to_cite_is_this_version_everywhere(cdmisfa: Cdmisfa) -> None:
+    printed = cdmisfa("cite").out
+    card = (LOGS.parents[1] / "CITATION.cff").read_text("utf-8")
+    version = metadata.version("cdmisfa")
+    assert f"version = {{{version}}}" in printed
+    assert f"\nversion: {version}\n" in card
+    titles = re.findall(r"  title = \{(.+?)\},\n", printed, re.DOTALL)
+    assert len(titles) == 2
+    plain = " ".join(card.split())
+    assert [title for title in titles if " ".join(title.split()) not in plain] == []

@@ -94,6 +94,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "completion",
             "Print what a shell needs to complete commands, scenes, presets, keys and runs.",
         ),
+        "cite": ("cite", "Print what a paper that uses it cites, as BibTeX."),
     },
 }
 """Each command by its heading of --help, with its module in this package and its line of help."""

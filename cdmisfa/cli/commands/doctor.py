@@ -18,6 +18,9 @@ from cdmisfa.cli.printing import print_document, print_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import GROUPS, Registry, find, plugins
 
+NAMES = ("recorder", "replay")
+"""Packages of ours beside `cdmisfa`, whose names others may have, too."""
+
 PACKAGES = ("numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplotlib")
 """Packages that no command can do without for long."""
 
@@ -87,6 +90,14 @@ def _extras() -> Iterator[Check]:
         yield Check(f"extra {extra}", has, detail, needed_for)
 
 
+def _names() -> Iterator[Check]:
+    owners = metadata.packages_distributions()
+    for name in NAMES:
+        if others := sorted(set(owners.get(name, ())) - {"cdmisfa"}):
+            detail = f"also of {', '.join(others)}: give cdmisfa an environment of its own"
+            yield Check(f"name {name}", False, detail)
+
+
 def _plugins() -> Iterator[Check]:
     try:
         from cdmisfa.agents.learners import LEARNERS
@@ -154,6 +165,7 @@ def _screen() -> Iterator[Check]:
 LOOKS: tuple[Callable[[], Iterator[Check]], ...] = (
     _python,
     _packages,
+    _names,
     _extras,
     _plugins,
     _simulator,
