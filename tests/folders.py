@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 from replay.recordings.source import RecordedSource
@@ -16,5 +15,5 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def coverage(recording: Path) -> dict[str, list[tuple[int, int]]]:
     """The stretches of frames that each view has."""
-    with contextlib.closing(RecordedSource(recording)) as source:
+    with RecordedSource(recording) as source:
         return source.coverage()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +84,7 @@ def test_colours_of_other_formats_are_taken(tmp_path: Path) -> None:
     (tmp_path / "pngs").mkdir()
     for i in range(3):
         Image.fromarray(image).save(tmp_path / "pngs" / f"{i}.png")
-    with contextlib.closing(ForeignSource(tmp_path / "pngs", rate=5, color=True)) as source:
+    with ForeignSource(tmp_path / "pngs", rate=5, color=True) as source:
         assert source.spec.frame_shape == (HEIGHT, 3 * WIDTH)
         assert (source.take(0, 1).frames[0] == beside(image)).all()
     for form in ("rgb24", "gray"):
@@ -104,7 +103,7 @@ def test_colours_are_learned_from_recorded_and_replayed_alike(
     assert run["source"]["recipe"].startswith("red, green and blue")
     gray = learned_alike(cdmisfa, tmp_path / "gray", log)
     assert gray["signals_sha256"] != run["signals_sha256"]
-    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+    with RecordedSource(tmp_path / "rec") as source:
         assert (source.take(0, COUNT).frames == beside(colors())).all()
 
 
@@ -114,12 +113,12 @@ def test_live_streams_are_recorded_in_colours(cdmisfa: Cdmisfa, tmp_path: Path) 
     words = ["av:lavfi:color=c=red:size=32x24:rate=50", "--color", "--size", "16x12"]
     done = cdmisfa("record", *words, "--frames", "5", "-o", rec)
     assert done.code == 0, done.err
-    with contextlib.closing(RecordedSource(rec)) as source:
+    with RecordedSource(rec) as source:
         red, green, blue = np.split(source.take(0, 2).frames[1], 3, axis=1)
         assert red.shape == (12, 16)
         assert red.min() >= 250
         assert max(green.max(), blue.max()) <= 5
-    with contextlib.closing(GymSource(["CartPole-v1"], size=(20, 30), color=True)) as task:
+    with GymSource(["CartPole-v1"], size=(20, 30), color=True) as task:
         assert task.spec.frame_shape == (20, 90)
         assert task.take(0, 2).frames.shape == (2, 20, 90)
 

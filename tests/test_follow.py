@@ -240,7 +240,7 @@ def test_a_resumed_run_goes_on_with_the_frames_that_it_had(tmp_path: Path) -> No
     config = LearnerConfig(tau=20)
 
     def learned(**more: Any) -> RunResult:
-        with contextlib.closing(FollowedSource(tmp_path / "rec", timeout=1)) as source:
+        with FollowedSource(tmp_path / "rec", timeout=1) as source:
             return run(source, config, tmp_path / "run", **{**words, **more})
 
     record(Unseeded(1), tmp_path / "rec", frames=200)

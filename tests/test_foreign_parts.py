@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -89,7 +88,7 @@ def test_a_part_that_was_cut_before_its_first_message_is_left_out_and_said(
 ) -> None:
     os.truncate(parts[3], 42)
     options: dict[str, Any] = {"size": SIZE, "align": "time", "rate": 50}
-    with contextlib.closing(ForeignSource(parts[0].parent, ["/r*"], **options)) as source:
+    with ForeignSource(parts[0].parent, ["/r*"], **options) as source:
         assert source.alignment["right"]["messages"] == 110
         assert f"{parts[3]}: " in source.warnings[1]
         assert source.warnings[1].endswith("there is no message before: left out")

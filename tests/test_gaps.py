@@ -237,7 +237,7 @@ def test_a_dataset_has_an_episode_between_gaps(cdmisfa: Cdmisfa, tmp_path: Path)
     assert cdmisfa("convert", left, right, "--align", "time", "-o", rec).code == 0
     done = cdmisfa("export", rec, "--to", "lerobot", "--lossless", "-o", out)
     assert done.code == 0, done.err
-    with contextlib.closing(RecordedSource(rec)) as source:
+    with RecordedSource(rec) as source:
         one, two = source.coverage().values()
         shared = intersection(one, two)
         assert len(shared) == 2
@@ -254,7 +254,7 @@ def test_a_dataset_has_an_episode_between_gaps(cdmisfa: Cdmisfa, tmp_path: Path)
         assert starts == [0, lengths[0] / 50]
         for row, frames in zip(episodes, own, strict=True):
             assert row[f"stats/{key}/mean"][0][0][0] == pytest.approx(frames.mean() / 255)
-        with contextlib.closing(ForeignSource(out, [key])) as source:
+        with ForeignSource(out, [key]) as source:
             read = [_frames(source, 0, *span) for span in source.spans(0, 0, source.frames)]
         for frames, again in zip(own, read, strict=True):
             assert np.abs(frames.astype(int) - again).max() <= 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 from collections.abc import Iterator
@@ -177,7 +176,7 @@ def test_judging_is_stopped_at_once_and_done_when_the_run_is_resumed(
 ) -> None:
     whole = cdmisfa("learn", log, *LEARN).json
     settings = ("learner.expansion=none", "learner.outputs=2")
-    with contextlib.closing(ForeignSource(log, time="t")) as source:
+    with ForeignSource(log, time="t") as source:
         hold_out(source, None, judged=True)
         about = description(source)
         learner = configure_for(source.spec, about, words=log_settings(settings, log)).learner
@@ -196,7 +195,7 @@ def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -
     none, policy = np.zeros(1), np.zeros(0, np.int64)
     learned = Module(1, "log", 0, 0, np.eye(6)[:1], np.zeros(6), none, none, none, policy)
     for salvage in (False, True):
-        with contextlib.closing(ForeignSource(tmp_path, rate=5, salvage=salvage)) as source:
+        with ForeignSource(tmp_path, rate=5, salvage=salvage) as source:
             source.hold_out(20)
             source.take(0, 100)
             with pytest.raises(LogExhaustedError, match="before 20 held out"):

@@ -28,7 +28,7 @@ def config(components: int) -> LearnerConfig:
 
 @pytest.mark.parametrize("components", COMPONENTS)
 def test_object_1_then_object_3(components: int) -> None:
-    with contextlib.closing(RecordedSource(SAMPLE, loop=True)) as source:
+    with RecordedSource(SAMPLE, loop=True) as source:
         learner = open_learner(config(components), source.spec, 2)
         learn_blocks(source, learner, max_iterations=icub.ITERATIONS, max_modules=2)
     found = [(m.stream_index, "".join(map(str, m.policy))) for m in learner.modules]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -200,7 +199,7 @@ def test_what_is_learned_live_is_learned_again_from_the_recording(
     counts = live.alignment
     for name in ("repeated", "dropped", "missing", "late", "disordered"):
         assert sum(count[name] for count in counts.values()) > 0, name
-    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+    with RecordedSource(tmp_path / "rec") as source:
         again = learned(source, config)
     assert again.signals_sha256 == first.signals_sha256
     assert again.iterations == first.iterations > 20
@@ -223,7 +222,7 @@ def test_a_recording_of_cameras_is_learned_from_while_it_is_written(tmp_path: Pa
     recorded = RecordedWhileWatched(opened(rough(), 3), folder)
 
     def follow() -> None:
-        with contextlib.closing(FollowedSource(folder, timeout=30)) as source:
+        with FollowedSource(folder, timeout=30) as source:
             grows.set()
             followed.append((learned(source, config), source.finished))
 
@@ -238,7 +237,7 @@ def test_a_recording_of_cameras_is_learned_from_while_it_is_written(tmp_path: Pa
 
     record_watched(recorded, progress=progress)
     thread.join()
-    with contextlib.closing(RecordedSource(folder)) as source:
+    with RecordedSource(folder) as source:
         again = learned(source, config)
     assert followed[0][0].signals_sha256 == again.signals_sha256
     assert again.iterations > 20
@@ -247,7 +246,7 @@ def test_a_recording_of_cameras_is_learned_from_while_it_is_written(tmp_path: Pa
 def test_a_gap_of_a_followed_recording_is_known_once_a_later_frame_came(tmp_path: Path) -> None:
     source = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
     record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
-    with contextlib.closing(FollowedSource(tmp_path / "rec")) as followed:
+    with FollowedSource(tmp_path / "rec") as followed:
         whole = RecordedSource(tmp_path / "rec")
         for n in (20, 40, 30):
             for one, two in zip(followed.take_all(n), whole.take_all(n), strict=True):
@@ -423,7 +422,7 @@ def test_a_recording_with_gaps_is_shown_and_exported_with_its_gaps(tmp_path: Pat
     names = sorted(path.name for path in (tmp_path / "png" / "left").iterdir())
     assert (names[30], names[31]) == ("00000030.png", "00000060.png")
     assert export(tmp_path / "rec", tmp_path / "robot", "lerobot") == 90 - 29
-    with contextlib.closing(RecordedSource(tmp_path / "rec", loop=True)) as looped:
+    with RecordedSource(tmp_path / "rec", loop=True) as looped:
         looped.seek(85)
         block = looped.take(0, 10)
         # it goes on at its beginning without a cut, as a programme that starts again

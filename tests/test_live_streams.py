@@ -93,7 +93,7 @@ class TestValues(ForwardContract):
 
 
 def test_a_task_shows_its_observations_as_truth() -> None:
-    with contextlib.closing(GymSource(["CartPole-v1"], size=(24, 32))) as source:
+    with GymSource(["CartPole-v1"], size=(24, 32)) as source:
         assert source.spec.truth == tuple(f"CartPole_v1_{i}" for i in range(4))
         assert source.spec.fps == 50
         block = source.take(0, 200)
@@ -110,7 +110,7 @@ def test_a_policy_is_given_the_observation() -> None:
         seen.append(observation)
         return 0
 
-    with contextlib.closing(GymSource(["CartPole-v1"], policy=policy, hold=4)) as source:
+    with GymSource(["CartPole-v1"], policy=policy, hold=4) as source:
         source.take(0, 8)
     assert len(seen) == 2
 
@@ -144,7 +144,7 @@ def learned_twice(cdmisfa: Cdmisfa, place: Path, *words: str) -> dict[str, Any]:
     again = cdmisfa("learn", place / "rec", *options).json
     assert again["signals_sha256"] == live.json["signals_sha256"]
     stated = json.loads((place / "run" / "run.json").read_text())["config"]["record"]
-    with contextlib.closing(RecordedSource(place / "rec")) as source:
+    with RecordedSource(place / "rec") as source:
         assert (stated["fps"], stated["start_ns"]) == (source.spec.fps, source.spec.start_ns)
     return {**live.json, "said": live.err}
 
@@ -189,7 +189,7 @@ def test_a_video_is_recorded_until_it_ends(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     clip = write_clip(tmp_path / "clip.mkv")
     done = cdmisfa("record", f"av:{clip}", "-o", str(tmp_path / "rec"), "--size", "64x48")
     assert re.search(r"ended at frame \d+: clip ended$", done.err, re.MULTILINE)
-    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+    with RecordedSource(tmp_path / "rec") as source:
         assert source.spec.fps == 25
         (held,) = source.coverage().values()
         shown = [block.frames[:, 0, 0].tolist() for block in source.take_all(source.frames)]
@@ -202,10 +202,10 @@ def test_a_video_is_recorded_until_it_ends(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     ("word", "shape"), [(TEST, (60, 80)), ("gym:CartPole-v1", (57, 85))], ids=["camera", "task"]
 )
 def test_frames_keep_the_ratio_of_the_sides(word: str, shape: tuple[int, int]) -> None:
-    with contextlib.closing(open_live([word], LiveOptions())) as source:
+    with open_live([word], LiveOptions()) as source:
         assert source.spec.frame_shape == shape
     wide = LiveOptions(size=(30, 80), fit="pad")
-    with contextlib.closing(open_live([word], wide)) as source:
+    with open_live([word], wide) as source:
         frames = source.take(0, 3).frames
         assert frames.shape == (3, 30, 80)
         inner = frames[:, :, 20:60] if word == TEST else frames[:, :, 17:62]
@@ -250,7 +250,7 @@ def web_camera() -> Iterator[str]:
 def test_a_web_camera_that_breaks_is_connected_to_anew(web_camera: str) -> None:
     said: list[str] = []
     options = LiveOptions(size=(48, 64), rate=25)
-    with contextlib.closing(open_live([web_camera], options, say=said.append)) as source:
+    with open_live([web_camera], options, say=said.append) as source:
         blocks = [block for _ in range(3) for block in source.take_all(25)]
     assert said[0] == "stream is gone: Input/output error: connecting to it anew"
     assert len(blocks) >= 2
@@ -277,7 +277,7 @@ def test_a_web_camera_that_does_not_answer_is_not_waited_for_long(
 def test_pictures_of_a_web_camera_were_taken_when_they_come(web_camera: str) -> None:
     # MJPEG tells no times, and those that FFmpeg makes up are those of 25 pictures a second.
     word = web_camera.replace("stream", "slow")
-    with contextlib.closing(open_live([word], LiveOptions(size=(48, 64)))) as source:
+    with open_live([word], LiveOptions(size=(48, 64))) as source:
         assert 5 < source.spec.fps < 11
         source.take(0, 12)
         counts = source.alignment["slow"]  # type: ignore[attr-defined]
@@ -307,7 +307,7 @@ def test_a_stream_over_tcp_ends_where_that_is_asked_for(tmp_path: Path) -> None:
         thread = threading.Thread(target=send)
         thread.start()
         options = LiveOptions(size=(48, 64), on_loss="end")
-        with contextlib.closing(open_live([f"tcp://127.0.0.1:{port}"], options)) as source:
+        with open_live([f"tcp://127.0.0.1:{port}"], options) as source:
             assert source.take(0, 10).frames.shape == (10, 48, 64)
             with pytest.raises(LogExhaustedError, match=rf"127\.0\.0\.1_{port}"):
                 source.take(0, 10**4)
@@ -345,7 +345,7 @@ def test_images_of_a_running_robot_are_recorded_and_learned_from(
     words = [f"{robot.address}/cam/left", f"{robot.address}/cam/right", "--size", "64x48"]
     run = learned_twice(cdmisfa, tmp_path, *words)
     assert run["source"]["rate"] == pytest.approx(50, rel=0.3)
-    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+    with RecordedSource(tmp_path / "rec") as source:
         assert source.spec.streams == ("cam_left", "cam_right")
         shown = source.take(0, 20).frames
         assert (shown == shown[:, :1, :1]).all()
@@ -357,7 +357,7 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
     image = RawImage(width=5, height=4, encoding="32FC1", step=20, data=data)
     words = [f"{robot.address}/depth"]
     with robot.showing(RawImageChannel, "/depth", lambda _: image):
-        with contextlib.closing(open_live(words, LiveOptions(depth=(1, 3)))) as source:
+        with open_live(words, LiveOptions(depth=(1, 3))) as source:
             assert source.take(0, 2).frames[1, 0].tolist() == [0, 0, 128, 255, 255]
             assert source.describe()["range_metres"] == [1, 3]
         with pytest.raises(UsageError, match="say which to show, as --range"):
@@ -377,7 +377,7 @@ def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
     run = learned_twice(cdmisfa, tmp_path, f"{robot.address}/words", "--field", "k")
     assert (" messages;" in run["said"], "pictures" in run["said"]) == (True, False)
     assert run["source"]["fields"] == ["k"]
-    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+    with RecordedSource(tmp_path / "rec") as source:
         assert (source.spec.frame_shape, source.spec.dtype) == ((1,), "float64")
         assert (np.diff(source.take(0, 20).frames[:, 0]) <= 3).all()
     with pytest.raises(UsageError, match="there is no z, it has k"):
@@ -411,7 +411,7 @@ def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
     words = [f"{robot.address}/cam/late"]
     with (
         robot.showing(RawImageChannel, "/cam/late", raw_image, after=said),
-        contextlib.closing(open_live(words, LiveOptions(), say=said.append)) as source,
+        open_live(words, LiveOptions(), say=said.append) as source,
     ):
         assert source.take(0, 2).frames.shape == (2, 48, 64)
 
@@ -437,7 +437,7 @@ def test_a_topic_that_the_server_does_not_know_yet_is_subscribed_to_again() -> N
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         word = f"foxglove://127.0.0.1:{server.socket.getsockname()[1]}/cam"
-        with contextlib.closing(open_live([word], LiveOptions(rate=100))) as source:
+        with open_live([word], LiveOptions(rate=100)) as source:
             assert source.take(0, 1).frames.shape == (1, 4, 5)
         server.shutdown()
         thread.join()
@@ -540,7 +540,7 @@ def ended(rec: Path, number: int, least: int) -> tuple[int, str]:
 def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
     code, said = ended(tmp_path / "rec", signal.SIGINT, 0)
     assert code == 0, said
-    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+    with RecordedSource(tmp_path / "rec") as source:
         assert source.frames > 3
     assert (tmp_path / "rec" / "lavfi_testsrc.mcap").exists()
 
@@ -554,5 +554,5 @@ def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
     assert refused.code == 2
     assert "is of live streams, which cannot go back" in refused.err
     cdmisfa("recover", str(tmp_path / "rec"), "-o", str(tmp_path / "saved"))
-    with contextlib.closing(RecordedSource(tmp_path / "saved")) as source:
+    with RecordedSource(tmp_path / "saved") as source:
         assert source.frames > 0

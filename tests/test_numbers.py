@@ -108,7 +108,7 @@ def test_whole_numbers_of_messages_that_are_rounded_are_said(tmp_path: Path) -> 
         return write_mcap(tmp_path / name, kind, {"/n": every(STEP, rows)})
 
     for first, count in ((2**53 - 63, 1), (2**53 - 72, 0)):
-        with contextlib.closing(ForeignSource(path(f"{count}", first), fields=["a", "b"])) as log:
+        with ForeignSource(path(f"{count}", first), fields=["a", "b"]) as log:
             assert log.changes == {}
             log.take(0, 9)
             assert len(log.changes) == count
@@ -202,7 +202,7 @@ def test_fields_of_protobuf_are_found_by_their_definition(tmp_path: Path) -> Non
     kind = MessageKind("foxglove.PoseInFrame", "protobuf", definition, "protobuf")
     path = write_mcap(tmp_path / "p.mcap", kind, {"/pose": every(STEP, poses())})
     fields = ["pose.position.x", "pose.orientation.w"]
-    with contextlib.closing(ForeignSource(path, fields=fields)) as source:
+    with ForeignSource(path, fields=fields) as source:
         assert source.take(0, 5).frames.tolist() == [[i, -i] for i in range(5)]
     with pytest.raises(UsageError, match="there is no pos, it has timestamp, frame_id, pose"):
         ForeignSource(path, fields=["pos"])
@@ -242,13 +242,13 @@ def test_the_rows_of_a_table_are_frames_at_their_times(
 ) -> None:
     columns = {"stamp": times, "a.b": angles()[:, 0], "word": ["x"] * COUNT, "c": range(COUNT)}
     path = write_table(tmp_path / name, columns)
-    with contextlib.closing(ForeignSource(path, time="stamp" + unit)) as source:
+    with ForeignSource(path, time="stamp" + unit) as source:
         assert source.spec.streams == ("t",)
         assert source.spec.fps == 50
         frames = source.take(0, COUNT).frames
         assert (frames == np.c_[angles()[:, 0], np.arange(COUNT)]).all()
         assert source.describe()["fields"] == [["a.b", "c"]]
-    with contextlib.closing(ForeignSource(path, fields=["c"], rate=10)) as source:
+    with ForeignSource(path, fields=["c"], rate=10) as source:
         assert (source.spec.fps, source.take(0, 3).frames.tolist()) == (10, [[0], [1], [2]])
 
 
@@ -259,7 +259,7 @@ def test_rows_without_a_number_are_left_out_and_a_pause_is_a_gap(tmp_path: Path)
     shuffled = np.random.default_rng(0).permutation(COUNT)
     columns = {"s": [stamps[i] for i in shuffled], "a": [numbers[i] for i in shuffled]}
     path = write_table(tmp_path / "t.csv", columns)
-    with contextlib.closing(ForeignSource(path, time="s", align="time")) as source:
+    with ForeignSource(path, time="s", align="time") as source:
         assert source.gaps
         assert source.pauses == {"t": [(40, 60)]}
         assert source.spans(0, 0, COUNT) == [(0, 40), (60, COUNT)]
@@ -272,7 +272,7 @@ def test_rows_without_a_number_are_left_out_and_a_pause_is_a_gap(tmp_path: Path)
 
 def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
     path = write_table(tmp_path / "t.parquet", {"state": angles().tolist(), "n": range(COUNT)})
-    with contextlib.closing(ForeignSource(path, fields=["state[1:3]", "n"], rate=5)) as source:
+    with ForeignSource(path, fields=["state[1:3]", "n"], rate=5) as source:
         assert (source.take(0, 2).frames == np.c_[angles()[:2, 1:3], [0, 1]]).all()
     with pytest.raises(UsageError, match="state holds 3 numbers, and 2 in row 1"):
         ForeignSource(
@@ -346,7 +346,7 @@ def test_streams_that_differ_are_not_learned_from_together(tmp_path: Path) -> No
     ragged = (json.dumps({"p": [0] * (3 - i % 2)}).encode() for i in range(9))
     path = write_mcap(tmp_path / "r.mcap", MessageKind("p", "json"), {"/p": every(STEP, ragged)})
     with (
-        contextlib.closing(ForeignSource(path, fields=["p"])) as source,
+        ForeignSource(path, fields=["p"]) as source,
         pytest.raises(UsageError, match=r"holds 2 numbers, and the first 3.*position\[0:2\]"),
     ):
         source.take(0, 2)
@@ -389,7 +389,7 @@ def test_commands_take_numbers_of_a_log(cdmisfa: Cdmisfa, tmp_path: Path) -> Non
     assert (plan["size"], plan["streams"][0]["shape"]) == ([3], "3 numbers")
     _, converted = learned_alike(cdmisfa, tmp_path, log, *how)["said"]
     assert "90 messages, 0 frames repeated" in converted
-    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+    with RecordedSource(tmp_path / "rec") as source:
         assert (source.take(0, COUNT).frames == angles()).all()
     assert cdmisfa("view", log, *how, "--save", tmp_path / "v.rrd").code == 0
     assert cdmisfa("export", log, *how, "--to", "lerobot", "-o", tmp_path / "set").code == 0

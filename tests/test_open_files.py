@@ -220,7 +220,7 @@ def test_each_of_many_views_names_only_its_own(tmp_path: Path) -> None:
     one, other = (folder / "v0007.mcap" for folder in (many, more))
     assert one.stat().st_size == other.stat().st_size < (few / "v0007.mcap").stat().st_size
     for folder in (few, many, more):
-        with contextlib.closing(RecordedSource(folder)) as source:
+        with RecordedSource(folder) as source:
             assert source.spec.streams == ManyViews(len(list(folder.iterdir()))).spec.streams
             (config,) = LogReader(folder / "v0000.mcap").attachments
             assert config.name == "config.json"

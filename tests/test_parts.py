@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import subprocess
 import sys
@@ -100,7 +99,7 @@ def test_kill_9_at_any_moment_leaves_parts_that_play_and_go_on(
         finally:
             process.kill()
             process.wait()
-        with contextlib.closing(RecordedSource(folder)) as source:
+        with RecordedSource(folder) as source:
             length = source.frames
             same(source.take(1, length), OscillatorySource().take(1, length))
         record_scene("oscillatory", folder, frames=FRAMES, split=split, resume=True)

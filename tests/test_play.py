@@ -137,7 +137,7 @@ def test_what_is_played_is_recorded_as_it_was(
         done = cdmisfa("record", *words, *options, "-o", tmp_path / "rec")
     assert done.code == 0, done.err
     assert (played[0].count, played[0].seconds) == (2 * FRAMES, (FRAMES - 1) / FPS)
-    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+    with RecordedSource(tmp_path / "rec") as source:
         assert source.spec.fps == FPS * rate
         assert source.frames >= FRAMES - 1
         for stream, name in enumerate(shown):  # at each tick the picture of this tick

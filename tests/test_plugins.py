@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
@@ -134,7 +133,7 @@ def test_a_source_that_was_opened_by_name_is_recorded_as_by_name(name: str, tmp_
     clock = RecordConfig(fps=25.0, compression="lz4")
     config = SCENES[name].config(seed=3)
     record_scene(name, tmp_path / "name", config, clock, frames=20)
-    with contextlib.closing(open_scene(name, config, clock)) as source:
+    with open_scene(name, config, clock) as source:
         record(source, tmp_path / "source", frames=20)
     assert contents(tmp_path / "name") == contents(tmp_path / "source")
 

@@ -341,7 +341,7 @@ def test_a_recording_cut_off_while_it_is_read_is_damage(
     tmp_path: Path, oscillatory_recording: Path, share: float
 ) -> None:
     copy = Path(shutil.copytree(oscillatory_recording, tmp_path / "copy"))
-    with contextlib.closing(RecordedSource(sorted(copy.glob("*.mcap")))) as source:
+    with RecordedSource(sorted(copy.glob("*.mcap"))) as source:
         source.take(0, 40)
         os.truncate(copy / "x1.mcap", int(share * (copy / "x1.mcap").stat().st_size))
         with contextlib.suppress(LogDamagedError):

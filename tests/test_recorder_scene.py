@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 import foxglove.messages
@@ -47,7 +46,7 @@ def test_frames_and_truth_are_the_bytes_that_they_were_before_there_was_a_world(
 
 
 def test_objects_are_where_the_truth_says(recorded):
-    with contextlib.closing(RecordedSource(recorded)) as source:
+    with RecordedSource(recorded) as source:
         truth = source.take(0, FRAMES).truth
     scenery = scenery_of(section_table(IcubConfig()))
     told = messages(recorded / "right.mcap", "/scene")

@@ -38,7 +38,7 @@ SMALL = IcubConfig(
 
 def seen_in(scene: IcubConfig, *blocks: tuple[int, int, int]) -> list[np.ndarray]:
     """Frames of (view, first, n) of a scene."""
-    with contextlib.closing(IcubSource(scene, RecordConfig())) as source:
+    with IcubSource(scene, RecordConfig()) as source:
         found = []
         for view, first, n in blocks:
             source.seek(first)
@@ -129,7 +129,7 @@ def test_physics_moves_objects_after_the_paper_s_motions_upright_on_the_table():
     assert np.abs(poses[..., 2] - pushed.table.top - standing).max() < 0.001
     np.testing.assert_array_equal(poses[:, :2, 3:], np.tile([0, 0, 0, 1], (130, 2, 1)))
     assert np.abs(poses[:, 2, 3:6]).max() > 0.3  # the ball rolls
-    with contextlib.closing(IcubSource(pushed, RecordConfig())) as source:
+    with IcubSource(pushed, RecordConfig()) as source:
         source.seek(5)
         block = source.take(0, 3)
     assert source.spec.truth == (*TRUTH, *HEIGHTS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import tracemalloc
 from collections.abc import Iterator
@@ -193,7 +192,7 @@ def test_damage_in_a_chunk_is_found_when_it_is_read(
     broken = bytearray(web.files["/rec/x1.mcap"])
     broken[segment.data_offset + segment.stored // 2] ^= 1
     web.files["/rec/x1.mcap"] = bytes(broken)
-    with contextlib.closing(RecordedSource(views)) as source:
+    with RecordedSource(views) as source:
         source.take(0, 10)
         source.seek(0)
         with pytest.raises(LogDamagedError, match=r"x1\.mcap: chunk at byte"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib.util
 import json
@@ -248,7 +247,7 @@ def test_intervals_of_epsilon_d_are_by_seeds() -> None:
 @pytest.mark.skipif(not SAMPLE.exists(), reason="the sample recording is not there")
 def test_the_icub_trial_keeps_what_its_figures_show(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(icub, "HELD_OUT", 400)
-    with contextlib.closing(RecordedSource(SAMPLE)) as source:
+    with RecordedSource(SAMPLE) as source:
         row, arrays = icub.learn_curves(source, paper_config("icub"), seed=0)
         frames = source.frames - 400
     assert row["iterations"] == frames // 40
@@ -363,7 +362,7 @@ def test_scenes_are_told_by_who_learns_which_object() -> None:
 @pytest.mark.skipif(not SAMPLE.exists(), reason="the sample recording is not there")
 def test_the_sample_recording_s_noise_is_not_learnable() -> None:
     eta = []
-    with contextlib.closing(RecordedSource(SAMPLE)) as source:
+    with RecordedSource(SAMPLE) as source:
         for view in range(3):
             source.seek(0)
             frames = source.take(view, 2000).frames.reshape(2000, -1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 import pytest
 from rtsp_camera import RATE, rtsp_camera
@@ -14,7 +12,7 @@ from recorder.cameras.words import open_live
 
 
 def test_a_network_camera_shows_what_it_sees_at_its_own_rate() -> None:
-    with rtsp_camera(100) as word, contextlib.closing(open_live([word], LiveOptions())) as source:
+    with rtsp_camera(100) as word, open_live([word], LiveOptions()) as source:
         assert source.spec.streams == ("left",)
         assert source.spec.fps == RATE
         frames = source.take(0, 20).frames
@@ -30,7 +28,7 @@ def test_a_network_camera_that_breaks_is_connected_to_anew() -> None:
     options = LiveOptions(rate=RATE)
     with (
         rtsp_camera(40) as word,
-        contextlib.closing(open_live([word], options, say=said.append)) as source,
+        open_live([word], options, say=said.append) as source,
     ):
         source.take_all(2 * RATE)
     assert any("left" in line and "connecting to it anew" in line for line in said), said

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import random
 from collections.abc import Sequence
 from fractions import Fraction
@@ -41,7 +40,7 @@ def write_video_messages(path: Path, packets: Sequence[bytes]) -> Path:
 
 def shown(path: Path, rows: Sequence[int]) -> list[np.ndarray[Any, Any]]:
     """The frames of a salvaged log, asked for in some order."""
-    with contextlib.closing(ForeignSource(path, size=SIZE, salvage=True, loop=True)) as source:
+    with ForeignSource(path, size=SIZE, salvage=True, loop=True) as source:
         frames = []
         for row in rows:
             source.seek(row)
@@ -57,7 +56,7 @@ def test_a_broken_image_is_refused_with_the_remedy_and_passed_over_with_it(tmp_p
     order = [*range(45), 8, 7, 39, 0, 1, 7]
     for row, frame in zip(order, shown(path, order), strict=True):
         np.testing.assert_array_equal(frame, images[stands_for.get(row % 40, row % 40)])
-    with contextlib.closing(ForeignSource(path, salvage=True)) as source:
+    with ForeignSource(path, salvage=True) as source:
         assert source.take(0, 8).frames.shape[0] == 8
         assert "2 broken of 40 images" in source.salvaged()[0]
     with pytest.raises(LogDamagedError, match=r"/cam.*its PNG is cut short$"):
@@ -83,7 +82,7 @@ def test_a_video_is_shown_again_from_the_next_whole_picture(tmp_path: Path) -> N
     order = [*range(COUNT), *random.Random(0).sample(range(COUNT), COUNT)]
     for row, frame in zip(order, shown(path, order), strict=True):
         np.testing.assert_array_equal(frame, expected[last.get(row, row)], err_msg=str(row))
-    with contextlib.closing(ForeignSource(path, size=SIZE)) as source:
+    with ForeignSource(path, size=SIZE) as source:
         source.seek(30)
         with pytest.raises(LogDamagedError, match="its message is empty, without a picture"):
             source.take(0, 1)
@@ -93,7 +92,7 @@ def test_pictures_of_a_lost_one_are_not_made_up(tmp_path: Path) -> None:
     pytest.importorskip("av")
     packets = video("h264")[: 2 * GROUP] + video("h264")[2 * GROUP + 1 :]
     path = write_video_messages(tmp_path / "a.mcap", packets)
-    with contextlib.closing(ForeignSource(path, size=SIZE)) as source:
+    with ForeignSource(path, size=SIZE) as source:
         source.seek(2 * GROUP)
         with pytest.raises(LogDamagedError, match="is broken there, or one that it needs: learn"):
             source.take(0, 1)
@@ -147,7 +146,7 @@ def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Pa
     data[place] ^= 1
     path.write_bytes(data)
     with (
-        contextlib.closing(ForeignSource(path)) as source,
+        ForeignSource(path) as source,
         pytest.raises(LogDamagedError, match=r"other messages than the summary names.*--salvage"),
     ):
         source.take(0, 8)
@@ -179,7 +178,7 @@ def test_channels_of_one_topic_and_kind_are_one_stream(cdmisfa: Cdmisfa, tmp_pat
     halves = [(RAW, [raw(image) for image in images[start::2]]) for start in (0, 1)]
     path = write_channels(tmp_path / "a.mcap", halves)
     for topics in ((), ("/cam",)):
-        with contextlib.closing(ForeignSource(path, topics, size=SIZE)) as source:
+        with ForeignSource(path, topics, size=SIZE) as source:
             np.testing.assert_array_equal(source.take(0, 40).frames, images)
     for row, frame in enumerate(shown(path, range(40))):  # by a pass over the log
         np.testing.assert_array_equal(frame, images[row])

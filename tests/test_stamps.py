@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,10 +58,10 @@ def test_images_are_shown_at_the_times_of_their_headers(kind: str, tmp_path: Pat
     what, messages = LOGS[kind]
     path = write_mcap(tmp_path / "a.mcap", what, {"/cam": every(STEP, messages())})
     images = list(pictures(COUNT))
-    with contextlib.closing(ForeignSource(path)) as logged:
+    with ForeignSource(path) as logged:
         assert (logged.spec.fps, logged.spec.start_ns) == (50, START)
         assert (logged.take(0, 3).frames == images[:3]).all()
-    with contextlib.closing(ForeignSource(path, stamp="header")) as source:
+    with ForeignSource(path, stamp="header") as source:
         assert (source.spec.fps, source.spec.start_ns) == (25, MADE)
         shown = source.take(0, COUNT).frames
         assert (shown == [images[i] for i in (0, 2, 1, *range(3, COUNT))]).all()
@@ -78,7 +77,7 @@ def test_parts_on_a_server_are_known_by_what_was_read_of_them(tmp_path: Path) ->
             part = write_mcap(tmp_path / name, kind, {"/cam": every(STEP, own)})
             web.files[f"/{name}.mcap"] = part.read_bytes()
         urls = [web.url(f"/{name}.mcap") for name in "ab"]
-        with contextlib.closing(ForeignSource(urls, stamp="header")) as source:
+        with ForeignSource(urls, stamp="header") as source:
             assert source.alignment["cam"]["messages"] == COUNT
             files = source.describe()["files"]
     assert [file["url"] for file in files] == urls

@@ -32,7 +32,7 @@ def written(folder: Path, rows: Mapping[int, str], *, names: str = "t,a,b") -> P
 
 def taken(path: Path, **options: Any) -> tuple[list[list[float]], tuple[str, ...]]:
     """All frames of a table, and what is said of it but of its times: see test_gaps."""
-    with contextlib.closing(ForeignSource(path, **{"time": "t", **options})) as source:
+    with ForeignSource(path, **{"time": "t", **options}) as source:
         said = tuple(line for line in source.warnings if "is taken by number" not in line)
         return source.take(0, source.frames).frames.tolist(), said
 
@@ -284,9 +284,9 @@ def test_a_recording_of_values_says_how_it_is_taken(cdmisfa: Cdmisfa, tmp_path: 
 
 def test_frames_that_are_held_in_a_gap_are_counted(tmp_path: Path) -> None:
     path = written(tmp_path, {ROWS - 1: "5.0,1,1"})
-    with contextlib.closing(ForeignSource(path, time="t", gaps="hold")) as source:
+    with ForeignSource(path, time="t", gaps="hold") as source:
         assert (source.frames, source.alignment["t"]["repeated"]) == (51, 39)
-    with contextlib.closing(ForeignSource(path, time="t")) as source:
+    with ForeignSource(path, time="t") as source:
         assert (source.frames, source.alignment["t"]["repeated"]) == (51, 0)
 
 

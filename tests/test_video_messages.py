@@ -87,7 +87,7 @@ def test_what_follows_a_broken_picture_is_not_made_up(tmp_path: Path) -> None:
         for row in (14, 24, 59):
             np.testing.assert_array_equal(images.image(row), expected[row])
     with (
-        contextlib.closing(ForeignSource(path, size=(HEIGHT, WIDTH))) as source,
+        ForeignSource(path, size=(HEIGHT, WIDTH)) as source,
         pytest.raises(LogDamagedError, match="its video is broken there"),
     ):
         source.take(0, COUNT)
@@ -100,7 +100,7 @@ def test_a_running_robots_video_is_shown_from_its_first_whole_picture() -> None:
     robot = Robot()
     with contextlib.closing(robot), robot.showing(CompressedVideoChannel, "/cam", message):
         word, options = f"{robot.address}/cam", LiveOptions(rate=50)
-        with contextlib.closing(open_live([word], options)) as source:
+        with open_live([word], options) as source:
             frames = source.take(0, 30).frames
     shown = decoded("h264")
     found = [next((k for k in range(COUNT) if (shown[k] == f).all()), None) for f in frames]

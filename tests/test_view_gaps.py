@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 
 import numpy as np
@@ -44,7 +43,7 @@ def shown(tmp_path_factory):
         for k in range(ITERATIONS):
             log.write(block_of(IMAGE, s, after_the_gap(k * TAU), TAU, rng))
         log.finish()
-    with contextlib.closing(RecordedSource(recording, loop=True)) as source:
+    with RecordedSource(recording, loop=True) as source:
         described = source.describe()
     learner = {"tau": TAU, "delta": 0.001}
     manifest = {"config": {"learner": learner}, "seed": 0, "source": described}

@@ -120,7 +120,7 @@ def _read(case: Case, path: Path, *, salvage: bool) -> None:
 
 
 def _play(case: Case, path: Path, *, salvage: bool) -> None:
-    with contextlib.closing(RecordedSource([path], salvage=salvage)) as source:
+    with RecordedSource([path], salvage=salvage) as source:
         if source.frames > 1000:
             raise BrokenPromise(f"{source.frames} frames in {len(case.raw)} bytes")
         blocks: list[Block] = []

@@ -213,7 +213,7 @@ class History:
 
     def check_recording(self) -> None:
         """What is there of a recording is what one world shows from its first frame on."""
-        with self._errors(), contextlib.closing(RecordedSource(self.recording)) as source:
+        with self._errors(), RecordedSource(self.recording) as source:
             worlds, first, most = set(WORLDS), source.first_frame, source.frames
             for stream, name in enumerate(source.spec.streams):
                 source.seek(first)
@@ -250,7 +250,7 @@ class History:
         check(WRONG, log.ok, f"{log.problems}")
         named: Any = result.source.get("views", ())
         if result.iterations and named and all(map(self._is_there, named)):
-            with contextlib.closing(RecordedSource(self.recording)) as source:
+            with RecordedSource(self.recording) as source:
                 shown, name = source.take(0, TAU), source.spec.streams[0]
             right = any(_shows(world, name, shown.t, shown.frames) for world in worlds)
             check(MIXED, right or not worlds, "its files show another world")

@@ -103,7 +103,7 @@ def told(case: Case, place: str, out: Path, times: tuple[str, ...] = ()) -> Any:
     if code and not (case.command in ("info", "verify") and written):
         return code, err
     if case.command == "convert":
-        with contextlib.closing(RecordedSource(out)) as source:
+        with RecordedSource(out) as source:
             frames = [source.take(0, source.frames).frames]
             source.seek(0)
             frames.append(source.take(1, source.frames).frames)
