@@ -18,6 +18,8 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import CompressionType, IndexType, Writer
 from PIL import Image
 
+from recorder.mcap.records import MAX_CHUNK
+
 Writing = Callable[[Path], Path]
 """Writes into a folder, and says what."""
 
@@ -359,7 +361,9 @@ CAMERAS: dict[str, Writing] = {
     "messages of a chunk": messages_of_a_chunk,
     "size of a chunk": chunk("zstd", 1 << 40, zeros(1)),
     "chunk of zstd": chunk("zstd", PART, zeros(300)),
+    "chunk of zstd at the limit": chunk("zstd", MAX_CHUNK, zeros(1024)),
     "chunk of LZ4": chunk("lz4", PART, lz4.frame.compress(bytes(300 * PART))),
+    "chunk of LZ4 at the limit": chunk("lz4", MAX_CHUNK, lz4.frame.compress(bytes(1024 * PART))),
     "chunk that is not packed": chunk("", 1 << 40, bytes(100)),
     "Parquet": table_of_zeros,
     "CSV": text_of_a_table,

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import lz4.frame
 import zstandard
+from mcap.writer import Writer
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = range(1, 8)
@@ -16,7 +19,6 @@ CHUNK_INDEX, ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA = range(8, 13)
 METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(13, 16)
 
 KINDS = ("none", "one", "ten", "attachment", "metadata", "schemaless")
-FEATURES = ("ch", "chx", "mx", "rch", "rsh", "st", "sum", "ax", "mdx", "pad")
 PADDING = b"\x01\xff\xff"
 
 
@@ -80,6 +82,23 @@ def finish(data: bytes, summary: bytes = b"", *, crc: bool = True, offsets: int 
     footer = struct.pack("<BQQQ", FOOTER, 20, start, offsets)
     check = zlib.crc32(summary + footer) if crc else 0
     return data + data_end + summary + footer + struct.pack("<I", check) + MAGIC
+
+
+def written(
+    times: Iterable[int], payload: Callable[[int], bytes], chunk_size: int, **options: Any
+) -> bytes:
+    """A log as others write it: messages of two topics by turns, a file and metadata."""
+    stream = io.BytesIO()
+    writer = Writer(stream, chunk_size=chunk_size, **options)
+    writer.start(profile="p", library="l")
+    schema = writer.register_schema("name", "encoding", b"data")
+    channels = [writer.register_channel(topic, "raw", schema) for topic in ("/a", "/b")]
+    writer.add_metadata("meta", {"key": "value"})
+    writer.add_attachment(1, 2, "file", "text/plain", b"attached")
+    for i, time in enumerate(times):
+        writer.add_message(channels[i % 2], time, payload(i), max(time - 7, 0), i)
+    writer.finish()
+    return stream.getvalue()
 
 
 def variants() -> Iterator[tuple[str, frozenset[str]]]:

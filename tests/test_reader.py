@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import struct
 import tracemalloc
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import mcap_files as files
 import pytest
@@ -18,18 +20,8 @@ from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.reader import LogReader
 
 
-def written(
-    times: list[int], *, compression: CompressionType = CompressionType.ZSTD, **options: object
-) -> bytes:
-    stream = io.BytesIO()
-    writer = Writer(stream, compression=compression, chunk_size=300, **options)  # type: ignore[arg-type]
-    writer.start()
-    schema = writer.register_schema("name", "encoding", b"data")
-    channels = [writer.register_channel(topic, "raw", schema) for topic in ("/a", "/b")]
-    for i, time in enumerate(times):
-        writer.add_message(channels[i % 2], time, bytes([i % 256]) * 40, max(time - 7, 0), i)
-    writer.finish()
-    return stream.getvalue()
+def written(times: Iterable[int], **options: Any) -> bytes:
+    return files.written(times, lambda i: bytes([i % 256]) * 40, 300, **options)
 
 
 def read(path: Path, **options: object) -> list[tuple[str, int, int, int, bytes]]:

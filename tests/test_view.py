@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from replay.view.build import build_view
 from replay.view.columns import named_tensors, tensors
 from replay.view.summary import summary_text
 
-REPLAY = Path(__file__).parents[1] / "replay"
 ITERATIONS = 24
 TAU = 40
 

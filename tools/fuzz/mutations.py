@@ -8,7 +8,6 @@ made right again afterwards, or not. The same number gives the same file.
 from __future__ import annotations
 
 import contextlib
-import io
 import struct
 import tempfile
 import zlib
@@ -17,15 +16,17 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import mcap_files as files
 import numpy as np
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
+from tools.torture.mutations import BYTES
 
 FRAMES = 20
 SHAPE = (2, 3)
@@ -123,18 +124,9 @@ def _recording(folder: Path, compression: str) -> bytes:
     return (folder / "left.mcap").read_bytes()
 
 
-def _other(**options: object) -> bytes:
-    stream = io.BytesIO()
-    writer = Writer(stream, chunk_size=180, **options)  # type: ignore[arg-type]
-    writer.start(profile="p", library="l")
-    schema = writer.register_schema("name", "encoding", b"data")
-    channels = [writer.register_channel(topic, "raw", schema) for topic in ("/a", "/b")]
-    writer.add_metadata("meta", {"key": "value"})
-    writer.add_attachment(1, 2, "file", "text/plain", b"attached")
-    for i in range(FRAMES):
-        writer.add_message(channels[i % 2], 7 * i % 20, bytes([i]) * (9 + i % 7), i, i)
-    writer.finish()
-    return stream.getvalue()
+def _other(**options: Any) -> bytes:
+    times = (7 * i % 20 for i in range(FRAMES))
+    return files.written(times, lambda i: bytes([i]) * (9 + i % 7), 180, **options)
 
 
 @cache
@@ -461,22 +453,6 @@ def _bytes_changed(random: Random, whole: bytes) -> bytes:
     """A file changed without regard to what its bytes mean."""
     raw = bytearray(whole)
     for _ in range(random.choice((1, 1, 2, 4))):
-        at, length = random.randrange(len(raw) + 1), random.randint(1, 64)
-        match random.randrange(8):
-            case 0 | 1:
-                raw[at : at + 1] = bytes([raw[at] ^ 1 << random.randrange(8)]) if raw[at:] else b""
-            case 2:
-                width = random.choice((2, 4, 8))
-                before = int.from_bytes(raw[at : at + width], "little")
-                raw[at : at + width] = _number(random, width, before).to_bytes(width, "little")
-            case 3:
-                del raw[at : at + length]
-            case 4:
-                raw[at:at] = raw[at : at + length]
-            case 5:
-                raw[at : at + length] = bytes(len(raw[at : at + length]))
-            case 6:
-                del raw[at:]
-            case 7:
-                raw[at:at] = random.randbytes(length)
+        if raw:
+            random.choice(BYTES)(random, raw)
     return bytes(raw)
