@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from waiting import python
 
 NOBODY = """
 import pwd
@@ -22,16 +22,7 @@ main()
 
 def alone(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     environment = {"PYTHONPATH": str(Path(__file__).parents[1]), "TMPDIR": str(folder)}
-    return subprocess.run(
-        [sys.executable, "-c", NOBODY, *words],
-        cwd=folder,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    return python("-c", NOBODY, *words, cwd=folder, env=environment, stdin=subprocess.DEVNULL)
 
 
 @pytest.fixture(scope="module")

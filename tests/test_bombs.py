@@ -6,8 +6,6 @@ import multiprocessing
 import os
 import re
 import resource
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import av
 import pytest
 from bombs import CAMERAS, METADATA, write_all
 from test_modules import learned
+from waiting import python
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.learning import Keyframe
@@ -197,9 +196,7 @@ def test_side_files(tmp_path: Path) -> None:
 def test_rows(tmp_path: Path, line: bytes) -> None:
     (tmp_path / REQUEST).write_text('{"trials": []}')
     (tmp_path / ROWS).write_bytes(b"".join(line % (i, LISTS) for i in range(8)))
-    command = subprocess.run(
-        [sys.executable, "-c", READ_ROWS, tmp_path], capture_output=True, text=True, check=True
-    )
+    command = python("-c", READ_ROWS, tmp_path, check=True)
     said, most = command.stdout.splitlines()
     assert re.search(rf"{ROWS}.*(MiB of memory|remove the line)", said)
     assert int(most) < 512 << 10

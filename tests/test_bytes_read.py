@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import python
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
@@ -55,12 +54,7 @@ def share_read(path: Path, work: str) -> float:
     if not other.exists():
         other.mkdir()
         (other / "left.mcap").write_bytes(path.read_bytes())
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(path), str(other / "left.mcap")],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = python("-c", script, path, other / "left.mcap", check=True)
     return int(done.stdout) / path.stat().st_size
 
 

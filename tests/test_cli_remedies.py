@@ -6,13 +6,12 @@ import importlib.util
 import json
 import re
 import shlex
-import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa
+from waiting import python
 from web_server import serving
 
 from cdmisfa.cli.commands.doctor import EXTRAS
@@ -152,9 +151,7 @@ def test_a_scheduler_without_an_address_is_one_line_to_the_end_of_the_process(
     tmp_path: Path,
 ) -> None:
     words = ("sweep", "oscillatory", "-o", tmp_path, "--engine", "dask", "--scheduler", "nope")
-    ended = subprocess.run(
-        [sys.executable, "-m", "cdmisfa", *words], capture_output=True, text=True, check=False
-    )
+    ended = python("-m", "cdmisfa", *words)
     said = "cdmisfa: no dask scheduler answers at nope: missing port number in address 'nope'\n"
     assert (ended.returncode, ended.stderr) == (1, said)
 
@@ -164,9 +161,7 @@ def test_another_package_of_the_name_of_ours_is_named(tmp_path: Path) -> None:
     other.parent.mkdir()
     other.touch()
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import cdmisfa"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False
-    )
+    done = python("-c", code, cwd=tmp_path)
     said = f"replay is not cdmisfa's: {other}; give cdmisfa an environment of its own"
     assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
 

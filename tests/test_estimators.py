@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
-import sys
 import tracemalloc
 from collections.abc import Callable
 from typing import Any
@@ -17,6 +15,7 @@ from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from sklearn.utils.estimator_checks import check_estimator
+from waiting import python
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.estimators import IncSFA, OnlineSFA, RecursiveSFA
@@ -219,8 +218,6 @@ def test_without_its_package_it_says_what_to_install(name: str, package: str, ex
         f"import cdmisfa.estimators as e\nhelp(e.{name})\n"
         f"try: e.{name}(2, n_whitened=4)\nexcept Exception as error: print(repr(error))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
+    done = python("-c", code, check=True)
     assert "window: " in done.stdout
     assert f"which is missing: pip install 'cdmisfa[{extra}]'" in done.stdout.splitlines()[-1]

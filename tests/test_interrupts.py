@@ -17,6 +17,7 @@ import click
 import pytest
 from conftest import Cdmisfa, Outcome
 from folders import contents
+from waiting import python
 
 from cdmisfa.cli import app
 from cdmisfa.cli.app import run
@@ -75,8 +76,7 @@ main()
 
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_while_python_ends_leaves_the_exit_code(number: signal.Signals) -> None:
-    words = [sys.executable, "-c", AT_THE_END, str(int(number))]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    done = python("-c", AT_THE_END, int(number))
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("cdmisfa ")
 
@@ -97,8 +97,7 @@ main()
 
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_while_the_command_line_is_imported_says_so(number: signal.Signals) -> None:
-    words = [sys.executable, "-c", IN_THE_BEGINNING, str(int(number))]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    done = python("-c", IN_THE_BEGINNING, int(number))
     assert (done.returncode, done.stderr) == (128 + number, "cdmisfa: interrupted\n")
 
 
@@ -303,12 +302,6 @@ def test_a_stop_inside_of_an_exec_ends_with_its_code_too(tmp_path: Path) -> None
         "app.cli.main = lambda **words: exec(kill)\n"
         "app.main()\n"
     )
-    ended = subprocess.run(
-        [sys.executable, "-m", "stopped"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    root = str(Path(__file__).parents[1])
+    ended = python("-m", "stopped", cwd=tmp_path, env={**os.environ, "PYTHONPATH": root})
     assert (ended.returncode, ended.stderr) == (143, "cdmisfa: interrupted\n")

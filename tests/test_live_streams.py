@@ -28,7 +28,7 @@ from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage as FoxgloveRaw
 from live_cameras import Robot
-from waiting import Clock, wait_for
+from waiting import Clock, python, wait_for
 from websockets.sync.server import ServerConnection, serve
 
 from cdmisfa import ArraySource, GymSource
@@ -462,11 +462,7 @@ def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(
         "play_as_robot([Path(sys.argv[1])], how, port=0, say=watch)\n"
     )
     assert cdmisfa("record", "oscillatory", "-o", tmp_path / "rec", "--frames", "20").code == 0
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script, str(tmp_path / "rec")],
-        capture_output=True,
-        text=True,
-    )
+    done = python("-W", "ignore", "-c", script, tmp_path / "rec")
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -488,7 +484,7 @@ def test_a_server_whose_headers_never_end_is_told_of_once() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         threading.Thread(target=answer, args=(listener,), daemon=True).start()
         word = f"foxglove://127.0.0.1:{listener.getsockname()[1]}/cam"
-        done = subprocess.run([sys.executable, "-c", script, word], capture_output=True, text=True)
+        done = python("-c", script, word)
     assert "does not answer" in done.stdout
     assert done.stderr == ""
 

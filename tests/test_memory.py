@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import python
 
 MOST = 512
 
@@ -40,8 +41,7 @@ image.save(sys.argv[1])
 
 def peak(folder: Path, work: str) -> int:
     """Megabytes that some work took at most, in a process of its own."""
-    words = [sys.executable, "-c", PEAK.replace("{work}", work), str(folder)]
-    ran = subprocess.run(words, capture_output=True, text=True, check=False)
+    ran = python("-c", PEAK.replace("{work}", work), folder)
     assert ran.returncode == 0, ran.stderr
     return int(ran.stdout)
 

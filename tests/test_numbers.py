@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import random
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ import pytest
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from message_files import START, STEP, every, learned_alike, write_mcap, write_table
+from waiting import python
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.images.decoding import MessageKind, message_decoder
@@ -330,8 +330,7 @@ def test_a_table_of_too_many_numbers_is_taken_in_part(tmp_path: Path) -> None:
     small, large = (dict.fromkeys(columns, np.zeros(rows, kind)) for kind in ("i1", "f8"))
     paths = write_table(tmp_path / "t.parquet", small), write_table(tmp_path / "l.parquet", large)
     # In a process of its own: what this one has freed could be used again, which takes no more.
-    command = [sys.executable, "-c", TAKE, *map(str, paths)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
+    done = python("-c", TAKE, *paths, check=True)
     numbers, taken, whole = done.stdout.splitlines()
     assert numbers.endswith("128 MiB of memory for it, the limit: take fewer columns, with --field")
     assert taken == "taken"

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import importlib
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from waiting import python
 
 from cdmisfa.cli.on_demand import names_on_demand
 
@@ -84,9 +84,7 @@ def test_a_view_is_written_without_most_of_rerun(tmp_path: Path) -> None:
         "main()\n"
     )
     words = ["learn", "oscillatory", "--max-iterations", "1", "-o", str(tmp_path / "run")]
-    done = subprocess.run(
-        [sys.executable, "-c", program, *words], capture_output=True, text=True, check=True
-    )
+    done = python("-c", program, *words, check=True)
     assert done.stderr.splitlines()[-1] == "True False False"
     assert (tmp_path / "run" / "run.rrd").stat().st_size > 0
 
@@ -102,7 +100,5 @@ def test_a_scene_is_learned_from_without_views_and_what_reads_logs_of_others(
         "wanted = {'rerun', 'matplotlib', 'pybullet', 'replay.camera_logs.source'}\n"
         "print(wanted & sys.modules.keys(), file=sys.stderr)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
+    done = python("-c", program, check=True)
     assert done.stderr.splitlines()[-1] == "set()"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import os
 import resource
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from folders import contents
+from waiting import python
 
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.errors import LogDamagedError, LogWriteError
@@ -48,13 +49,8 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def limited(*words: str, **options: Any) -> None:
     """Run Python in a process that may have few files open."""
-    done = subprocess.run(
-        [sys.executable, *words],
-        capture_output=True,
-        text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (LIMIT, LIMIT)),
-        **options,
-    )
+    few = functools.partial(resource.setrlimit, resource.RLIMIT_NOFILE, (LIMIT, LIMIT))
+    done = python(*words, preexec_fn=few, **options)
     assert done.returncode == 0, (words, done.stderr[-600:])
 
 
@@ -307,11 +303,11 @@ def test_nobody_overwrites_what_a_recorder_has_closed(tmp_path: Path) -> None:
         "from recorder.log.logfile import LogFile\n"
         "LogFile(Path(sys.argv[1]), force=True).finish()\n"
     )
-    command = [sys.executable, "-c", overwrite, str(tmp_path / "a.mcap")]
+    command = ("-c", overwrite, tmp_path / "a.mcap")
     with held(tmp_path):
-        done = subprocess.run(command, capture_output=True, text=True)
+        done = python(*command)
         assert "is in use by another process" in done.stderr
         LogFile(tmp_path / "b.mcap").finish()
         LogFile(tmp_path / "b.mcap", force=True).finish()
     assert (tmp_path / "a.mcap.partial").read_bytes() == b"first"
-    assert subprocess.run(command).returncode == 0
+    assert python(*command).returncode == 0

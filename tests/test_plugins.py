@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ import pytest
 from conftest import Cdmisfa, Outcome
 from folders import contents
 from PIL import Image
+from waiting import python
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.errors import UsageError
@@ -297,15 +297,9 @@ def test_doctor_lists_plugins_and_says_why_one_fails(cdmisfa: Cdmisfa, environme
 
 def test_the_toys_own_tests_pass_with_the_contracts(environment: Path) -> None:
     shutil.copytree(TOY / "tests", environment / "toy_tests")
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "toy_tests"],
-        env={**os.environ, "PYTHONPATH": f"{environment}:{ROOT}"},
-        cwd=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    found = {**os.environ, "PYTHONPATH": f"{environment}:{ROOT}"}
+    words = ("pytest", "-q", "-p", "no:cacheprovider", "toy_tests")
+    done = python("-m", *words, env=found, cwd=environment)
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
     assert "skipped" not in done.stdout

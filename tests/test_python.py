@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from conftest import Cdmisfa
 from PIL import Image
 from rerun.chunk import RrdReader
 from view_data import View
+from waiting import python
 
 import cdmisfa
 from cdmisfa import Recording, Run, learn
@@ -337,12 +336,7 @@ def test_the_library_lists_what_a_user_needs_and_explains_each() -> None:
     for name in names:
         assert getattr(cdmisfa, name).__doc__, name
     for name in ("learn", "Run", "Recording"):
-        done = subprocess.run(
-            [sys.executable, "-c", f"import cdmisfa; help(cdmisfa.{name})"],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        done = python("-c", f"import cdmisfa; help(cdmisfa.{name})", check=True)
         assert "Raises:" in done.stdout
 
 

@@ -7,12 +7,12 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from conftest import Cdmisfa
+from waiting import python
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/tour.md", "docs/applying.md")
@@ -76,15 +76,6 @@ def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
 
 def test_python_example_works(elsewhere: Path) -> None:
     (example,) = blocks("python")
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            example + "\nprint(run.modules[0].stream, len(outputs) == 100 * len(table))",
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    shown = "\nprint(run.modules[0].stream, len(outputs) == 100 * len(table))"
+    done = python("-c", example + shown)
     assert (done.returncode, done.stdout.strip()) == (0, "x1 True"), done.stderr

@@ -2,11 +2,10 @@
 
 import contextlib
 import dataclasses
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from waiting import python
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import build, load_preset
@@ -124,7 +123,7 @@ def test_the_simulator_says_nothing():
         "from recorder.world.scenes import open_scene\n"
         "s = open_scene('icub'); s.take(0, 2); s.close(); print('done')"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    run = python("-c", code)
     assert (run.returncode, run.stdout, run.stderr) == (0, "done\n", "")
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import copy
 import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from numpy.typing import NDArray
+from waiting import python
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.features.incsfa import Feature
@@ -258,13 +257,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
     for threads in ("1", "2", "5"):
         names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
         environment = {**os.environ, **dict.fromkeys(names, threads)}
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        done = python("-c", code, env=environment, check=True)
         hashes.add(done.stdout)
     assert len(hashes) == 1
 

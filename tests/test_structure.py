@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
 import click
 import pytest
 from conftest import Cdmisfa
+from waiting import python
 
 from cdmisfa.cli.app import COMMANDS, cli
 
@@ -24,12 +24,6 @@ def inits(package: str) -> list[Path]:
 
 
 HEAVY = ("numpy", "_cffi_backend", "rerun", "pybullet", "matplotlib", "pyarrow", "mcap", "rich")
-
-
-def python(*args: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, *args], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
-    )
 
 
 FORBIDDEN = {
@@ -83,14 +77,8 @@ def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
     code = (
         "from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))"
     )
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root), "COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
+    return python(
+        "-c", code, cwd=root, env={**os.environ, "PYTHONPATH": str(root), "COLUMNS": "200"}
     )
 
 
@@ -208,8 +196,7 @@ def test_page_of_signals_is_what_the_command_prints(cdmisfa: Cdmisfa) -> None:
 def test_sources_without_compiled_kernels_say_so(tmp_path: Path) -> None:
     for package in PACKAGES:
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("*.so"))
-    words = [sys.executable, "-m", "cdmisfa", "learn", "oscillatory", "--max-iterations", "1"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = python("-m", "cdmisfa", "learn", "oscillatory", "--max-iterations", 1, cwd=tmp_path)
     assert done.returncode == 1
     assert done.stderr.startswith("cdmisfa: ")
     assert "holds no compiled kernels: install cdmisfa" in done.stderr

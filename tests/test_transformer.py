@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from run_data import read_signals, rows_of
+from waiting import python
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -79,7 +77,5 @@ def test_neither_learner_nor_sklearn_is_loaded():
         "import sys, replay.runs.modules; "
         "print([m for m in sys.modules if m in ('cdmisfa.agents.learner', 'sklearn', 'rerun')])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
+    done = python("-c", code, check=True)
     assert done.stdout.strip() == "[]"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from waiting import python
 
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.progress.config import ProgressConfig
@@ -183,9 +182,7 @@ def test_without_gymnasium_it_says_what_to_install() -> None:
         "import cdmisfa\nhelp(cdmisfa.WatchEnv)\n"
         "try: cdmisfa.WatchEnv(None)\nexcept Exception as error: print(repr(error))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
+    done = python("-c", code, check=True)
     assert "max_iterations: " in done.stdout
     assert "is missing: pip install 'cdmisfa[gym]'" in done.stdout.splitlines()[-1]
 
@@ -202,12 +199,6 @@ def test_the_example_of_ppo_runs(tmp_path: Path) -> None:
         "        assert self.env.observation_space.contains(seen)\n"
         "        return self.env.action_space.sample(), None\n"
     )
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / "ppo.py"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(EXAMPLES.parent)])},
-    )
+    found = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(EXAMPLES.parent)])}
+    done = python(EXAMPLES / "ppo.py", check=True, env=found)
     assert [line.partition(":")[0] for line in done.stdout.splitlines()] == ["PPO", "the learner"]

@@ -26,6 +26,12 @@ class Clock:
         self.now += seconds + self.over
 
 
+def python(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:
+    """What a Python process of its own left that was given these words."""
+    how = {"capture_output": True, "text": True, "timeout": 300, **how}
+    return subprocess.run([sys.executable, *map(str, words)], **how)
+
+
 @contextlib.contextmanager
 def started(*words: object, **environment: str) -> Iterator[subprocess.Popen[str]]:
     """The command line in a process of its own, which is killed where it goes on at the end."""

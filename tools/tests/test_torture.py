@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from waiting import wait_for
+from waiting import python, wait_for
 
 from tools.torture import harness, page
 from tools.torture.campaigns import CAMPAIGNS, campaign
@@ -232,13 +231,6 @@ def test_every_campaign_ends(name: str) -> None:
 
 
 def test_an_unknown_campaign_is_refused() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.torture", "kittens"],
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = python("-m", "tools.torture", "kittens", cwd=Path(__file__).parents[2])
     assert done.returncode == 2
     assert "no campaign kittens" in done.stderr
