@@ -66,15 +66,13 @@ def _signalled_children() -> None:
 @pytest.fixture(scope="module", params=["_plain", "_wide"])
 def both_modules(request: pytest.FixtureRequest) -> Iterator[None]:
     """Tests of kernels run with each of the two modules that were compiled."""
+    from both_modules import using
+
     from cdmisfa import kernels
 
-    if request.param == "_wide" and not kernels._plain.lib.has_wide_lanes():
+    if request.param == "_wide" and not kernels.WIDE:
         pytest.skip("this processor has no AVX2")
-    module = importlib.import_module(f"cdmisfa.kernels.{request.param}")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "lib", module.lib)
-        patch.setattr(kernels, "ffi", module.ffi)
-        patch.setattr(kernels, "_buffer", module.ffi.from_buffer)
+    with using(importlib.import_module(f"cdmisfa.kernels.{request.param}")):
         yield
 
 

@@ -247,20 +247,6 @@ class TestRuns:
 
 
 class TestErrors:
-    @pytest.mark.parametrize("command", ["learn", "info", "verify", "recover"])
-    @pytest.mark.parametrize("content", [b"", b"not an MCAP file at all" * 20])
-    def test_a_file_that_is_no_mcap(
-        self, cdmisfa: Cdmisfa, tmp_path: Path, command: str, content: bytes
-    ) -> None:
-        path = tmp_path / "left.mcap"
-        path.write_bytes(content)
-        options = ("-o", tmp_path / "out.mcap") if command == "recover" else ()
-        done = cdmisfa(command, path, *options)
-        assert done.code == 3, done.err
-        assert "left.mcap" in done.err + done.out
-        assert "Traceback" not in done.err
-        assert not (tmp_path / "out.mcap").exists()
-
     def test_a_damaged_recording(
         self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
     ) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 from folders import contents
-from numpy.typing import NDArray
+from live_cameras import SHAPE, bar
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig
@@ -21,22 +21,8 @@ from recorder.config import Split
 from recorder.recording import RecordingStoppedError, record
 from replay.recordings.source import RecordedSource
 
-SHAPE = (12, 16)
 FRAMES = 700
 CONFIG = LearnerConfig(tau=20, components=3, expansion="none", warm_up=3)
-
-Picture = NDArray[np.uint8]
-
-
-def pictures(seed: int) -> Iterator[Picture]:
-    """What a camera delivers, one picture after the other: a bar that moves, and noise."""
-    rng = np.random.default_rng(seed)
-    t = 0
-    while True:
-        picture = rng.integers(0, 40, SHAPE, np.uint8)
-        picture[:, int(7.5 + 7 * np.sin((seed + 1) * t / 40))] += 200
-        yield picture
-        t += 1
 
 
 class Webcams:
@@ -45,7 +31,7 @@ class Webcams:
     def __init__(self, streams: tuple[str, ...] = ("left", "right"), length: int | None = None):
         self.spec = SourceSpec(streams, SHAPE, "uint8", fps=30, start_ns=10**18, length=length)
         self.t = 0
-        self._cameras = [pictures(seed) for seed in range(len(streams))]
+        self._cameras = len(streams)
 
     def take_all(self, n: int) -> tuple[Block, ...]:
         if n < 1:
@@ -53,8 +39,8 @@ class Webcams:
         if self.spec.length is not None and self.t + n > self.spec.length:
             raise LogExhaustedError("the cameras were unplugged")
         blocks = []
-        for stream, camera in enumerate(self._cameras):
-            frames = np.stack([next(camera) for _ in range(n)])
+        for stream in range(self._cameras):
+            frames = np.stack([bar(stream, self.t + k) for k in range(n)])
             frames.flags.writeable = False
             truth = np.empty((n, 0))
             truth.flags.writeable = False
@@ -63,7 +49,7 @@ class Webcams:
         return tuple(blocks)
 
     def take(self, stream: int, n: int) -> Block:
-        if not 0 <= stream < len(self._cameras):
+        if not 0 <= stream < self._cameras:
             raise ValueError(f"stream {stream} does not exist")
         return self.take_all(n)[stream]
 

@@ -7,6 +7,7 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from both_modules import using
 from hypothesis import assume, given, settings
 from numpy.typing import NDArray
 
@@ -156,10 +157,7 @@ def learned(
     """All that a kernel module makes of a stream."""
     sfa.state, _ = guarded(RecursiveState(*(np.zeros_like(array) for array in sfa.state)))
     vars(sfa).pop("_record", None)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "lib", module.lib)
-        patch.setattr(kernels, "ffi", module.ffi)
-        patch.setattr(kernels, "_buffer", module.ffi.from_buffer)
+    with using(module):
         changes = [sfa.update(x, gap) for x, gap in zip(blocks, gaps, strict=True)]
         return [*changes, *sfa.state, sfa.phi, *sfa.compare(np.ones_like(sfa.phi))]
 

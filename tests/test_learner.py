@@ -23,7 +23,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import overwrite
 from cdmisfa.core.signals import BlockSignals, SignalsHash, values
 from cdmisfa.features.incsfa import IncrementalFeature
-from recorder.world.oscillatory import OscillatorySource, one_period
+from recorder.world.oscillatory import OscillatorySource
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
 
@@ -370,41 +370,12 @@ def test_a_feature_of_another_shape_is_refused() -> None:
         CuriousLearner(CONFIG, SPEC, 0, feature=feature)
 
 
-def test_pixels_count_one_255th() -> None:
-    spec = SourceSpec(("a", "b"), (3, 4), "uint8")
-    config = LearnerConfig(expansion="none", components=3, tau=20)
-    pixels = np.random.default_rng(2).integers(0, 256, (40, 20, 3, 4), dtype=np.uint8)
-    image = CuriousLearner(config, spec, 1)
-    vector = CuriousLearner(config, SourceSpec(("a", "b"), (12,), "float64"), 1)
-    for k, frames in enumerate(pixels):
-        values_ = frames.reshape(20, 12) / 255.0
-        one = image.step(block(image.stream, 20 * k, frames))
-        two = vector.step(block(vector.stream, 20 * k, values_))
-        np.testing.assert_allclose(one.y, two.y, rtol=1e-6, atol=1e-9)
-        assert one.next_stream == two.next_stream
-
-
 def test_one_stream_alone_is_learned_and_never_left() -> None:
     found = trial(0, modules=1, source=OscillatorySource(("x2",)))
     (module,) = found.learner.modules
     assert module.policy.tolist() == [0]
     assert {record.next_stream for record in found.signals} == {0}
     assert module.eta[0] == pytest.approx(0.006, abs=0.001)
-
-
-def test_ten_thousand_streams() -> None:
-    n = 10_000
-    spec = SourceSpec(tuple(map(str, range(n))), (2,), "float64")
-    learner = CuriousLearner(CONFIG, spec, 0)
-    tables = [one_period(name) for name in ("x1", "x2", "x3")]
-    for k in range(100):
-        stream = learner.stream
-        frames = freeze(np.take(tables[stream % 3], range(100 * k, 100 * k + 100), 0, mode="wrap"))
-        record = learner.step(block(stream, 100 * k, frames))
-    assert record.R.shape == (0, 2, 0)
-    assert record.Q.shape == (n, 2)
-    assert np.isfinite(record.Q).all()
-    assert record.Q.any()
 
 
 @pytest.mark.parametrize(

@@ -413,13 +413,6 @@ class TestWithoutItsSource:
         assert gone_on.json["iterations"] == 5
         assert gone_on.json["frames"] == 125
 
-    def test_what_is_given_and_differs_is_refused(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
-        run = tmp_path / "run"
-        words = ("-o", run, "--max-iterations", 3, "--no-rerun")
-        cdmisfa("learn", "oscillatory", *words)
-        refused = cdmisfa("learn", "--resume", *words, "--seed", 5)
-        assert (refused.code, "seed = 0, not 5" in refused.err) == (2, True)
-
     def test_a_run_that_does_not_say(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
         go(OscillatorySource(), tmp_path / "run", 3)
         refused = cdmisfa("learn", "--resume", "-o", tmp_path / "run")

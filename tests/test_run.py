@@ -13,7 +13,7 @@ from run_data import parts_of, read_signals
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
-from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
 from cdmisfa.experiments.documents import write_json
@@ -88,13 +88,6 @@ def test_it_ends_as_it_is_told_and_leaves_a_whole_run(
         result.signals_sha256,
     )
     assert json.loads((out / "run.json").read_text())["result"] == result.as_json()
-
-
-def test_less_than_a_block_is_not_enough(tmp_path: Path) -> None:
-    for out in (None, tmp_path / "run"):
-        with pytest.raises(LogExhaustedError, match="the streams end after 50 frames"):
-            run(out, OscillatorySource(length=50))
-    assert not (tmp_path / "run" / "run.json").exists()
 
 
 @pytest.mark.parametrize(("n", "kept"), [(1, [0]), (8, [0, 7]), (51, [0, 50]), (53, [0, 50, 52])])
