@@ -106,6 +106,8 @@ def signals_of(
         learning_error=float(rng.random()),
         interest=rng.random(n),
         state=rng.integers(-1, 4, n),
+        typical=float(rng.random()),
+        regret=float(rng.random()),
     )
 
 

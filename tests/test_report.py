@@ -23,7 +23,14 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments import reports
 from cdmisfa.experiments.reports import command_again, write_report
 from replay.camera_logs.options import CameraOptions
-from replay.report.conditions import LIVELY, attempts, conditions_of, deciding
+from replay.report.conditions import (
+    LIVELY,
+    SLOW_AGAIN,
+    STILL_GAINING,
+    attempts,
+    conditions_of,
+    deciding,
+)
 from replay.report.page import MOST_BYTES
 from replay.report.told import read_told
 from replay.runs.modules import save_modules
@@ -240,6 +247,7 @@ def test_what_it_learned_from_is_gone_or_was_changed(
 
 def test_the_progress_learner_is_shown_with_its_own_rules(tmp_path: Path) -> None:
     assert LIVELY == judging.LIVELY
+    assert (SLOW_AGAIN, STILL_GAINING) == (judging.SLOW_AGAIN, judging.STILL_GAINING)
     settings = {**PROGRESS, "test_frames": 400}
     write_run(tmp_path / "run.mcap", VECTOR, 60, learner=settings, edit=by_progress)
     page = Page(write_report([tmp_path]))

@@ -22,11 +22,11 @@ from cdmisfa.experiments.sources import configure, open_source
 ROOT = Path(__file__).parents[1]
 
 SIGNALS: Mapping[str, str] = {
-    "2.0": "4c7950b36d5160b6a19710d78431d7feb9b2788e1ffbdedac060e43b432090a1",
-    "2.0 of images": "3ffed8c9e884247400ba723b3703a716d6093dcd98fe918b4a70e84bea92518d",
-    "1.0": "a7a505b233e7585546ab580d7f3f84df9824a6c4d141a35d39f8b0d4d63360da",
-    "progress": "7a797d075470f7bd373a15af1a1044e0b36a2bca9f2707cf1259430d1fea5d2e",
-    "progress of images": "bbef8d869ad135f322ca7d006802fbf343acf758c8d71584da60507854ea59ec",
+    "2.0": "ab36b99cbf97e81d3a54de409e1888e135f3fa9dfb5e0eaa67665d4b73c27054",
+    "2.0 of images": "13c67daef9667811a65994187d9e1aa32e49f7378de6031f985bc4e8ab782b5a",
+    "1.0": "4182be146ff6de3c252ac219f1104fb955030c7f78e3ed09e50b7a4cf65c376a",
+    "progress": "fb42c26e3f841c15f6b6dfab3a561e3995a41e6e41c020c1d5ae8c5687a7ff02",
+    "progress of images": "5311c3d8c5f78faddbf202ed0fa5bbadce4e55cb6c29916a1ad5481e7c33af28",
 }
 """Of 20 iterations on the oscillatory streams, and of 2 on images, with seed 3."""
 

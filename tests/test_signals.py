@@ -32,6 +32,7 @@ xi:float64::1 xi_dot:float64::1 curiosity:float64::1 expert:float64::1 reward:fl
 R:float64:SAS:1 Q:float64:SA:1 policy:int64:S:1 epsilon:float64::1 explored:bool::1
 action:int64::1 next_stream:int64::1 change:float64::3 tested:float64::3
 fitted:float64::3 learning_error:float64::3 interest:float64:S:3 state:int64:S:3
+typical:float64::4 regret:float64::4
 """
 """What the record consists of: name, type, dimensions, first version. It is only added to."""
 

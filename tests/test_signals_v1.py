@@ -39,6 +39,8 @@ LACKS = (
     "learning_error",
     "interest",
     "state",
+    "typical",
+    "regret",
 )
 
 
@@ -126,7 +128,7 @@ def test_two_versions_that_differ_elsewhere_too(tmp_path) -> None:
     assert difference is not None
     assert (difference.iteration, difference.signal) == (5, "epsilon")
     assert difference.versions == (1, SCHEMA_VERSION)
-    assert str(difference).startswith("signals of version 1 against 3; of those in both: iteration")
+    assert str(difference).startswith("signals of version 1 against 4; of those in both: iteration")
 
 
 @pytest.mark.parametrize("command", ["view", "plot", "compare"])

@@ -319,6 +319,8 @@ class CuriousLearner:
             learning_error=math.nan,
             interest=self._no_interest,
             state=self._no_state,
+            typical=math.nan,
+            regret=math.nan,
             R=agent.dense / (scale or 1.0),
             Q=kernels.action_values(self._agent),
             policy=agent.policy.copy(),

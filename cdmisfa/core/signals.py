@@ -39,7 +39,7 @@ NO_STATE = -1
 MISSING: Mapping[str, float | int] = {"float64": math.nan, "int64": NO_STATE}
 """Value of a signal that is missing, by its type."""
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning."""
 
 
@@ -219,6 +219,20 @@ class BlockSignals:
         "learner that does not say.",
         "S",
         since=3,
+    )
+    typical: float = _signal(
+        "η_typ",
+        "Slowness of the stream's typical direction, beside which the candidate is slow or not; "
+        "progress learner only.",
+        "",
+        "1/frame",
+        since=4,
+    )
+    regret: float = _signal(
+        "",
+        "Log of the slowness that the candidate of some time ago has now over its own: what it has "
+        "gained since; progress learner only.",
+        since=4,
     )
 
 

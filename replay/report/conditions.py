@@ -18,6 +18,9 @@ from replay.runs.run import Outline
 LIVELY = (0.5, 2.0)
 """Variance of an output that the progress learner counts as alive."""
 
+SLOW_AGAIN, STILL_GAINING = 0.65, 0.1
+"""Where it counts what was fitted as slow, and something as gained of late."""
+
 
 @dataclass(frozen=True, slots=True)
 class Condition:
@@ -149,8 +152,10 @@ def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[
     header, lines = outline.header, outline.lines
     change, _ = header.settled or (None, None)
     agreement, frames = header.number("agreement"), header.number("test_frames")
+    slow = header.number("slow")
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.abs(np.log(lines["tested"] / lines["fitted"]))
+        gain, flatness = (lines[name] / lines["typical"] for name in ("tested", "fitted"))
     untested = ~np.isfinite(lines["tested"])
     window = None if frames is None else max(frames / max(outline.tau, 1), 1.0)
     return [
@@ -174,6 +179,21 @@ def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[
             "variance", "variance of its slowest output on new frames",
             f"learned between {LIVELY[0]:g} and {LIVELY[1]:g}: it is alive, and as it was",
             signals["variance"], low=LIVELY[0], high=LIVELY[1],
+        ),
+        Condition(
+            "slow", "slowness on new frames over that of the stream's typical direction",
+            "" if slow is None else f"learned below {slow:g}: else nothing stands out",
+            gain, high=slow,
+        ),
+        Condition(
+            "slow before", "slowness on the frames it learned from over the typical one",
+            f"learned below {SLOW_AGAIN:g}", np.where(untested, np.nan, flatness), high=SLOW_AGAIN,
+            drawn=False,
+        ),
+        Condition(
+            "regret", "regret: what it has gained of late, as log of its slowness some time ago",
+            f"learned up to {STILL_GAINING:g}: else it still gains", lines["regret"],
+            high=STILL_GAINING,
         ),
         Condition(
             "tests", "blocks that it learned from since it was begun",

@@ -26,7 +26,7 @@ from replay.storage.identity import file_sha256
 
 LINES = (
     *("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsilon"),
-    *("change", "tested", "fitted", "learning_error", "interest"),
+    *("change", "tested", "fitted", "learning_error", "interest", "typical", "regret"),
 )
 """Signals whose values an outline keeps for every iteration, to choose ranges from."""
 

@@ -226,6 +226,8 @@ class ProgressLearner:
             "learning_error": candidate.error,
             "interest": interesting,
             "state": self._streams["state"].copy(),
+            "typical": candidate.typical,
+            "regret": candidate.regret,
         }
         if candidate.tests:
             said["variance"] = candidate.variance
