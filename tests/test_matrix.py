@@ -228,8 +228,9 @@ def test_the_commands_of_the_page_work(
     lines = [
         line for block in page.split("```sh")[1:] for line in block.split("```")[0].split("\n")
     ]
+    Path("wanted.csv").write_text("path," + page.split("```\npath,")[1].split("```")[0])
     commands = [shlex.split(line)[1:] for line in lines if line]
-    assert len(commands) == 10
+    assert len(commands) == 14
     for words in commands:
         done = cdmisfa(*words)
         assert done.code == 0, (words, done.err)

@@ -57,6 +57,7 @@ FORBIDDEN = {
     "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),
     "replay.camera_logs": ("replay.recordings.source", "replay.view.columns", "rerun"),
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
+    "replay.cutting": ("replay.export.frames", "replay.viewer.program", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer.program", "rerun"),
     "replay.playing": (
         "cdmisfa.experiments.session",

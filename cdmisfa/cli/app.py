@@ -78,6 +78,10 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "Write a run's signals as a table or arrays, a recording as images, videos or a "
             "dataset.",
         ),
+        "cut": (
+            "logs",
+            "Write a part of MCAP logs, or several joined, messages as they are.",
+        ),
         "upload": ("logs", "Upload a result to an S3 bucket, as `-o s3://...` does."),
     },
     "Studies": {

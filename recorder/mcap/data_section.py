@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.records import MAGIC, RECORD_HEADER, Segment, crc32
-from recorder.mcap.store import Store
+from recorder.mcap.store import OnePass, Store
 from recorder.mcap.summary import FOOTER_BYTES
 from recorder.mcap.walk import DATA_END_BYTES, LogStructure
 
@@ -21,13 +22,13 @@ class DataSection:
     """The bytes of a log before its data's end record.
 
     Args:
-        file: the log.
+        file: the log; an attribute, too.
         structure: of the log.
         damaged: called where the checksum does not match.
     """
 
     def __init__(self, file: Store, structure: LogStructure, damaged: Callable[[], None]) -> None:
-        self._file = file
+        self.file = file
         self._structure = structure
         self._damaged = damaged
         self._checked = 0
@@ -44,8 +45,19 @@ class DataSection:
         if not stated or self._checked == end:
             return
         self._checked = end
-        if (self._file.crc(0, end) if crc is None else crc) != stated:
+        if (self.file.crc(0, end) if crc is None else crc) != stated:
             self._damaged()
+
+    @contextlib.contextmanager
+    def passing(self) -> Iterator[OnePass]:
+        """The log, of which each byte is read once, as far as it is read forwards, and checked."""
+        yield (store := OnePass(self.file))
+        self.check(store.pass_to(self._structure.data_end))
+
+    @property
+    def vouched(self) -> bool:
+        """Whether a checksum over all of the data is stated, of a log that can be read in all."""
+        return bool(self._structure.data_crc) and not self.file.remote
 
     def check_unproven(self) -> None:
         """Check it for a chunk that has no checksum of its own; of a URL not all is read for it."""
@@ -62,7 +74,7 @@ class DataSection:
             return 0
         if self._structure.by_index:
             places = [s.offset + RECORD_HEADER.size for s in segments[:1]]
-            segments = [Segment.of_chunk(p, self._file.peek(p, _CHUNK_HEADER)) for p in places]
+            segments = [Segment.of_chunk(p, self.file.peek(p, _CHUNK_HEADER)) for p in places]
         return sum(1 for s in segments if s.crc == 0 and s.size)
 
     def confirm(self) -> None:
@@ -72,18 +84,18 @@ class DataSection:
             LogDamagedError: it was replaced while it was read.
         """
         if self._remote:
-            self._file.forget()
+            self.file.forget()
             if self._marks() != self._marks_then:
                 raise LogDamagedError(
-                    f"{self._file.path}: it was replaced while it was read; begin again"
+                    f"{self.file.path}: it was replaced while it was read; begin again"
                 )
 
     def _marks(self) -> list[int]:
         """CRCs of what another log would not have: the beginning, and those that it states."""
-        end, size = self._structure.data_end, self._file.size
+        end, size = self._structure.data_end, self.file.size
         last = size - FOOTER_BYTES - len(MAGIC)
         spans = ((0, _BEGINNING), (end, end + DATA_END_BYTES), (last, size))
-        return [self._file.crc(start, stop) for start, stop in spans]
+        return [self.file.crc(start, stop) for start, stop in spans]
 
     def sha256(self, start: int, counted: Callable[[int], None] = lambda count: None) -> str:
         """SHA-256 of the file from a place on, with its checksum checked where that is 0.
@@ -94,7 +106,7 @@ class DataSection:
         """
         sha256, crc, at = hashlib.sha256(), 0, start
         end = self._structure.data_end if self._structure.data_crc else 0
-        for block in self._file.blocks(start, self._file.size):
+        for block in self.file.blocks(start, self.file.size):
             sha256.update(block)
             crc = crc32(block[: max(end - at, 0)], crc)
             at += len(block)
@@ -105,13 +117,13 @@ class DataSection:
 
     def changed(self) -> bool:
         """Whether the file may hold something else than when it was opened."""
-        return self._file.changed()
+        return self.file.changed()
 
     def read(self, offset: int, count: int) -> bytes:
         """`count` bytes of the file, fewer only where it ends."""
-        return self._file.read(offset, count)
+        return self.file.read(offset, count)
 
     def tail(self) -> Iterator[bytes]:
         """The bytes from its data end record on, where the file was opened by its index."""
         if self._structure.by_index:
-            yield from self._file.blocks(self._structure.data_end, self._file.size)
+            yield from self.file.blocks(self._structure.data_end, self.file.size)

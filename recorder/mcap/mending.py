@@ -10,13 +10,10 @@ from bisect import bisect_right
 from typing import Final
 
 import numpy as np
-from mcap.opcode import Opcode
 
 from recorder.mcap.chunks import check_size, decompressed
 from recorder.mcap.records import (
     CHUNK_HEADER,
-    INDEX_HEADER,
-    MESSAGE_HEADER,
     MalformedRecord,
     Problem,
     Segment,
@@ -113,7 +110,7 @@ def _checked_table(store: Store, chunk: Segment, crc: int) -> MessageTable:
 
 def _indexes(store: Store, at: int, end: int, table: MessageTable, stated: bool) -> bytes:
     """The message indexes of a chunk as they must stand in [at, end), none where it has none."""
-    left = [_index(table, number) for number in np.unique(table.channel).tolist()]
+    left = [table.index(number) for number in np.unique(table.channel).tolist()]
     if len(left) > _MOST_CHANNELS or sum(map(len, left)) > end - at:
         return b""
     found = b""
@@ -124,16 +121,6 @@ def _indexes(store: Store, at: int, end: int, table: MessageTable, stated: bool)
         best = left.pop(-place)
         found += best
     return found
-
-
-def _index(table: MessageTable, number: int) -> bytes:
-    """The message index of a channel: log time and place of each message, in file order."""
-    own = table.channel == number
-    pairs = np.empty((int(own.sum()), 2), "<u8")
-    pairs[:, 0] = table.log_time[own]
-    pairs[:, 1] = table.at[own] - MESSAGE_HEADER.size
-    size = pairs.nbytes
-    return INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, size + 6, number, size) + pairs.tobytes()
 
 
 def _alike(store: Store, at: int, index: bytes) -> float:

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import ByteArray, IntArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.kernels.frames import walk_records
-from recorder.mcap.records import MESSAGE_HEADER, RECORD_HEADER, MalformedRecord, Segment
+from recorder.mcap.records import (
+    INDEX_HEADER,
+    MESSAGE_HEADER,
+    RECORD_HEADER,
+    MalformedRecord,
+    Segment,
+)
 
 Pairs = list[tuple[int, NDArray[np.uint64]]]
 """The message indexes of a chunk: channel, and (n, 2) log time and place of each message."""
@@ -92,6 +98,16 @@ class MessageTable:
         at = int(self.at[row])
         return self.data[at : at + int(self.size[row])].data
 
+    def index(self, channel: int) -> bytes:
+        """The message index of a channel: log time and place of each message, in file order."""
+        own = self.channel == channel
+        pairs = np.empty((int(own.sum()), 2), "<u8")
+        pairs[:, 0] = self.log_time[own]
+        pairs[:, 1] = self.at[own] - MESSAGE_HEADER.size
+        size = pairs.nbytes
+        head = INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, size + 6, channel, size)
+        return head + pairs.tobytes()
+
     def agrees(self, indexes: Pairs) -> bool:
         """Whether message indexes name these messages, and no others."""
         channels = np.repeat([n for n, _ in indexes], [len(pairs) for _, pairs in indexes])
@@ -155,7 +171,7 @@ def in_order(
         segments: chunks in file order.
         table_of: decodes a chunk; None where it is left out. Few are asked for at once.
     """
-    for group in _overlapping(segments):
+    for group in overlapping(segments):
         times = [_times(table_of(segment)) for segment in group]
         order = np.argsort(np.concatenate(times), kind="stable")
         counts = [len(each) for each in times]
@@ -173,8 +189,8 @@ def _times(table: MessageTable | None) -> NDArray[np.uint64]:
     return np.empty(0, np.uint64) if table is None else table.log_time
 
 
-def _overlapping(segments: Sequence[Segment]) -> Iterator[list[Segment]]:
-    """Group segments so that sorting within each group sorts all."""
+def overlapping(segments: Sequence[Segment]) -> Iterator[list[Segment]]:
+    """Group chunks so that sorting the messages within each group sorts all."""
     ordered = sorted(enumerate(segments), key=lambda pair: (pair[1].start, pair[0]))
     group: dict[int, Segment] = {}
     end, last = -1, -1
