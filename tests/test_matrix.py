@@ -32,6 +32,7 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.testing.sources import SourceContract
 from recorder.images.decoding import MessageKind
 from replay.camera_logs.source import ForeignSource
+from replay.corpus.index import read_index
 
 COUNT = 60
 STEP_MS = 20
@@ -42,7 +43,7 @@ FORMATS = (
     *("recording", "run", *(f"{kind} mcap" for kind in MESSAGES_OF), *BAGS, "video", "video mcap"),
     *(*PICTURES, "lerobot", "table", "url", "several", "glob"),
 )
-COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "play")
+COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "play", "index")
 REFUSED = {
     ("export", "run"): "name the recording",
     ("export", "table"): "holds no images",
@@ -168,6 +169,7 @@ def command_line(command: str, kind: str, words: list[object], out: Path) -> lis
             *("play", *words, "--to", "foxglove", "--port", 0, "--wait", 0),
             *("--rate", 100, "--json", *(["--fps", 50] if rate else [])),
         ],
+        "index": ["index", *words, "-o", out / "all.parquet", "--deep", "--jobs", 1, "--json"],
         "record": ["record", *words, "-o", out / "rec", "--frames", "5"],
     }[command]
 
@@ -202,6 +204,13 @@ def test_a_command_takes_a_log_or_says_why_not(
             assert done.json["iterations"] == 1
         case "play":
             assert done.json["messages"] >= streams * COUNT
+        case "index":
+            rows = read_index(tmp_path / "all.parquet").to_pylist()
+            assert [row["problem"] for row in rows if row["problem"]] == []
+            images = [row for row in rows if row["messages"] == COUNT]
+            assert kind == "run" or len(images) >= streams
+            known = [row for row in rows if row["gaps"] in (0, 1)]  # one is in the bags
+            assert kind in ("run", "table") or len(known) >= streams
         case "convert":
             assert [view["frames"] for view in done.json["views"]] == [COUNT] * streams
 

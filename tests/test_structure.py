@@ -56,6 +56,7 @@ FORBIDDEN = {
     "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),
     "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),
     "replay.camera_logs": ("replay.recordings.source", "replay.view.columns", "rerun"),
+    "replay.corpus": ("replay.viewer.program", "cdmisfa.experiments.session", "rerun"),
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
     "replay.cutting": ("replay.export.frames", "replay.viewer.program", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer.program", "rerun"),

@@ -84,6 +84,10 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         ),
         "upload": ("logs", "Upload a result to an S3 bucket, as `-o s3://...` does."),
     },
+    "Many logs": {
+        "index": ("corpus", "Index what is in many logs: streams, times, damage, doubles."),
+        "query": ("corpus", "Ask an index in SQL, or say what it has: how much, broken, double."),
+    },
     "Studies": {
         "reproduce": (
             "trials",

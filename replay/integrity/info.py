@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -14,7 +14,7 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.reader import Check, LogReader
-from recorder.mcap.records import Channel, Problem
+from recorder.mcap.records import Channel, Problem, Segment
 from replay.arrays import are_arrays
 from replay.camera_logs.opening import channels_of, log_format, only_foreign
 from replay.camera_logs.pictures import FolderImages
@@ -237,16 +237,27 @@ def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
         return
     for log in logs:
         try:
-            if isinstance(log, Path) and only_foreign(log):
-                yield _describe_foreign(log)
-            elif isinstance(log, Path) and are_arrays([log]):
-                yield _describe_arrays(log)
-            else:
-                yield _describe_file(log)
+            yield describe_log(log)
         except CdmisfaError as error:
             if alone and (len(logs) == 1 or not isinstance(error, LogDamagedError)):
                 raise
             yield _unread(log, error)
+
+
+def describe_log(log: Location, *, decode: bool | None = None) -> LogInfo:
+    """Describe a file, its URL, or a folder that is one log; raises as `describe`.
+
+    What is in it is decoded, only its summary is read, or as much as `CHECK_BYTES` says.
+    """
+    if isinstance(log, Path) and only_foreign(log):
+        return _describe_foreign(log, 0 if decode is False else CHECK_BYTES)
+    if isinstance(log, Path) and are_arrays([log]):
+        return _describe_arrays(log)
+    store = open_store(log)
+    small = isinstance(log, Path) and store.size <= CHECK_BYTES
+    check: Check = "pass" if (small if decode is None else decode) else "chunks"
+    with LogReader(store, salvage=True, check=check) as reader:
+        return describe_reader(reader, decode=decode)
 
 
 def _unread(place: str | Location, error: CdmisfaError) -> LogInfo:
@@ -255,7 +266,8 @@ def _unread(place: str | Location, error: CdmisfaError) -> LogInfo:
     return LogInfo(str(place), "foreign", (), 0, False, crc, wrong, {}, state=state)
 
 
-def _describe_foreign(place: Path) -> LogInfo:
+def _describe_foreign(place: Path, most: int) -> LogInfo:
+    """Describe a log that is in no MCAP file; of pictures up to `most` bytes are checked."""
     known = channels_of(place)
     channels = [
         ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
@@ -263,9 +275,9 @@ def _describe_foreign(place: Path) -> LogInfo:
     ]
     missing = tuple(Problem(str(place), c.missing) for c in known if c.missing)
     broken = None
-    if log_format(place) == "pictures":
+    if most and log_format(place) == "pictures":
         with contextlib.closing(FolderImages(place, None)) as pictures:
-            broken = pictures.broken(CHECK_BYTES)
+            broken = pictures.broken(most)
     state: State = "damaged" if broken else "unchecked" if broken is None else "whole"
     return LogInfo(
         path=str(place),
@@ -301,42 +313,47 @@ def _bytes_of(place: Path) -> int:
     return sum(path.stat().st_size for path in files if path.is_file())
 
 
-def _describe_file(path: Location) -> LogInfo:
-    store = open_store(path)
-    small = isinstance(path, Path) and store.size <= CHECK_BYTES
-    check: Check = "pass" if small else "chunks"
-    with LogReader(store, salvage=True, check=check) as reader:
+def describe_reader(
+    reader: LogReader,
+    *,
+    decode: bool | None = None,
+    told: Callable[[Segment], None] = lambda _: None,
+) -> LogInfo:
+    """Describe an MCAP file, opened with `salvage`; `told` of each chunk that is decoded."""
+    if decode is None:
         decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
-        counts, channels = count_messages(reader, decode=decode), []
-        for number, found in sorted(counts.items()):
-            undefined = Channel(number, 0, f"(channel {number}, never defined)", "", {})
-            channel = reader.channels.get(number, undefined)
-            schema = reader.schemas.get(channel.schema_id)
-            name, times = schema.name if schema else "", (found.start, found.end)
-            entry = (channel.topic, channel.encoding, name, found.messages, *times, path.name)
-            channels.append(ChannelInfo(*entry))
-        metadata = {m.name: m.values for m in reader.metadata}
-        state = state_of(reader)
-        if state == "whole" and not (decode and _all_checked(reader)):
-            state = "unchecked"
-        version = record_version(metadata.get(RUN_METADATA, {}))
-        stored, decompressed = (sum(getattr(s, n) for s in reader.segments) for n in SIZES)
-        compression = Counter(s.compression or "none" for s in reader.segments if s.chunked)
-        return LogInfo(
-            path=str(path),
-            kind=kind_of(reader),
-            channels=tuple(channels),
-            chunks=sum(s.chunked for s in reader.segments),
-            complete=reader.complete,
-            crc=crc_of(reader) if decode else "unchecked",
-            problems=problems_of(reader),
-            metadata={path.name: metadata},
-            signals=RecordInfo(version, missing_signals(version)) if version else None,
-            state=state,
-            notes=tuple(reader.unproven()),
-            size=SizeInfo(reader.size, stored, decompressed, dict(compression)),
-            library=reader.library,
-        )
+    counts, channels = count_messages(reader, decode=decode, told=told), []
+    name = reader.path.name
+    for number, found in sorted(counts.items()):
+        undefined = Channel(number, 0, f"(channel {number}, never defined)", "", {})
+        channel = reader.channels.get(number, undefined)
+        schema = reader.schemas.get(channel.schema_id)
+        kind, times = schema.name if schema else "", (found.start, found.end)
+        entry = (channel.topic, channel.encoding, kind, found.messages, *times, name)
+        channels.append(ChannelInfo(*entry))
+    metadata = {m.name: m.values for m in reader.metadata}
+    state = state_of(reader)
+    if state == "whole" and not (decode and _all_checked(reader)):
+        state = "unchecked"
+    version = record_version(metadata.get(RUN_METADATA, {}))
+    stored, decompressed = (sum(getattr(s, n) for s in reader.segments) for n in SIZES)
+    compression = Counter(s.compression or "none" for s in reader.segments if s.chunked)
+    return LogInfo(
+        path=str(reader.path),
+        kind=kind_of(reader),
+        channels=tuple(channels),
+        chunks=sum(s.chunked for s in reader.segments),
+        complete=reader.complete,
+        crc=crc_of(reader) if decode else "unchecked",
+        problems=problems_of(reader),
+        metadata={name: metadata},
+        seed=_seed([*metadata.values()]),
+        signals=RecordInfo(version, missing_signals(version)) if version else None,
+        state=state,
+        notes=tuple(reader.unproven()),
+        size=SizeInfo(reader.size, stored, decompressed, dict(compression)),
+        library=reader.library,
+    )
 
 
 def _all_checked(reader: LogReader) -> bool:

@@ -30,6 +30,7 @@ EXTRAS = {
     "rl": (("gymnasium", "stable_baselines3"), "examples/ppo.py"),
     "foxglove": (("foxglove", "websockets"), "foxglove:// streams of robots; play as a robot"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs; -o s3://"),
+    "corpus": (("duckdb",), "query"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "arena": (("ale_py", "av", "gymnasium", "skvideo", "sklearn"), "streams of the arena"),
     "sklearn": (("sklearn",), "RecursiveSFA and IncSFA, estimators of scikit-learn"),

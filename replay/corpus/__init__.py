@@ -1,0 +1,1 @@
+"""Many logs: an index of what is in them, and questions to it."""

@@ -1,0 +1,277 @@
+"""The index of many logs: what is new or changed is read, the rest is kept, by a join."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
+from cdmisfa.core.processes import WorkerDied, run_all
+from cdmisfa.core.untrusted import check_regular
+from recorder.log.files import atomic_write, held, make_folder, refuse_unless
+from replay.corpus.finding import INDEX, found_logs
+from replay.corpus.rows import MARK, SCHEMA, VERSION, Answer, Task, look
+from replay.storage.location import Location, location
+from replay.storage.opening import no_such
+
+BATCH: Final = 32
+"""Logs that a process looks at in one go."""
+
+SAVED_EVERY: Final = 5000
+"""Logs after which what is known is written, so that a kill costs no more than these."""
+
+_SHA256: Final = Task._fields.index("sha256")
+
+
+@dataclass(slots=True)
+class Indexed:
+    """What became of an index.
+
+    Attributes:
+        index: its file.
+        logs: how many it has now.
+        streams: how many rows.
+        read: logs that were looked at, as they were new or had changed.
+        kept: logs that were as before.
+        gone: logs that it had and that are not there any more, and those that went meanwhile.
+        broken: logs with a problem.
+        anew: why nothing was kept of an index that was there; "" where something may be.
+        stopped: it was stopped before all logs were looked at; the rest is for the next time.
+    """
+
+    index: Path
+    logs: int = 0
+    streams: int = 0
+    read: int = 0
+    kept: int = 0
+    gone: list[str] = field(default_factory=list)
+    broken: int = 0
+    anew: str = ""
+    stopped: bool = False
+
+
+def index_path(place: str | Path) -> Path:
+    """The index of a folder, or one that is named by itself.
+
+    Raises:
+        UsageError: there is none.
+    """
+    path = Path(place)
+    found = path / INDEX if path.is_dir() else path
+    if path.is_dir() and not found.exists():
+        raise UsageError(f"{path} has no index: make one with cdmisfa index {path}")
+    if not found.exists():
+        raise no_such(path)
+    return found
+
+
+def index_logs(
+    words: Sequence[str | Location],
+    out: Path | None = None,
+    *,
+    deep: bool = False,
+    full: bool = False,
+    jobs: int = 1,
+    told: Callable[[float, float | None], None] = lambda done, total: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Indexed:
+    """Make the index of logs, or bring the one that is there up to date.
+
+    What has the size and the time of change that the index knows is not opened. An index that is
+    interrupted, or for which the disk has no room, is as it was, or has what was read so far.
+
+    Args:
+        words: folders, patterns, files and URLs.
+        out: the index; by default corpus.parquet in the folder that is the one word.
+        deep: decode every log, for its checksums, gaps, shapes and a checksum of each stream.
+        full: read every byte, and keep what is known of those with the same SHA-256.
+        jobs: processes; what is found does not depend on them.
+        told: how many of the logs that are to be read were.
+        stop: asked now and then; true ends it with what was read.
+
+    Raises:
+        UsageError: a word names nothing, another process indexes there, or what is there is no
+            index.
+        LogDamagedError: the index is damaged.
+        LogWriteError: it cannot be written.
+    """
+    index = _place_of(words, out)
+    make_folder(index.parent)
+    with held(index.parent):
+        made = Indexed(index)
+        there = _there(words, index.parent)
+        old = _known(index, made)
+        tasks, indexed, listed = _tasks(there, old, deep, full), old["path"], there["path"]
+        made.gone = _without(pc.unique(indexed), listed).to_pylist()
+        made.kept = len(there) - len(tasks)
+        old = old.filter(pc.is_in(indexed, listed))
+        answers: dict[int, Answer] = {}
+        saved = done = 0
+        for at, count, answer in _looked(tasks, deep, full, jobs):
+            answers[at] = answer
+            done += count
+            told(done, len(tasks))
+            if stop() and done < len(tasks):
+                made.stopped = True
+                break
+            if done - saved >= SAVED_EVERY:
+                saved = done
+                _write(old, answers, index)
+        made.read = sum(len(answer.looked) for answer in answers.values())
+        made.kept += done - made.read
+        table = old
+        if answers or made.gone or not index.exists() or made.anew:
+            table = _write(old, answers, index)
+    made.gone += itertools.chain(*(answer.gone for answer in answers.values()))
+    made.streams, made.logs = table.num_rows, len(pc.unique(table["path"]))
+    made.broken = len(pc.unique(table.filter(pc.is_valid(table["problem"]))["path"]))
+    return made
+
+
+def read_index(path: Path) -> pa.Table:
+    """The rows of an index.
+
+    Raises:
+        UsageError: it is no index, or one of another version.
+        LogDamagedError: it is damaged.
+    """
+    version = _version(path)
+    if version != VERSION:
+        raise UsageError(
+            f"{path} is an index of version {version}, this program has {VERSION}: make it again "
+            "with cdmisfa index"
+        )
+    try:
+        with pq.ParquetFile(path) as file:  # `read_table` imports pandas, where that is there
+            return file.read()
+    except (pa.ArrowException, OSError) as error:
+        raise _damaged(path, error) from error
+
+
+def _version(path: Path) -> int:
+    check_regular(path)
+    try:
+        stated = (pq.read_schema(path).metadata or {}).get(MARK, b"")
+    except (pa.ArrowException, OSError) as error:
+        raise _damaged(path, error) from error
+    if not stated.isdigit():
+        raise UsageError(f"{path} is no index of logs: name another file with -o")
+    return int(stated)
+
+
+def _damaged(path: Path, error: Exception) -> LogDamagedError:
+    said = one_line(error)[:200]
+    return LogDamagedError(f"{path} is damaged ({said}): remove it, and index again")
+
+
+def _place_of(words: Sequence[str | Location], out: Path | None) -> Path:
+    """Where the index of some logs is."""
+    if out is not None:
+        refuse_unless(out, "an index is a Parquet file", ".parquet")
+        return out
+    if len(words) == 1 and isinstance(place := location(words[0]), Path):
+        if place.is_dir():
+            return place / INDEX
+        if not (place.exists() or any(letter in str(place) for letter in "*?[")):
+            raise no_such(place)
+    named = " ".join(map(str, words))
+    raise UsageError(f"{named}: no folder, which would hold its index: say where, with -o")
+
+
+def _there(words: Sequence[str | Location], folder: Path) -> pa.Table:
+    """The logs that are there, with their paths relative to the folder of the index."""
+    below = os.path.join(folder, "")
+    found: dict[str, Task] = {}
+    for log in found_logs(words):
+        path = log.file.removeprefix(below)
+        if len(path) == len(log.file) and "://" not in path:
+            path = os.path.relpath(path, folder)
+        found[path] = Task(log.file, path, *log[1:])
+    columns = list(zip(*found.values(), strict=True)) or [()] * len(Task._fields)
+    types = (pa.int64() if name == "bytes" else pa.string() for name in Task._fields)
+    arrays = [pa.array(column, kind) for column, kind in zip(columns, types, strict=True)]
+    return pa.table(arrays, list(Task._fields))
+
+
+def _known(index: Path, made: Indexed) -> pa.Table:
+    """What an index has; nothing where there is none, or one of another version."""
+    if not index.exists():
+        return SCHEMA.empty_table()
+    if (version := _version(index)) != VERSION:
+        made.anew = f"{index} was an index of version {version}: it is made anew"
+        return SCHEMA.empty_table()
+    return read_index(index)
+
+
+def _tasks(there: pa.Table, old: pa.Table, deep: bool, full: bool) -> list[Task]:
+    """The logs that are not as the index has them, or with `full` all."""
+    known = old.filter(pc.and_(pc.not_equal(old["changed"], ""), pc.or_(old["deep"], not deep)))
+    at = pc.index_in(_keys(there), _keys(known))
+    if full:
+        tasks = there.set_column(_SHA256, "sha256", known["sha256"].take(at))
+    else:
+        tasks = there.filter(pc.is_null(at))
+    tasks = tasks.take(pc.sort_indices(tasks["path"]))
+    return [Task(*row.values()) for row in tasks.to_pylist()]
+
+
+def _keys(logs: pa.Table) -> pa.ChunkedArray:
+    """What is another one for a log that was written again."""
+    return pc.binary_join_element_wise(
+        logs["path"], pc.cast(logs["bytes"], pa.string()), logs["changed"], "\0"
+    )
+
+
+def _looked(
+    tasks: Sequence[Task], deep: bool, full: bool, jobs: int
+) -> Iterator[tuple[int, int, Answer]]:
+    """Look at logs, as many at a time as one process takes; where that dies, at each by itself.
+
+    Yields:
+        The number of the first task of some that follow one another, how many, what was found.
+    """
+    batches = [tasks[at : at + BATCH] for at in range(0, len(tasks), BATCH)]
+    work = functools.partial(_look, deep=deep, full=full)
+    died: list[int] = []
+    for number, answer in run_all(work, batches, jobs=min(jobs, math.ceil(len(batches) / 4))):
+        if isinstance(answer, WorkerDied):
+            died.append(number * BATCH)
+        else:
+            yield number * BATCH, len(batches[number]), answer
+    alone = [(at + i, task) for at in died for i, task in enumerate(tasks[at : at + BATCH])]
+    for number, answer in run_all(work, [[task] for _, task in alone], jobs=max(jobs, 2)):
+        at, task = alone[number]
+        if isinstance(answer, WorkerDied):
+            answer = look([task._replace(problem=answer.what)], deep, full)
+        yield at, 1, answer
+
+
+def _look(tasks: Sequence[Task], *, deep: bool, full: bool) -> Answer:
+    return look(tasks, deep, full)
+
+
+def _write(old: pa.Table, answers: Mapping[int, Answer], index: Path) -> pa.Table:
+    """Write what is known by now, in the order of paths: of what was not looked at, as before."""
+    parts = [answers[at] for at in sorted(answers)]
+    looked = pa.array(itertools.chain(*(part.looked for part in parts)), pa.string())
+    kept = old.filter(pc.invert(pc.is_in(old["path"], looked)))
+    tables = [kept.cast(SCHEMA), *(part.rows for part in parts)]
+    table = pa.concat_tables(tables).unify_dictionaries().combine_chunks()
+    table = table.take(pc.sort_indices(table["path"])).replace_schema_metadata(SCHEMA.metadata)
+    with atomic_write(index) as partial:
+        pq.write_table(table, partial, compression="zstd")
+    return table
+
+
+def _without(values: pa.Array, others: pa.ChunkedArray) -> pa.Array:
+    return values.filter(pc.invert(pc.is_in(values, others)))

@@ -1,0 +1,463 @@
+"""An index of many logs: what it says, how it is kept up to date, and what breaks it not."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import shlex
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from camera_files import pictures, write_images, write_pictures
+from conftest import Cdmisfa
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from s3_server import buckets, serving_s3
+
+from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
+from cdmisfa.core.processes import WorkerDied
+from recorder.log.files import held
+from replay.corpus import index as indexing
+from replay.corpus import rows as looking
+from replay.corpus.finding import INDEX, found_logs
+from replay.corpus.index import index_logs, read_index
+from replay.corpus.query import ask, summary
+from replay.corpus.rows import MARK, SCHEMA, Answer, Task
+from replay.integrity.info import LogInfo
+
+ROOT = Path(__file__).parents[1]
+
+Rows = list[dict[str, Any]]
+
+
+@pytest.fixture
+def corpus(tmp_path: Path, oscillatory_recording: Path, oscillatory_run: Path) -> Path:
+    """A recording, a run, a log of others, pictures, arrays, and three files that are broken."""
+    folder = tmp_path / "logs"
+    shutil.copytree(oscillatory_recording, folder / "night" / "one")
+    shutil.copytree(oscillatory_run, folder / "runs" / "first")
+    frames = ((50 * i, image) for i, image in enumerate(pictures(20, 9)))
+    write_images(folder / "robot.mcap", {"/camera": frames})
+    write_pictures(folder / "seen", 5)
+    np.save(folder / "joints.npy", np.zeros((30, 7)))
+    whole = (folder / "night" / "one" / "x1.mcap").read_bytes()
+    (folder / "torn.mcap").write_bytes(whole[: len(whole) // 2])
+    (folder / "text.mcap").write_text("no log")
+    (folder / "empty.mcap").touch()
+    return folder
+
+
+def rows_of(folder: Path) -> Rows:
+    rows: Rows = read_index(folder / INDEX).to_pylist()
+    return rows
+
+
+def row(folder: Path, path: str, topic: str | None = None) -> dict[str, Any]:
+    found = [r for r in rows_of(folder) if r["path"] == path and topic in (None, r["topic"])]
+    assert len(found) == 1 or topic is None, found
+    return found[0]
+
+
+def repacked(log: Path, copy: Path) -> None:
+    """The same messages in another file, in larger chunks without compression."""
+    with log.open("rb") as file, copy.open("wb") as out:
+        writer = Writer(out, compression=CompressionType.NONE)
+        writer.start()
+        numbers: dict[int, int] = {}
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            assert schema is not None
+            if channel.id not in numbers:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                number = writer.register_channel(channel.topic, channel.message_encoding, kind)
+                numbers[channel.id] = number
+            times = message.log_time, message.publish_time
+            writer.add_message(numbers[channel.id], times[0], message.data, times[1])
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+class TestRows:
+    def test_each_stream_is_a_row_of_what_its_summary_says(self, corpus: Path) -> None:
+        made = index_logs([corpus])
+        assert (made.logs, made.read, made.kept, made.broken) == (10, 10, 0, 3)
+        view = row(corpus, "night/one/x1.mcap", "/view/x1")
+        size = (corpus / "night" / "one" / "x1.mcap").stat().st_size
+        assert view == {
+            **view,
+            "log": "night/one",
+            "kind": "recording",
+            "schema": "cdmisfa.Vector",
+            "shape": "2",
+            "messages": 2000,
+            "rate": 50.0,
+            "seconds": 39.98,
+            "gaps": 0,
+            "bytes": size,
+            "compression": "zstd",
+            "crc": "unchecked",
+            "state": "unchecked",
+            "seed": 0,
+            "sha256": None,
+            "content": None,
+            "problem": None,
+            "deep": False,
+        }
+        camera = row(corpus, "robot.mcap")
+        assert (camera["kind"], camera["log"], camera["messages"]) == ("foreign", "robot.mcap", 20)
+        assert (camera["shape"], camera["gaps"]) == (None, None)
+        assert row(corpus, "seen")["messages"] == 5
+        assert (row(corpus, "joints.npy")["shape"], row(corpus, "joints.npy")["messages"]) == (
+            "7",
+            30,
+        )
+
+    def test_a_run_is_one_log_with_its_configuration(self, corpus: Path) -> None:
+        index_logs([corpus])
+        found = [r for r in rows_of(corpus) if r["kind"] == "run"]
+        assert {(r["path"], r["log"], r["seed"]) for r in found} == {
+            ("runs/first/run.mcap", "runs/first", 0)
+        }
+        sql = "SELECT DISTINCT configuration->>'$.config.learner.tau' AS tau FROM streams WHERE "
+        assert ask(corpus / INDEX, sql + "kind = 'run'").to_pylist() == [{"tau": "100"}]
+
+    def test_what_is_broken_is_a_row_that_says_why(self, corpus: Path) -> None:
+        index_logs([corpus])
+        wrong = {r["path"]: (r["state"], r["problem"]) for r in rows_of(corpus) if r["problem"]}
+        assert wrong.keys() == {"torn.mcap", "text.mcap", "empty.mcap"}
+        assert wrong["torn.mcap"][0] == "cut short"
+        assert wrong["text.mcap"] == (
+            "damaged",
+            "not an MCAP file (its first bytes are not MCAP's)",
+        )
+        torn = row(corpus, "torn.mcap", "/view/x1")
+        assert 900 < torn["messages"] < 1100  # what can be read of it counts
+
+    def test_deep_finds_damage_that_no_summary_shows(self, corpus: Path) -> None:
+        log = corpus / "night" / "one" / "x2.mcap"
+        data = bytearray(log.read_bytes())
+        data[len(data) // 3] ^= 0xFF
+        log.write_bytes(data)
+        index_logs([corpus])
+        assert row(corpus, "night/one/x2.mcap", "/view/x2")["problem"] is None
+        made = index_logs([corpus], deep=True)
+        assert made.read == 10
+        broken = row(corpus, "night/one/x2.mcap", "/view/x2")
+        assert (broken["crc"], broken["state"]) == ("bad", "damaged")
+        assert "CRC" in broken["problem"]
+        assert row(corpus, "night/one/x1.mcap", "/view/x1")["crc"] == "ok"
+        assert row(corpus, "robot.mcap")["shape"] == "12x16"
+        assert index_logs([corpus]).read == 0  # what is known deeply stays known
+
+    def test_frames_that_a_recording_lacks_are_counted(
+        self, cdmisfa: Cdmisfa, tmp_path: Path, oscillatory_recording: Path
+    ) -> None:
+        repacked(oscillatory_recording / "x1.mcap", tmp_path / "foreign.mcap")
+        with (tmp_path / "gap.mcap").open("wb") as out:
+            writer = Writer(out)
+            writer.start()
+            number = writer.register_channel("/a", "json", 0)
+            for i in [*range(50), *range(70, 90)]:
+                writer.add_message(number, i * 10**8, b"{}", i * 10**8)
+            writer.finish()  # type: ignore[no-untyped-call]
+        index_logs([tmp_path], deep=True)
+        assert row(tmp_path, "gap.mcap")["gaps"] == 20
+        assert row(tmp_path, "foreign.mcap", "/truth")["gaps"] == 0
+
+    def test_jobs_and_order_change_nothing(self, corpus: Path, tmp_path: Path) -> None:
+        index_logs([corpus], tmp_path / "one.parquet")
+        later = corpus / "robot.mcap"
+        aside = tmp_path / "robot.mcap"
+        later.rename(aside)
+        index_logs([corpus], tmp_path / "two.parquet")
+        aside.rename(later)
+        index_logs([corpus], tmp_path / "two.parquet", jobs=2)
+        one, two = (read_index(tmp_path / f"{name}.parquet") for name in ("one", "two"))
+        assert one.to_pylist() == two.to_pylist()
+
+
+class TestUpToDate:
+    def test_only_what_is_new_or_changed_is_read(
+        self, corpus: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        index_logs([corpus])
+        before = (corpus / INDEX).stat()
+        assert index_logs([corpus]).read == 0
+        assert (corpus / INDEX).stat() == before  # not even written
+        shutil.copytree(corpus / "night" / "one", corpus / "night" / "two")
+        os.utime(corpus / "robot.mcap", ns=(1, 1))
+        (corpus / "text.mcap").unlink()
+        opened: list[str] = []
+        look = looking.look
+        monkeypatch.setattr(
+            indexing,
+            "look",
+            lambda tasks, *a: opened.extend(t.path for t in tasks) or look(tasks, *a),
+        )
+        made = index_logs([corpus])
+        assert opened == [*(f"night/two/x{i}.mcap" for i in (1, 2, 3)), "robot.mcap"]
+        assert (made.read, made.kept, made.gone, made.logs) == (4, 8, ["text.mcap"], 12)
+
+    def test_full_looks_at_bytes_where_size_and_time_are_the_same(self, corpus: Path) -> None:
+        index_logs([corpus], deep=True, full=True)
+        log = corpus / "robot.mcap"
+        state, data = log.stat(), bytearray(log.read_bytes())
+        data[len(data) // 2] ^= 0xFF
+        log.write_bytes(data)
+        os.utime(log, ns=(state.st_atime_ns, state.st_mtime_ns))
+        assert index_logs([corpus]).read == 0
+        made = index_logs([corpus], full=True)
+        assert made.read == 1 + 2  # what could not be opened is looked at again
+        assert row(corpus, "night/one/x1.mcap", "/view/x1")["crc"] == "ok"  # kept as it was
+
+    def test_a_folder_and_its_index_can_move(self, corpus: Path, tmp_path: Path) -> None:
+        index_logs([corpus])
+        moved = corpus.rename(tmp_path / "elsewhere")
+        assert index_logs([moved]).read == 0
+        paths = ask(moved / INDEX, "SELECT DISTINCT path FROM logs")["path"].to_pylist()
+        assert all(Path(path).exists() for path in paths)
+
+    def test_an_index_of_several_lies_where_it_is_told(self, corpus: Path, tmp_path: Path) -> None:
+        out = tmp_path / "all.parquet"
+        made = index_logs([f"{corpus}/*.mcap", corpus / "night"], out)
+        assert made.logs == 4 + 3
+        paths = ask(out, "SELECT path FROM logs")["path"].to_pylist()
+        assert all(Path(path).exists() for path in paths)
+        with pytest.raises(UsageError, match="say where, with -o"):
+            index_logs([f"{corpus}/*.mcap"])
+
+    def test_an_s3_prefix(
+        self, corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        with serving_s3() as endpoint, buckets(endpoint, monkeypatch) as files:
+            files.mkdir("bucket")
+            files.put(str(corpus / "night"), "bucket/logs/night", recursive=True)
+            files.put(str(corpus / "torn.mcap"), "bucket/logs/torn.mcap")
+            out = tmp_path / "remote.parquet"
+            made = index_logs(["s3://bucket/logs"], out)
+            assert (made.logs, made.read, made.broken) == (4, 4, 1)
+            found = [r for r in read_index(out).to_pylist() if r["topic"] == "/view/x1"]
+            assert found[0]["path"] == "s3://bucket/logs/night/one/x1.mcap"
+            assert found[0]["messages"] == 2000
+            assert index_logs(["s3://bucket/logs"], out).read == 0
+            files.put(str(corpus / "night/one/x2.mcap"), "bucket/logs/night/one/x1.mcap")
+            assert index_logs(["s3://bucket/logs"], out).read == 1
+
+
+class TestBadInput:
+    def test_links_in_circles_end(self, corpus: Path) -> None:
+        (corpus / "night" / "up").symlink_to(corpus)
+        (corpus / "self").symlink_to(corpus / "self")
+        (corpus / "lost.mcap").symlink_to("nowhere")
+        names = [Path(log.file).name for log in found_logs([corpus])]
+        assert len(names) == 11
+        assert [log.problem for log in found_logs([corpus]) if log.file.endswith("lost.mcap")] == [
+            "it cannot be read: No such file or directory"
+        ]
+
+    def test_a_name_that_is_no_text(self, corpus: Path) -> None:
+        shutil.copy(corpus / "robot.mcap", os.fsencode(corpus / "r") + b"\xff.mcap")
+        index_logs([corpus])
+        assert row(corpus, "r\\xff.mcap")["problem"] == "its name is not UTF-8: give it another"
+
+    def test_files_that_vanish_or_change_meanwhile(
+        self, corpus: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        log = corpus / "robot.mcap"
+        (corpus / "night" / "one" / "x1.mcap").touch()
+        describe = looking.describe_reader
+
+        def changing(reader: Any, **how: Any) -> LogInfo:
+            info = describe(reader, **how)
+            if reader.path.name == "robot.mcap":
+                os.utime(log, ns=(1, 1))
+            (corpus / "torn.mcap").unlink(missing_ok=True)
+            return info
+
+        monkeypatch.setattr(looking, "describe_reader", changing)
+        made = index_logs([corpus])
+        assert (made.logs, made.gone) == (9, ["torn.mcap"])
+        assert row(corpus, "robot.mcap")["problem"].endswith("index again")
+        monkeypatch.undo()
+        assert index_logs([corpus]).read == 1
+        assert row(corpus, "robot.mcap")["problem"] is None
+
+    def test_two_at_once(self, corpus: Path) -> None:
+        index_logs([corpus])
+        before = (corpus / INDEX).read_bytes()
+        with held(corpus), pytest.raises(UsageError, match="in use by another process"):
+            index_logs([corpus], full=True)
+        assert (corpus / INDEX).read_bytes() == before
+
+    def test_an_index_of_another_version(self, cdmisfa: Cdmisfa, corpus: Path) -> None:
+        index_logs([corpus])
+        table = read_index(corpus / INDEX)
+        pq.write_table(table.replace_schema_metadata({MARK: b"7"}), corpus / INDEX)
+        done = cdmisfa("query", corpus)
+        assert done.code == 2
+        assert "version 7, this program has 1: make it again with cdmisfa index" in done.err
+        done = cdmisfa("index", corpus)
+        assert done.code == 0
+        assert "version 7: it is made anew" in done.err
+        assert cdmisfa("query", corpus).code == 0
+
+    def test_what_is_no_index_is_left_alone(self, corpus: Path, tmp_path: Path) -> None:
+        other = tmp_path / "other.parquet"
+        pq.write_table(pa.table({"a": [1]}), other)
+        before = other.read_bytes()
+        with pytest.raises(UsageError, match="is no index"):
+            index_logs([corpus], other)
+        assert other.read_bytes() == before
+        other.write_bytes(before[:-9])
+        with pytest.raises(LogDamagedError, match="remove it, and index again"):
+            index_logs([corpus], other)
+
+    def test_a_full_disk_leaves_the_index_before(
+        self, corpus: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        index_logs([corpus])
+        before = (corpus / INDEX).read_bytes()
+        os.utime(corpus / "robot.mcap", ns=(1, 1))
+
+        def full(table: pa.Table, path: Path, **_: Any) -> None:
+            Path(path).write_bytes(b"half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(indexing.pq, "write_table", full)
+        with pytest.raises(LogWriteError, match="No space left"):
+            index_logs([corpus])
+        assert (corpus / INDEX).read_bytes() == before
+        assert [path.name for path in corpus.glob("*.partial")] == []
+
+    def test_a_log_that_kills_its_worker_is_a_row(
+        self, corpus: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def dying(
+            work: Callable[[Sequence[Task]], Answer], batches: Sequence[Sequence[Task]], jobs: int
+        ) -> Iterator[tuple[int, Answer | WorkerDied]]:
+            for number, tasks in enumerate(batches):
+                deadly = any(task.path == "robot.mcap" for task in tasks)
+                yield number, WorkerDied("it died") if deadly else work(tasks)
+
+        monkeypatch.setattr(indexing, "run_all", dying)
+        made = index_logs([corpus])
+        assert (made.logs, made.read) == (10, 10)
+        assert row(corpus, "robot.mcap")["problem"] == "it died"
+        assert row(corpus, "seen")["problem"] is None
+
+    def test_what_was_read_is_kept_when_it_is_stopped(
+        self, corpus: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(indexing, "BATCH", 4)
+        made = index_logs([corpus], stop=lambda: True)
+        assert (made.stopped, made.read, made.logs) == (True, 4, 4)
+        made = index_logs([corpus])
+        assert (made.stopped, made.read, made.kept) == (False, 6, 4)
+        index_logs([corpus], deep=True, full=True, stop=lambda: True)
+        assert len({r["path"] for r in rows_of(corpus)}) == 10  # the rest is as it was
+
+    def test_many_broken_files(self, tmp_path: Path) -> None:
+        rng = np.random.default_rng(0)
+        for i in range(500):
+            (tmp_path / f"{i}.mcap").write_bytes(b"\x89MCAP0\r\n" * (i % 2) + rng.bytes(i))
+        made = index_logs([tmp_path])
+        assert (made.logs, made.broken) == (500, 500)
+
+
+class TestQuery:
+    def test_the_summary_says_how_much_what_is_broken_and_what_is_double(
+        self, cdmisfa: Cdmisfa, corpus: Path
+    ) -> None:
+        shutil.copytree(corpus / "night" / "one", corpus / "night" / "two")
+        (corpus / "night" / "two" / "x2.mcap").rename(corpus / "night" / "two" / "named.mcap")
+        assert cdmisfa("index", corpus).code == 0
+        said = cdmisfa("query", corpus).out
+        assert "recording  3" in said  # the torn one is the third
+        assert "broken: 3\n" in said
+        assert "double: 3, " in said
+        assert f"{corpus}/night/one/x2.mcap = {corpus}/night/two/named.mcap" in said
+        document = cdmisfa("query", corpus, "--json").json
+        assert document["counts"]["double"] == 3
+        kinds = {kind["kind"]: kind for kind in document["kinds"]}
+        assert kinds["recording"]["files"] == 3 + 3 + 1
+        assert kinds["recording"]["seconds"] > 2 * 39
+
+    def test_deep_finds_the_same_messages_in_other_files(self, corpus: Path) -> None:
+        repacked(corpus / "night" / "one" / "x1.mcap", corpus / "again.mcap")
+        index_logs([corpus])
+        assert summary(corpus / INDEX).counts["double"] == 0
+        index_logs([corpus], deep=True)
+        (double,) = summary(corpus / INDEX).double
+        assert [Path(path).name for path in double["paths"]] == ["again.mcap", "x1.mcap"]
+
+    def test_answers_as_table_json_and_parquet(
+        self, cdmisfa: Cdmisfa, corpus: Path, tmp_path: Path
+    ) -> None:
+        cdmisfa("index", corpus)
+        sql = "SELECT kind, count(*) AS n FROM logs WHERE problem IS NULL GROUP BY kind ORDER BY n"
+        expected = [
+            {"kind": "run", "n": 1},
+            {"kind": "recording", "n": 3},
+            {"kind": "foreign", "n": 3},
+        ]
+        found = cdmisfa("query", corpus, sql, "--json").json
+        assert sorted(found["rows"], key=str) == sorted(expected, key=str)
+        assert "kind       n" in cdmisfa("query", corpus, sql).out
+        out = tmp_path / "answer.parquet"
+        assert cdmisfa("query", corpus, sql, "-o", out).code == 0
+        assert sorted(pq.read_table(out).to_pylist(), key=str) == sorted(expected, key=str)
+        assert cdmisfa("query", corpus, sql, "-o", out).code == 2  # it is there
+
+    @pytest.mark.parametrize(
+        "sql",
+        [
+            "SELEC",
+            "SELECT nothing FROM streams",
+            "SELECT * FROM '{corpus}/secret.csv'",
+            "COPY streams TO '{corpus}/out.csv'",
+            "ATTACH '{corpus}/out.db'",
+            "SET enable_external_access = true",
+            "SELECT * FROM rows_of",
+            "INSTALL httpfs",
+        ],
+    )
+    def test_a_query_fails_in_one_line_and_reaches_no_file(
+        self, cdmisfa: Cdmisfa, corpus: Path, sql: str
+    ) -> None:
+        (corpus / "secret.csv").write_text("a,b\n1,2\n")
+        cdmisfa("index", corpus)
+        before = sorted(corpus.iterdir())
+        done = cdmisfa("query", corpus, sql.format(corpus=corpus))
+        assert (done.code, done.out) == (2, "")
+        assert done.err.startswith("cdmisfa: the query fails: ")
+        assert done.err.count("\n") == 1
+        assert sorted(corpus.iterdir()) == before
+
+    def test_without_an_index_it_says_how_to_make_one(
+        self, cdmisfa: Cdmisfa, tmp_path: Path
+    ) -> None:
+        done = cdmisfa("query", tmp_path)
+        assert (done.code, done.out) == (2, "")
+        assert f"has no index: make one with cdmisfa index {tmp_path}" in done.err
+        assert cdmisfa("index", tmp_path / "missing").code == 2
+
+
+def test_the_commands_of_the_page_work(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (ROOT / "docs" / "corpus.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
+    lines = "".join(re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)).splitlines()
+    for program, *words in map(shlex.split, lines):
+        assert program == "cdmisfa"
+        done = cdmisfa(*words)
+        assert done.code == 0, done.err
+    assert pq.read_table("broken.parquet").num_rows == 0
+    columns = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| .* \|", page, re.MULTILINE))))
+    assert set(SCHEMA.names) <= columns
