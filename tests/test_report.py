@@ -23,14 +23,8 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments import reports
 from cdmisfa.experiments.reports import command_again, write_report
 from replay.camera_logs.options import CameraOptions
-from replay.report.conditions import (
-    LIVELY,
-    SLOW_AGAIN,
-    STILL_GAINING,
-    attempts,
-    conditions_of,
-    deciding,
-)
+from replay.report import conditions
+from replay.report.conditions import LIVELY, attempts, conditions_of, deciding
 from replay.report.page import MOST_BYTES
 from replay.report.told import read_told
 from replay.runs.modules import save_modules
@@ -247,7 +241,8 @@ def test_what_it_learned_from_is_gone_or_was_changed(
 
 def test_the_progress_learner_is_shown_with_its_own_rules(tmp_path: Path) -> None:
     assert LIVELY == judging.LIVELY
-    assert (SLOW_AGAIN, STILL_GAINING) == (judging.SLOW_AGAIN, judging.STILL_GAINING)
+    for name in ("SLOW_AGAIN", "STILL_GAINING", "PASSED_ON", "TURNING", "FULL"):
+        assert getattr(conditions, name) == getattr(judging, name)
     settings = {**PROGRESS, "test_frames": 400}
     write_run(tmp_path / "run.mcap", VECTOR, 60, learner=settings, edit=by_progress)
     page = Page(write_report([tmp_path]))
@@ -264,7 +259,17 @@ def test_the_progress_learner_is_shown_with_its_own_rules(tmp_path: Path) -> Non
     tested, fitted = (told.outline.lines[name] for name in ("tested", "fitted"))
     apart = np.abs(np.log(tested / fitted))
     np.testing.assert_array_equal(rules["agreement"].holds, apart < 0.25)
-    np.testing.assert_array_equal(rules["change"].holds, told.outline.lines["change"] < 0.05)
+
+
+def test_the_progress_learner_saves_where_all_its_rules_hold_and_nowhere_else(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    words = ("--algorithm", "progress", "--no-rerun", "--no-report", "-o", tmp_path)
+    assert cdmisfa("learn", "oscillatory", *words).code == 0
+    told = read_told(tmp_path, frames=1)
+    rules = conditions_of(told.outline, told.signals)
+    rows = attempts(told.outline, told.signals, rules)
+    assert [(row.together, row.saved) for row in rows] == [(1, True)] * 3
 
 
 def test_several_runs_a_folder_of_them_and_a_sweep(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from replay.runs.run import Outline
 LIVELY = (0.5, 2.0)
 """Variance of an output that the progress learner counts as alive."""
 
-SLOW_AGAIN, STILL_GAINING = 0.65, 0.1
-"""Where it counts what was fitted as slow, and something as gained of late."""
+SLOW_AGAIN, STILL_GAINING, PASSED_ON, TURNING, FULL = 0.65, 0.1, 0.03, 4.0, 4.5
+"""Its further constants, `cdmisfa/agents/progress/judging.py`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Condition:
         drawn: it has a plot of its own.
         symbol: what stands before the limit where that is drawn.
         counts: it decides by itself; else it only follows from the others.
-        held: (n,) where it held, where the limits were others before; see `conditions_of`.
+        held: (n,) where it held, where that is more than its limits tell.
     """
 
     short: str
@@ -158,6 +158,13 @@ def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[
         gain, flatness = (lines[name] / lines["typical"] for name in ("tested", "fitted"))
     untested = ~np.isfinite(lines["tested"])
     window = None if frames is None else max(frames / max(outline.tau, 1), 1.0)
+    tests, regret, settled = signals["novel_blocks"] - 1.0, lines["regret"], None
+    if change is not None and window is not None:
+        windows = tests / window
+        with np.errstate(invalid="ignore"):
+            firm = lines["change"] < change * np.clip(windows / FULL, 0.0, 1.0) ** 2
+            idle = (np.abs(regret) < PASSED_ON) & (lines["change"] < TURNING * change)
+        settled = ~untested & (firm | (idle & (windows >= FULL)))
     return [
         Condition(
             "error", "learning error e of the stream that is watched: change plus disagreement",
@@ -167,8 +174,9 @@ def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[
         ),
         Condition(
             "change", "change c of its slowest output with a block",
-            "" if change is None else f"learned below {change:g}",
-            np.where(untested, np.nan, lines["change"]), high=change, log=True,
+            "" if change is None else f"learned below {change:g}; sooner below less, by the tests "
+            f"there are; below {TURNING * change:g} where nothing is gained",
+            np.where(untested, np.nan, lines["change"]), high=change, log=True, held=settled,
         ),
         Condition(
             "agreement", "disagreement |ln(tested / fitted)|: slowness on new frames against old",
@@ -192,13 +200,13 @@ def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[
         ),
         Condition(
             "regret", "regret: what it has gained of late, as log of its slowness some time ago",
-            f"learned up to {STILL_GAINING:g}: else it still gains", lines["regret"],
-            high=STILL_GAINING,
+            f"learned up to {STILL_GAINING:g}, or before there is any: else it still gains",
+            regret, high=STILL_GAINING, held=~(regret > STILL_GAINING),
         ),
         Condition(
-            "tests", "blocks that it learned from since it was begun",
+            "tests", "blocks that it was tested on since it was begun",
             "" if window is None else f"learned from {window:g} on: a whole window of tests",
-            signals["novel_blocks"].astype(float), low=window, drawn=False,
+            tests, low=window, drawn=False,
         ),
     ]  # fmt: skip
 

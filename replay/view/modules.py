@@ -8,6 +8,7 @@ or is still learning, it holds what the signals tell, from the save on.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import rerun as rr
@@ -36,10 +37,17 @@ from replay.view.columns import Column, Target, tensors
 from replay.view.labels import label
 from replay.view.world import ROOM, places_of
 
-SAVED = rr.SeriesPoints(
-    colors=[packed(BRICK)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
-)
-"""How the iteration is marked in which a module was saved."""
+
+@cache
+def saved_mark() -> rr.SeriesPoints:
+    """How the iteration is marked in which a module was saved.
+
+    Made when it is needed: with it pyarrow imports pandas, where that is installed.
+    """
+    return rr.SeriesPoints(
+        colors=[packed(BRICK)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
+    )
+
 
 MOST_BARS = 256
 """Weights that are no picture, and drawn as bars: more are a tensor."""
@@ -159,7 +167,7 @@ class ModulesView:
             number, stream = int(columns["module"][i]), int(columns["stream"][i])
             t, iteration = int(columns.frames[i]), int(columns.iterations[i])
             self._stream_of[number], place = stream, f"modules/{number}"
-            self._target.log(f"{place}/saved", SAVED)
+            self._target.log(f"{place}/saved", saved_mark())
             self._target.log_at(f"{place}/saved", t + columns.tau, iteration, rr.Scalars([0.0]))
             if number not in self._own and t in weights:
                 hang_weights(self._target, f"{place}/weights", len(weights[t]))

@@ -27,7 +27,7 @@ from replay.runs.run import Outline
 from replay.view.columns import TIMELINE_SIGNALS, Column, Target, power_of_ten
 from replay.view.labels import label, line_labels, part
 from replay.view.lanes import Lanes
-from replay.view.modules import SAVED, hang_weights, write_weights
+from replay.view.modules import hang_weights, saved_mark, write_weights
 from replay.view.summary import decision_text
 
 AXES = {"S": "stream", "A": "action", "J": "output"}
@@ -365,7 +365,7 @@ class RunView:
         name = "learning_error" if self._by_progress else "eta_dot"
         path = "streams/saved" if self._by_progress else "abstraction/saved"
         stood = power_of_ten(columns[name]).reshape(len(columns), -1)[saved, :1]
-        column = self._column(path, partial(Column, self._target), SAVED)
+        column = self._column(path, partial(Column, self._target), saved_mark())
         column.add(columns.frames[saved], columns.iterations[saved], stood)
 
     def _send(self, columns: SignalColumns, rows: IntArray, path: str, values: Any) -> None:
