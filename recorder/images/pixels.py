@@ -197,7 +197,7 @@ def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) 
     if not enlarge and (image.shape[0] < height or image.shape[1] < width):
         raise UsageError(
             f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
-            "choose a smaller --size"
+            "choose larger images, or a smaller --size"
         )
     small = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
     return np.asarray(small, np.uint8)
