@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import struct
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import encoded, raw
+from camera_files import encoded, raw, write_cameras
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
@@ -33,6 +34,8 @@ from recorder.images.pixels import (
     raw_image,
     shrink,
 )
+from recorder.mcap.reader import LogReader
+from replay.camera_logs import mcap_log
 from replay.camera_logs.source import ForeignSource
 
 RAW_IMAGES = MessageKind("foxglove.RawImage", "protobuf")
@@ -322,3 +325,29 @@ def test_a_message_that_is_no_image_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1020000000 ns"):
         source.take(0, 2)
     assert source.t == 0
+
+
+def test_topics_of_a_log_share_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 400 topics each would hold the places of every chunk and message index."""
+    topics = [f"/cam{i}" for i in range(12)]
+    write_cameras(tmp_path / "log.mcap", dict.fromkeys(topics, (60, 20)))
+    opened: list[LogReader] = []
+
+    class Counted(LogReader):
+        def __init__(self, *args: Any, **how: Any) -> None:
+            super().__init__(*args, **how)
+            opened.append(self)
+
+    monkeypatch.setattr(mcap_log, "LogReader", Counted)
+    with contextlib.closing(ForeignSource(tmp_path / "log.mcap", topics)) as source:
+        assert len(opened) == 1
+        blocks = [block for _ in range(3) for block in source.take_all(20)]
+        assert len(source.describe()["files"]) == 1
+    for number, topic in enumerate(topics):
+        with contextlib.closing(ForeignSource(tmp_path / "log.mcap", [topic])) as alone:
+            own = [block.frames for block in blocks if block.stream == number]
+            assert np.array_equal(np.concatenate(own), alone.take(0, 60).frames)
+    assert len(opened) == 1 + len(topics)
+    for reader in opened:
+        with pytest.raises(ValueError, match="is closed"):
+            list(reader.messages())

@@ -109,8 +109,8 @@ class Chunks:
         self._cached += len(table.data)
         return table
 
-    def index(self, segment: Segment) -> Pairs:
-        """Read a chunk's message indexes.
+    def index(self, segment: Segment, channels: Collection[int] | None = None) -> Pairs:
+        """Read a chunk's message indexes, or those of some channels.
 
         Raises:
             MalformedRecord: they are larger than any chunk.
@@ -122,8 +122,9 @@ class Chunks:
             raise MalformedRecord("its message index is larger than any chunk")
         data, found = self._file.read(first, stop - first), []
         for part in segment.indexes:
-            pairs = np.frombuffer(data, np.uint64, 2 * part.count, part.offset - first)
-            found.append((part.channel, pairs.reshape(-1, 2)))
+            if channels is None or part.channel in channels:
+                pairs = np.frombuffer(data, np.uint64, 2 * part.count, part.offset - first)
+                found.append((part.channel, pairs.reshape(-1, 2)))
         return found
 
     @contextlib.contextmanager

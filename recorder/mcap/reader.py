@@ -281,9 +281,9 @@ class LogReader:
                 self._refuse(segment.name, str(error))
             return None
 
-    def index(self, segment: Segment) -> Pairs:
+    def index(self, segment: Segment, channels: Collection[int] | None = None) -> Pairs:
         """Read a chunk's message indexes; see `Chunks.index`."""
-        return self._chunks.index(segment)
+        return self._chunks.index(segment, channels)
 
     def is_at(self, path: Path) -> bool:
         """Whether a path leads to the very file that was opened."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
@@ -21,14 +22,43 @@ from replay.camera_logs.stream import (
     explained,
     sorted_times,
 )
-from replay.storage.location import Location
+from replay.storage.location import Location, Url
 from replay.storage.opening import open_store
 
 Found = TypeVar("Found")
 
 
+class Readers(contextlib.ExitStack):
+    """Logs of which several topics are taken: each is opened once, and closed with this."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._open: dict[Location, LogReader] = {}
+        self._expected: dict[LogReader, list[Segment]] = {}
+
+    def reader(self, path: Location, *, salvage: bool) -> LogReader:
+        """The reader of a log; raises as `LogReader` does."""
+        if path not in self._open:
+            self._open[path] = self.enter_context(LogReader(open_store(path), salvage=salvage))
+        return self._open[path]
+
+    def expect(self, reader: LogReader, segments: list[Segment]) -> None:
+        """Say which chunks a topic is about to read, where the one before had others."""
+        if self._expected.get(reader) != segments:
+            self._expected[reader] = segments
+            reader.expect(segments)
+
+
 class McapImages(MessageImages):
     """The images, or the numbers, on one topic of one log, in the order of log time.
+
+    Args:
+        path: the log.
+        topic: may be left out where there is one of images.
+        salvage: leave out what is damaged.
+        reading: what is taken.
+        readers: of logs of which other topics are taken, too; of what is behind a URL each topic
+            has a reader of its own, which reads ahead.
 
     Raises:
         UsageError: no such topic, or not what is wanted on it.
@@ -42,12 +72,16 @@ class McapImages(MessageImages):
         *,
         salvage: bool = False,
         reading: Reading = IMAGES,
+        readers: Readers | None = None,
     ) -> None:
         self.path = path
-        self._own: tuple[MessageTable | None, NDArray[np.intp]] = None, np.empty(0, np.intp)
+        self._own: tuple[int, NDArray[np.intp]] = -1, np.empty(0, np.intp)
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
-        self.reader = LogReader(open_store(path), salvage=salvage)
+        self._alone = Readers()
+        shared = readers is not None and not isinstance(path, Url)
+        self._readers = readers if readers is not None and shared else self._alone
+        self.reader = self._readers.reader(path, salvage=salvage)
         try:
             _refuse_nothing(self.reader)
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
@@ -64,18 +98,21 @@ class McapImages(MessageImages):
             counts = [len(own) for _, own in found]
             self._segment_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)[order]
             self._row_in = np.concatenate([np.arange(count) for count in counts])[order]
-            self.reader.expect(self._segments)
+            self._readers.expect(self.reader, self._segments)
         except BaseException:
-            self.reader.close()
+            self._alone.close()
             raise
         self.warnings = self.reader.warnings
 
     def taken(self, row: int, take: Callable[[memoryview], Found]) -> Found:
-        table = self.reader.table(self._segments[int(self._segment_of[row])])
+        number = int(self._segment_of[row])
+        if number != self._own[0]:
+            self._readers.expect(self.reader, self._segments)
+        table = self.reader.table(self._segments[number])
         if table is None:
             raise MalformedRecord("it is damaged")
-        if self._own[0] is not table:
-            self._own = table, self._rows_of(table)
+        if number != self._own[0]:
+            self._own = number, self._rows_of(table)
         own, place = self._own[1], int(self._row_in[row])
         if place >= len(own) or table.log_time[own[place]] != self.times[row]:
             raise MalformedRecord("its chunk holds other messages than the summary names")
@@ -83,8 +120,7 @@ class McapImages(MessageImages):
             return take(table.view(int(own[place])))
 
     def close(self) -> None:
-        self._own = None, self._own[1]
-        self.reader.close()
+        self._alone.close()
 
     def _rows_of(self, table: MessageTable) -> NDArray[np.intp]:
         """The rows of a chunk's table that are of the topic."""
@@ -107,8 +143,7 @@ class McapImages(MessageImages):
         ]
         self.reader.expect(segments, indexes=True)
         for segment in segments:
-            index = self.reader.index(segment)
-            own = [pairs for channel, pairs in index if channel in channels]
+            own = [pairs for _, pairs in self.reader.index(segment, channels)]
             pairs = own[0] if len(own) == 1 else np.concatenate(own)
             yield segment, pairs[pairs[:, 1].argsort(kind="stable"), 0]
 

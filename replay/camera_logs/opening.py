@@ -6,7 +6,7 @@ import contextlib
 import fnmatch
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from cdmisfa.core.errors import UsageError
 from recorder.images.options import IMAGES, Reading
@@ -18,7 +18,7 @@ from replay.camera_logs.lerobot import (
     dataset_channels,
     is_dataset,
 )
-from replay.camera_logs.mcap_log import McapImages, mcap_topics
+from replay.camera_logs.mcap_log import McapImages, Readers, mcap_topics
 from replay.camera_logs.pictures import PICTURES, VIDEOS, FolderImages, VideoImages, by_number
 from replay.camera_logs.selected import VideoMessages, by_stamps, join_by_time
 from replay.camera_logs.stream import ChannelFacts, ImageStream, NothingLoggedError, holds_none
@@ -71,7 +71,12 @@ def image_logs(paths: Sequence[str | Location]) -> list[Location]:
 
 
 def open_images(
-    path: Location, topic: str | None, *, salvage: bool = False, reading: Reading = IMAGES
+    path: Location,
+    topic: str | None,
+    *,
+    salvage: bool = False,
+    reading: Reading = IMAGES,
+    readers: Readers | None = None,
 ) -> ImageStream:
     """Open the images on a topic of a log, or in a folder, or numbers, at the times wanted.
 
@@ -80,12 +85,14 @@ def open_images(
         topic: may be left out where there is one topic of images.
         salvage: leave out what is damaged.
         reading: what is taken of messages and tables, and by which times.
+        readers: of logs of which other topics are taken, too; closed behind all of them.
 
     Raises:
         UsageError: no such topic, or not what is wanted on it.
         LogDamagedError: the log is damaged.
     """
-    images = _open(path, topic, salvage=salvage, reading=reading)
+    how: dict[str, Any] = {"salvage": salvage, "reading": reading, "readers": readers}
+    images = _open(path, topic, **how)
     try:
         if isinstance(images.decode, VideoPackets):
             images = VideoMessages(images, images.decode)
@@ -95,13 +102,20 @@ def open_images(
         raise
 
 
-def _open(path: Location, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
+def _open(
+    path: Location,
+    topic: str | None,
+    *,
+    salvage: bool,
+    reading: Reading,
+    readers: Readers | None = None,
+) -> ImageStream:
     """Open a log with the reader of its format, which raises as `open_images` does."""
     kind = log_format(path)
     if isinstance(path, Url) or kind == "mcap":
-        return McapImages(path, topic, salvage=salvage, reading=reading)
+        return McapImages(path, topic, salvage=salvage, reading=reading, readers=readers)
     if kind == "split":
-        return _open_parts(path, topic, salvage=salvage, reading=reading)
+        return _open_parts(path, topic, salvage=salvage, reading=reading, readers=readers)
     if kind == "bag":
         return BagImages(path, topic, reading=reading)
     if kind == "table":
@@ -115,7 +129,7 @@ def _open(path: Location, topic: str | None, *, salvage: bool, reading: Reading)
     return VideoImages(path, topic, color=reading.color)
 
 
-def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
+def _open_parts(path: Path, topic: str | None, **how: Any) -> ImageStream:
     """Open the images on a topic of a log in parts.
 
     A part may lack a topic that is named, and one that has nothing in it is left out.
@@ -126,7 +140,7 @@ def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Readin
     with contextlib.ExitStack() as opened:
         for file in sorted(path.glob("*.mcap"), key=by_number):
             try:
-                parts.append(McapImages(file, topic, salvage=salvage, reading=reading))
+                parts.append(McapImages(file, topic, **how))
                 opened.callback(parts[-1].close)
             except NothingLoggedError as error:
                 empty.append(error)
@@ -152,7 +166,7 @@ def identity_of(path: Location, streams: Sequence[ImageStream]) -> Identity:
     """
     readers = [s.reader for s in streams if isinstance(s, McapImages) and s.path == path]
     if readers:
-        return log_identity(*readers)
+        return log_identity(*dict.fromkeys(readers))
     if isinstance(path, Url):
         raise ValueError(f"{path} is not open")
     if not path.is_dir():

@@ -37,6 +37,7 @@ from replay.camera_logs.alignment import (
 )
 from replay.camera_logs.copies import copies
 from replay.camera_logs.hue import CHOSEN, shows_hue
+from replay.camera_logs.mcap_log import Readers
 from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
 from replay.camera_logs.options import Align, CameraOptions
 from replay.camera_logs.selected import (
@@ -110,6 +111,7 @@ class ForeignSource(LoggedSource):
         self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
         self._streams: list[ImageStream] = []
+        self._readers = Readers()
         self.changes: dict[int, str] = {}
         self._shown: dict[int, tuple[int, Shown]] = {}
         try:
@@ -151,8 +153,8 @@ class ForeignSource(LoggedSource):
                 "seconds after the first image: no image lies between them"
             )
         for path, topic in named_streams(self._files, options.topics, reading):
-            images = open_images(path, topic, salvage=self._salvage, reading=reading)
-            self._streams.append(images)
+            how: dict[str, Any] = {"salvage": self._salvage, "readers": self._readers}
+            self._streams.append(open_images(path, topic, reading=reading, **how))
         if options.align != "index":
             self._streams = join_parts(self._streams)
         if len({bool(stream.fields) for stream in self._streams}) > 1:  # refused with any --align
@@ -269,6 +271,7 @@ class ForeignSource(LoggedSource):
     def close(self) -> None:
         for stream in self._streams:
             stream.close()
+        self._readers.close()
 
     def _block(self, stream: int, t: int, n: int) -> Block:
         """The frames of a stream; an image smaller than a frame is a UsageError."""
