@@ -277,8 +277,7 @@ GOOD = {
     "policies": ["011", "110"],
     "saved_at": [600, 1100],
     "follows": [[0.99, 0.01], [0.02, 0.97]],
-    "curiosity": [0.003, 0.0, 0.001],
-    "reward": [0.004, 0.0, 0.002],
+    **{key: [0.003, 0.0, 0.001] for key in ("curiosity", "reward")},
     "iterations": 1400,
 }
 """A trial on the iCub as it should be."""

@@ -140,7 +140,8 @@ class Difficulty(Experiment):
         found.notes.append(
             f"White noise has slowness {WHITE_NOISE:.4f}. Only learnable streams have frames; a "
             "trial that does not stay above a direction cosine of .95 is not in n, and never in "
-            "the median."
+            "the median. The paper's own measure, the curiosity function of earlier work, it does "
+            "not define; the rewards that its agent goes by are told with the experiments above."
         )
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cdmisfa.experiments.results import MeanSd, summary, wilson
+from cdmisfa.experiments.results import MeanSd, mean_interval, summary, wilson
 from cdmisfa.modules import Module
 
 Settings = Mapping[str, Any]
@@ -177,6 +178,14 @@ def groups(trials: Sequence[Trial], *keys: str) -> dict[tuple[Any, ...], list[Tr
 def of_all(good: int, n: int) -> str:
     """How many of n trials did what they should, bold where some did not."""
     return f"{good} of {n}" if good == n else f"**{good} of {n}**"
+
+
+def first_above(first: ArrayLike, *others: ArrayLike) -> bool | None:
+    """Whether values are above others of the same trials; None where 95 % intervals cannot say."""
+    bounds = [mean_interval(np.subtract(first, other)) for other in others]
+    if all(low > 0 for low, _ in bounds):
+        return True
+    return False if any(high < 0 for _, high in bounds) else None
 
 
 def mean_of(values: ArrayLike, digits: int) -> str:

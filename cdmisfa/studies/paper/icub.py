@@ -30,6 +30,7 @@ from cdmisfa.studies.paper.experiment import (
     Request,
     Settings,
     Trial,
+    first_above,
     groups,
     learned_order,
     mean_of,
@@ -106,11 +107,10 @@ class Icub(Experiment):
         found.claim_all("iCub: the modules encode the positions of objects 1 and 3", both, n)
         found.claim_all("iCub: no third module is learned", ended, n)
         for part, key in (("curiosity reward", "curiosity"), ("reward in all", "reward")):
-            rewards = [t.row[key] for t in new]
-            most = sum(one > max(two, three) for one, two, three in rewards)
-            mean = ", ".join(f"{value:.5f}" for value in np.mean(rewards, axis=0))
-            words = f"{most} of {n} trials; means {mean}"
-            found.claim(f"iCub: view 1 earns more {part} than the others", most == n, words)
+            earned = np.array([t.row[key] for t in new]).T
+            most = first_above(*earned)
+            means = ", ".join(f"{value:.5f}" for value in earned.mean(axis=1))
+            found.claim(f"iCub: view 1 earns more {part} than views 2 and 3", most, means)
         tight, wide = (follow_both(group) for group in (old, loose))
         found.claim(
             "1.0 does not do on the iCub",
@@ -224,7 +224,8 @@ class Curves(Sink):
         self.arrays: dict[str, NDArray[Any]] = {}
         self._truth = truth
         self._curves: dict[str, list[NDArray[Any]]] = {
-            name: [] for name in ("eta_dot", "Q", "policy", "stream", "curiosity", "reward")
+            name: []
+            for name in ("eta_dot", "Q", "policy", "stream", "epsilon", "curiosity", "reward")
         }
         self._recent: deque[tuple[NDArray[Any], NDArray[Any]]] = deque(maxlen=-(-DRAWN // tau))
 
@@ -252,7 +253,7 @@ def learn_curves(source: RecordedSource, config: LearnerConfig, seed: int) -> Ou
     """Learn from a recording: a trial's row, and the curves and each module's last outputs."""
     curves = Curves(config.tau, source.spec.truth)
     row = learn_and_judge(source, config, seed, source.frames - HELD_OUT, curves)
-    row |= stay_rewards(curves.arrays, row["saved_at"])
+    row |= stay_rewards(curves.arrays, config)
     source.seek(0)
     shown = [source.take(view, 1).frames[0] for view in range(len(source.spec.streams))]
     return row, {**curves.arrays, "shown": np.stack(shown)}

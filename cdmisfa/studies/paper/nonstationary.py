@@ -241,7 +241,9 @@ def _claim_about_order(
             words = ", ".join(
                 f"{v:g}: {low:+.3f} .. {high:+.3f}" for v, (low, high) in differ.items()
             )
-            same = all(low <= 0 <= high for low, high in differ.values())
+            same: bool | None = all(low <= 0 <= high for low, high in differ.values())
+            if same and any(_rank(columns[key][v]) > limit for v in (*others, reference)):
+                same = None  # where one of them lies cannot be judged
             found.claim(claim, same, f"against {reference:g}, 95 % intervals: {words}")
     if "tau" in columns:
         shortest, *others = (_rank(columns["tau"][tau]) for tau in sorted(columns["tau"]))

@@ -27,6 +27,7 @@ from cdmisfa.studies.paper.experiment import (
     Request,
     Settings,
     Trial,
+    first_above,
     groups,
     learned_order,
     mean_of,
@@ -78,21 +79,22 @@ def slowness_on(module: Module) -> float:
     return float(instantaneous_slowness((x - module.mean) @ module.phi[:1].T)[0])
 
 
-def stay_rewards(curves: Mapping[str, Any], modules: Sequence[int]) -> dict[str, list[float]]:
-    """What staying in each of three streams earns while the first module is learned, in the mean.
+def stay_rewards(curves: Mapping[str, Any], config: LearnerConfig) -> dict[str, list[float]]:
+    """What staying in each of three streams earns while the first policy is found, in the mean.
 
     That is what the paper's agent itself goes by: the easier a stream, the faster the weights
-    settle there. NaN of a stream without a reward.
+    settle there. Once epsilon is below its knee the agent mostly stays where it likes it.
 
     Args:
-        curves: (N,) `stream`, `curiosity` and `reward` of the iterations, NaN where there is none.
-        modules: iterations at whose end modules were saved.
+        curves: (N,) `stream`, `epsilon`, `curiosity` and `reward` of the iterations.
+        config: the learner's.
 
     Returns:
-        Of `curiosity`, its part, and of the whole `reward`: (3,).
+        Of `curiosity`, its part, and of the whole `reward`: (3,), NaN of a stream without one.
     """
-    streams = np.asarray(curves["stream"]).astype(int)
-    at = np.arange(1, modules[0] if modules else len(streams))
+    streams, epsilon = np.asarray(curves["stream"]).astype(int), np.asarray(curves["epsilon"])
+    end = int(np.argmax(epsilon < config.epsilon_knee)) or len(epsilon)
+    at = np.arange(1, end)
     stayed = at[(streams[at] == streams[at - 1]) & np.isfinite(curves["reward"][at])]
     return {
         name: [summary(curves[name][stayed[streams[stayed] == s]]).mean for s in range(3)]
@@ -118,7 +120,7 @@ class Oscillatory(Experiment):
             "iterations": result.iterations,
             **modules,
             "eta": [slowness_on(m) for m in result.modules],
-            **stay_rewards(curves, modules["saved_at"]),
+            **stay_rewards(curves, config),
         }
         arrays = {name: curves[name].astype(np.float32) for name in ("eta_dot", "R", "Q")}
         return row, {**arrays, "policy": curves["policy"].astype(np.int8)}
@@ -134,13 +136,16 @@ class Oscillatory(Experiment):
             slowness = f"slowness of {module} on its stream (paper: its frequency)"
             found.of_module(f"{module} saved at iteration", trials, "saved_at", i, digits=0)
             found.of_module(slowness, trials, "eta", i, paper, digits=4)
-        for name, stream in zip(STREAMS, range(3), strict=True):
-            quantity = f"curiosity reward of a stay in {name}, before the first module"
-            found.measured(quantity, [t.row["curiosity"][stream] for t in trials], digits=5)
+        earned = np.array([t.row["curiosity"] for t in trials]).T
+        for name, values in zip(STREAMS, earned, strict=True):
+            quantity = f"curiosity reward of a stay in {name}, while exploring"
+            found.measured(quantity, values, digits=5)
         order = "modules x1, x2, x3 in this order, policies [0,1,1], [1,0,1], [1,1,0]"
         found.claim_all(order, good, n)
-        falls = sum(a > b > c for a, b, c in (t.row["curiosity"] for t in trials))
-        found.claim_all("curiosity reward: x1 earns more than x2, and x2 than x3", falls, n)
+        one, two, three = earned
+        falls = first_above(one, two) and first_above(two, three)
+        means = ", ".join(f"{value:.5f}" for value in earned.mean(axis=1))
+        found.claim("x1 earns more curiosity reward than x2, and x2 than x3", falls, means)
         found.sum_up(
             "The order on the oscillatory streams",
             f"modules x1, x2, x3 with the optimal policies in {good} of {n} trials (paper: 20 of "
