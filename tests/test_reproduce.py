@@ -21,7 +21,7 @@ from cdmisfa.experiments.trial import run_trial
 from cdmisfa.studies.paper import ablation, difficulty, icub, nonstationary, oscillatory, scenes
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Trial, groups
 from cdmisfa.studies.paper.oscillatory import Oscillatory, paper_config
-from cdmisfa.studies.paper.reproduce import reproduce
+from cdmisfa.studies.paper.reproduce import EXPERIMENTS, reproduce
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
 
@@ -116,6 +116,18 @@ def test_results_of_more_or_other_trials_are_replaced_only_with_force(
     assert {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()} == before
     assert cdmisfa(*command, "--trials", 1, "--force").code in (0, 4)
     assert json.loads((folder / "results.json").read_text())["trials"] == 2
+
+
+def test_trials_with_other_settings_than_the_first_are_known_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Mixed(oscillatory.FiveStreams):
+        def conditions(self, request: Request) -> list[dict[str, Any]]:
+            return [{"keys": {}}, {"keys": {"nu": 0.05}, "recording": "x"}]
+
+    monkeypatch.setitem(EXPERIMENTS, "five", Mixed())
+    first = reproduce("five", Request(1, True, None, tmp_path))
+    assert reproduce("five", Request(1, True, None, tmp_path)) == first
 
 
 @pytest.mark.usefixtures("undrawn")

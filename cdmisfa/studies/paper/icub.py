@@ -141,7 +141,8 @@ class Icub(Experiment):
         paths = pages.save_figure(figure, folder, "icub")
         scene, axes = pages.new_figure(1, 2)
         shown = next(t.arrays["shown"] for t in trials)
-        images = np.asarray(scene_picture(IcubConfig())), np.concatenate(shown)
+        views = [np.pad(view, ((1, 1), (0, 0)), constant_values=255) for view in shown]
+        images = np.asarray(scene_picture(IcubConfig())), np.concatenate(views)
         names = "from outside", "what it sees: left, center, right"
         for panel, image, letter, name in zip(axes[0], images, "ab", names, strict=True):
             panel.imshow(image, cmap="gray", vmin=0, vmax=255)

@@ -89,7 +89,7 @@ class NonStationary(Experiment):
 
     title = "Non-stationary environments"
 
-    trials = (30, 3)
+    trials = (20, 3)
 
     def conditions(self, request: Request) -> list[Settings]:
         """Tables 1 and 2: every epsilon^c for every value of a key."""

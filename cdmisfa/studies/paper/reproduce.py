@@ -108,7 +108,9 @@ def reproduce(
     trials = [_finished(request.folder, rows[task.id]) for task in tasks]
     found = Findings()
     experiment.evaluate(trials, found)
-    table = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
+    cells = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
+    columns = list(dict.fromkeys(name for row in cells for name in row))
+    table = [{name: row.get(name) for name in columns} for row in cells]
     with atomic_write(request.folder / "rows.parquet") as partial:
         parquet.write_table(pyarrow.Table.from_pylist(table), partial)
     figures = experiment.draw(trials, request.folder)
@@ -142,10 +144,13 @@ def _finished(folder: Path, row: Mapping[str, Any]) -> Trial:
 def _write_results(
     name: str, request: Request, found: Findings, trials: int, figures: Sequence[Path]
 ) -> dict[str, Any]:
+    chosen = " --quick" if request.quick else ""
+    chosen += f" --trials {request.trials}" if request.trials is not None else ""
     document: dict[str, Any] = plain(
         {
             "schema": 1,
             "experiment": name,
+            "command": f"cdmisfa reproduce {name}{chosen}",
             "title": EXPERIMENTS[name].title,
             "quick": request.quick,
             "trials": trials,
@@ -246,8 +251,8 @@ def write_paper_page(root: Path, path: Path) -> None:
     page.add(markdown(("statement", "so here", "measured", "by"), claims), "")
     for document in documents:
         name = document["experiment"]
-        command = f"cdmisfa reproduce {name}{' --quick' if document['quick'] else ''}"
-        page.add(f"## {document['title']}", "", f"`{command}`, {document['trials']} trials.", "")
+        made = f"`{document['command']}`, {document['trials']} trials."
+        page.add(f"## {document['title']}", "", made, "")
         page.add(markdown_tables(document))
         page.add(*(f"{note}\n" for note in document["notes"]))
         for figure in document["figures"]:
