@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
+from subprocess import Popen
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from waiting import wait_for
+from waiting import running, started, wait_for
 
 from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig
@@ -41,16 +39,9 @@ record_scene("oscillatory", Path(sys.argv[1]), frames=int(sys.argv[2]),
 """
 
 
-@contextlib.contextmanager
-def recorder(folder: Path, *, wait: float = 0.02) -> Iterator[subprocess.Popen[bytes]]:
+def recorder(folder: Path, *, wait: float = 0.02) -> AbstractContextManager[Popen[str]]:
     """A recorder that takes its time."""
-    words = [sys.executable, "-c", RECORDER, str(folder), str(FRAMES), str(wait)]
-    process = subprocess.Popen(words)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
+    return running("-c", RECORDER, folder, FRAMES, wait)
 
 
 @pytest.fixture(scope="module")
@@ -254,18 +245,10 @@ def test_a_resumed_run_goes_on_with_the_frames_that_it_had(tmp_path: Path) -> No
 
 def test_a_signal_ends_the_waiting(cdmisfa: Cdmisfa, tmp_path: Path, finished: Path) -> None:
     with recorder(tmp_path / "rec", wait=0.5):
-        words = ["learn", str(tmp_path / "rec"), "--follow", "-o", str(tmp_path / "run")]
-        learner = subprocess.Popen(
-            [sys.executable, "-m", "cdmisfa", *words, "--no-rerun", "--set", "learner.tau=600"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        try:
+        words = ("learn", tmp_path / "rec", "--follow", "-o", tmp_path / "run", "--no-rerun")
+        with started(*words, "--set", "learner.tau=600") as learner:
             wait_for((tmp_path / "run" / "run.mcap.partial").exists, 60, learner)
             time.sleep(0.3)
             learner.send_signal(signal.SIGINT)
             assert learner.wait(30) == 130
-        finally:
-            learner.kill()
-            learner.wait()
     assert (tmp_path / "run" / "run.json").exists()

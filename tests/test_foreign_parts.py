@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_cameras, write_images
 from conftest import Cdmisfa
 from folders import contents
-from waiting import wait_for
+from waiting import started, wait_for
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.camera_logs.source import ForeignSource
@@ -120,12 +118,11 @@ def test_a_conversion_that_was_stopped_goes_on(
     words = ("convert", tmp_path / "a.mcap", *BOTH, "-o")
     assert cdmisfa(*words, tmp_path / "whole").code == 0
     folder = tmp_path / "rec"
-    command = [sys.executable, "-m", "cdmisfa", *map(str, words), str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     partial = folder / "left.mcap.partial"
-    wait_for(lambda: partial.exists() and partial.stat().st_size >= 20_000, 60, process)
-    process.send_signal(number)
-    _, said = process.communicate(timeout=60)
+    with started(*words, folder) as process:
+        wait_for(lambda: partial.exists() and partial.stat().st_size >= 20_000, 60, process)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=60)
     if number == signal.SIGTERM:
         assert process.returncode == 143, said
         assert said.rstrip().endswith("rec is not finished: go on with --resume")

@@ -10,8 +10,6 @@ import re
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -28,7 +26,7 @@ from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage as FoxgloveRaw
 from live_cameras import Robot
-from waiting import Clock, python, wait_for
+from waiting import Clock, python, started, wait_for
 from websockets.sync.server import ServerConnection, serve
 
 from cdmisfa import ArraySource, GymSource
@@ -523,13 +521,12 @@ def test_what_cannot_be_is_refused_in_one_line(
 
 def ended(rec: Path, number: int, least: int) -> tuple[int, str]:
     """The exit code and words of a recording that is sent a signal once it has some bytes."""
-    command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(rec)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     partial = rec / "lavfi_testsrc.mcap.partial"
-    wait_for(lambda: partial.exists() and partial.stat().st_size > least, 60, process)
-    time.sleep(0.3)
-    process.send_signal(number)
-    _, said = process.communicate(timeout=60)
+    with started("record", TEST, "-o", rec) as process:
+        wait_for(lambda: partial.exists() and partial.stat().st_size > least, 60, process)
+        time.sleep(0.3)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=60)
     return process.returncode, said
 
 

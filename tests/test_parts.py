@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import Cdmisfa
 from folders import contents
-from waiting import wait_for
+from waiting import running, wait_for
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
@@ -93,12 +91,8 @@ def test_kill_9_at_any_moment_leaves_parts_that_play_and_go_on(
     )
     for count in (2, 4):
         folder = tmp_path / str(count)
-        process = subprocess.Popen([sys.executable, "-c", program, str(folder), str(split)])
-        try:
+        with running("-c", program, folder, split) as process:
             wait_for(lambda f=folder, n=count: len(list(f.glob("x3-*"))) >= n, 60, process)
-        finally:
-            process.kill()
-            process.wait()
         with RecordedSource(folder) as source:
             length = source.frames
             same(source.take(1, length), OscillatorySource().take(1, length))

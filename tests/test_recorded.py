@@ -67,35 +67,20 @@ def copy(vectors: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(vectors, tmp_path / "copy"))
 
 
-class TestRecordedVectors(SourceContract):
-    ends = True
+class TestRecorded(SourceContract):
+    ends, loop = True, False
     long = 200
 
-    @pytest.fixture(autouse=True)
-    def _folder(self, vectors: Path) -> None:
-        self.folder = vectors
+    @pytest.fixture(autouse=True, params=["vectors", "pictures"])
+    def _folder(self, request: pytest.FixtureRequest) -> None:
+        self.folder = request.getfixturevalue(request.param)
 
     def open(self) -> FrameSource:
-        return RecordedSource(self.folder)
+        return RecordedSource(self.folder, loop=self.loop)
 
 
-class TestRecordedPictures(SourceContract):
-    ends = True
-    long = 200
-
-    @pytest.fixture(autouse=True)
-    def _folder(self, pictures: Path) -> None:
-        self.folder = pictures
-
-    def open(self) -> FrameSource:
-        return RecordedSource(self.folder)
-
-
-class TestLoopedPictures(TestRecordedPictures):
-    ends = False
-
-    def open(self) -> FrameSource:
-        return RecordedSource(self.folder, loop=True)
+class TestLooped(TestRecorded):
+    ends, loop = False, True
 
 
 def test_recorded_equals_live_to_the_bit(vectors: Path) -> None:

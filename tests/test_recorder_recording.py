@@ -5,8 +5,6 @@ import hashlib
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -15,7 +13,7 @@ import pytest
 from folders import contents
 from foxglove_schemas_protobuf import RawImage_pb2
 from mcap.reader import make_reader
-from waiting import wait_for
+from waiting import running, started, wait_for
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.config import RecordConfig, Split
@@ -158,15 +156,12 @@ if __name__ == "__main__":
 
 def interrupt(folder: Path, number: int) -> tuple[int, int]:
     """Record in another process and send it a signal; its exit code and last progress."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", RECORD, str(folder), "1000000"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    for line in process.stdout:
-        if int(line) > 500:
-            break
-    process.send_signal(number)
-    rest, _ = process.communicate(timeout=30)
+    with running("-c", RECORD, folder, 1000000) as process:
+        for line in process.stdout:
+            if int(line) > 500:
+                break
+        process.send_signal(number)
+        rest, _ = process.communicate(timeout=30)
     return process.returncode, int(([line, *rest.splitlines()])[-1])
 
 
@@ -306,17 +301,14 @@ def test_ctrl_c_reaches_the_writer_alone(tmp_path, wait_for_frames):
     """A terminal sends Ctrl-C to every process of the group, whatever it is doing."""
     script = tmp_path / "run.py"
     script.write_text(RECORD.replace("frames=int", "jobs=2, frames=int"))
-    process = subprocess.Popen(
-        [sys.executable, str(script), str(tmp_path / "a"), "1000000"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    if wait_for_frames:
-        process.stdout.readline()
-    else:
-        wait_for(lambda: list(tmp_path.glob("a/*.partial")), 60, process)
-    os.killpg(process.pid, signal.SIGINT)
-    _, complaint = process.communicate(timeout=30)
+    how = {"start_new_session": True, "env": {**os.environ, "PYTHONPATH": str(ROOT)}}
+    with running(script, tmp_path / "a", 1000000, **how) as process:
+        if wait_for_frames:
+            process.stdout.readline()
+        else:
+            wait_for(lambda: list(tmp_path.glob("a/*.partial")), 60, process)
+        os.killpg(process.pid, signal.SIGINT)
+        _, complaint = process.communicate(timeout=30)
     assert process.returncode in (1, 130, -signal.SIGINT)
     assert complaint.count("Traceback") <= 2
     assert "spawn_main" not in complaint
@@ -327,17 +319,13 @@ def test_ctrl_c_reaches_the_writer_alone(tmp_path, wait_for_frames):
 def recorder(tmp_path):
     """A recording by two processes that does not end by itself, and they."""
     folder = tmp_path / "a"
-    words = ["record", "oscillatory", "-o", str(folder), "--frames", "100000000", "--jobs", "2"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "cdmisfa", *words], stderr=subprocess.PIPE, text=True
-    )
-    wait_for(
-        lambda: sum(p.stat().st_size for p in folder.glob("*.partial")) >= 1 << 17, 60, process
-    )
-    commands = {n: Path(f"/proc/{n}/cmdline").read_text() for n in children(process)}
-    with process:
+    words = ("record", "oscillatory", "-o", folder, "--frames", 100000000, "--jobs", 2)
+    with started(*words) as process:
+        wait_for(
+            lambda: sum(p.stat().st_size for p in folder.glob("*.partial")) >= 1 << 17, 60, process
+        )
+        commands = {n: Path(f"/proc/{n}/cmdline").read_text() for n in children(process)}
         yield process, [pid for pid, command in commands.items() if "spawn_main" in command]
-        process.kill()
 
 
 def test_a_killed_rendering_process_ends_the_recording_with_one_line(recorder, tmp_path):
@@ -347,7 +335,7 @@ def test_a_killed_rendering_process_ends_the_recording_with_one_line(recorder, t
     assert process.returncode == 1
     (line,) = complaint.strip().splitlines()
     assert line.startswith("cdmisfa: a rendering process ended: go on with --resume")
-    assert not any(running(pid) for pid in workers)
+    assert not any(alive(pid) for pid in workers)
     for view in STREAMS:
         assert whole_frames(tmp_path / "a" / f"{view}.mcap.partial", view) > 0
 
@@ -364,7 +352,7 @@ def test_a_second_signal_does_not_wait_for_a_process_that_stands_still(recorder)
     _, complaint = process.communicate(timeout=5)
     assert process.returncode == 143
     assert complaint.endswith("is not finished: go on with --resume\n")
-    assert not any(running(pid) for pid in workers)
+    assert not any(alive(pid) for pid in workers)
 
 
 def test_rendering_processes_end_with_their_killed_parent(recorder):
@@ -373,7 +361,7 @@ def test_rendering_processes_end_with_their_killed_parent(recorder):
     assert len(rendering) >= 2
     process.kill()
     process.communicate()
-    wait_for(lambda: not any(running(child) for child in rendering), 20)
+    wait_for(lambda: not any(alive(child) for child in rendering), 20)
 
 
 def children(process):
@@ -382,7 +370,7 @@ def children(process):
     return [int(word) for path in listed for word in path.read_text().split()]
 
 
-def running(pid: int) -> bool:
+def alive(pid: int) -> bool:
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
     except OSError:

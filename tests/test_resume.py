@@ -7,8 +7,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ import pytest
 from conftest import Cdmisfa
 from folders import contents
 from run_data import parts_of, read_signals
-from waiting import wait_for
+from waiting import running, wait_for
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, FrameSource
@@ -144,10 +142,9 @@ def killed_when(out: Path, resume: bool, ready: Callable[[], bool]) -> None:
     """Run `SLOW` and kill -9 it once something has happened."""
     mode = "resume" if resume else "new"
     here = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    process = subprocess.Popen([sys.executable, "-c", SLOW, str(out), mode], env=here)
-    wait_for(ready, 60, process)
-    os.kill(process.pid, signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
+    with running("-c", SLOW, out, mode, env=here) as process:
+        wait_for(ready, 60, process)
+    assert process.returncode == -signal.SIGKILL
 
 
 def test_kill_9_anywhere_loses_nothing(whole: Path, tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import socket
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -18,6 +17,7 @@ from conftest import Cdmisfa
 from PIL import Image
 from run_data import IMAGE, PROGRESS, VECTOR, read_signals, run_of, write_run
 from view_data import views_of
+from waiting import running, wait_for
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.view import panels
@@ -274,11 +274,8 @@ def test_the_program_ends_with_a_parent_that_is_killed(tmp_path):
         f"v.viewer_program = lambda: pathlib.Path({str(program)!r})\n"
         "v.run_program([])\n"
     )
-    with subprocess.Popen([sys.executable, "-c", code]) as parent:
-        while not told.exists():
-            assert parent.poll() is None
-            time.sleep(0.02)
-        parent.kill()
+    with running("-c", code) as parent:
+        wait_for(told.exists, 60, parent)
     child = Path("/proc") / told.read_text().strip() / "cmdline"
     for _ in range(100):
         if not child.exists() or not child.read_bytes():

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 
 
@@ -33,19 +34,19 @@ def python(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:
 
 
 @contextlib.contextmanager
-def started(*words: object, **environment: str) -> Iterator[subprocess.Popen[str]]:
-    """The command line in a process of its own, which is killed where it goes on at the end."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "cdmisfa", *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **environment},
-    ) as process:
+def running(*words: object, **how: Any) -> Iterator[subprocess.Popen[str]]:
+    """Such a process, which is killed where it goes on at the end."""
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **how}
+    with subprocess.Popen([sys.executable, *map(str, words)], **how) as process:
         try:
             yield process
         finally:
             process.kill()
+
+
+def started(*words: object, **environment: str) -> AbstractContextManager[subprocess.Popen[str]]:
+    """The command line in such a process."""
+    return running("-m", "cdmisfa", *words, env={**os.environ, **environment})
 
 
 def wait_for(
