@@ -73,7 +73,7 @@ def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[An
         raise ValueError(
             f"the learner asked for frames of {spec.frame_shape} {spec.dtype}, not {shape} {dtype}"
         )
-    if dtype.kind == "f" and not (  # a NaN is neither, and no array is made
+    if dtype.kind == "f" and not (  # also true of NaN; without an array as large as the frames
         block.frames.max(initial=0) <= LARGEST_VALUE
         and block.frames.min(initial=0) >= -LARGEST_VALUE
     ):

@@ -32,7 +32,7 @@ class LearnerEntry:
 
 
 def _curious(config: LearnerConfig, spec: SourceSpec, seed: int) -> Learner:
-    from cdmisfa.agents.learner import CuriousLearner  # of no use to read a key
+    from cdmisfa.agents.learner import CuriousLearner  # not needed to read a key
 
     return CuriousLearner(config, spec, seed)
 

@@ -88,7 +88,7 @@ def stoppable(
 
     def ask(number: int, frame: FrameType | None) -> None:
         if stop.number or (opens and not stop.asked):
-            if callable(handle := outer[number]):  # which knows the exit code
+            if callable(handle := outer[number]):  # it notes the signal, for the exit code
                 handle(number, frame)
             raise KeyboardInterrupt
         stop.number = number

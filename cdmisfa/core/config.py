@@ -91,7 +91,7 @@ class LearnerConfig:
     roc_error: float = 0.1
 
     def __post_init__(self) -> None:
-        from cdmisfa.core.expansion import EXPANSIONS  # the keys alone are told without numpy
+        from cdmisfa.core.expansion import EXPANSIONS  # with numpy: to name keys needs neither
 
         convert_fields(self, "learner")
         one_of(self, "learner", EXPANSIONS, "expansion")
@@ -381,7 +381,7 @@ def section_table(section: Any) -> dict[str, Any]:
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
         if field.metadata.get("unsaid") and value == field.default:
-            continue  # tables of before it came stay as they were
+            continue  # so that tables from before this key are still equal
         if dataclasses.is_dataclass(value):
             table[field.name] = section_table(value)
         else:

@@ -109,7 +109,7 @@ class Workers:
     def _begin(self) -> Connection:
         """Start a process; its end of the pipe is here no more, so that its death shows."""
         context = multiprocessing.get_context("spawn")
-        resource_tracker.ensure_running()  # when it begins it lets Ctrl-C through again
+        resource_tracker.ensure_running()  # before Ctrl-C is blocked: its start unblocks it
         with _starting, _without_main_and_signals():
             if self._closed:
                 raise BrokenProcessPool("the worker processes were closed")
@@ -285,13 +285,13 @@ def _dask_pool(jobs: int, scheduler: str | None) -> _Pool:
         raise UsageError(
             "--engine dask needs a package that is not installed: pip install 'cdmisfa[dask]'"
         ) from error
-    # It tells of every lost connection with a traceback; what matters is raised.
+    # Else it logs a traceback of every lost connection; what matters is raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     how: dict[str, Any] = {"address": scheduler, "timeout": CONNECT_SECONDS}
     if scheduler is None:
         how = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None}
     try:
-        if scheduler is not None:  # a client of no address ends with a traceback, half a minute on
+        if scheduler is not None:  # a wrong one would be a traceback after half a minute
             distributed.comm.resolve_address(scheduler)
         client = distributed.Client(**how, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:

@@ -319,7 +319,7 @@ def _fields(version: int) -> _Fields:
     return _Fields(
         attrgetter(*(s.name for s in signals if not s.dims)),
         attrgetter(*(s.name for s in arrays)),
-        # By this name it is the very one of numpy's own arrays, so that nothing is compared.
+        # Made by this name, the type is numpy's own object, and comparing it costs nothing.
         [np.dtype("<" + np.dtype(s.dtype).str[1:]) for s in arrays],
     )
 

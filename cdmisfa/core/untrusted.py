@@ -166,7 +166,7 @@ def read_regular(path: Path, limit: int) -> bytes:
         LogDamagedError: the disk does not give it.
     """
     with opened_regular(path, limit) as file:
-        return file.read(limit) or b""  # nothing of what would be waited for, as in /proc
+        return file.read(limit) or b""  # None of what would have to be waited for, as in /proc
 
 
 @contextlib.contextmanager

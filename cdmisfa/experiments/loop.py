@@ -149,7 +149,7 @@ class Keyframes(Sink):
         if before < self._due:
             return
         keyframe = self._keyframe()
-        if not self._due:  # the first, of which nobody knows yet how small it is compressed
+        if not self._due:  # the first: its size, compressed, is not known yet
             self._due = self._share * sum(a.nbytes for a in keyframe.state.arrays.values())
             if before < self._due:
                 return
@@ -163,7 +163,7 @@ class Keyframes(Sink):
 
     def _keyframe(self) -> Keyframe:
         learner, taken = self._learner, getattr(self._source, "taken", None)
-        # Cameras have moved on, where they ended or were stopped within the next block.
+        # A camera's own t may lie behind the last block, where it ended within the next one.
         t = self._source.t if self._t is None else self._t
         return Keyframe(learner.iteration, t, learner.state, self._versions, taken)
 

@@ -70,7 +70,7 @@ def _page(paths: list[Path], runs: list[Path], cameras: CameraOptions) -> str:
         if others := [path for path in paths if path not in runs]:
             raise UsageError(f"{others[0]} is no run: a report compares runs with runs alone")
         return report_of_runs(paths, f"{len(paths)} runs compared")
-    from replay.inputs import open_to_look  # what reads logs of others takes its time
+    from replay.inputs import open_to_look  # takes long
 
     with contextlib.closing(open_to_look(paths, cameras)) as source:
         return report_of_recording(source, paths)

@@ -93,7 +93,7 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
         for name, value in kept.items()
         if name in OPTIONS
     }
-    options.setdefault("holdout", 0.0)  # begun when nothing was held out
+    options.setdefault("holdout", 0.0)  # of runs from before there was a holdout
     preset = options.get("preset")
     if preset is not None and str(preset).endswith(".toml"):
         options["preset"] = found_path(str(preset), run)
@@ -109,7 +109,7 @@ def command_of_fork(
     except UsageError:
         words, options = (), {}
     world = sections.get("scene", {}).get("seed")
-    kept = () if world is None else (f"scene.seed={world}",)  # only the learner's changes
+    kept = () if world is None else (f"scene.seed={world}",)  # the world keeps the parent's seed
     options["settings"] = (*options.get("settings", ()), *kept, *settings)
     return tuple(source) or words, options
 
@@ -166,7 +166,7 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
 
 
 def _is_recording(words: Sequence[str]) -> bool:
-    from replay.recordings.source import RecordedSource  # what begins a run needs no reader
+    from replay.recordings.source import RecordedSource  # not needed to begin a run
     from replay.recordings.view_file import NoRecordingError
 
     try:
@@ -279,14 +279,14 @@ def refuse_difference(
         before["spec"]["streams"] = spec.streams
         before["source"] = renamed(source_then, names)
     found = differences(_json(before), _json(now))
-    # another learner first, for other keys and another arithmetic follow from it
+    # another learner first: other keys and another arithmetic come of it
     for key, old, new in sorted(found, key=lambda one: one[0] != "config.learner.algorithm"):
         if key == "config.learner.portable":
-            continue  # begun when it had an effect
+            continue  # stated when it had an effect
         if key.startswith("config.scene.") and streams is not None and streams not in SCENES:
-            continue  # begun when every source was called a scene
+            continue  # stated when every source was called a scene
         if key.removeprefix("config.record.") in CLOCK and _clock(header.spec) == _clock(spec):
-            continue  # begun when a preset's clock was said of every source
+            continue  # stated when every source was given its preset's clock
         raise UsageError(
             f"{log.parent} was made with {key.removeprefix('config.')} = {old}, not {new}: resume "
             "with what it was made with, or choose another folder"

@@ -306,7 +306,7 @@ class Session:
             told += [BestEffort(sink, told) for sink in sinks]
             ended = learn_blocks(self.source, self.learner, told, stop=stop, **self._limits)
             ended, held_out = self._judged(ended, stop)
-            stopped = ended == INTERRUPTED  # then nothing is done that takes as long as the log
+            stopped = ended == INTERRUPTED  # then nothing is read that is as long as the log
             described = description(self.source, at_once=stopped, told=hashing)
             result = self._result(described, digest.hexdigest(), ended=ended, held_out=held_out)
             if log is not None:
@@ -341,7 +341,7 @@ class Session:
         """Write what is kept of the log before, its own or its parent's; hash its signals."""
         before = log.path.parent / SET_ASIDE if self._resumed else self.before
         assert before is not None
-        keyframe, self.keyframe = self.keyframe, None  # as large as what the learner holds
+        keyframe, self.keyframe = self.keyframe, None  # as large as the learner's memory
         if keyframe is not None:
             at, t, fork = keyframe.iteration, keyframe.t, self.manifest.get(FORK, {})
             for signals in log.copy_log(before, at):

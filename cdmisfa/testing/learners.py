@@ -107,7 +107,7 @@ class LearnerContract:
         signals_sha256(learner, source, self.iterations)
         t, state = source.t, learner.state
         sha256 = signals_sha256(learner, source, self.iterations)
-        other.restore(state)  # the state is a copy, which the learner went on without
+        other.restore(state)  # a copy, which did not change when the learner went on
         assert len(other.modules) == len(state.modules)
         source.seek(t)
         assert signals_sha256(other, source, self.iterations) == sha256

@@ -46,7 +46,7 @@ _AGAIN: Final = 0.2
 HEADER: Final = struct.Struct("<BIQ")
 """Header of a message: opcode, subscription, log time in nanoseconds."""
 
-# What its threads meet is also raised here: nobody reads it twice, with a traceback.
+# Errors of its threads are raised here, too: it need not log them with a traceback.
 logging.getLogger("websockets").addHandler(logging.NullHandler())
 
 
@@ -135,7 +135,7 @@ class FoxgloveCamera:
                     stated = stated_format(kind.schema, kind.encoding, data)
                     self.distances = stated in DISTANCES
                 if video is None or video.begins(data):
-                    video = None  # it has begun
+                    video = None  # from its first whole picture on all are shown
                     yield age, decode(data)
 
     def describe(self) -> Mapping[str, Any]:
@@ -153,7 +153,7 @@ class FoxgloveCamera:
                 told = _told(connection.recv(timeout=left if said else min(left, _QUIET)))
             except TimeoutError:
                 if images and not self._topic:
-                    break  # several, of which a further one makes no single one
+                    break  # there are several already, and one topic was looked for
                 if not said:
                     self._say(f"{self._lacking(images)}; waiting {left:.0f} s for it")
                 said = True

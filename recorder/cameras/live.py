@@ -192,7 +192,7 @@ class LiveSource(ForwardSource):
         tick = time_of(self._tick, self._spec.fps, self._spec.start_ns)
         deadline = tick + round(PATIENCE * NANOSECONDS)
         while True:
-            now = self._readers.now()  # before the look: what came until then is seen
+            now = self._readers.now()  # before looking, so that all that came until then is seen
             waiting = [self._take_in(number, tick) for number in range(len(self._streams))]
             if self._ends is not None and tick > self._ends:
                 raise LogExhaustedError(self._why)
@@ -207,7 +207,7 @@ class LiveSource(ForwardSource):
         """Take in what came of a stream; whether a picture for the tick may still come."""
         stream = self._streams[number]
         while stream.newest <= tick:
-            why = self._readers.over(number)  # before the look, as above
+            why = self._readers.over(number)  # before looking, as above
             picture = self._readers.take(number)
             if picture is None:
                 if why and self._ends is None:

@@ -329,6 +329,6 @@ class Readers:
                 self._say(f"{why}: {what}")
             if self._on_loss == "reconnect":
                 with self._lock:
-                    reading.connection += 1  # the thread that hangs is given up
+                    reading.connection += 1  # the thread that hangs is for the connection before
                     reading.heard = now
                 self._threads[number] = self._connect(reading)

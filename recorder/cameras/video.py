@@ -60,7 +60,7 @@ class VideoCamera:
         self._av = pyav(word)
         self._form, self._address = _form_and_address(word, self._av.formats_available)
         self._remote = _NETWORK.match(self._address) is not None
-        # /dev/shm has files
+        # what is in /dev/shm is a file
         device = self._address.startswith("/dev/") and not Path(self._address).is_file()
         self.finite = not self._remote and not device
         self._convert = frame_colors if color else frame_gray
@@ -105,7 +105,7 @@ class VideoCamera:
 
     def _open(self) -> Any:
         """Open it within the memory budget; decoding runs beside other cameras, without one."""
-        options = {"max_pixels": str(2 * MAX_PIXELS)}  # of which a decoder may pad some
+        options = {"max_pixels": str(2 * MAX_PIXELS)}  # twice, as a decoder may pad a picture
         if self._address.startswith("rtsp"):
             options["rtsp_transport"] = "tcp"
         if self._remote:
@@ -187,6 +187,6 @@ def _form_and_address(word: str, formats: Collection[str]) -> tuple[str | None, 
 
 def _reason(error: Exception) -> str:
     """Text of an error of FFmpeg without the address, which may hold a password."""
-    if type(error).__name__ == "ExitError":  # what waiting for too long ends with
+    if type(error).__name__ == "ExitError":  # of FFmpeg's reads that took too long
         return "it did not answer in time"
     return str(getattr(error, "strerror", None) or _SECRET.sub("", one_line(error)))

@@ -348,7 +348,7 @@ def prepared_folder(
             stack.enter_context(held(folder))
             old = {*stale, *itertools.chain(*view_logs(folder, views).values())}
             old |= {folder / RECORDING} if stale else set()
-            for path in sorted(old, reverse=True):  # what is left by a kill has its first parts
+            for path in sorted(old, reverse=True):  # last parts first: a kill leaves the first ones
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error

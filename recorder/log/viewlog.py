@@ -163,7 +163,7 @@ class ViewLog:
         )
         stated = self._recording.metadata(self._view, self.t)
         log.add_metadata(RECORDING_METADATA, stated.record())
-        if not stated.stream_count or stated.stream_index == 0:  # it may name all streams, too
+        if not stated.stream_count or stated.stream_index == 0:  # it may name all of many views
             config = self._recording.config_json()
             log.add_attachment(CONFIG_NAME, "application/json", config, log_time=spec.start_ns)
         self._channels = {

@@ -111,7 +111,7 @@ def _recover(src: Path, dst: Path, force: bool) -> Recovery:
     for file, target in zip(files, targets, strict=True):
         if target.exists() and file.samefile(target):
             raise UsageError(f"{target}: cannot be recovered into itself, name another file")
-    alone = not src.is_dir()  # else it may be that there is something in the other logs
+    alone = not src.is_dir()  # of a folder, other logs may hold something
     found = [_recover_file(f, t, force, alone) for f, t in zip(files, targets, strict=True)]
     return Recovery(
         out=str(dst),

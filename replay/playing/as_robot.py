@@ -83,7 +83,7 @@ class Robot:
             raise UsageError(
                 "to serve as a robot needs foxglove-sdk: pip install 'cdmisfa[foxglove]'"
             ) from None
-        # Else a line of its own about each client that leaves without a word.
+        # Else it logs a line about each client that leaves without a word.
         foxglove.set_log_level("CRITICAL")
         subscribed: set[tuple[int, int]] = set()
 
@@ -95,7 +95,7 @@ class Robot:
                 subscribed.discard((client.id, channel.id))
 
         self._subscribed = subscribed
-        self._context = context = foxglove.Context()  # channels are gone with it
+        self._context = context = foxglove.Context()  # holds the channels
         self._channels: dict[Topic, Any] = {}
         for topic in topics:
             schema = foxglove.Schema(

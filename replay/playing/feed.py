@@ -188,7 +188,7 @@ def opened_source(paths: Sequence[Path], how: Playback) -> Iterator[Logged]:
     """
     try:
         source = open_to_look(paths, replace(how.cameras, rate=how.fps))
-    except UsageError as error:  # where --rate is how fast it is played
+    except UsageError as error:  # here --rate is the speed
         raise UsageError(str(error).replace("with --rate", "with --fps")) from None
     with contextlib.closing(source):
         how.about(source)
@@ -249,7 +249,7 @@ def _logged_messages(readers: Sequence[LogReader], wanted: Sequence[str]) -> Fee
         for message in heapq.merge(*each, key=lambda message: message.time_ns):
             if message.time_ns != now:
                 now, told = message.time_ns, set()
-            if message not in told:  # every file of a recording has the truth
+            if message not in told:  # the ground truth is in every file of a recording
                 told.add(message)
                 yield message
 

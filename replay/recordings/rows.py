@@ -258,7 +258,7 @@ class ChannelRows:
             self._count(number, len(times))
             (row, stop), first = self._starts[number : number + 2], self._facts.first_frame
             if (times != self._facts.times(np.arange(first + row, first + stop))).any():
-                # This says what is wrong.
+                # Raises, and says what is wrong.
                 self._number(times, row, [RowRange(first, first + row, 0)] if row else [])
             self._unconfirmed.remove(number)
         return table

@@ -222,7 +222,7 @@ def decode_columns(
         for name, signal in SIGNALS.items():
             if name in found:
                 values[name] = found[name].astype(signal.dtype, copy=False)
-            else:  # an empty array, or one that this version has not got
+            else:  # an empty array, or a signal that this version does not have
                 value = np.asarray(getattr(first, name), dtype=signal.dtype)
                 values[name] = np.broadcast_to(value, (len(same_size), *value.shape))
         yield SignalColumns(values)

@@ -239,7 +239,7 @@ def differing_outcomes(first: Outline, second: Outline) -> tuple[tuple[str, str,
     a, b = (outcome(outline, timed=True) for outline in (first, second))
     return tuple(
         (name, a.get(name, "-"), b.get(name, "-"))
-        for name in sorted({**a, **b}, key=ITERATIONS.__eq__)  # which come last
+        for name in sorted({**a, **b}, key=ITERATIONS.__eq__)  # iterations last
         if a.get(name) != b.get(name)
     )
 

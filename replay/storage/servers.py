@@ -138,7 +138,7 @@ class _HttpServer(Server):
             what = error.message.split("\n")[0].split(": b")[0].rstrip(":")
             raise UnreachableError(f"the server's answer is no HTTP: {what[:80]}") from None
         except aiohttp.ClientConnectorError as error:
-            if not self._reached:  # a name that is wrong does not get better
+            if not self._reached:  # a wrong name is not tried again
                 raise
             raise RetryError from error
         except (aiohttp.ClientError, asyncio.IncompleteReadError, TimeoutError) as error:

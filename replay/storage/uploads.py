@@ -145,7 +145,7 @@ def _put(file: Path, url: Url) -> None:
                 sent.append({"PartNumber": number, "ETag": _stated(url, answer, "ETag")})
             _asked(url, "complete_multipart_upload", MultipartUpload={"Parts": sent}, **of)
         except BaseException:
-            with contextlib.suppress(CdmisfaError):  # parts that nobody completes are paid for
+            with contextlib.suppress(CdmisfaError):  # parts that are never completed cost money
                 _asked(url, "abort_multipart_upload", **of)
             raise
     answer = _asked(url, "head_object", **place)
