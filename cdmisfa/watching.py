@@ -14,6 +14,7 @@ from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import BlockSignals
+from cdmisfa.core.turning import turn_to
 
 try:
     from gymnasium import Env
@@ -109,6 +110,7 @@ class WatchEnv(Env):
         self._nothing: NDArray[Any] = np.zeros(shape, self.observation_space.dtype)
         self.action_space = Discrete(len(spec.streams))
         self.learner: Learner | None = None
+        self._watched = 0
         self.signals: BlockSignals | None = None
         self._seen = self._nothing
         self._ended = True
@@ -131,7 +133,8 @@ class WatchEnv(Env):
             self._source.seek(self._start)
         self.learner = open_learner(self._config, self._source.spec, own)
         self.signals, self._seen, self._ended = None, self._nothing, False
-        return self._seen.copy(), {"stream": self.learner.stream}
+        self._watched = self.learner.stream
+        return self._seen.copy(), {"stream": self._watched}
 
     def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
         """Watch a stream for a block, and learn from it.
@@ -154,7 +157,9 @@ class WatchEnv(Env):
             streams = len(self._source.spec.streams)
             raise UsageError(f"no stream {action!r}: the actions are 0 to {streams - 1}")
         reward, terminated = 0.0, False
-        learner.watch(int(action))
+        turn_to(self._source, self._watched, int(action))
+        self._watched = int(action)
+        learner.watch(self._watched)
         try:
             block = self._source.take(learner.stream, learner.tau)
         except LogExhaustedError:

@@ -130,3 +130,22 @@ def test_what_has_no_colours_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setitem(CAMERAS._entries, "plain", CameraKind(lambda word, name: None))
     with pytest.raises(UsageError, match="plain:1 shows gray images: leave out --color"):
         open_live(["plain:1"], LiveOptions(color=True))
+
+
+def test_a_scene_is_recorded_and_learned_in_colours(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    pytest.importorskip("pybullet")
+    small = ("--color", "--set", "scene.eyes.width=8", "--set", "scene.eyes.height=6")
+    rec = tmp_path / "rec"
+    done = cdmisfa("record", "icub", *small, "--frames", "80", "-o", rec)
+    assert done.code == 0, done.err
+    runs = []
+    for source, *how in ((rec,), ("icub", *small)):
+        words = ("--algorithm", "progress", "--max-iterations", "2", "--json", "--no-rerun")
+        runs.append(cdmisfa("learn", source, *how, *words).json)
+    assert runs[0]["signals_sha256"] == runs[1]["signals_sha256"]
+    with contextlib.closing(RecordedSource(rec)) as source:
+        assert source.spec.frame_shape == (6, 3 * 2 * 8)
+        red, green, blue = np.split(source.take(0, 1).frames[0].astype(int), 3, axis=1)
+    assert red.mean() > green.mean() > blue.mean()  # the table is brown
+    refused = cdmisfa("record", "oscillatory", "--color", "-o", tmp_path / "none")
+    assert (refused.code, "scene.color means nothing" in refused.err) == (2, True)

@@ -15,7 +15,7 @@ from cdmisfa.experiments.sources import configure
 from recorder.config import RecordConfig
 from recorder.recording import save_picture
 from recorder.world.icub.config import EyesConfig, IcubConfig
-from recorder.world.icub.lens import SAMPLES, Lens
+from recorder.world.icub.lens import SAMPLES, Lens, light
 from recorder.world.icub.textures import SIDE, TEXTURES, texture
 
 pytest.importorskip("pybullet")
@@ -54,7 +54,7 @@ def test_what_came_later_is_off_and_unsaid_in_the_plain_scene():
     for key in keys:
         value = type(getattr(plain, key))(1)
         changed = dataclasses.replace(plain, **{key: value})
-        assert not changed.plain
+        assert changed.plain == (key == "transit")  # which changes no frame
         assert section_table(changed)[key] == value
         assert build(IcubConfig, "scene", section_table(changed)) == changed
 
@@ -166,6 +166,25 @@ def test_blur_and_vignette_by_hand():
     edge = Lens(IcubConfig(blur=True, vignette=0.5)).through(rays_of(200, 1), 0, 0)[0, ..., 0]
     assert edge[0, 0, 0] == edge[-1, 1, -1] == 100
     assert edge[23:25, :, 31:33].min() >= 199
+
+
+def test_light_drifts_for_all_views_alike_and_eyes_adapt_to_it():
+    factors = light(0.2, 0, 6000)
+    assert (factors.min(), factors.max()) == (0.8, 1.2)
+    assert np.abs(np.diff(factors)).max() < 0.001
+    np.testing.assert_array_equal(light(0.2, 2990, 20), factors[2990:3010])
+    at, scene = 700, IcubConfig(drift=0.2)
+    drifting = Lens(scene).through(rays_of(100, 3), at, 0)
+    np.testing.assert_array_equal(drifting[:, 0, 0, 0, 0], np.rint(100 * factors[at : at + 3]))
+    seen = np.concatenate([rays_of(60, 2), rays_of(200, 1)])
+    adapted = Lens(dataclasses.replace(scene, exposure=True)).through(seen, at, 0)
+    assert np.abs(adapted.mean(axis=(1, 2, 3, 4)) - 128).max() < 1
+    drifts = dataclasses.replace(SMALL, drift=0.2)
+    with contextlib.closing(IcubSource(drifts, RecordConfig())) as source:
+        source.seek(at)
+        block = source.take(0, 3)
+    assert source.spec.truth == (*TRUTH, "light")
+    np.testing.assert_array_equal(block.truth[:, -1], factors[at : at + 3])
 
 
 @pytest.mark.parametrize("name", sorted(TEXTURES))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import math
 import sys
 from pathlib import Path
@@ -16,9 +17,10 @@ from view_data import View, scalars
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.config import section_table
 from cdmisfa.core.signals import STATES
-from recorder.log.scenery import NECK, scenery_of, turned
+from recorder.log.scenery import scenery_of, turned
 from recorder.mcap.reader import LogReader
 from recorder.world.icub.config import IcubConfig
+from recorder.world.icub.head import NECK
 from recorder.world.icub.matrices import eye_matrix
 from recorder.world.icub.source import TRUTH
 from replay.following import read_outputs
@@ -52,6 +54,26 @@ def test_eyes_stand_where_those_of_the_simulator_stand(yaw):
         half = math.atan(eye.height / 2 / eye.focal)
         assert math.degrees(2 * half) == pytest.approx(config.eyes.vertical_fov)
     np.testing.assert_allclose(np.mean([e.place for e in gaze.eyes], axis=0), gaze.middle.place)
+
+
+def test_a_head_that_takes_frames_to_turn_is_shown_on_its_way(tmp_path):
+    config = section_table(IcubConfig(transit=9.0, texture=True))
+    records = write_run(tmp_path / "run.mcap", SCENE, ITERATIONS, source={**LIVE, "scene": config})
+    build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
+    rows = View(tmp_path / "run.rrd").rows
+    ways = [
+        (b.t - n, b.t)
+        for a, b in itertools.pairwise(records)
+        if (n := 5 * abs(b.stream - a.stream))
+    ]
+    shown = [records[0].t, *(t for low, high in ways for t in range(low, high + 1))]
+    assert rows["/scene/watching"]["frame"] == rows["/scene/neck"]["frame"] == shown
+    angles = [
+        2 * math.acos(min(q[0][3], 1.0)) for q in rows["/scene/neck"]["Transform3D:quaternion"]
+    ]
+    assert np.abs(np.diff(angles)).max() < math.radians(20)
+    red, _, blue = scenery_of(config).objects[0].colour
+    assert blue > red + 0.3
 
 
 def test_objects_stand_where_the_world_knew_them_and_the_head_looks_at_what_is_watched(tmp_path):

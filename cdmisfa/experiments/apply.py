@@ -22,7 +22,7 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, freeze
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.options import option_name
-from cdmisfa.experiments.sources import configure, is_scene, open_logs
+from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, open_live
@@ -104,7 +104,7 @@ class Application:
         if any(map(is_live, words)):
             source = open_live(words, self._live(words, cameras, live), say=say)
         elif is_scene(words, cameras):
-            source = configure(words[0]).open_scene()
+            source = configure(words[0], settings=of_scene((), cameras)).open_scene()
         else:
             source = self._log(words, cameras, loop=loop, salvage=salvage)
         shape = self.recipe.shape

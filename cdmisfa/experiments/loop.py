@@ -10,6 +10,7 @@ from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
+from cdmisfa.core.turning import turn_to
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
@@ -83,6 +84,7 @@ def learn_blocks(
                 sink.event(source.t, learner.iteration - 1, f"the source ended: {error}", "WARNING")
             break
         signals = learner.step(block)
+        turn_to(source, block.stream, learner.stream)
         for sink in sinks:
             sink.block(block, signals, learner)
             for text in learner.events:

@@ -22,6 +22,7 @@ from cdmisfa.core.errors import (
 )
 from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
+from cdmisfa.core.turning import turn_to
 from cdmisfa.experiments.names import placed, same_names
 from cdmisfa.experiments.resume import (
     config_history,
@@ -204,6 +205,7 @@ class Recomputation:
         for _ in range(count):
             block = self.source.take(self.learner.stream, self.learner.tau)
             signals = self.learner.step(block)
+            turn_to(self.source, block.stream, self.learner.stream)
             self.t = self.source.t
             if self._later and self._later[0].start == self.learner.iteration:
                 try:

@@ -239,6 +239,7 @@ def restore_from(
     if keyframe.taken is not None:
         records = (signals for columns in read_columns(log) for signals in columns.records())
         for signals in itertools.islice(records, keyframe.iteration):
+            source.seek(signals.t)
             source.take(signals.stream, learner.tau)
         if source.taken != keyframe.taken:
             raise LogDamagedError(

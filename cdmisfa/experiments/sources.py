@@ -155,10 +155,9 @@ def _configure(
     learner: str | None = None,
 ) -> Configuration:
     """Fill a configuration from the sections of a chosen preset and of settings."""
-    scene = SCENES[kind]
     algorithm = words.get("learner", {}).get("algorithm", learner if preset is None else None)
     own = LEARNERS[algorithm].preset if algorithm is not None else None
-    tables = chosen if preset is not None else load_preset(own or scene.preset)
+    tables = chosen if preset is not None else load_preset(own or SCENES[kind].preset)
     for section in (*tables, *words):
         if section not in SECTIONS:
             raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
@@ -171,7 +170,7 @@ def _configure(
     named = {"algorithm": algorithm}
     return Configuration(
         learner=build(LEARNERS[algorithm].configuration, "learner", *layers["learner"], named),
-        scene=build(scene.config, "scene", *layers["scene"], {"kind": kind}),
+        scene=build(SCENES[kind].config, "scene", *layers["scene"], {"kind": kind}),
         record=build(RecordConfig, "record", *layers["record"]),
     )
 
@@ -247,8 +246,8 @@ def open_source(
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
     if follow is None and is_scene(words, cameras):
-        configuration = configure(str(words[0]), preset, settings, seed)
-        return configuration.open_scene(), configuration
+        scene = configure(str(words[0]), preset, of_scene(settings, cameras), seed)
+        return scene.open_scene(), scene
     told = log_settings(settings, None if resumed else words[0])
     source = open_logs(words, loop=loop, salvage=salvage, cameras=cameras, follow=follow)
     try:
@@ -261,17 +260,22 @@ def open_source(
 
 
 def is_scene(words: Sequence[str | Path], cameras: ImageOptions | None = None) -> bool:
-    """Whether words name a live scene, which no options of cameras are for.
+    """Whether words name a live scene, which no options of cameras are for but `--color`.
 
     Raises:
         UsageError: they do, and some are given.
     """
     if len(words) != 1 or words[0] not in SCENES:
         return False
-    if cameras is not None and (given := cameras.given()):
+    if cameras is not None and (given := replace(cameras, color=cameras.color == "auto").given()):
         clock = "; its rate is --set record.fps=HZ" if "--rate" in given else ""
         raise UsageError(f"{words[0]} is a scene: {are_for(given, 'cameras')}{clock}")
     return True
+
+
+def of_scene(settings: Sequence[str], cameras: ImageOptions | None) -> Sequence[str]:
+    """The settings of a scene with what options of cameras say of it: whether it has colours."""
+    return (*settings, "scene.color=true") if cameras is not None and cameras.color else settings
 
 
 def open_logs(
@@ -302,8 +306,7 @@ def open_logs(
         len(words) > 1 or words[0] in SCENES or loop or salvage or cameras != CameraOptions()
     ):
         raise UsageError("--follow takes the folder of one recording, and neither loops nor skips")
-    scene = next((word for word in words if word in SCENES), None)
-    if scene is not None and not Path(scene).exists():
+    if scene := next((word for word in words if word in SCENES and not Path(word).exists()), None):
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
     from replay.inputs import locations, open_log
     from replay.storage.location import Url

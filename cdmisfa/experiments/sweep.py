@@ -27,6 +27,7 @@ from cdmisfa.experiments.sources import (
     configure_for,
     is_scene,
     log_settings,
+    of_scene,
     open_logs,
 )
 from cdmisfa.experiments.store import (
@@ -212,7 +213,7 @@ def _configured(
 ) -> tuple[Callable[[Sequence[str]], Configuration], dict[str, Any] | None]:
     """The configuration for settings, and what a source says of itself; None of a live scene."""
     if is_scene(words, cameras):
-        return lambda told: configure(str(words[0]), preset, told, None), None
+        return lambda told: configure(str(words[0]), preset, of_scene(told, cameras), None), None
     source = open_logs(words, loop=loop, cameras=cameras, goal=("sweep", "SWEEP"))
     with contextlib.closing(source):
         recorded, spec = dict(source.describe()), source.spec

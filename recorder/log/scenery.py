@@ -16,15 +16,23 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import LogDamagedError
+from recorder.world.icub.config import TABLE_FROM, TABLE_TO
+from recorder.world.icub.head import (
+    ROAM,
+    YAW,
+    neck_at,
+    quaternion,
+    turn,
+    turn_frames,
+    turns,
+)
+from recorder.world.icub.room import painted
 
 KIND = "icub"
 """The scene that is described here."""
 
-NECK = (-0.010809, 0.0, 0.241953)
-"""Origin of the neck yaw joint of iCub v2.5, where a log has no head poses."""
-
-TABLE_FROM, TABLE_TO = (-0.95, -0.75), (-0.3, 0.75)
-"""Corners of the table that is shown: its true top fills every eye image, and hides the legs."""
+ROAMING = ROAM, YAW
+"""The view of a head that roams, and the truth's name of how far that is turned to the left."""
 
 Quaternion = tuple[float, float, float, float]
 """A turn as (x, y, z, w)."""
@@ -85,7 +93,8 @@ class Gaze:
 
     Attributes:
         name: of the view.
-        yaw: of the head, degrees to the left.
+        yaw: of the neck, degrees to the left.
+        pitch: of the neck, degrees upwards.
         tilt: of the eyes, degrees upwards.
         head: the head's pose.
         middle: an eye between the two.
@@ -94,6 +103,7 @@ class Gaze:
 
     name: str
     yaw: float
+    pitch: float
     tilt: float
     head: HeadPose
     middle: Eye
@@ -109,24 +119,37 @@ class Scenery:
         gazes: one for each view.
         table: which stands still.
         objects: which move.
+        eyes: their measures, keys `scene.eyes.*`.
+        transit: degrees that the head turns in a frame; 0 where it jumps.
     """
 
     robot: str
     gazes: tuple[Gaze, ...]
     table: Thing
     objects: tuple[Thing, ...]
+    eyes: Mapping[str, Any]
+    transit: float = 0.0
 
     def gaze(self, view: str) -> Gaze | None:
         """The gaze of a view, None where there is no such view."""
         return next((gaze for gaze in self.gazes if gaze.name == view), None)
 
+    def turned(self, gaze: Gaze, yaw: float) -> Gaze:
+        """A gaze with the head turned otherwise, degrees to the left."""
+        return _gaze(gaze.name, yaw, self.eyes, gaze.head.position)
 
-def scenery_of(config: Mapping[str, Any], neck: Place = NECK) -> Scenery | None:
+    def way(self, before: Gaze, after: Gaze) -> list[Gaze]:
+        """Where the head looks at the frames that are lost as it turns from one to the other."""
+        frames = turn_frames(after.yaw - before.yaw, self.transit)
+        return [self.turned(after, yaw) for yaw in turn(before.yaw, after.yaw, frames)]
+
+
+def scenery_of(config: Mapping[str, Any], neck: Place | None = None) -> Scenery | None:
     """What a scene's configuration (`scene.*`) says.
 
     Args:
         config: the table, as `as_table` gives it.
-        neck: origin of the neck yaw joint.
+        neck: origin of the neck yaw joint; by default that of iCub v2.5.
 
     Returns:
         None of another scene.
@@ -139,12 +162,13 @@ def scenery_of(config: Mapping[str, Any], neck: Place = NECK) -> Scenery | None:
     try:
         eyes, table = config["eyes"], config["table"]
         views = zip(eyes["views"], eyes["yaw"], strict=True)
+        neck = neck_at(float(eyes.get("pitch", 0.0))) if neck is None else neck
         gazes = tuple(_gaze(str(name), float(yaw), eyes, neck) for name, yaw in views)
         top, thickness = float(table["top"]), float(table["thickness"])
         near, far = np.array(TABLE_FROM), np.array(TABLE_TO)
         x, y = ((near + far) / 2).tolist()
         length, width = (far - near).tolist()
-        red, green, blue = (float(part) for part in table["colour"])
+        red, green, blue = (float(part) for part in _paint(config, "table") or table["colour"])
         return Scenery(
             robot=str(config["robot"]),
             gazes=gazes,
@@ -153,9 +177,36 @@ def scenery_of(config: Mapping[str, Any], neck: Place = NECK) -> Scenery | None:
                 place=(x, y, top - thickness / 2),
             ),
             objects=_objects(config, top),
+            eyes=eyes,
+            transit=float(config.get("transit", 0.0)),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise LogDamagedError(f"the configuration of the scene is broken ({error})") from error
+
+
+def turns_of(config: Mapping[str, Any], streams: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """Frames that are lost between each two streams as the head turns, [from][to].
+
+    Args:
+        config: of the scene, as a recording states it.
+        streams: their places among the scene's.
+
+    Returns:
+        None of a scene whose head jumps, or has none.
+    """
+    if not config.get("transit"):
+        return ()
+    try:
+        yaw, transit = config["eyes"]["yaw"], float(config["transit"])
+        table = turns(yaw, transit, roam=bool(config.get("roam")))
+        return tuple(tuple(table[a][b] for b in streams) for a in streams)
+    except (LookupError, TypeError, ValueError):
+        return ()
+
+
+def _paint(config: Mapping[str, Any], name: str) -> tuple[float, float, float] | None:
+    """The colour of a thing where it is painted."""
+    return painted(name) if config.get("texture") else None
 
 
 def _objects(config: Mapping[str, Any], top: float) -> tuple[Thing, ...]:
@@ -170,7 +221,7 @@ def _objects(config: Mapping[str, Any], top: float) -> tuple[Thing, ...]:
     )
     return tuple(
         Thing(
-            *(name, shape, size, (float(table["grey"]),) * 3),
+            *(name, shape, size, _paint(config, name) or (float(table["grey"]),) * 3),
             place=(sum(table["x"]) / 2, -sum(table["y"]) / 2, top + size[2] / 2),
             truth=(f"object{i}_x", f"object{i}_y"),
         )
@@ -179,8 +230,8 @@ def _objects(config: Mapping[str, Any], top: float) -> tuple[Thing, ...]:
 
 
 def _gaze(name: str, yaw: float, eyes: Mapping[str, Any], neck: Place) -> Gaze:
-    half, tilt = math.radians(yaw) / 2, float(eyes["tilt"])
-    head: Quaternion = (0.0, 0.0, math.sin(half), math.cos(half))
+    tilt, pitch = float(eyes["tilt"]), float(eyes.get("pitch", 0.0))
+    head = quaternion(yaw, pitch)
     sink = math.radians(tilt) / 2
     turn = times(times(head, (0.0, math.sin(sink), 0.0, math.cos(sink))), _GAZE)
     height, width = int(eyes["height"]), int(eyes["width"])
@@ -192,7 +243,8 @@ def _gaze(name: str, yaw: float, eyes: Mapping[str, Any], neck: Place) -> Gaze:
         return Eye((x, y, z), turn, width, height, focal)
 
     beside = float(eyes["half_distance"])
-    return Gaze(name, yaw, tilt, HeadPose(neck, head), eye(0.0), (eye(beside), eye(-beside)))
+    both = eye(beside), eye(-beside)
+    return Gaze(name, yaw, pitch, tilt, HeadPose(neck, head), eye(0.0), both)
 
 
 def times(first: Quaternion, second: Quaternion) -> Quaternion:

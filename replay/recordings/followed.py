@@ -80,6 +80,11 @@ class FollowedSource(ClockedSource):
         return any(self._path.glob("*.mcap")) and not any(self._path.glob(f"*.mcap{PARTIAL}*"))
 
     @property
+    def turns(self) -> tuple[tuple[int, ...], ...]:
+        """See `RecordedSource`."""
+        return self._now.turns
+
+    @property
     def taken(self) -> str:
         """SHA-256 of the blocks that were taken, in their order."""
         return self._sha256.hexdigest()

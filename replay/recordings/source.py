@@ -21,6 +21,7 @@ from cdmisfa.core.blocks import Block, HeadPose, freeze
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import parse_json
 from recorder.log.messages import POSE_TOPIC, RECORDING_METADATA
+from recorder.log.scenery import turns_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import PARTIAL
@@ -202,12 +203,21 @@ class RecordedSource(LoggedSource):
 
     def origin(self) -> Mapping[str, Any]:
         """What the source of which this was recorded said of itself; empty of scenes."""
+        return self._stated("source")
+
+    @functools.cached_property
+    def turns(self) -> tuple[tuple[int, ...], ...]:
+        """Frames that are lost between each two views, as in the scene; see `turn_to`."""
+        return turns_of(self._stated("scene"), [view[0].facts.stream_index for view in self._views])
+
+    def _stated(self, section: str) -> Mapping[str, Any]:
+        """A section of the recording's configuration; empty where it has none."""
         reader = self._views[0][0].reader
         own = next((one for one in reader.attachments if one.name == CONFIG_NAME), None)
         if own is None:
             return {}
         try:
-            stated = parse_json(bytes(reader.attachment_data(own)))["source"]
+            stated = parse_json(bytes(reader.attachment_data(own)))[section]
         except (ValueError, LookupError, TypeError):
             return {}
         return stated if isinstance(stated, dict) else {}

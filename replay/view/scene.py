@@ -22,7 +22,7 @@ from rerun.urdf import UrdfTree
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import CdmisfaError
-from recorder.log.scenery import Eye, Gaze, Scenery, Thing
+from recorder.log.scenery import ROAMING, Eye, Gaze, Scenery, Thing
 from replay.palette import GREY, Rgb, colour, packed_all, pale
 from replay.recordings.source import yaw_of
 from replay.runs.columns import SignalColumns
@@ -67,8 +67,10 @@ class SceneView:
     def __init__(self, target: Target, scenery: Scenery, every: int, *, body: bool = True) -> None:
         self._target, self._every, spec = target, every, target.spec
         self.notes: list[str] = []
-        self._watched, self._turned = -1, False
-        self._neck: Any = None
+        self._watched, self._scenery = -1, scenery
+        self._looks: Gaze | None = None
+        self._neck: Mapping[str, Any] = {}
+        self._shown = False
         target.log(SCENE, rr.ViewCoordinates.BRU)
         _write_thing(target, f"{SCENE}/table", scenery.table, at_rest=True)
         self._objects = [
@@ -83,7 +85,7 @@ class SceneView:
             if gaze is not None:
                 _write_pyramid(target, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
         try:
-            self._neck = write_body(target.recording, SCENE, scenery.robot) if body else None
+            self._neck = write_body(target.recording, SCENE, scenery.robot) if body else {}
         except CdmisfaError as error:
             self.notes.append(str(error))
 
@@ -93,6 +95,7 @@ class SceneView:
             self._turn(columns)
         for frames, truth in batch.truth:
             self.move(frames, truth)
+            self._roam(batch, frames, truth)
 
     def move(self, at: IntArray, truth: FloatArray) -> None:
         """Put the objects where (n, D) truth says they are at n frames."""
@@ -106,23 +109,54 @@ class SceneView:
         streams = columns["stream"].astype(np.int64)
         turns = np.flatnonzero(np.diff(streams, prepend=self._watched))
         self._watched = int(streams[-1])
-        places = [(i, gaze) for i in turns if (gaze := self._gazes[streams[i]]) is not None]
-        if not places:
+        rows: list[tuple[int, int, Gaze, Rgb]] = []
+        for i in turns.tolist():
+            s, frame, iteration = (int(a[i]) for a in (streams, columns.frames, columns.iterations))
+            if (gaze := self._gazes[s]) is not None:
+                way = [] if self._looks is None else self._scenery.way(self._looks, gaze)
+                first, self._looks = frame - len(way), gaze
+                gazes = enumerate([*way, gaze], first)
+                rows += [(at, iteration, look, colour(s)) for at, look in gazes]
+        self._look(rows)
+
+    def _roam(self, batch: Batch, at: IntArray, truth: FloatArray) -> None:
+        """Turn a head that roams, while it is watched, to where the truth says."""
+        spec, blocks, (view, yaw) = self._target.spec, batch.blocks, ROAMING
+        if view not in spec.streams or yaw not in spec.truth or not len(blocks.starts):
             return
-        at = np.array([i for i, _ in places])
-        gazes = [gaze for _, gaze in places]
-        if not self._turned:  # the eyes are the same in every view
-            self._turned = True
+        s, places = spec.streams.index(view), blocks.places(at)
+        rows = np.flatnonzero((blocks.streams[places] == s) & (at % self._every == 0))
+        yaws, first = truth[:, spec.truth.index(yaw)], self._scenery.gazes[0]
+        self._look(
+            [
+                (
+                    int(at[i]),
+                    int(blocks.iterations[places[i]]),
+                    self._scenery.turned(first, yaws[i]),
+                    colour(s),
+                )
+                for i in rows
+            ]
+        )
+
+    def _look(self, rows: Sequence[tuple[int, int, Gaze, Rgb]]) -> None:
+        """Show where the head looks at frames, in iterations, and the colour of what it watches."""
+        if not rows:
+            return
+        frames, iterations, gazes, rgbs = zip(*rows, strict=True)
+        if not self._shown:  # the eyes are the same in every view
+            self._shown = True
             thick = rr.LineStrips3D(pyramid(gazes[0].middle), radii=[THICK])
             self._target.log(f"{WATCHING}/edges", thick)
-        when = columns.frames[at], columns.iterations[at]
-        rgbs = [colour(int(s)) for s in streams[at]]
+        when = np.array(frames), np.array(iterations)
         self._target.send(WATCHING, *when, _poses(gazes))
         edges = rr.LineStrips3D.columns(colors=packed_all(rgbs))
         self._target.send(f"{WATCHING}/edges", *when, edges)
-        if self._neck is not None:
-            turned = self._neck.compute_transform_columns([math.radians(g.yaw) for g in gazes])
-            self._target.send(f"{SCENE}/neck", *when, turned)
+        for place, joint in self._neck.items():
+            angles = [math.radians(g.yaw if place == NECK else g.pitch) for g in gazes]
+            if place == NECK or any(angles):
+                turned = joint.compute_transform_columns(angles)
+                self._target.send(f"{SCENE}/{place}", *when, turned)
 
     def flush(self) -> None:
         """Hand over what waits."""
@@ -159,7 +193,7 @@ def _write_thing(target: Target, path: str, thing: Thing, *, at_rest: bool = Fal
     """Show what a thing looks like; where it is, only of one that stands still."""
     if at_rest:
         target.log(path, rr.Transform3D(translation=thing.place))
-    light = 0.0 if at_rest else LIGHT
+    light = LIGHT if len(set(thing.colour)) == 1 and not at_rest else 0.0
     rgb = [round(255 * min(part + light, 1.0)) for part in thing.colour]
     solid = rr.components.FillMode.Solid
     half = [size / 2 for size in thing.size]
@@ -182,8 +216,11 @@ def _poses(gazes: Sequence[Gaze]) -> Any:
     )
 
 
-NECK = "neck_yaw"
-"""The joint that turns the head to the left."""
+NECK, NECK_PITCH = "neck", "neck_pitch"
+"""The entities of the joints that turn the head to the left, and bend it upwards."""
+
+JOINTS = {NECK: "neck_yaw", NECK_PITCH: "neck_pitch"}
+"""Their names in the models."""
 
 BODY = "body"
 """The entity of all that it looks like, in that of the scene."""
@@ -192,7 +229,7 @@ PACKAGE = "package://iCub/"
 """Prefix of the meshes' names in the models."""
 
 
-def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Any:
+def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Mapping[str, Any]:
     """Show a robot that stands upright in the frame of the entity `root`.
 
     Args:
@@ -201,7 +238,7 @@ def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Any:
         robot: its name in icub-models.
 
     Returns:
-        Its neck's joint, a `rerun.urdf.UrdfJoint`.
+        Its neck's joints, `rerun.urdf.UrdfJoint`, as `JOINTS`.
 
     Raises:
         CdmisfaError: the package or the model is not there, or it cannot be read.
@@ -219,9 +256,9 @@ def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Any:
             tree.log_urdf_to_recording(recording)
         except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:
             raise CdmisfaError(f"{model} cannot be shown: {error}") from error
-    neck = tree.get_joint_by_name(NECK)
-    if neck is None:
-        raise CdmisfaError(f"{model} has no joint {NECK}")
+    neck = {place: tree.get_joint_by_name(name) for place, name in JOINTS.items()}
+    if None in neck.values():
+        raise CdmisfaError(f"{model} lacks a joint of the neck: {' or '.join(JOINTS.values())}")
     stands = rr.Transform3D(parent_frame=f"tf#/{root}", child_frame=tree.root_link().name)
     recording.log(f"{root}/stands", stands, static=True)
     return neck

@@ -16,7 +16,7 @@ import rerun as rr
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.signals import STATES
 from cdmisfa.core.untrusted import parse_json
-from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
+from recorder.log.scenery import KIND, Scenery, scenery_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
 from replay.following import read_outputs
@@ -220,7 +220,7 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
         config = _table(_table(parse_json(data)).get("scene"))
     except ValueError as error:
         raise LogDamagedError(f"{file}: its {CONFIG_NAME} is broken ({error})") from error
-    return scenery_of(config, NECK if pose is None else pose.position)
+    return scenery_of(config, None if pose is None else pose.position)
 
 
 def _places(header: RunHeader, run: Path, recording: Path | None) -> Iterator[Path]:

@@ -99,7 +99,7 @@ def record_command(
     Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
     av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. Logs of others are written by cdmisfa convert.
     """
-    from cdmisfa.experiments.sources import configure, is_scene
+    from cdmisfa.experiments.sources import configure, is_scene, of_scene
     from recorder.cameras.words import is_live
     from recorder.log.manifest import RecordingStart
     from recorder.recording import recorded, save_picture
@@ -132,7 +132,7 @@ def record_command(
         where = "" if resumed is None else f"{resumed} does not say of what it is: "
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
     seed = seed if given_seed or start.seed is None else start.seed
-    configuration = configure(named, preset, settings, seed)
+    configuration = configure(named, preset, of_scene(settings, images), seed)
     if scene_picture is not None:
         save_picture(named, configuration.scene, scene_picture, force=writing["force"])
         tell(f"picture {scene_picture}")

@@ -12,12 +12,18 @@ from typing import Any
 from cdmisfa.core.config import in_range, positive
 from cdmisfa.core.errors import UsageError
 from recorder.config import SceneConfig, check_view_names
+from recorder.world.icub.head import ROAM, SLOWEST_TURN
 
 Range = tuple[float, float]
 
 TABLE_FROM, TABLE_TO = (-0.95, -0.75), (-0.3, 0.75)
 """Corners of the table of a furnished room, and of that which pictures from outside show: the plain
 one fills every eye image, and would hide the robot's legs. Root frame, metres."""
+
+
+def later(default: Any) -> Any:
+    """Field of a key that the plain scene does not state."""
+    return field(default=default, metadata={"unsaid": True})
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +45,8 @@ class TableConfig:
 class EyesConfig:
     """The head and its two parallel eyes (keys `scene.eyes.*`).
 
-    The eyes' places are iKin's for iCub v2.5, relative to the neck yaw joint.
+    The eyes' places are iKin's for iCub v2.5, relative to the neck yaw joint. The angles are those
+    of joints: `yaw` and `pitch` of the neck, to the left and upwards, and `tilt` of the eyes.
     """
 
     views: tuple[str, ...] = ("left", "center", "right")
@@ -54,11 +61,12 @@ class EyesConfig:
     near: float = 0.1
     far: float = 5.0
     light: tuple[float, float, float] = (-0.3, 0.2, 1.0)
+    pitch: float = later(0.0)
 
     def __post_init__(self) -> None:
         positive(self, "scene.eyes", "near", "far", "half_distance")
         in_range(self, "scene.eyes", 1.0, 170.0, "vertical_fov")
-        in_range(self, "scene.eyes", -89.0, 89.0, "tilt")
+        in_range(self, "scene.eyes", -89.0, 89.0, "tilt", "pitch")
         in_range(self, "scene.eyes", 1, 4096, "width", "height")
         if len(self.views) != len(self.yaw):
             raise UsageError(
@@ -124,11 +132,6 @@ class SphereConfig:
         _range("scene.object3.y", self.y)
 
 
-def later(default: Any) -> Any:
-    """Field of a key that the plain scene does not state."""
-    return field(default=default, metadata={"unsaid": True})
-
-
 @dataclass(frozen=True, slots=True)
 class IcubConfig(SceneConfig):
     """The iCub scene (keys `scene.*`); the plain one, unless one of the last keys is set.
@@ -144,6 +147,12 @@ class IcubConfig(SceneConfig):
         noise: of the sensor at middle grey, standard deviation in grey levels.
         color: a frame shows red, green and blue beside one another.
         physics: objects slide and roll after where they are to be, instead of being put there.
+        transit: degrees that the head turns in a frame: who looks at another view loses the frames
+            of the turn. 0 where it jumps.
+        roam: another view, `roam`, is of a head that looks at one of the others for a while, then
+            turns to the next.
+        drift: share by which the light goes up and down, over minutes.
+        exposure: the eyes adapt to the light: all images of a view are as bright in the mean.
     """
 
     kind: str = "icub"
@@ -162,16 +171,36 @@ class IcubConfig(SceneConfig):
     noise: float = later(0.0)
     color: bool = later(False)
     physics: bool = later(False)
+    transit: float = later(0.0)
+    roam: bool = later(False)
+    drift: float = later(0.0)
+    exposure: bool = later(False)
 
     def __post_init__(self) -> None:
         SceneConfig.__post_init__(self)
-        in_range(self, "scene", 0.0, 1.0, "shadow", "vignette")
+        in_range(self, "scene", 0.0, 1.0, "shadow", "vignette", "drift")
         in_range(self, "scene", 0.0, 64.0, "noise")
+        in_range(self, "scene", 0.0, 360.0, "transit")
+        if 0 < self.transit < SLOWEST_TURN:
+            raise UsageError(
+                f"scene.transit is {self.transit}: 0, or {SLOWEST_TURN} degrees a frame or more"
+            )
+        if self.roam and ROAM in self.eyes.views:
+            raise UsageError(f"scene.eyes.views has a {ROAM}, as scene.roam would: rename it")
 
     @property
     def plain(self) -> bool:
-        """Whether objects over one endless table are all that there is."""
-        return all(getattr(self, f.name) == f.default for f in fields(self) if f.metadata)
+        """Whether objects over one endless table are all that there is to be drawn."""
+        return all(
+            getattr(self, f.name) == f.default
+            for f in fields(self)
+            if f.metadata and f.name != "transit"
+        )
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of all views."""
+        return (*self.eyes.views, ROAM) if self.roam else self.eyes.views
 
 
 def _range(key: str, limits: Range) -> None:

@@ -6,6 +6,8 @@ draws only the objects and puts them in front of that picture by depth: six time
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,15 +41,16 @@ class Eyes:
         self._tables = [[self._draw_table(m) for m in view] for view in self._matrices]
         world.hide_table()
 
-    def look(self, view: int, t: int, positions: FloatArray) -> ByteArray:
+    def look(self, view: int, t: int, positions: FloatArray, yaw: Sequence[float]) -> ByteArray:
         """What a view shows from frame t on, (n, height, width of both eyes).
 
         Args:
             view: number of the view.
             t: no matter here: only where the objects are makes a difference.
             positions: (n, objects, ...) of the objects, see `World.place`.
+            yaw: of the head at each frame, degrees; in a plain scene a view has one.
         """
-        del t
+        del t, yaw
         frames = np.empty((len(positions), *self.shape), np.uint8)
         for frame, places in zip(frames, positions, strict=True):
             self._world.place(places)

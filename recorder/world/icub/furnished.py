@@ -89,21 +89,19 @@ class FurnishedEyes:
         self._balls = [_ball(scene, across, height) for across, height in sizes_of(scene)]
         self._shadows = _object_shadows(scene, world) if scene.shadow else []
         world.show_objects(())
-        shadows = RoomShadows(world, room, robot=scene.arms) if scene.shadow else None
-        world.show_room(range(len(room.pieces)), robot=scene.arms)
-        self._plates = []
-        for yaw in eyes.yaw:
-            world.turn_head(yaw)
-            self._plates.append([self._plate(shadows, yaw, side) for side in (1, -1)])
+        self._pieces = range(len(room.pieces))
+        self._room = RoomShadows(world, room, robot=scene.arms) if scene.shadow else None
         world.show_room((), robot=False)
+        self._plates: dict[float, list[Plate]] = {}
 
-    def look(self, view: int, t: int, positions: FloatArray) -> ByteArray:
+    def look(self, view: int, t: int, positions: FloatArray, yaw: Sequence[float]) -> ByteArray:
         """What a view shows from frame t on; see `Eyes.look`."""
         height, width = self._size
         frames = np.empty((len(positions), height, 2, width, self._channels), np.uint8)
-        for frame, places in zip(frames, positions, strict=True):
+        for frame, places, turned in zip(frames, positions, yaw, strict=True):
+            plates = self._plates_at(turned)
             self._world.place(places)
-            for eye, plate in enumerate(self._plates[view]):
+            for eye, plate in enumerate(plates):
                 self._see(plate, places, frame[:, eye])
         images = self._lens.through(frames, t, view)
         return np.moveaxis(images, -1, 2).reshape(len(frames), *self.shape)
@@ -169,6 +167,16 @@ class FurnishedEyes:
     def _toned(self, colours: ByteArray) -> ByteArray:
         """Colours, (..., 3 or 4), in as many channels as the eyes see."""
         return colours[..., :3] if self._channels == 3 else grey(colours)[..., None]
+
+    def _plates_at(self, yaw: float) -> list[Plate]:
+        """What stands still, for both eyes; drawn when the head is first turned there."""
+        if yaw not in self._plates:
+            world, arms = self._world, self._scene.arms
+            world.show_objects(())
+            world.show_room(self._pieces, robot=arms)
+            self._plates[yaw] = [self._plate(self._room, yaw, side) for side in (1, -1)]
+            world.show_room((), robot=False)
+        return self._plates[yaw]
 
     def _plate(self, room: RoomShadows | None, yaw: float, side: int) -> Plate:
         scene, fine = self._scene, (self._size[0] * FINE, self._size[1] * FINE)

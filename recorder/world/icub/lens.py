@@ -1,4 +1,4 @@
-"""What optics and the sensor do to an image, the same at every frame t of a seed.
+"""What light, optics and the sensor do to an image, the same at every frame t of a seed.
 
 A frame's noise has numbers of its own, so that none before has to be drawn. It is a sum of random
 bytes, which is the same on every machine.
@@ -11,15 +11,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.world.icub.config import IcubConfig
 
 SAMPLES = 2
 """Rays of a pixel along each side, which are averaged."""
 
+_RISE = 1500
+"""Frames in which drifting light goes from its least to its most."""
+
 _NOISE = 0x4015E
+_EXPOSED = np.float32(128)
+"""Mean of an image to which the eyes adapt."""
+
 _BYTES = 4
 _SPREAD = np.float32(1 / np.sqrt(_BYTES * (256**2 - 1) / 12))
+
+
+def light(drift: float, t: int, n: int) -> FloatArray:
+    """Factor of the light at n frames from t on, (n,): it swells and fades by a share."""
+    there = (t + np.arange(n)) % (2 * _RISE) / _RISE
+    share = 1 - np.abs(there - 1)
+    return np.asarray(1 + drift * (2 * share * share * (3 - 2 * share) - 1))
 
 
 class Lens:
@@ -58,6 +71,11 @@ class Lens:
         if self._scene.blur:
             total = _spread(_spread(total, 1), 3)
         image = total * self._gain
+        if self._scene.drift:
+            factors = light(self._scene.drift, t, len(image)).astype(np.float32)
+            image *= factors[:, None, None, None, None]
+        if self._scene.exposure:
+            image *= _EXPOSED / np.maximum(_means(image), 1)[:, None, None, None, None]
         if self._scene.noise:
             # Half of its variance is the same everywhere, half grows with the light.
             image += self._noise(t, view, image.shape) * np.sqrt(
@@ -75,6 +93,12 @@ class Lens:
         total = np.add.reduce(raw, axis=1, dtype=np.int16)[:, : int(np.prod(shape[1:]))]
         centred = total.reshape(shape) - np.float32(255 * _BYTES / 2)
         return np.asarray(centred * (_SPREAD * np.float32(self._scene.noise)))
+
+
+def _means(images: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n,) means of images, of whole numbers, so that no order of a sum matters."""
+    whole = np.rint(images).astype(np.int64).reshape(len(images), -1)
+    return np.asarray(whole.sum(axis=1) / whole.shape[1], np.float32)
 
 
 def _spread(image: Any, axis: int) -> Any:

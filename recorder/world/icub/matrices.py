@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.world.icub.config import EyesConfig
+from recorder.world.icub.head import bent
 
 LUMA = (299, 587, 114)
 """Thousandths of red, green and blue in grey (ITU-R BT.601); whole numbers round exactly."""
@@ -22,14 +23,15 @@ def eye_matrix(eyes: EyesConfig, neck: FloatArray, yaw: float, side: int) -> Mat
 
     Args:
         eyes: the head's measures.
-        neck: (3,) origin of the neck yaw joint, root frame (x back, y right, z up).
+        neck: (3,) origin of the neck yaw joint, root frame (x back, y right, z up), where it is
+            with the neck bent.
         yaw: of the head, degrees to the left.
         side: +1 the left eye, -1 the right one.
     """
     turn, tilt = math.radians(yaw), math.radians(eyes.tilt)
-    forward = np.array([-math.cos(turn), -math.sin(turn), 0.0])
-    left = np.array([math.sin(turn), -math.cos(turn), 0.0])
-    up = np.array([0.0, 0.0, 1.0])
+    forward = bent((-math.cos(turn), -math.sin(turn), 0.0), eyes.pitch)
+    left = bent((math.sin(turn), -math.cos(turn), 0.0), eyes.pitch)
+    up = bent((0.0, 0.0, 1.0), eyes.pitch)
     place = neck + eyes.forward * forward + side * eyes.half_distance * left + eyes.up * up
     gaze = math.cos(tilt) * forward + math.sin(tilt) * up
     return look(place, place + gaze)

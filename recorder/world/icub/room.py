@@ -77,6 +77,13 @@ def _document() -> dict[str, Any]:
     return tomllib.loads(text)
 
 
+def painted(name: str) -> Place:
+    """The colour of the table or of an object, "box", "cylinder" or "ball", with its paint."""
+    told = _document()
+    place: Place = tuple((told["table"] if name == "table" else told["objects"][name])["colour"])
+    return place
+
+
 def _legs(legs: Mapping[str, Any], low: Place, high: Place) -> list[dict[str, Any]]:
     """The table's four legs, from the floor to its top."""
     half, inset = legs["half"], legs["inset"]
@@ -102,7 +109,7 @@ def _objects(scene: IcubConfig, told: Mapping[str, Any]) -> tuple[Piece, ...]:
     shapes = (
         ("box", box_mesh((box.half_size,) * 3, period=0.0), box.grey),
         ("cylinder", can_mesh(cylinder.radius, cylinder.height), cylinder.grey),
-        ("sphere", ball_mesh(ball.radius), ball.grey),
+        ("ball", ball_mesh(ball.radius), ball.grey),
     )
     return tuple(
         Piece(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +13,8 @@ from recorder.config import RecordConfig
 from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.eyes import Eyes
 from recorder.world.icub.furnished import FurnishedEyes
+from recorder.world.icub.head import YAW, Roaming, quaternion, turns
+from recorder.world.icub.lens import light
 from recorder.world.icub.physics import PhysicalMotions
 from recorder.world.icub.world import Motions, World
 
@@ -22,6 +23,9 @@ TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
 
 HEIGHTS = tuple(f"object{i}_z" for i in (1, 2, 3))
 """More of them where physics moves the objects: heights of their middles, root frame, metres."""
+
+LIGHT = "light"
+"""Where the light drifts, its factor."""
 
 
 class IcubSource(ClockedSource):
@@ -42,27 +46,41 @@ class IcubSource(ClockedSource):
         self._eyes = (
             Eyes(scene.eyes, self._world) if scene.plain else FurnishedEyes(scene, self._world)
         )
-        truth = TRUTH + HEIGHTS if scene.physics else TRUTH
+        self._roaming = Roaming(scene.eyes.yaw, scene.transit, self._seed) if scene.roam else None
+        told = ((HEIGHTS, scene.physics), ((LIGHT,), scene.drift), ((YAW,), scene.roam))
+        truth = TRUTH + tuple(name for names, there in told if there for name in names)
         self._spec = SourceSpec(
-            scene.eyes.views, self._eyes.shape, "uint8", truth, record.fps, record.start_ns
+            scene.views, self._eyes.shape, "uint8", truth, record.fps, record.start_ns
         )
 
     @property
     def head_poses(self) -> Sequence[HeadPose]:
-        """The head's pose in each view."""
-        x, y, z = self._world.neck.tolist()
-        halves = [math.radians(yaw) / 2 for yaw in self._scene.eyes.yaw]
-        return [HeadPose((x, y, z), (0.0, 0.0, math.sin(h), math.cos(h))) for h in halves]
+        """The head's pose in each view in which it stands still."""
+        (x, y, z), eyes = self._world.neck.tolist(), self._scene.eyes
+        return [HeadPose((x, y, z), quaternion(yaw, eyes.pitch)) for yaw in eyes.yaw]
+
+    @property
+    def turns(self) -> tuple[tuple[int, ...], ...]:
+        """Frames that are lost where another view is looked at; see `turn_to`."""
+        scene = self._scene
+        return turns(scene.eyes.yaw, scene.transit, roam=scene.roam)
 
     def take(self, stream: int, n: int) -> Block:
         """Render the next n frames of a view; see `FrameSource.take`."""
         check_request(self._spec, stream, n)
-        positions = self._motions.positions(self._t, n)
-        frames = self._eyes.look(stream, self._t, positions)
+        scene, t = self._scene, self._t
+        positions = self._motions.positions(t, n)
+        roamed = [] if self._roaming is None else self._roaming.angles(t, n)
+        yaws = scene.eyes.yaw
+        angles = [yaws[stream]] * n if stream < len(yaws) else roamed
         truth = [positions[..., :2].reshape(n, -1), positions[..., 2:3].reshape(n, -1)]
-        block = Block(stream, self._t, freeze(frames), freeze(np.concatenate(truth, axis=1)))
+        if scene.drift:
+            truth.append(light(scene.drift, t, n)[:, None])
+        if scene.roam:
+            truth.append(np.array(roamed)[:, None])
+        frames = self._eyes.look(stream, t, positions, angles)
         self._t += n
-        return block
+        return Block(stream, t, freeze(frames), freeze(np.concatenate(truth, axis=1)))
 
     def describe(self) -> Mapping[str, Any]:
         """The scene's seed and everything it was built from."""

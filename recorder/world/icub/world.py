@@ -115,8 +115,8 @@ def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
     return limits[0] + (limits[1] - limits[0]) * unit
 
 
-NECK_YAW = b"neck_yaw"
-"""The joint that turns the head to the left; the last of the neck."""
+NECK_YAW, NECK_PITCH = b"neck_yaw", b"neck_pitch"
+"""The joints that turn the head to the left, the last of the neck, and bend it upwards."""
 
 ARMS = {
     "shoulder_pitch": -30.0,
@@ -306,20 +306,21 @@ class World:
         if not robot_seen:
             for link in (-1, *joints):
                 bullet.changeVisualShape(self._robot, link, rgbaColor=(0, 0, 0, 0))
-        infos = [bullet.getJointInfo(self._robot, i) for i in joints]
-        neck = next((info for info in infos if info[1] == NECK_YAW), None)
-        if neck is None:
+        found = {info[1]: info for info in (bullet.getJointInfo(self._robot, i) for i in joints)}
+        if not {NECK_YAW, NECK_PITCH} <= found.keys():
             raise UsageError(f"scene.robot {scene.robot} has no neck: choose a whole robot")
-        self._neck_joint = neck[0]
-        low, high = math.degrees(neck[8]), math.degrees(neck[9])
-        for yaw in scene.eyes.yaw:
-            if not low <= yaw <= high:
-                raise UsageError(
-                    f"scene.eyes.yaw has {yaw:g}: the neck of {scene.robot} turns "
-                    f"from {low:.0f} to {high:.0f} degrees"
-                )
-        place = bullet.getLinkState(self._robot, self._neck_joint)[4]
-        # To the micrometre: the rest is rounding noise of the simulator's float32.
+        self._neck_joint, eyes = found[NECK_YAW][0], scene.eyes
+        for key, angles in ((NECK_YAW, eyes.yaw), (NECK_PITCH, (eyes.pitch,))):
+            low, high = (math.degrees(limit) for limit in found[key][8:10])
+            for angle in angles:
+                if not low <= angle <= high:
+                    raise UsageError(
+                        f"scene.eyes.{key.decode()[5:]} has {angle:g}: the neck of {scene.robot} "
+                        f"turns from {low:.0f} to {high:.0f} degrees"
+                    )
+        bullet.resetJointState(self._robot, found[NECK_PITCH][0], math.radians(eyes.pitch))
+        place = bullet.getLinkState(self._robot, self._neck_joint, computeForwardKinematics=1)[4]
+        # To the micrometre: the rest is the rounding of the simulator's float32.
         self.neck = np.array([round(part, 6) for part in place])
         self._add_bodies(scene)
 

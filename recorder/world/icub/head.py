@@ -1,0 +1,120 @@
+"""How the robot's head turns from one view to another, and where a head that roams looks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from cdmisfa.core.arrays import FloatArray
+
+ROAM, YAW = "roam", "head_yaw"
+"""The view of a head that roams, and the truth's name for how far that is turned to the left."""
+
+FRAMES_OF_A_LOOK = 60
+"""Frames after which a head that roams may turn to another view."""
+
+ROAMS_BY = 7.5
+"""Degrees that it turns in a frame where `scene.transit` does not say so."""
+
+SLOWEST_TURN = 0.1
+"""Degrees in a frame; slower, a turn would take thousands."""
+
+_ROAM, _DIGITS = 0x40A3, 6
+
+
+NECK, NECK_PITCH = (-0.010809, 0.0, 0.241953), (-0.010809, 0.0, 0.254797)
+"""Origins of iCub v2.5's joints of the neck, that of its yaw while its pitch is 0; root frame."""
+
+Place = tuple[float, float, float]
+
+
+def bent(vector: Place, pitch: float) -> FloatArray:
+    """A vector of a level head, (3,), root frame, as the neck bends by degrees upwards."""
+    cos, sin = math.cos(math.radians(pitch)), math.sin(math.radians(pitch))
+    x, y, z = vector
+    return np.array([cos * x + sin * z, y, cos * z - sin * x])
+
+
+def neck_at(pitch: float) -> Place:
+    """Origin of the neck's yaw joint, root frame, as the neck bends by degrees upwards."""
+    if not pitch:
+        return NECK
+    (x, y, z), (a, b, c) = NECK, NECK_PITCH
+    moved = bent((x - a, y - b, z - c), pitch)
+    return a + float(moved[0]), b + float(moved[1]), c + float(moved[2])
+
+
+def quaternion(yaw: float, pitch: float) -> tuple[float, float, float, float]:
+    """How a head is turned in the root frame, (x, y, z, w); degrees to the left and upwards."""
+    a, b = math.radians(yaw) / 2, math.radians(pitch) / 2
+    across, along = math.sin(b), math.cos(b)
+    # A zero has no sign: recordings of a level head are as they were.
+    return (
+        across * math.sin(a) + 0.0,
+        across * math.cos(a) + 0.0,
+        along * math.sin(a),
+        along * math.cos(a),
+    )
+
+
+def turn_frames(degrees: float, transit: float) -> int:
+    """Frames of a turn, at most so many degrees in each in the mean; 0 where the head jumps."""
+    if not transit >= SLOWEST_TURN:
+        return 0
+    return math.ceil(max(0.0, min(abs(degrees), 360.0)) / transit)  # also of a broken log's
+
+
+def turn(start: float, stop: float, frames: int) -> list[float]:
+    """Angles at the frames of a turn at least jerk; at the frame behind them it has ended."""
+    shares = [(i + 1) / (frames + 1) for i in range(frames)]
+    path = (start + (stop - start) * s * s * s * (10 - 15 * s + 6 * s * s) for s in shares)
+    return [round(angle, _DIGITS) for angle in path]
+
+
+def turns(yaw: Sequence[float], transit: float, *, roam: bool) -> tuple[tuple[int, ...], ...]:
+    """Frames that are lost between each two views, [from][to].
+
+    Nobody knows where a head that roams will be: to find it and to leave it takes the longest turn.
+
+    Args:
+        yaw: of the head in each view, degrees.
+        transit: degrees that it turns in a frame; 0 where it jumps.
+        roam: another view, behind the others, is of a head that roams.
+    """
+    frames = [[turn_frames(b - a, transit) for b in yaw] for a in yaw]
+    if roam:
+        longest = max(map(max, frames))
+        frames = [*([*row, longest] for row in frames), [*[longest] * len(yaw), 0]]
+    return tuple(map(tuple, frames))
+
+
+class Roaming:
+    """Where a head that roams looks: at one of the views, chosen anew every so many frames.
+
+    Args:
+        yaw: of the views, degrees.
+        transit: degrees that it turns in a frame; 0 for `ROAMS_BY`.
+        seed: of what it looks at.
+    """
+
+    def __init__(self, yaw: Sequence[float], transit: float, seed: int) -> None:
+        self._yaw, self._transit, self._seed = yaw, transit or ROAMS_BY, seed
+        self._look = lru_cache(maxsize=4)(self._look_anew)
+
+    def angles(self, start: int, n: int) -> list[float]:
+        """Degrees to the left at n frames from `start` on."""
+        places = (divmod(t, FRAMES_OF_A_LOOK) for t in range(start, start + n))
+        return [self._look(look)[frame] for look, frame in places]
+
+    def _look_anew(self, look: int) -> list[float]:
+        before, now = (self._yaw[self._chosen(max(i, 0))] for i in (look - 1, look))
+        frames = min(turn_frames(now - before, self._transit), FRAMES_OF_A_LOOK - 1)
+        return [*turn(before, now, frames), *[now] * (FRAMES_OF_A_LOOK - frames)]
+
+    def _chosen(self, look: int) -> int:
+        bits = np.random.Philox(key=np.array([self._seed, _ROAM], np.uint64))
+        bits.advance(look)
+        return int(bits.random_raw() % len(self._yaw))

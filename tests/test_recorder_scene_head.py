@@ -1,0 +1,169 @@
+"""The head of the iCub scene: its joints, its turns, which cost frames, and one that roams."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from cdmisfa.core.config import LearnerConfig, section_table
+from cdmisfa.core.errors import UsageError
+from cdmisfa.experiments.session import Session, run
+from cdmisfa.watching import WatchEnv
+from recorder.config import RecordConfig
+from recorder.log.scenery import scenery_of, turned, turns_of
+from recorder.recording import record_scene
+from recorder.world.icub.config import EyesConfig, IcubConfig
+from recorder.world.icub.head import FRAMES_OF_A_LOOK, Roaming, turn, turn_frames, turns
+from replay.recordings.source import RecordedSource
+from replay.runs.run import read_outline
+
+YAW = (45.0, 0.0, -45.0)
+
+
+def test_a_turn_takes_so_many_frames_and_neither_jumps_nor_overshoots():
+    assert [turn_frames(d, 7.5) for d in (0, 45, -90, 46)] == [0, 6, 12, 7]
+    assert turn_frames(90, 0) == 0
+    path = [45.0, *turn(45, -45, 12), -45.0]
+    steps = np.diff(path)
+    assert (steps < 0).all()
+    assert -steps.min() < 2 * 90 / 13  # at least jerk: 15/8 of the mean
+    assert np.abs(np.diff(path, n=2)).max() < 4
+    np.testing.assert_allclose(path, -np.array(path[::-1]))
+
+
+def test_turns_cost_what_lies_between_two_views_and_most_with_one_that_roams():
+    assert turns(YAW, 7.5, roam=False) == ((0, 6, 12), (6, 0, 6), (12, 6, 0))
+    assert turns(YAW, 7.5, roam=True)[3] == (12, 12, 12, 0)
+    assert [row[3] for row in turns(YAW, 7.5, roam=True)] == [12, 12, 12, 0]
+    stated = section_table(IcubConfig(transit=7.5))
+    assert turns_of(stated, [2, 0]) == ((0, 12), (12, 0))
+    assert turns_of(section_table(IcubConfig()), [0, 1, 2]) == ()
+    for broken in (1e-320, "x", float("nan"), float("inf"), -1.0):
+        assert not np.any(turns_of({**stated, "transit": broken}, [0, 1]))
+    assert turn_frames(1e300, 1.0) == 360
+    with pytest.raises(UsageError, match=r"scene\.transit is 0\.01"):
+        IcubConfig(transit=0.01)
+
+
+def test_a_roaming_head_dwells_on_views_and_turns_between_them_the_same_at_every_cut():
+    angles = Roaming(YAW, 7.5, 3).angles(0, 3000)
+    parts = [Roaming(YAW, 7.5, 3).angles(t, n) for t, n in ((1000, 2000), (0, 1), (1, 999))]
+    assert [*parts[1], *parts[2], *parts[0]] == angles
+    assert Roaming(YAW, 7.5, 4).angles(0, 3000) != angles
+    assert set(YAW) <= set(angles)
+    assert np.abs(np.diff(angles)).max() < 15
+    runs = [(yaw, len(list(same))) for yaw, same in itertools.groupby(angles)]
+    dwells = [n for yaw, n in runs if yaw in YAW]
+    assert min(dwells[:-1]) >= FRAMES_OF_A_LOOK - 12
+    assert len({yaw for yaw, _ in runs}) < 40  # of few angles, each drawn once
+
+
+def test_a_bent_neck_is_that_of_the_simulator():
+    pytest.importorskip("pybullet")
+    from recorder.world.icub.source import IcubSource
+
+    scene = IcubConfig(eyes=EyesConfig(pitch=-20.0))
+    with contextlib.closing(IcubSource(scene, RecordConfig())) as source:
+        poses = source.head_poses
+    for pose, gaze in zip(poses, scenery_of(section_table(scene)).gazes, strict=True):
+        np.testing.assert_allclose(pose.position, gaze.head.position, atol=2e-6)
+        np.testing.assert_allclose(pose.quaternion, gaze.head.quaternion, atol=1e-12)
+        assert turned(pose.quaternion, (-1.0, 0.0, 0.0))[2] < 0  # it looks down
+    level = IcubConfig(eyes=EyesConfig(pitch=-89.0))
+    with pytest.raises(UsageError, match=r"scene\.eyes\.pitch has -89"):
+        IcubSource(level, RecordConfig())
+
+
+SMALL = IcubConfig(
+    seed=1,
+    eyes=EyesConfig(views=("left", "right"), yaw=(30.0, -30.0), width=16, height=12),
+    transit=6.0,
+)
+COST = 10
+LEARNER = LearnerConfig(tau=8, components=3)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    pytest.importorskip("pybullet")
+    from recorder.world.icub.source import IcubSource
+
+    with contextlib.closing(IcubSource(SMALL, RecordConfig())) as source:
+        yield source
+
+
+def test_a_switch_costs_the_same_frames_live_and_from_the_log(scene, tmp_path):
+    recording = tmp_path / "recording"
+    record_scene("icub", recording, SMALL, frames=500)
+    scene.seek(0)
+    live = run(scene, LEARNER, tmp_path / "live", max_iterations=25, rerun=False)
+    with contextlib.closing(RecordedSource(recording)) as source:
+        logged = run(source, LEARNER, tmp_path / "log", max_iterations=25, rerun=False)
+    assert live.signals_sha256 == logged.signals_sha256
+    blocks = read_outline(tmp_path / "log" / "run.mcap").blocks
+    lost = np.diff(blocks.starts) - LEARNER.tau
+    switched = np.diff(blocks.streams) != 0
+    assert 3 < switched.sum() < 21
+    np.testing.assert_array_equal(lost, COST * switched)
+    with contextlib.closing(RecordedSource(recording)) as source:
+        assert Session.check(tmp_path / "log", (str(recording),), start=11).holds
+        for stop in (7, 25):  # stopped, and resumed
+            again = run(
+                source,
+                LEARNER,
+                tmp_path / "again",
+                max_iterations=stop,
+                rerun=False,
+                keyframes=1,
+                resume=stop > 7,
+            )
+        assert again.signals_sha256 == live.signals_sha256
+
+
+def test_a_log_that_ends_within_a_turn_ends_the_run(scene, tmp_path):
+    recording = tmp_path / "recording"
+    record_scene("icub", recording, SMALL, frames=60)
+    with contextlib.closing(RecordedSource(recording)) as source:
+        ended = run(source, LEARNER, None, max_iterations=25)
+    assert ended.ended == "log_exhausted"
+    assert 2 < ended.iterations < 8
+
+
+def test_an_environment_of_gymnasium_loses_them_too(scene):
+    scene.seek(0)
+    env = WatchEnv(scene, tau=8)
+    _, info = env.reset(seed=0)
+    for action, t in ((info["stream"], 8), (1 - info["stream"], 26), (1 - info["stream"], 34)):
+        env.step(action)
+        assert scene.t == t
+
+
+def test_a_roaming_view_shows_what_the_others_do_while_it_dwells_there():
+    pytest.importorskip("pybullet")
+    from recorder.world.icub.source import IcubSource
+
+    roaming = dataclasses.replace(SMALL, roam=True)
+    with contextlib.closing(IcubSource(roaming, RecordConfig())) as source:
+        assert source.spec.streams == ("left", "right", "roam")
+        source.seek(200)
+        roam = source.take(2, 130)
+        seen = []
+        for stream in (0, 1):
+            source.seek(200)
+            seen.append(source.take(stream, 130))
+        source.seek(290)
+        again = source.take(2, 7)
+    np.testing.assert_array_equal(again.frames, roam.frames[90:97])
+    yaw = roam.truth[:, source.spec.truth.index("head_yaw")]
+    np.testing.assert_array_equal(seen[0].truth, roam.truth)
+    for block, where in zip(seen, SMALL.eyes.yaw, strict=True):
+        there = yaw == where
+        assert there.any()
+        np.testing.assert_array_equal(block.frames[there], roam.frames[there])
+    assert ((yaw > -30) & (yaw < 30)).any()
+    with pytest.raises(UsageError, match="rename it"):
+        dataclasses.replace(roaming, eyes=EyesConfig(views=("roam",), yaw=(0.0,)))
