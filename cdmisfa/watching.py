@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.agents.learners import LEARNERS, open_learner
-from cdmisfa.core.blocks import FrameSource, SeekableSource
+from cdmisfa.core.blocks import FrameSource, SeekableSource, turn_to
 from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.core.turning import turn_to
 
 try:
     from gymnasium import Env

@@ -6,6 +6,7 @@ whichever is watched, as the channels of a television do.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
@@ -253,6 +254,18 @@ class ClockedSource(ForwardSource, SeekableSource):
         finally:
             self.seek(start)
         return beside([block[0] for block in blocks]) if spec.images else curves(blocks[0][:, :8])
+
+
+def turn_to(source: FrameSource, before: int, after: int) -> None:
+    """Pass over the frames that are lost as a head turns from one stream to another.
+
+    A source whose head has to turn says how many: `turns`, [from][to]. They depend on the two
+    alone, so that a recording gives the blocks that the scene gave.
+    """
+    turns = getattr(source, "turns", ())
+    if turns and isinstance(source, SeekableSource):
+        with contextlib.suppress(LogExhaustedError):  # which the next `take` says
+            source.seek(source.t + turns[before][after])
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,11 +6,10 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from cdmisfa.core.blocks import Block, FrameSource
+from cdmisfa.core.blocks import Block, FrameSource, turn_to
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
-from cdmisfa.core.turning import turn_to
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import replay.runs.run
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.core.blocks import SeekableSource, description
+from cdmisfa.core.blocks import SeekableSource, description, turn_to
 from cdmisfa.core.errors import (
     LogDamagedError,
     LogExhaustedError,
@@ -22,7 +22,6 @@ from cdmisfa.core.errors import (
 )
 from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.core.turning import turn_to
 from cdmisfa.experiments.names import placed, same_names
 from cdmisfa.experiments.resume import (
     config_history,

@@ -24,6 +24,7 @@ COLOURS = 256
 """Colours of a view's picture, which so takes a third of the bytes; rare ones are kept."""
 
 LEARN = {
+    "room": ("icub", "--preset", "icub-real"),
     "icub": (SAMPLE, "--loop"),
     "progress": (SAMPLE, "--loop", "--algorithm", "progress"),
     "progress1": (SAMPLE, "--loop", "--algorithm", "progress", "--seed", "1"),
@@ -39,7 +40,7 @@ COMPARED = {"by 2.0": ("seed0", "seed1", "seed2"), "by progress": ("progress", "
 """Runs that are laid over one another."""
 
 VIEWS = {
-    "view": ("icub", "World", "--at", "51990"),
+    "view": ("room", "World", "--at", "4590"),
     "oscillatory": ("seed0", "Overview"),
     "abstraction": ("icub", "Abstraction"),
     "gate": ("icub", "Gate"),

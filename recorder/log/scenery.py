@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import LogDamagedError
 from recorder.world.icub.config import TABLE_FROM, TABLE_TO
 from recorder.world.icub.head import (
+    ARMS,
     ROAM,
     YAW,
     neck_at,
@@ -121,6 +122,7 @@ class Scenery:
         objects: which move.
         eyes: their measures, keys `scene.eyes.*`.
         transit: degrees that the head turns in a frame; 0 where it jumps.
+        arms: angles of the arms' joints, degrees, where they do not hang.
     """
 
     robot: str
@@ -129,6 +131,7 @@ class Scenery:
     objects: tuple[Thing, ...]
     eyes: Mapping[str, Any]
     transit: float = 0.0
+    arms: Mapping[str, float] = field(default_factory=dict)
 
     def gaze(self, view: str) -> Gaze | None:
         """The gaze of a view, None where there is no such view."""
@@ -179,6 +182,9 @@ def scenery_of(config: Mapping[str, Any], neck: Place | None = None) -> Scenery 
             objects=_objects(config, top),
             eyes=eyes,
             transit=float(config.get("transit", 0.0)),
+            arms={s + joint: a for joint, a in ARMS.items() for s in ("l_", "r_")}
+            if config.get("arms")
+            else {},
         )
     except (KeyError, TypeError, ValueError) as error:
         raise LogDamagedError(f"the configuration of the scene is broken ({error})") from error

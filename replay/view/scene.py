@@ -69,7 +69,7 @@ class SceneView:
         self.notes: list[str] = []
         self._watched, self._scenery = -1, scenery
         self._looks: Gaze | None = None
-        self._neck: Mapping[str, Any] = {}
+        self._body: UrdfTree | None = None
         self._shown = False
         target.log(SCENE, rr.ViewCoordinates.BRU)
         _write_thing(target, f"{SCENE}/table", scenery.table, at_rest=True)
@@ -85,7 +85,7 @@ class SceneView:
             if gaze is not None:
                 _write_pyramid(target, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
         try:
-            self._neck = write_body(target.recording, SCENE, scenery.robot) if body else {}
+            self._body = write_body(target.recording, SCENE, scenery.robot) if body else None
         except CdmisfaError as error:
             self.notes.append(str(error))
 
@@ -144,19 +144,26 @@ class SceneView:
         if not rows:
             return
         frames, iterations, gazes, rgbs = zip(*rows, strict=True)
-        if not self._shown:  # the eyes are the same in every view
-            self._shown = True
+        first, self._shown = not self._shown, True
+        if first:  # the eyes are the same in every view
             thick = rr.LineStrips3D(pyramid(gazes[0].middle), radii=[THICK])
             self._target.log(f"{WATCHING}/edges", thick)
         when = np.array(frames), np.array(iterations)
         self._target.send(WATCHING, *when, _poses(gazes))
         edges = rr.LineStrips3D.columns(colors=packed_all(rgbs))
         self._target.send(f"{WATCHING}/edges", *when, edges)
-        for place, joint in self._neck.items():
-            angles = [math.radians(g.yaw if place == NECK else g.pitch) for g in gazes]
-            if place == NECK or any(angles):
-                turned = joint.compute_transform_columns(angles)
-                self._target.send(f"{SCENE}/{place}", *when, turned)
+        self._pose("neck", NECK, when, [gaze.yaw for gaze in gazes])
+        if first:
+            for name, angle in {**self._scenery.arms, NECK_PITCH: gazes[0].pitch}.items():
+                if angle:
+                    self._pose(name, name, (when[0][:1], when[1][:1]), [angle])
+
+    def _pose(self, place: str, name: str, when: tuple[IntArray, IntArray], angles: Any) -> None:
+        """Turn a joint of the robot by degrees, at frames, in iterations."""
+        joint = None if self._body is None else self._body.get_joint_by_name(name)
+        if joint is not None:
+            turned = joint.compute_transform_columns([math.radians(angle) for angle in angles])
+            self._target.send(f"{SCENE}/{place}", *when, turned)
 
     def flush(self) -> None:
         """Hand over what waits."""
@@ -216,11 +223,8 @@ def _poses(gazes: Sequence[Gaze]) -> Any:
     )
 
 
-NECK, NECK_PITCH = "neck", "neck_pitch"
-"""The entities of the joints that turn the head to the left, and bend it upwards."""
-
-JOINTS = {NECK: "neck_yaw", NECK_PITCH: "neck_pitch"}
-"""Their names in the models."""
+NECK, NECK_PITCH = "neck_yaw", "neck_pitch"
+"""The joints that turn the head to the left, and bend it upwards."""
 
 BODY = "body"
 """The entity of all that it looks like, in that of the scene."""
@@ -229,7 +233,7 @@ PACKAGE = "package://iCub/"
 """Prefix of the meshes' names in the models."""
 
 
-def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Mapping[str, Any]:
+def write_body(recording: rr.RecordingStream, root: str, robot: str) -> UrdfTree:
     """Show a robot that stands upright in the frame of the entity `root`.
 
     Args:
@@ -238,7 +242,7 @@ def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Mapping[
         robot: its name in icub-models.
 
     Returns:
-        Its neck's joints, `rerun.urdf.UrdfJoint`, as `JOINTS`.
+        Its joints.
 
     Raises:
         CdmisfaError: the package or the model is not there, or it cannot be read.
@@ -256,12 +260,11 @@ def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Mapping[
             tree.log_urdf_to_recording(recording)
         except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:
             raise CdmisfaError(f"{model} cannot be shown: {error}") from error
-    neck = {place: tree.get_joint_by_name(name) for place, name in JOINTS.items()}
-    if None in neck.values():
-        raise CdmisfaError(f"{model} lacks a joint of the neck: {' or '.join(JOINTS.values())}")
+    if tree.get_joint_by_name(NECK) is None:
+        raise CdmisfaError(f"{model} has no joint {NECK}")
     stands = rr.Transform3D(parent_frame=f"tf#/{root}", child_frame=tree.root_link().name)
     recording.log(f"{root}/stands", stands, static=True)
-    return neck
+    return tree
 
 
 def _model(robot: str) -> Path:

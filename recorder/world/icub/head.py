@@ -1,4 +1,4 @@
-"""How the robot's head turns from one view to another, and where a head that roams looks."""
+"""The robot's joints: how its head turns to a view, where one that roams looks, how arms rest."""
 
 from __future__ import annotations
 
@@ -21,6 +21,15 @@ ROAMS_BY = 7.5
 
 SLOWEST_TURN = 0.1
 """Degrees in a frame; slower, a turn would take thousands."""
+
+ARMS = {
+    "shoulder_pitch": -30.0,
+    "shoulder_roll": 30.0,
+    "shoulder_yaw": 15.0,
+    "elbow": 50.0,
+    "wrist_prosup": 60.0,
+}
+"""Angles of the joints of both arms where they rest on the table, degrees; without l_ and r_."""
 
 _ROAM, _DIGITS = 0x40A3, 6
 

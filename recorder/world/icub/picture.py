@@ -30,32 +30,36 @@ _FLOOR = -0.6
 _HALF_THICKNESS = 0.015
 
 
-def scene_picture(scene: IcubConfig) -> Image.Image:
+def scene_picture(scene: IcubConfig, size: tuple[int, int] = SIZE) -> Image.Image:
     """The iCub scene at its first frame, the head turned to the middle view.
 
     A furnished scene is drawn with what the left eye sees in each view, in colour, below it. The
     plain one's table is drawn as large as the objects need, since the real one, which fills
     every eye image, would hide the robot's legs.
 
+    Args:
+        scene: what stands where.
+        size: width and height of the picture from outside, pixels.
+
     Raises:
         CdmisfaError: the simulator is not installed.
     """
     with contextlib.closing(World(scene, robot_seen=True)) as world:
         if scene.room:
-            return _furnished(scene, world)
+            return _furnished(scene, world, size)
         _furnish(world, scene.table)
         world.place(Motions(scene, scene.seed or 0).positions(0, 1)[0])
         world.turn_head(scene.eyes.yaw[len(scene.eyes.yaw) // 2])
-        width, height = SIZE[0] * _SAMPLES, SIZE[1] * _SAMPLES
+        width, height = size[0] * _SAMPLES, size[1] * _SAMPLES
         colours, _ = world.render(
             look(_CAMERA, _TARGET),
             perspective(_FOV, width / height, 0.1, 20.0),
             *(width, height, _LIGHT),
         )
-    return _small(colours[..., :3], SIZE)
+    return _small(colours[..., :3], size)
 
 
-def _furnished(scene: IcubConfig, world: World) -> Image.Image:
+def _furnished(scene: IcubConfig, world: World, size: tuple[int, int]) -> Image.Image:
     """The room, and what the left eye sees of it in each view."""
     from PIL import Image
 
@@ -74,15 +78,15 @@ def _furnished(scene: IcubConfig, world: World) -> Image.Image:
         light = light.repeat(_SAMPLES, axis=0).repeat(_SAMPLES, axis=1)
         return _small(np.rint(colours[..., :3] * light[..., None]).astype(np.uint8), size)
 
-    width = SIZE[0] // len(eyes.yaw)
+    width = size[0] // len(eyes.yaw)
     below = width, width * eyes.height // eyes.width
-    picture = Image.new("RGB", (SIZE[0], SIZE[1] + below[1]))
+    picture = Image.new("RGB", (size[0], size[1] + below[1]))
     for number, yaw in enumerate(eyes.yaw):
         world.turn_head(yaw)
         view = eye_matrix(eyes, world.neck, yaw, 1)
-        picture.paste(drawn(view, eyes.vertical_fov, eyes.far, below), (number * width, SIZE[1]))
+        picture.paste(drawn(view, eyes.vertical_fov, eyes.far, below), (number * width, size[1]))
     world.turn_head(eyes.yaw[len(eyes.yaw) // 2])
-    picture.paste(drawn(look(_INSIDE, _TARGET), _WIDE, 20.0, SIZE), (0, 0))
+    picture.paste(drawn(look(_INSIDE, _TARGET), _WIDE, 20.0, size), (0, 0))
     return picture
 
 

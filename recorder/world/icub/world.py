@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
+from recorder.world.icub.head import ARMS
 from recorder.world.icub.room import Piece, Room
 
 CHUNK = 4096
@@ -117,15 +118,6 @@ def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
 
 NECK_YAW, NECK_PITCH = b"neck_yaw", b"neck_pitch"
 """The joints that turn the head to the left, the last of the neck, and bend it upwards."""
-
-ARMS = {
-    "shoulder_pitch": -30.0,
-    "shoulder_roll": 30.0,
-    "shoulder_yaw": 15.0,
-    "elbow": 50.0,
-    "wrist_prosup": 60.0,
-}
-"""Angles of the joints of both arms where they rest on the table, degrees; without l_ and r_."""
 
 _AWAY = (0.0, 0.0, -100.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
