@@ -143,7 +143,7 @@ def test_a_scene_is_recorded_and_learned_in_colours(cdmisfa: Cdmisfa, tmp_path: 
         words = ("--algorithm", "progress", "--max-iterations", "2", "--json", "--no-rerun")
         runs.append(cdmisfa("learn", source, *how, *words).json)
     assert runs[0]["signals_sha256"] == runs[1]["signals_sha256"]
-    with contextlib.closing(RecordedSource(rec)) as source:
+    with RecordedSource(rec) as source:
         assert source.spec.frame_shape == (6, 3 * 2 * 8)
         red, green, blue = np.split(source.take(0, 1).frames[0].astype(int), 3, axis=1)
     assert red.mean() > green.mean() > blue.mean()  # the table is brown
