@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,8 @@ from cdmisfa.studies.arena.trial import (
 pytestmark = pytest.mark.usefixtures("tiny")
 
 WORDS = ("sway", "hiss", "swing>hiss", "sway#1", "blank")
-UNLEARNED = {"frame": None, "block": None, "watched": None, "fitted": False}
+UNLEARNED = {"frame": None, "block": None, "watched": None, "known": None, "fitted": False}
+NO_PAIRS: dict[str, list[bool]] = {"one": [], "others": []}
 REFERENCE = 0, 8, "none"
 """Seed, components and expansion."""
 
@@ -44,7 +46,7 @@ REFERENCE = 0, 8, "none"
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory, tiny: None) -> Library:
     found = Library(tmp_path_factory.mktemp("streams"))
-    for name in ("sway", "echo", "swing", "hiss", "short", "blank", "late"):
+    for name in ("sway", "echo", "swing", "hiss", "short", "blank", "late", "darker:sway"):
         found.prepare(name, *REFERENCE)
     return found
 
@@ -60,7 +62,12 @@ def batch(library: Library, name: str) -> Module:
     return library.reference(name, *REFERENCE).slowest
 
 
-def judged(library: Library, *saved: tuple[Module, int, int], words: Any = WORDS) -> dict[str, Any]:
+def judged(
+    library: Library,
+    *saved: tuple[Module, int, int],
+    words: Any = WORDS,
+    decided: Sequence[tuple[int, int, int]] = (),
+) -> dict[str, Any]:
     """What a run came to that watched all streams in turn and saved modules at (stream, frame)."""
     source = ArenaSource(words, library, 0, change=2000)
     watched = [(40 * k, k % len(words)) for k in range(100)]
@@ -70,7 +77,7 @@ def judged(library: Library, *saved: tuple[Module, int, int], words: Any = WORDS
         told.append(SavedModule(one, stream, shown.name, shown.learnable, frame, frame // 40))
     names = {s.name for phases in source.phases for s in phases if s.learnable}
     references = {name: library.reference(name, *REFERENCE) for name in names}
-    return Judge(Course(told, watched, {1: 7}, 4000, ""), source, references).row()
+    return Judge(Course(told, watched, {1: 7}, decided, 4000, ""), source, references).row()
 
 
 def learned(row: dict[str, Any]) -> dict[str, int | None]:
@@ -104,6 +111,18 @@ def test_a_sound_module_of_another_stream_counts_where_it_knows_this_one(library
     ):
         row = judged(library, *saved, words=words)
         assert learned(row) == dict(zip(("sway", "echo"), frames, strict=True))
+
+
+def test_streams_of_one_world_or_others_that_one_module_gives_are_told(library: Library) -> None:
+    words = ("sway", "darker:sway", "echo", "hiss")
+    for by, one, others in (
+        ((0, 0, 1), [True], [False, False]),
+        ((0, 1, 0), [False], [True, False]),
+    ):
+        decided = [(400 + stream, stream, module) for stream, module in enumerate(by)]
+        row = judged(library, words=words, decided=[(40, 1, 5), *decided])
+        assert row["pairs"] == {"one": one, "others": others}
+    assert judged(library, words=words)["pairs"] == {"one": [False], "others": [False, False]}
 
 
 def test_what_was_learned_in_vain_is_told(library: Library) -> None:
@@ -213,11 +232,18 @@ class Chooser:
     def over(self) -> str:
         return "nothing_left" if self.iteration >= self.ends else ""
 
+    def summary(self) -> dict[str, Any]:
+        learned = {"state": "learned", "module": len(self.modules)}
+        return {"streams": [learned, {"state": "given_up", "module": None}]}
+
     def step(self, block: Any) -> None:
         self.iteration += 1
         if self.iteration in self.saves:
             self.modules.append(self.saves[self.iteration])
-        self.events = ("stream hiss is given up after 2 blocks",) if self.iteration % 4 == 0 else ()
+        if self.iteration % 4 == 0:
+            self.events = ("stream hiss is given up after 2 blocks",)
+        else:
+            self.events = ("stream sway is learned",) if self.iteration in self.saves else ()
 
 
 @pytest.mark.parametrize(
@@ -232,6 +258,7 @@ def test_a_run_ends_by_itself_or_with_its_frames(
     course = run_learner(learner, ArenaSource(entry.words, library, 0), entry)
     assert [at for at, _ in course.watched] == [40 * k for k in range(blocks)]
     assert course.given_up == {1: 2}
+    assert course.decided == [(200, 0, 0)]
     assert (len(course.watched), course.frames, course.ended) == (blocks, 40 * blocks, ended)
     assert [(s.stream, s.signal, s.frame, s.block) for s in course.saved] == [(0, "sway", 200, 5)]
 
@@ -345,7 +372,7 @@ def came_to(**more: Any) -> dict[str, Any]:
     """A result: of a run that did not learn sway."""
     result = {"frames": 400, "blocks": 10, "ended": "", "modules": [], "wrong": 0, "doubles": 0}
     result |= {"targets": [{**UNLEARNED, "stream": "sway", "signal": "sway"}]}
-    return result | {"probes": [], "in_vain": 0.0, "told": {}, **more}
+    return result | {"probes": [], "in_vain": 0.0, "told": {}, "pairs": NO_PAIRS, **more}
 
 
 def test_of_a_trial_that_several_versions_computed_that_of_now_counts(tmp_path: Path) -> None:
@@ -374,7 +401,9 @@ def test_a_page_says_what_was_not_learned_and_of_what_there_is_a_module(tmp_path
     for seed, modules in enumerate(([], [module, noise])):
         result = came_to(modules=modules, wrong=seed, doubles=seed)
         changed = {"stream": "hiss>sway", "signal": "sway", "frame": 2000, "block": 50}
-        result["targets"].append({**changed, "watched": 12 * seed, "fitted": True})
+        result["targets"].append(
+            {**changed, "watched": 12 * seed, "known": not seed, "fitted": True}
+        )
         point = {"set": "tiny", "learner": "progress"}
         row = {"id": str(seed), "status": "done", "point": point, "seed": seed, "code": "old"}
         rows.append(json.dumps(row | {"result": result}) + "\n")

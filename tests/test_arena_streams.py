@@ -141,6 +141,29 @@ def test_bad_cameras_do_what_they_say() -> None:
     )
 
 
+def test_a_world_is_seen_from_other_sides() -> None:
+    y, x = np.mgrid[:48, :64]
+    plain = stateless((4 * x + y).astype(np.uint8)[None])
+    rng = np.random.default_rng(0)
+    seen = {
+        name: int(camera(rng, plain).frames[0, 20, 40]) for name, camera in cameras.SIDES.items()
+    }
+    middle, back = np.array([23.5, 31.5]), np.deg2rad(12)
+    down, right = np.array([20, 40]) - middle
+    turned = np.array(
+        [np.cos(back) * down + np.sin(back) * right, np.cos(back) * right - np.sin(back) * down]
+    )
+    places = {
+        "moved": (25, 45),
+        "turned": turned + middle,
+        "nearer": np.array([down, right]) / 1.2 + middle,
+    }
+    for name, place in places.items():
+        row, column = np.round(place).astype(int)
+        assert seen[name] == plain.frames[0, row, column]
+    assert seen["darker"] == plain.frames[0, 20, 40] // 2
+
+
 def test_what_is_before_a_camera_is_known() -> None:
     rng = np.random.default_rng(0)
     shown = stateless(np.full((3000, 48, 64), 120, np.uint8))

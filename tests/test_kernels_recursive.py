@@ -145,7 +145,7 @@ def test_whatever_frames_hold_nothing_else_is_written(
             assert not np.isfinite(sfa.mean).all()
             assert np.isnan(sfa.slowness)
             assert not sfa.phi.any()
-        sfa.compare(np.ones((1, frames.shape[1])))
+        sfa.compare(np.ones(frames.shape[1]))
     for own in memory:
         assert (own[:GUARD] == 7).all()
         assert (own[-GUARD:] == 7).all()
@@ -159,7 +159,7 @@ def learned(
     vars(sfa).pop("_record", None)
     with using(module):
         changes = [sfa.update(x, gap) for x, gap in zip(blocks, gaps, strict=True)]
-        return [*changes, *sfa.state, sfa.phi, *sfa.compare(np.ones_like(sfa.phi))]
+        return [*changes, *sfa.state, sfa.phi, *sfa.compare(np.ones_like(sfa.phi[0]))]
 
 
 @pytest.mark.skipif(not kernels.WIDE, reason="this processor has no wide lanes")

@@ -26,9 +26,6 @@ PIECE: int = kernels.lib.PIECE
 
 _TINY = 1e-300
 
-_SAME_DIRECTION = 1e-9
-"""Share of the largest variance below which what is left of an output is rounding noise."""
-
 
 class RecursiveState(NamedTuple):
     """Everything that changes: I inputs, L directions, K whitened components, J outputs.
@@ -56,12 +53,11 @@ class RecursiveState(NamedTuple):
 
 
 class Likeness(NamedTuple):
-    """What some outputs give of the slowest feature of a stream: the sum that is most like it.
+    """What an output gives of the slowest feature of a stream.
 
     Attributes:
-        variance: of that weighted sum of them, over the variance that it has where the outputs
-            have variance 1 and no correlation.
-        slowness: of that sum.
+        variance: of that output.
+        slowness: of it.
         rho: its correlation with the slowest feature, from 0 to 1.
     """
 
@@ -166,46 +162,28 @@ class RecursiveFeature:
         return self.state.mean
 
     def compare(self, phi: FloatArray, frames: NDArray[Any] | None = None) -> Likeness:
-        """What other outputs give together on what was learned from, which is not kept.
+        """What another output gives on what was learned from, which is not kept.
 
         Args:
-            phi: (R, I) their weights of the centred input.
-            frames: (n, I) the last that were learned from, which tell what the outputs take from
-                outside of the directions kept; without them that counts as nothing.
+            phi: (I,) its weights of the centred input.
+            frames: (n, I) the last that were learned from, which tell what it takes from outside
+                of the directions kept; without them that counts as nothing.
         """
         rank = self.state.counts[0]
         basis, variance = self.state.basis[:rank], self.state.variance[:rank]
-        q = kernels.outputs(basis, np.zeros(len(basis)), phi)
-        power = kernels.multiply(q * variance, q.T)
-        steps = kernels.multiply(kernels.multiply(q, self.state.differences[:rank, :rank]), q.T)
+        q = kernels.outputs(basis, np.zeros(len(basis)), phi[None])
+        power = kernels.multiply(q * variance, q.T).item()
+        moved = kernels.multiply(q, self.state.differences[:rank, :rank])
+        steps = kernels.multiply(moved, q.T).item()
         if frames is not None:
             outside = phi - kernels.multiply(q, basis)
             rest = kernels.outputs(outside, kernels.mean_output(outside, self.mean), frames)
-            power += kernels.multiply(rest.T, rest) / len(rest)
-            moved = np.diff(rest, axis=0)
-            steps += kernels.multiply(moved.T, moved) / max(len(moved), 1)
-        shared = kernels.multiply(q * variance, self.state.weights[:1, :rank].T)[:, 0]
-        a = _solved(power, shared)
-        given = min(max(float((a * shared).sum()), 0.0), 1.0)
-        moves = max(float((a * (steps * a).sum(axis=1)).sum()), 0.0)
+            power += kernels.multiply(rest.T, rest).item() / len(rest)
+            jumps = np.diff(rest, axis=0)
+            steps += kernels.multiply(jumps.T, jumps).item() / max(len(jumps), 1)
+        shared = kernels.multiply(q * variance, self.state.weights[:1, :rank].T).item()
         return Likeness(
-            variance=given / max(float((a * a).sum()), _TINY),
-            slowness=math.sqrt(moves / max(given, _TINY)) / (2.0 * math.pi),
-            rho=math.sqrt(given),
+            variance=power,
+            slowness=math.sqrt(max(steps, 0.0) / max(power, _TINY)) / (2.0 * math.pi),
+            rho=min(abs(shared) / math.sqrt(max(power, _TINY)), 1.0),
         )
-
-
-def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """The x of matrix x = right, of a covariance (R, R) and (R,); 0 in what does not vary."""
-    matrix, x = matrix.copy(), right.copy()
-    least = _SAME_DIRECTION * matrix.diagonal().max(initial=0.0)
-    for i in range(len(x)):
-        if matrix[i, i] <= least:
-            matrix[i], x[i] = 0.0, 0.0
-            continue
-        x[i], matrix[i] = x[i] / matrix[i, i], matrix[i] / matrix[i, i]
-        for j in range(len(x)):
-            if j != i:
-                x[j] -= matrix[j, i] * x[i]
-                matrix[j] -= matrix[j, i] * matrix[i]
-    return x

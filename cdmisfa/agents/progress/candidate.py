@@ -88,7 +88,7 @@ class Candidate:
         self._moments = np.zeros((3, n_outputs))
         self._phi = np.zeros((n_outputs, n_inputs))
         self._last = np.zeros(n_outputs)
-        self._reference = np.zeros((1, n_inputs))
+        self._reference = np.zeros(n_inputs)
 
     def learn(self, frames: NDArray[Any], gap: bool) -> None:
         """Test on a block, then learn from it.
@@ -139,7 +139,7 @@ class Candidate:
     def _look_back(self) -> None:
         if self._reference.any():
             self.regret = log_ratio(self.sfa.compare(self._reference).slowness, self.fitted)
-        self._reference[0] = self.sfa.phi[0]
+        self._reference[:] = self.sfa.phi[0]
         self._reference_age = 0
 
     @property

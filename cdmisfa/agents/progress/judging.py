@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa import kernels
 from cdmisfa.agents.progress.candidate import Candidate, log_ratio
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.signals import STATES
 from cdmisfa.features.outputs import window_rate
-from cdmisfa.features.recursive import Likeness
 from cdmisfa.modules import Module
 
 FULL = 4.5
@@ -58,10 +56,13 @@ PRESENT = (0.1, 10.0)
 SAME = 0.8
 """Correlation from which outputs are the same, see `Likeness`."""
 
-TOGETHER = 3
-"""Slow outputs of a module, at most, that are compared with a candidate."""
+ALIKE = 0.65
+"""Correlation of mean pictures from which they may be of one world."""
 
-AS_SLOW = 1.4
+EVEN = 0.03
+"""Variance of a mean picture over that of frames, below which it is even."""
+
+AS_SLOW = 1.25
 """Slowness of a module over the candidate's, up to which it is as slow."""
 
 FAINT = 0.003
@@ -197,50 +198,47 @@ def promising(candidate: Candidate, config: ProgressConfig) -> bool:
     )
 
 
-def gives(module: Module, candidate: Candidate, frames: NDArray[Any]) -> Likeness:
-    """What a module's leading slow outputs give of what a candidate found.
+def alike(module: Module, candidate: Candidate) -> bool:
+    """Whether a stream looks in the mean as that of a module, where that says anything.
 
-    Args:
-        module: frozen.
-        candidate: tells by the statistics of its stream.
-        frames: (n, I) the last block of the stream, see `RecursiveFeature.compare`.
+    It says nothing of values that are no pictures, nor of pictures that are even in the mean.
     """
-    slow = int(np.minimum.accumulate(module.slow[:TOGETHER]).sum())
-    return candidate.sfa.compare(module.phi[: max(slow, 1)], frames)
+    if len(module.frame_shape) < 2:
+        return True
+    a, b = (mean - mean.mean() for mean in (module.mean, candidate.sfa.mean))
+    one, other, shared = ((x * y).sum() for x, y in ((a, a), (b, b), (a, b)))
+    even = max(one, other) < EVEN * candidate.sfa.state.variance.sum()
+    return bool(even or shared > ALIKE * math.sqrt(one * other))
 
 
 def known_by(
     candidate: Candidate, modules: list[Module], own: int, frames: NDArray[Any]
 ) -> int | None:
-    """Index in `modules` of the one that `gives` what the candidate found, its own first, if any.
+    """Index in `modules` of the one that gives what the candidate found, its own first, if any.
 
-    What is the same is also as slow where the module was learned. Light that falls on everything
-    is in the outputs of any module.
+    That is as slow there as what is learned must be, and the streams look `alike`: a smooth
+    weighting follows many a thing, of other worlds, too.
 
     Args:
         candidate: what was found.
         modules: frozen.
         own: index of the stream's own module, -1 where it has none.
-        frames: (n, I) the last block of the stream.
+        frames: (n, I) the last block of the stream, see `RecursiveFeature.compare`.
     """
     low, high = PRESENT
-    for index in sorted(range(len(modules)), key=lambda index: index != own):
-        variance, eta, rho = gives(modules[index], candidate, frames)
-        at_home = abs(log_ratio(float(modules[index].eta[0]), candidate.fitted))
-        as_slow = eta <= AS_SLOW * candidate.fitted and at_home < kernels.log(AS_SLOW)
-        if low < variance < high and rho > SAME and as_slow:
+    near = [index for index, module in enumerate(modules) if alike(module, candidate)]
+    for index in sorted(near, key=lambda index: index != own):
+        variance, eta, rho = candidate.sfa.compare(modules[index].phi[0], frames)
+        if low < variance < high and rho > SAME and eta <= AS_SLOW * candidate.fitted:
             return index
-    if own >= 0 and _still_there(candidate, modules[own], frames):
+    if own in near and _still_there(candidate, modules[own], frames):
         return own
     return None
 
 
 def _still_there(candidate: Candidate, module: Module, frames: NDArray[Any]) -> bool:
-    """Whether a stream shows what its own module encodes, at times less and differently.
-
-    That is told by the slowest output alone: some sum of three shows a little of anything.
-    """
-    like = candidate.sfa.compare(module.phi[:1], frames)
+    """Whether a stream shows what its own module encodes, at times less and differently."""
+    like = candidate.sfa.compare(module.phi[0], frames)
     if like.rho > SAME:
         return like.variance > FAINT
     itself = abs(log_ratio(like.slowness, float(module.eta[0]))) < STRANGE

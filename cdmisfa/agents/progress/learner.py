@@ -31,7 +31,6 @@ from cdmisfa.agents.progress.judging import (
     begin_watching,
     decide,
     differs,
-    gives,
     hopeless,
     known_by,
     mastered,
@@ -56,7 +55,7 @@ FEWEST_BLOCKS = 20
 WATCHED = 0.4
 """Windows of tests that the output of a decided stream's module is told over."""
 
-DECIDING = 3
+DECIDING = 4
 """Rises when something else is decided than before, so that runs of then are not gone on with."""
 
 COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle", "i8")])
@@ -308,11 +307,10 @@ class ProgressLearner:
             self._freeze()
             index = len(self.modules) - 1
         module = self.modules[index]
-        alone = candidate.sfa.compare(module.phi[:1], frames)
-        begin_watching(own, alone.variance, alone.slowness)
+        given = candidate.sfa.compare(module.phi[0], frames)
+        begin_watching(own, given.variance, given.slowness)
         if index == before and state != LEARNING:
             return ()
-        given = gives(module, candidate, frames)
         eta = float(candidate.tested[0]) if new else given.slowness
         learned = module.stream_index == stream
         decide(own, LEARNED if learned else KNOWN, index, eta)

@@ -267,6 +267,8 @@ MEASURES: Final[Mapping[str, Callable[[Row], float | None]]] = {
     "modules": lambda row: len(row["modules"]),
     "wrong": lambda row: row["wrong"],
     "doubles": lambda row: row["doubles"],
+    "one": lambda row: _mean(row["pairs"]["one"]),
+    "merged": lambda row: _mean(row["pairs"]["others"]),
     "in_vain": lambda row: row["in_vain"],
     "told": lambda row: max(row["told"].values(), default=None),
     "ended": lambda row: None if row["ended"] is None else bool(row["ended"]),
@@ -305,15 +307,18 @@ def _last(row: Row, key: str) -> int | None:
 
 
 def _probe(row: Row, key: str) -> float | None:
-    values = [p[key] for p in row["probes"] if p[key] is not None]
+    return _mean([p[key] for p in row["probes"] if p[key] is not None])
+
+
+def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
 
 
 def _targets(found: Sequence[Row]) -> list[dict[str, Any]]:
     """Of everything that can be learned, with how many seeds it was, and how soon.
 
-    Where it was not there may be modules of it: "too_fast" is with how many seeds; where it was a
-    module of another stream may have given it before it was watched: "known".
+    Where it was not there may be modules of it: "too_fast" is with how many seeds; where it was it
+    may have been by a module of something else: "known".
     """
     tables = []
     for same in zip(*(row["targets"] for row in found), strict=True):
@@ -323,8 +328,8 @@ def _targets(found: Sequence[Row]) -> list[dict[str, Any]]:
         fast = sum(had and t["frame"] is None for had, t in zip(saved, same, strict=True))
         table = {"stream": same[0]["stream"], "signal": signal, "too_fast": fast}
         table |= {"learned": len(learned), "trials": len(same)}
-        watched = [t["watched"] for t in learned if t["watched"]]
-        table |= {"known": len(learned) - len(watched), "watched": _measure(watched)}
+        table["known"] = sum(t["known"] for t in learned)
+        table["watched"] = _measure([t["watched"] for t in learned if t["watched"]])
         tables.append(table | {"block": _measure([t["block"] for t in learned])})
     return tables
 

@@ -81,6 +81,42 @@ def pausing(rng: Rng, plain: Footage) -> Footage:
     return replace(plain, frames=plain.frames[shown], state=plain.state[shown])
 
 
+def side(turned: float = 0.0, nearer: float = 1.0, aside: float = 0.0) -> Camera:
+    """A camera that sees the same world from another side; what lies beyond its edge is drawn out.
+
+    Args:
+        turned: about its axis, in degrees.
+        nearer: times as large as it is seen.
+        aside: moved, to the right and down, as a share of the height.
+    """
+
+    def seen(_: Rng, plain: Footage) -> Footage:
+        shape = np.array(plain.frames.shape[1:])
+        middle = (shape[:, None, None] - 1) / 2
+        y, x = np.mgrid[: shape[0], : shape[1]] - middle
+        sine, cosine = np.sin(np.deg2rad(turned)), np.cos(np.deg2rad(turned))
+        there = np.stack([cosine * y + sine * x, cosine * x - sine * y]) / nearer
+        there = (there + middle + aside * shape[0]).round().astype(int)
+        row, column = there.clip(0, shape[:, None, None] - 1)
+        return replace(plain, frames=plain.frames[:, row, column])
+
+    return seen
+
+
+def darker(rng: Rng, plain: Footage) -> Footage:
+    """Frames half as bright."""
+    return replace(plain, frames=plain.frames // 2)
+
+
+SIDES: Final = {
+    "moved": side(aside=0.1),
+    "turned": side(turned=12),
+    "nearer": side(nearer=1.2),
+    "darker": darker,
+}
+"""Cameras that see the same world as a good one, otherwise."""
+
+
 def _seen(plain: Footage, seen: Callable[[int, int], NDArray[np.floating]]) -> Footage:
     return replace(plain, frames=in_pieces(len(plain.frames), seen).frames)
 

@@ -21,6 +21,8 @@ COLUMNS: Final[Mapping[str, tuple[str, int]]] = {
     "fitted": ("fitted", 2),
     "wrong": ("noise learned", 1),
     "doubles": ("twice", 1),
+    "one": ("one world", 2),
+    "merged": ("merged", 3),
     "told": ("noise told", 0),
     "in_vain": ("in vain", 2),
     "ended": ("ends", 2),
@@ -36,7 +38,8 @@ OF_ALL: Final = ("seeds", *(head for head, _ in COLUMNS.values()), R2)
 """What a terminal shows of every entry; the page has two choices of it, and all of it as data."""
 
 OF_SETS: Final = (
-    "seeds", "learned", "fitted", "noise learned", "twice", "noise told", "blocks", R2
+    "seeds", "learned", "fitted", "noise learned", "twice", "one world", "merged", "noise told",
+    "blocks", R2,
 )  # fmt: skip
 OF_LEARNERS: Final = (
     "seeds", "learned", "noise learned", "in vain", "ends", "blocks", "all learned", "frames"
@@ -71,7 +74,7 @@ def _cells(entry: Entry) -> dict[str, str]:
     return {"seeds": seeds, **found, R2: tells if m["probe"]["n"] else "-"}
 
 
-_HIGHEST: Final = {"learned": 1.0, "fitted": 1.0, "in_vain": 1.0}
+_HIGHEST: Final = dict.fromkeys(("learned", "fitted", "one", "merged", "in_vain"), 1.0)
 
 
 def _number(measure: Mapping[str, Any], digits: int) -> str:

@@ -126,9 +126,10 @@ CAMERAS: Registry[Camera] = Registry(
         "lit": cameras.lit,
         "occluded": cameras.occluded,
         "pausing": cameras.pausing,
+        **cameras.SIDES,
     },
 )
-"""Bad cameras, and what may be before one, through which any stream of pictures may be seen."""
+"""Bad cameras, what may be before one, and other sides, for any stream of pictures."""
 
 _WORD: Final = re.compile(r"(?:(?P<camera>\w+):)?(?P<kind>[\w.-]+?)(?:#(?P<apart>\d+))?")
 
@@ -151,6 +152,11 @@ class Showing:
     def name(self) -> str:
         """What it shows, wherever it begins: `flicker:pendulum`."""
         return f"{self.camera}:{self.kind}" if self.camera else self.kind
+
+    @property
+    def sided(self) -> bool:
+        """Whether a good camera sees it, from whatever side."""
+        return self.camera in ("", *cameras.SIDES)
 
     @property
     def learnable(self) -> bool:

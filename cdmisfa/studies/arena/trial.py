@@ -6,6 +6,7 @@ That is which streams it learned, what it learned in vain, and what that tells o
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -98,6 +99,8 @@ class Course:
         saved: the modules, in order.
         watched: of every block, the frame at which it begins and its stream.
         given_up: blocks of each stream that was given up, watched until it first was.
+        decided: whenever a stream was learned or known: frames seen by then, the stream, and the
+            index of the module that gives it.
         frames: how many were seen.
         ended: why the learner ended by itself, a key of `ENDINGS`; "" where it did not, None
             where it was not asked.
@@ -106,6 +109,7 @@ class Course:
     saved: Sequence[SavedModule]
     watched: Sequence[tuple[int, int]]
     given_up: Mapping[int, int]
+    decided: Sequence[tuple[int, int, int]]
     frames: int
     ended: str | None
 
@@ -132,7 +136,7 @@ def run_learner(learner: Learner, source: ArenaSource, streams: ArenaSet) -> Cou
     saved: list[SavedModule] = []
     watched: list[tuple[int, int]] = []
     given_up: dict[int, int] = {}
-    names = [f"stream {name} is given up" for name in streams.words]
+    decided: list[tuple[int, int, int]] = []
     visits = np.zeros(len(streams.words), dtype=int)
     ended = ""
     while source.t < streams.frames:
@@ -143,14 +147,19 @@ def run_learner(learner: Learner, source: ArenaSource, streams: ArenaSet) -> Cou
         watched.append((block.t, block.stream))
         visits[block.stream] += 1
         # Told by its event: the state is not kept where all that was given up is looked at again.
-        if any(text.startswith(names[block.stream]) for text in learner.events):
-            given_up.setdefault(block.stream, int(visits[block.stream]))
+        name = f"stream {streams.words[block.stream]} "
+        if told := [text for text in learner.events if text.startswith(name)]:
+            if told[0].startswith(f"{name}is given up"):
+                given_up.setdefault(block.stream, int(visits[block.stream]))
+            row = learner.summary().get("streams", {block.stream: {}})[block.stream]
+            if row.get("state") in ("learned", "known"):
+                decided.append((source.t, block.stream, row["module"] - 1))
         shown = source.shown(block.stream, source.t - 1)
         about = block.stream, shown.name, shown.learnable, source.t, len(watched)
         saved += [SavedModule(module, *about) for module in learner.modules[len(saved) :]]
         if learner.stream != block.stream:
             source.seek(source.t + streams.switch_cost)
-    return Course(saved, watched, given_up, source.t, None if streams.goes_on else ended)
+    return Course(saved, watched, given_up, decided, source.t, None if streams.goes_on else ended)
 
 
 def slowest_output(module: Module, frames: NDArray[Any]) -> tuple[FloatArray, float]:
@@ -196,6 +205,7 @@ class Judge:
             "doubles": sum(self._double(k) for k in range(len(course.saved))),
             "in_vain": self._in_vain(),
             "told": self._told(),
+            "pairs": self._pairs(),
             "probes": self._probes(),
         }
 
@@ -225,6 +235,24 @@ class Judge:
         never = [not any(s.learnable for s in phases) for phases in self._source.phases]
         names = self._source.spec.streams
         return {names[s]: blocks for s, blocks in self._course.given_up.items() if never[s]}
+
+    def _pairs(self) -> dict[str, list[bool]]:
+        """Whether one module gives both, of pairs of streams that show one world or others.
+
+        One world is seen from two sides; of others every pair counts, whatever sees them.
+        """
+        by = {stream: module for _, stream, module in self._course.decided}
+        found: dict[str, list[bool]] = {"one": [], "others": []}
+        steady = [(s, p[0]) for s, p in enumerate(self._source.phases) if len(p) == 1]
+        for (a, this), (b, that) in itertools.combinations(steady, 2):
+            merged = a in by and by[a] == by.get(b)
+            if not (this.learnable and that.learnable):
+                continue
+            if this.kind != that.kind:
+                found["others"].append(merged)
+            elif this.sided and that.sided and this.camera != that.camera:
+                found["one"].append(merged)
+        return found
 
     def _output(self, k: int, signal: str, part: Part = FOLLOWING) -> tuple[FloatArray, float]:
         """Module k's first output on a part of a signal's frames, and its slowness."""
@@ -290,12 +318,15 @@ class Judge:
                     "signal": showing.name,
                     "fitted": self._learned(showing.name, FITTED) is not None,
                 }
-                when: dict[str, Any] = dict.fromkeys(("frame", "block", "watched"))
+                when: dict[str, Any] = dict.fromkeys(("frame", "block", "watched", "known"))
                 if module is not None:
-                    frame = max(begins, module.frame)
+                    by = module.module.index - 1
+                    said = (t for t, *what in self._course.decided if what == [stream, by])
+                    frame = next((t for t in said if t > begins), max(begins, module.frame))
                     until = [(t, s) for t, s in self._course.watched if t < frame]
                     of_it = sum(s == stream and t >= begins for t, s in until)
                     when = {"frame": frame, "block": len(until), "watched": of_it}
+                    when["known"] = module.signal != showing.name
                 found.append(target | when)
         return found
 
