@@ -15,6 +15,7 @@ import pytest
 from benchmarks import (
     converting,
     cutting,
+    estimators,
     foreign,
     history,
     iteration,
@@ -58,6 +59,14 @@ def test_long_recordings_take_no_more_memory(tmp_path: Path, work: str) -> None:
         path = long_recordings.write_long(tmp_path / str(size), size * long_recordings.MEGABYTE)
         peaks.append(long_recordings.measured(work, path)[1])
     assert peaks[1] < peaks[0] + 25
+
+
+def test_estimators(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimators, "CASES", ((2000, 8),))
+    estimators.main(quick=True)
+    table = json.loads((results / "estimators.json").read_text())["tables"][0]
+    slowest = {row[1]: float(row[-1]) for row in table["rows"]}
+    assert slowest["RecursiveSFA"] < slowest["IncrementalPCA"]
 
 
 def test_learn(tmp_path: Path) -> None:
