@@ -145,6 +145,11 @@ class Module(Shown):
         shaped = array.shape[1:] in (own, (prod(own),)) or array.shape == own
         bounded = self.recipe.size is None and self.recipe.range is not None
         if shaped and (array.dtype == UINT8 or array.dtype.kind == "f") and not bounded:
+            if self.recipe.size and array.dtype.kind == "f" and (array > 1).any():
+                raise UsageError(
+                    f"frames of {array.dtype} hold {array.max():g}: scale them to 0 to 1, or give "
+                    "uint8"
+                )
             return array
         return self.recipe.frames(array if array.dtype.kind in "biuf" else given)
 

@@ -13,8 +13,9 @@ from conftest import Cdmisfa
 from mcap.writer import Writer
 from PIL import Image
 
-from cdmisfa import Module, Recipe, Run, make_frame
+from cdmisfa import ArraySource, Module, Recipe, Recording, Run, make_frame
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.experiments.run_folder import with_recipes
 from recorder.images.options import Depth, Fit
 from replay.camera_logs.source import ForeignSource
 from replay.runs.modules import load_modules, save_modules
@@ -81,6 +82,8 @@ def test_a_raw_picture_becomes_the_frame_that_the_log_shows(
     for given in (pictures, list(pictures)):
         np.testing.assert_array_equal(module.transform(given), module.transform(frames))
     np.testing.assert_array_equal(make_frame(pictures[0], recipe), frames[0])
+    if dtype == "u1":
+        np.testing.assert_array_equal(make_frame(pictures[0].astype(int), recipe), frames[0])
 
 
 def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
@@ -122,6 +125,14 @@ def test_a_recording_of_a_log_keeps_its_recipe(cdmisfa: Cdmisfa, tmp_path: Path)
     assert {one.recipe for one in module} <= {recipe}
 
 
+def test_frames_that_are_the_pictures_say_their_size() -> None:
+    shown = ArraySource({"a": np.zeros((40, 9, 12), np.uint8)})
+    module = module_of(None, (9, 12))
+    for source in (Recording(np.zeros((40, 9, 12))).source(), shown):
+        (own,) = with_recipes([module], source, source.describe())
+        assert own.recipe == Recipe((9, 12), raw=(9, 12))
+
+
 def test_a_jpeg_is_turned_as_its_exif_says(tmp_path: Path) -> None:
     picture = of_type("u1", 20, 30)[0]
     exif = Image.Exif()
@@ -139,6 +150,11 @@ def test_a_jpeg_is_turned_as_its_exif_says(tmp_path: Path) -> None:
         (Recipe((8, 16)), np.zeros((4, 7, 20), np.uint8), "20x7 is smaller than the .* 16x8"),
         (Recipe((8, 16), raw=(20, 40)), np.zeros((4, 40, 20), np.uint8), "20x40 .* 40x20: turn it"),
         (Recipe((8, 16)), np.full((4, 20, 40), 1.5), "pictures of float64 .*: give .n, height"),
+        (
+            Recipe((8, 16)),
+            np.full((4, 8, 16), 200.0),
+            "hold 200: scale them to 0 to 1, or give uint8",
+        ),
         (Recipe((8, 16)), np.zeros((4, 20, 40, 2), np.uint8), r"uint8 \(20, 40, 2\) given"),
         (Recipe((8, 16)), np.zeros((20, 40), np.uint8), r"pictures of uint8 \(40,\) given"),
         (Recipe((8, 16)), [b"nothing"], "a picture cannot be taken: .* broken"),

@@ -125,8 +125,10 @@ def with_recipes(
         from replay.camera_logs.source import ForeignSource
 
         own = Recipe.of(described, source.spec.frame_shape, stream)
+        raw: Any = () if "size" in described else own.size or ()  # frames are the pictures
         if isinstance(source, ForeignSource | ArrayLog):
-            own = replace(own, raw=getattr(source.framings[stream], "first", ()))
+            raw = getattr(source.framings[stream], "first", ())
+        own = replace(own, raw=raw)
         stated = source.pixels(stream) if isinstance(source, ForeignSource) else ""
         return replace(own, pixels=stated) if stated.startswith("bayer_") else own
 

@@ -24,7 +24,8 @@ _DISTANCES = {"u2": "16UC1", "f4": "32FC1", "f8": "32FC1"}
 
 _PICTURES = (
     "give (n, height, width) of uint8 or uint16, (n, height, width, 3) or 4 of uint8, or these of "
-    "bool or floats of 0 to 1, or a list of such pictures, or of the bytes of JPEG or PNG files"
+    "bool, floats of 0 to 1, integers of 0 to 255, or a list of such pictures, or of the bytes of "
+    "JPEG or PNG files"
 )
 
 
@@ -179,13 +180,17 @@ def make_frame(picture: Any, recipe: Recipe) -> Shown:
 def pixels_of(pictures: NDArray[Any]) -> NDArray[Any]:
     """Pictures as uint8 or uint16: truth as 0 and 255, floats of 0 to 1 as round(255 x).
 
-    Others stay as they are.
+    Whole numbers of 0 to 255 stay these, and others as they are.
     """
     if pictures.dtype == np.bool_:
         return np.where(pictures, np.uint8(255), np.uint8(0))
-    if pictures.dtype.kind == "f" and pictures.size and 0 <= pictures.min() <= pictures.max() <= 1:
-        return np.asarray(np.rint(pictures * pictures.dtype.type(255)), np.uint8)
-    return pictures
+    most = {"f": 1, "i": 255, "u": 255}.get(pictures.dtype.kind, 0)
+    plain = pictures.dtype in (np.uint8, np.uint16) or not pictures.size
+    if plain or not most or not 0 <= pictures.min() <= pictures.max() <= most:
+        return pictures
+    if pictures.dtype.kind == "f":
+        pictures = np.rint(pictures * pictures.dtype.type(255))
+    return np.asarray(pictures, np.uint8)
 
 
 def _image(array: NDArray[Any], recipe: Recipe) -> Shown:
