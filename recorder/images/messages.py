@@ -111,6 +111,13 @@ def stated_format(schema: str, encoding: str, data: bytes | memoryview) -> str:
     return "" if opened is None else opened(data).encoding
 
 
+def packed_picture(schema: str, encoding: str, data: bytes | memoryview) -> bytes | None:
+    """The JPEG or PNG in a message of a kind in `PACKED`, None of what is packed otherwise."""
+    found = _IMAGES[schema, encoding](data)
+    plain = isinstance(found, Compressed) and found.encoding not in DISTANCES
+    return bytes(found.data) if plain else None
+
+
 def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
     """The parser of Foxglove's images in protobuf, which need no definition; None of others."""
     for kind in (RawImage, CompressedImage, CompressedVideo):
@@ -245,6 +252,9 @@ _IMAGES: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Pixels | 
     ("sensor_msgs/CompressedImage", "ros1"): partial(_ros_compressed, ros1=True),
 }
 """What messages say that hold images, which may be distances."""
+
+PACKED: Final = frozenset(kind for kind in _IMAGES if "Compressed" in kind[0])
+"""Kinds of messages that hold a JPEG or PNG, which takes long to decode."""
 
 _VIDEOS: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Packet]]] = {
     ("foxglove.CompressedVideo", "protobuf"): _foxglove(_protobuf, CompressedVideo),

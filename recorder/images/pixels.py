@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, BinaryIO, Final
 
 import numpy as np
@@ -46,6 +47,9 @@ _BAYER: Final[Mapping[str, str]] = {
 DISTANCES: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
 """Formats of distances: their numbers, and how many metres one is (REP 118)."""
 
+AT_ONCE: Final = 4_000_000
+"""Most pixels of an image that is decoded beside others, without a limit to the memory it takes."""
+
 _BAND: Final = 1 << 20
 """Pixels that are converted at a time: what is between takes several bytes each."""
 
@@ -60,6 +64,30 @@ _TURNS: Final = (
     *("ROTATE_270", "TRANSVERSE", "ROTATE_90"),
 )
 """What puts an image upright, by its orientation from 2 on; 1 is."""
+
+
+class _Strict:
+    """Makes warnings errors while any thread is within, for their filters are of all threads."""
+
+    def __init__(self) -> None:
+        self._lock, self._within = threading.Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._within:
+                self._before = warnings.catch_warnings()
+                self._before.__enter__()
+                warnings.simplefilter("error")
+            self._within += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._within -= 1
+            if not self._within:
+                self._before.__exit__(None, None, None)
+
+
+_STRICT: Final = _Strict()
 
 
 class UnknownPixels(MalformedImage):
@@ -203,17 +231,18 @@ def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) 
     return np.asarray(small, np.uint8)
 
 
-def compressed_image(data: bytes, *, color: bool = False) -> ByteArray:
+def compressed_image(data: bytes, *, color: bool = False, most: int = MAX_PIXELS) -> ByteArray:
     """The image in a JPEG or PNG, gray, (height, width) uint8.
 
     Args:
         data: the file.
         color: give what has colours as they are, (height, width, 3) red, green and blue.
+        most: its pixels at most; no more than `AT_ONCE` in several threads at once.
 
     Raises:
         MalformedImage: it is neither, broken, or too large.
     """
-    with _opened(data) as image:
+    with _opened(data, most) as image:
         if image.mode in _WORDS:
             words = np.asarray(image)
             return _by_bands(words, lambda part: (part.astype(np.int64) >> 8).clip(0, 255))
@@ -235,14 +264,13 @@ def compressed_words(data: bytes) -> NDArray[np.uint16]:
 
 
 @contextmanager
-def _opened(data: bytes) -> Iterator[Image.Image]:
+def _opened(data: bytes, most: int = MAX_PIXELS) -> Iterator[Image.Image]:
     """Decode a JPEG or PNG, turned upright."""
     limit = f"more than {BUDGET >> 20} MiB of memory, the limit"
     try:
-        with budget(), warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with nullcontext() if most <= AT_ONCE else budget(), _STRICT:
             file = open_picture(data)
-            if not 0 < file.width * file.height <= MAX_PIXELS:
+            if not 0 < file.width * file.height <= most:
                 raise MalformedImage(f"an image of {file.width}x{file.height} is not read")
             # Of a progressive JPEG all coefficients are held until its end.
             held = file.width * file.height * (2 * len(file.getbands()) + 4)

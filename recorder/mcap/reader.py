@@ -271,7 +271,7 @@ class LogReader:
         Raises:
             LogDamagedError: it is damaged, without `salvage`.
         """
-        if segment.offset in self._failed:
+        if self.salvage and segment.offset in self._failed:
             return None
         try:
             return self._chunks.table(segment)

@@ -103,7 +103,7 @@ class BagImages(MessageImages):
     """
 
     def __init__(self, path: Path, topic: str | None, *, reading: Reading = IMAGES) -> None:
-        self.path = path
+        self.path, self.color = path, reading.color
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
         self._messages: Iterator[tuple[Any, int, bytes]] = iter(())

@@ -74,7 +74,7 @@ class McapImages(MessageImages):
         reading: Reading = IMAGES,
         readers: Readers | None = None,
     ) -> None:
-        self.path = path
+        self.path, self.color = path, reading.color
         self._own: tuple[int, NDArray[np.intp]] = -1, np.empty(0, np.intp)
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields

@@ -9,6 +9,7 @@ import contextlib
 import re
 from array import array
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +18,7 @@ import numpy as np
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, data_bytes, opened_regular, read_regular
 from recorder.images.options import VIDEO_RECIPE, Size
 from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
@@ -25,7 +26,7 @@ from recorder.images.videos import frame_colors, frame_gray, pyav
 from recorder.images.whole import MalformedImage, check_png
 from recorder.mcap.records import MalformedRecord, Problem
 from replay.camera_logs.containers import extent_of
-from replay.camera_logs.stream import ImageStream, UnreadableError, explained, sorted_times
+from replay.camera_logs.stream import Begun, ImageStream, UnreadableError, explained, sorted_times
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
 
@@ -49,6 +50,7 @@ class FolderImages(ImageStream):
 
     def __init__(self, path: Path, topic: str | None, *, color: bool = False) -> None:
         self.path, self._color = path, color
+        self._begun = Begun()
         self.topic = path.resolve().name
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a folder of pictures has no topics, leave {topic} out")
@@ -66,7 +68,14 @@ class FolderImages(ImageStream):
     def count(self) -> int:
         return len(self._files)
 
+    def begin(self, row: int, threads: Executor) -> None:
+        with contextlib.suppress(CdmisfaError):
+            data = read_regular(self._files[row], MAX_PICTURE)
+            self._begun.begin(row, threads, data, color=self._color)
+
     def image(self, row: int) -> ByteArray:
+        if (shown := self._begun.pop(row)) is not None:
+            return shown
         try:
             data = read_regular(self._files[row], MAX_PICTURE)
         except UsageError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -71,6 +72,10 @@ class Selected(ImageStream):
     def image(self, row: int) -> Shown:
         stream, own = self._at(row)
         return stream.image(own)
+
+    def begin(self, row: int, threads: Executor) -> None:
+        stream, own = self._at(row)
+        stream.begin(own, threads)
 
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
         stream, own = self._at(row)

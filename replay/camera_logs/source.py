@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ from replay.camera_logs.selected import (
     join_parts,
     names_of,
 )
-from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.stream import CORES, ImageStream, decoding_ahead
 from replay.storage.identity import Identity, LoggedSource
 from replay.storage.location import Location, Url
 from replay.stored import Span, outside
@@ -111,7 +112,7 @@ class ForeignSource(LoggedSource):
         self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
         self._streams: list[ImageStream] = []
-        self._readers = Readers()
+        self._readers, self._threads = Readers(), ThreadPoolExecutor(CORES)
         self.changes: dict[int, str] = {}
         self._shown: dict[int, tuple[int, Shown]] = {}
         try:
@@ -272,13 +273,15 @@ class ForeignSource(LoggedSource):
         for stream in self._streams:
             stream.close()
         self._readers.close()
+        self._threads.shutdown()
 
     def _block(self, stream: int, t: int, n: int) -> Block:
         """The frames of a stream; an image smaller than a frame is a UsageError."""
         frames = np.empty((n, *self._spec.frame_shape), self._spec.dtype)
-        rows = self._rows[stream]
-        for i in range(n):
-            frames[i] = self._frame(stream, int(rows[(t + i) % self._count]))
+        rows = self._rows[stream][np.arange(t, t + n) % self._count].tolist()
+        images, shown = self._streams[stream], self._shown.get(stream, (-1,))[0]
+        for i, row in enumerate(decoding_ahead(images, rows, shown, self._threads)):
+            frames[i] = self._frame(stream, row)
         return Block(stream, t, freeze(frames), freeze(np.empty((n, 0))))
 
     def _name(self) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Final, TypeVar
@@ -12,12 +15,13 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
-from recorder.images.messages import SCHEMAS, Decoder, stated_format
+from recorder.images.messages import PACKED, SCHEMAS, Decoder, packed_picture, stated_format
 from recorder.images.options import RECIPE, Reading, Size
-from recorder.images.pixels import Shown
+from recorder.images.pixels import AT_ONCE, Shown, compressed_image
 from recorder.log.messages import VECTOR_SCHEMA
 from replay.storage.location import Location
 
@@ -25,6 +29,9 @@ from replay.storage.location import Location
 class UnreadableError(LogDamagedError):
     """A library cannot read a file."""
 
+
+CORES: Final = os.cpu_count() or 1
+"""Images of a stream that are decoded at once."""
 
 LAST_NS: Final = 2**62
 """Log times from here on are beyond any clock, in nanoseconds."""
@@ -108,6 +115,9 @@ class ImageStream(ABC):
             LogDamagedError: the log is damaged there.
         """
 
+    def begin(self, row: int, threads: Executor) -> None:  # noqa: B027 - some cannot be ahead
+        """Begin to decode an image that is asked for soon; what is wrong with it shows then."""
+
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
         """Apply a function to the bytes of a message; raises as `image`."""
         raise NotImplementedError
@@ -140,21 +150,53 @@ class ImageStream(ABC):
         """Let go of the files; harmless when called twice."""
 
 
+class Begun:
+    """Pictures that are decoded in threads before they are asked for."""
+
+    def __init__(self) -> None:
+        self._coming: dict[int, Future[ByteArray]] = {}
+
+    def begin(self, row: int, threads: Executor, data: bytes, *, color: bool) -> None:
+        """Begin to decode the picture of a row, a JPEG or PNG."""
+        decode = partial(compressed_image, color=color, most=AT_ONCE)
+        self._coming[row] = threads.submit(decode, data)
+
+    def pop(self, row: int) -> ByteArray | None:
+        """The picture of a row; None where it was not begun, or who asks shall see why not."""
+        coming = self._coming.pop(row, None)
+        return None if coming is None or coming.exception() is not None else coming.result()
+
+
 class MessageImages(ImageStream):
     """The images, or the numbers, in the messages on one topic of a log.
 
     Attributes:
         kind: of the messages.
+        color: whether colours are taken as they are.
     """
 
     kind: MessageKind
+    color: bool
     decode: Decoder
 
     @abstractmethod
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found: ...
 
     def image(self, row: int) -> Shown:
-        return self.taken(row, self.decode)
+        shown = self._begun.pop(row)
+        return self.taken(row, self.decode) if shown is None else shown
+
+    def begin(self, row: int, threads: Executor) -> None:
+        kind = self.kind.schema, self.kind.encoding
+        if kind not in PACKED or self.fields:
+            return
+        with suppress(CdmisfaError):
+            if (data := self.taken(row, partial(packed_picture, *kind))) is not None:
+                self._begun.begin(row, threads, data, color=self.color)
+
+    @cached_property
+    def _begun(self) -> Begun:
+        return Begun()
 
     def pixels(self) -> str | None:
         return self.taken(0, partial(stated_format, self.kind.schema, self.kind.encoding))
@@ -169,6 +211,30 @@ class MessageImages(ImageStream):
     @cached_property
     def _stamp(self) -> Stamp | None:
         return stamp_of(self.kind)
+
+
+def decoding_ahead(
+    images: ImageStream, rows: Sequence[int], shown: int, threads: Executor
+) -> Iterator[int]:
+    """Rows in their order, of which the next are decoded in threads meanwhile.
+
+    No more than two images a processor are held; with one processor none is begun.
+
+    Args:
+        images: the stream.
+        rows: of it.
+        shown: the row that is decoded already.
+        threads: as many as there are processors.
+    """
+    coming = iter([row for row in dict.fromkeys(rows) if row != shown] if CORES > 1 else ())
+    count = 2 * CORES
+    for row in rows:
+        if row != shown:
+            for one in itertools.islice(coming, count):
+                images.begin(one, threads)
+            count = 1
+        yield row
+        shown = row
 
 
 def choose_images(
