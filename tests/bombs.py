@@ -15,9 +15,10 @@ import mcap_files as files
 import numpy as np
 import zstandard
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from mcap.writer import CompressionType, IndexType, Writer
+from message_files import every, write_mcap
 from PIL import Image
 
+from recorder.images.decoding import MessageKind
 from recorder.mcap.records import MAX_CHUNK
 
 Writing = Callable[[Path], Path]
@@ -51,7 +52,9 @@ INSERT INTO topics VALUES(1, '/cam', 'sensor_msgs/msg/Image', 'cdr', '');
 
 
 IMAGE = struct.pack("<H", 1) + files.text("foxglove.RawImage") + files.text("protobuf") + bytes(4)
-"""The schema of raw images."""
+CHANNEL = struct.pack("<HH", 1, 1) + files.text("/cam") + files.text("protobuf") + files.texts({})
+CAM = files.record(files.SCHEMA, IMAGE) + files.record(files.CHANNEL, CHANNEL)
+"""A topic of raw images, and its schema."""
 
 
 def zeros(mebibytes: int) -> bytes:
@@ -121,21 +124,6 @@ def png_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
 
 
-def picture(folder: Path) -> Path:
-    """A PNG of 60,000x60,000."""
-    (folder / "pictures").mkdir()
-    (folder / "pictures" / "0.png").write_bytes(png(60_000))
-    return folder / "pictures"
-
-
-def progressive(folder: Path) -> Path:
-    """A JPEG whose coefficients are all held until its end."""
-    (folder / "pictures").mkdir()
-    image = Image.new("CMYK", (9000, 4000), 3)
-    image.save(folder / "pictures" / "0.jpg", progressive=True)
-    return folder / "pictures"
-
-
 def a_picture(name: str, data: Callable[[], bytes]) -> Writing:
     """A folder of one picture."""
 
@@ -145,6 +133,11 @@ def a_picture(name: str, data: Callable[[], bytes]) -> Writing:
         return folder / "pictures"
 
     return write
+
+
+def progressive() -> bytes:
+    """A JPEG whose coefficients are all held until its end."""
+    return packed(Image.new("CMYK", (9000, 4000), 3), "JPEG", progressive=True)
 
 
 def says_large() -> bytes:
@@ -178,11 +171,8 @@ def chunk(compression: str, size: int, stored: bytes) -> Writing:
     """An MCAP log of a chunk that says how long it is, and may hold more."""
 
     def write(folder: Path) -> Path:
-        beginning = files.MAGIC + files.header() + files.record(files.SCHEMA, IMAGE)
-        channel = struct.pack("<HH", 1, 1) + files.text("/cam") + files.text("protobuf")
-        beginning += files.record(files.CHANNEL, channel + files.texts({}))
         body = files.chunk(b"", 5, 5, compression=compression, size=size, stored=stored, crc=False)
-        (folder / "a.mcap").write_bytes(files.finish(beginning + body))
+        (folder / "a.mcap").write_bytes(files.finish(files.MAGIC + files.header() + CAM + body))
         return folder / "a.mcap"
 
     return write
@@ -208,10 +198,7 @@ def text_of_a_table(folder: Path) -> Path:
 
 def messages_of_a_chunk(folder: Path) -> Path:
     """An MCAP log of 1,100,000 empty messages in one chunk."""
-    channel = struct.pack("<HH", 1, 1) + files.text("/cam") + files.text("protobuf")
-    body = files.record(files.SCHEMA, IMAGE)
-    body += files.record(files.CHANNEL, channel + files.texts({}))
-    body += files.record(files.MESSAGE, files.message(1, 0, 5, 5, b"")) * 1_100_000
+    body = CAM + files.record(files.MESSAGE, files.message(1, 0, 5, 5, b"")) * 1_100_000
     log = files.MAGIC + files.header() + files.chunk(body, 5, 5, compression="zstd")
     (folder / "a.mcap").write_bytes(files.finish(log))
     return folder / "a.mcap"
@@ -219,21 +206,8 @@ def messages_of_a_chunk(folder: Path) -> Path:
 
 def log(schema: str, encoding: str, payloads: Iterable[bytes]) -> Writing:
     """An MCAP log of messages, a chunk each or more."""
-
-    def write(folder: Path) -> Path:
-        with (folder / "a.mcap").open("wb") as file:
-            writer = Writer(
-                file, chunk_size=1, compression=CompressionType.ZSTD, index_types=IndexType.NONE
-            )
-            writer.start()
-            kind = writer.register_schema(schema, "protobuf", b"")
-            topic = writer.register_channel("/cam", encoding, kind)
-            for payload in payloads:
-                writer.add_message(topic, 5, payload, 5)
-            writer.finish()
-        return folder / "a.mcap"
-
-    return write
+    kind = MessageKind(schema, encoding, b"", "protobuf")
+    return lambda folder: write_mcap(folder / "a.mcap", kind, {"/cam": every(1, payloads)})
 
 
 def picture_message(side: int) -> bytes:
@@ -343,12 +317,12 @@ CAMERAS: dict[str, Writing] = {
     "packed .db3": packed_file,
     "chunk of .bag": ros1_chunks(160_000_000),
     "packed chunk of .bag": ros1_chunks(160_000_000, "BZ2"),
-    "PNG": picture,
+    "PNG": a_picture("0.png", lambda: png(60_000)),
     "PNG in a message": log("foxglove.CompressedImage", "protobuf", [picture_message(60_000)]),
     "PNG's profile": a_picture("0.png", profile),
     "JPEG's size": a_picture("0.jpg", says_large),
     "JPEG's scans": a_picture("0.jpg", scans),
-    "progressive JPEG": progressive,
+    "progressive JPEG": a_picture("0.jpg", progressive),
     "video's index": endless_index,
     "video's frames": huge_frames,
     "video's pictures": huge_pictures,
