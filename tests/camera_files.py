@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from mcap.writer import Writer
+from message_files import write_mcap
 from PIL import Image
 
 from recorder.images.decoding import MessageKind
 
 HEIGHT, WIDTH = 12, 16
 START_MS = 1000
-RAW = MessageKind("foxglove.RawImage", "protobuf")
+RAW = MessageKind("foxglove.RawImage", "protobuf", language="protobuf")
 PACKED = MessageKind("foxglove.CompressedImage", "protobuf")
 
 
@@ -66,18 +66,11 @@ def write_images(
     **options: bool,
 ) -> Path:
     """A log of foxglove.RawImage: on each topic milliseconds and images; by time."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4096, **options)
-        writer.start(profile)
-        schema = writer.register_schema(RAW.schema, RAW.encoding, b"")
-        messages = []
-        for topic, images in topics.items():
-            channel = writer.register_channel(topic, RAW.encoding, schema)
-            messages += [(ms * 1_000_000, channel, raw(image)) for ms, image in images]
-        for time, channel, data in sorted(messages):
-            writer.add_message(channel, time, data, time)
-        writer.finish()
-    return path
+    messages = {
+        topic: [(ms * 1_000_000, raw(image)) for ms, image in images]
+        for topic, images in topics.items()
+    }
+    return write_mcap(path, RAW, messages, by_time=True, profile=profile, **options)
 
 
 def write_pictures(folder: Path, count: int) -> list[int]:

@@ -23,17 +23,26 @@ def every(step: int, messages: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
 
 
 def write_mcap(
-    path: Path, kind: MessageKind, topics: Mapping[str, Iterable[tuple[int, bytes]]]
+    path: Path,
+    kind: MessageKind,
+    topics: Mapping[str, Iterable[tuple[int, bytes]]],
+    *,
+    by_time: bool = False,
+    profile: str = "",
+    **options: Any,
 ) -> Path:
-    """A log of messages of a kind: each topic with log times and messages, one behind the other."""
+    """A log of messages of a kind: each topic with log times and messages.
+
+    One topic stands behind the other, or all messages stand in the order of their times.
+    """
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4096)
-        writer.start()
+        writer = Writer(file, **{"chunk_size": 4096, **options})
+        writer.start(profile)
         schema = writer.register_schema(kind.schema, kind.language, kind.definition)
-        for topic, messages in topics.items():
-            channel = writer.register_channel(topic, kind.encoding, schema)
-            for time, message in messages:
-                writer.add_message(channel, time, message, time)
+        numbers = {name: writer.register_channel(name, kind.encoding, schema) for name in topics}
+        each = ((time, numbers[name], data) for name in topics for time, data in topics[name])
+        for time, channel, data in sorted(each) if by_time else each:
+            writer.add_message(channel, time, data, time)
         writer.finish()
     return path
 

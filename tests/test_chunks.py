@@ -13,13 +13,15 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
+from message_files import write_mcap
 from reference import frames as reference
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels import frames as kernels
 from recorder.config import RecordConfig
+from recorder.images.decoding import MessageKind
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from recorder.mcap.chunks import decompressed
@@ -184,13 +186,8 @@ def test_chunks_that_are_held_stay_as_they_are_while_others_are_decoded(
     path = tmp_path / "log.mcap"
     random = np.random.default_rng(1)
     payloads = [random.integers(0, 9, 3000, np.uint8).tobytes() for _ in range(60)]
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=8192, compression=compression)
-        writer.start()
-        channel = writer.register_channel("a", "b", 0)
-        for i, payload in enumerate(payloads):
-            writer.add_message(channel, i, payload, i)
-        writer.finish()
+    kind, how = MessageKind("", "b"), {"chunk_size": 8192, "compression": compression}
+    write_mcap(path, kind, {"a": enumerate(payloads)}, **how)
     with LogReader(path) as reader:
         held = [table for _, table in reader.tables()]
         assert len(held) == 20

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from message_files import write_mcap
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SeekableSource, description
@@ -22,6 +23,7 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
+from recorder.images.decoding import MessageKind
 from recorder.mcap.reader import LogReader
 from replay.camera_logs.opening import identity_of
 from replay.camera_logs.source import ForeignSource
@@ -160,18 +162,14 @@ def test_a_sample_reaches_from_the_first_bytes_to_the_last(size: int) -> None:
 
 
 def test_a_log_without_checksums_is_told_from_one_with_the_same_index(tmp_path: Path) -> None:
-    from mcap.writer import CompressionType, Writer
+    from mcap.writer import CompressionType
 
     known = []
     for value in range(2):
         data = np.random.default_rng(value).integers(0, 256, 3000, np.uint8).tobytes()
-        with (tmp_path / f"{value}.mcap").open("wb") as file:
-            writer = Writer(file, compression=CompressionType.NONE, enable_data_crcs=False)
-            writer.start()
-            channel = writer.register_channel("t", "raw", 0)
-            writer.add_message(channel, 0, data, 0)
-            writer.finish()  # type: ignore[no-untyped-call]
-        with LogReader(tmp_path / f"{value}.mcap") as reader:
+        how = {"compression": CompressionType.NONE, "enable_data_crcs": False}
+        path, kind = tmp_path / f"{value}.mcap", MessageKind("", "raw")
+        with LogReader(write_mcap(path, kind, {"t": [(0, data)]}, **how)) as reader:
             known.append(log_identity(reader).sample())
     assert known[0]["bytes"] == known[1]["bytes"]
     assert known[0]["sample_sha256"] != known[1]["sample_sha256"]

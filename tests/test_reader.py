@@ -14,9 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
+from message_files import write_mcap
 
 from cdmisfa.core.errors import LogDamagedError
+from recorder.images.decoding import MessageKind
 from recorder.mcap.reader import LogReader
 
 
@@ -169,14 +171,8 @@ def test_a_growing_file_is_followed(tmp_path: Path) -> None:
 
 def test_a_long_file_is_read_in_little_memory(tmp_path: Path) -> None:
     path = tmp_path / "long.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start()
-        channel = writer.register_channel("/a", "raw", 0)
-        block = bytes(500_000)
-        for i in range(400):
-            writer.add_message(channel, i, block, i, i)
-        writer.finish()
+    messages = enumerate([bytes(500_000)] * 400)
+    write_mcap(path, MessageKind("", "raw"), {"/a": messages}, chunk_size=1 << 20)
     with LogReader(path) as reader:
         tracemalloc.start()
         assert sum(len(m.data) for m in reader.messages()) == 200_000_000

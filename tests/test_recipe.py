@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from camera_files import RAW, encoded, raw
 from conftest import Cdmisfa
-from mcap.writer import Writer
+from message_files import write_mcap
 from PIL import Image
 
 from cdmisfa import ArraySource, Module, Recipe, Recording, Run, make_frame
@@ -31,17 +31,8 @@ def of_type(dtype: str, *shape: int) -> Any:
 
 def logged(path: Path, pictures: Any, encoding: str) -> Path:
     """A log of pictures, 25 a second."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel(
-            "/cam", RAW.encoding, writer.register_schema(RAW.schema, RAW.encoding, b"")
-        )
-        for i, picture in enumerate(pictures):
-            at = (1 + i) * 40_000_000
-            writer.add_message(channel, at, raw(picture, encoding), at)
-        writer.finish()
-    return path
+    messages = ((i * 40_000_000, raw(p, encoding)) for i, p in enumerate(pictures, start=1))
+    return write_mcap(path, RAW, {"/cam": messages})
 
 
 def module_of(recipe: Recipe | None, shape: tuple[int, ...]) -> Module:
