@@ -134,7 +134,10 @@ def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):
         assert all(entity in found for entity in view.contents if isinstance(view.contents, list))
     name = tmp_path.name
     own = [s.iteration for s in written if s.stream == 1]
-    assert found[f"/compare/1_{name}/learning_error_of/2_x2"]["iteration"] == own
+    curve = found[f"/compare/1_{name}/learning_error_of/2_x2"]
+    assert own == [0, 2, 9]
+    assert curve["iteration"] == [0, 2, 2, 9, 9]  # it ends where another stream is watched
+    assert np.isnan(scalars(curve)).ravel().tolist() == [False, True, False, True, False]
 
 
 CURVES_LEFT = ("eta", "learning_error", "tested", "epsilon")

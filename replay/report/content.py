@@ -344,7 +344,7 @@ def _events(told: RunTold) -> Iterator[dict[str, str]]:
             "frame": f"{event.t:,}",
             "text": event.text,
             "kind": "bad" if event.level in ("WARNING", "ERROR", "FATAL") else "",
-            "view": _look(told, str(event.t)),
+            "view": _look(told, str(min(event.t, max(told.outline.end - 1, told.start)))),
         }
 
 

@@ -196,9 +196,8 @@ class Plot:
             part += parts * (len(t) + 1)
         x, y, part = self.x(t[known]), self.y(values[known]), part[known]
         y = np.clip(y, 0, self.height)
-        if len(x) > 2 * BINS:
-            kept = _extremes(x, y, part)
-            x, y, part = x[kept], y[kept], part[kept]
+        kept = _extremes(x, y, part)
+        x, y, part = x[kept], y[kept], part[kept]
         found = []
         for piece in np.split(np.arange(len(x)), np.flatnonzero(np.diff(part)) + 1):
             if len(piece) == 1:
@@ -223,7 +222,7 @@ def _extremes(x: FloatArray, y: FloatArray, part: IntArray) -> IntArray:
     """Indices of the least and the greatest y at each place and in each part, in order."""
     place = np.minimum((x * (BINS / WIDE)).astype(np.int64), BINS - 1)
     starts = np.flatnonzero(np.diff(place, prepend=-1) | np.diff(part, prepend=part[:1] - 1))
-    stops = np.append(starts[1:], len(x))
+    stops = np.append(starts, len(x))[1:]
     kept = [
         a + k
         for a, b in zip(starts.tolist(), stops.tolist(), strict=True)

@@ -6,7 +6,6 @@ import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -82,12 +81,12 @@ def _of_modules(told: RunTold) -> Iterator[Fact]:
                 f"{name}: its slowness on new frames is {apart:.2f} times that on frames it "
                 "learned from: it may fit accidents.",
             )
-    for a, b in combinations(told.modules, 2):
-        r = _alike(a, b)
-        if r > ALIKE:
-            one, other = (f"{m.module.index} ({m.module.stream})" for m in (a, b))
-            how = f"|r| = {r:.2f} on the frames of the first"
-            yield Fact("bad", f"Modules {one} and {other} say the same: {how}.")
+    for k, first in enumerate(told.modules):
+        alike = [(m, r) for m in told.modules[k + 1 :] if (r := _alike(first, m)) > ALIKE]
+        if alike:
+            others = ", ".join(f"{m.module.index} ({m.module.stream}) {r:.2f}" for m, r in alike)
+            one = f"{first.module.index} ({first.module.stream})"
+            yield Fact("bad", f"As module {one} says, so on its frames do, by |r|: {others}.")
 
 
 def _accidents(told: RunTold, module: ModuleTold) -> float | None:

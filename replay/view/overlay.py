@@ -146,7 +146,8 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
             frames, iterations = columns.frames[kept], columns.iterations[kept]
             if path not in lines:
                 names, rgbs = [row.name] * values.shape[1], [rgb] * values.shape[1]
-                lines[path] = target.lines(path, names, rgbs)
+                within = columns.tau if entity.startswith(OF_STREAM) else 0
+                lines[path] = target.lines(path, names, rgbs, within=within)
             lines[path].add(frames, iterations, values)
             if fork is not None and entity not in marked and iterations[-1] >= fork:
                 marked.add(entity)
