@@ -1,4 +1,4 @@
-"""What the folder of a recording or a run holds."""
+"""What the folder of a recording or a run holds, and a bit of a file that is wrong."""
 
 from __future__ import annotations
 
@@ -17,3 +17,10 @@ def coverage(recording: Path) -> dict[str, list[tuple[int, int]]]:
     """The stretches of frames that each view has."""
     with RecordedSource(recording) as source:
         return source.coverage()
+
+
+def flip(path: Path, at: int | None = None) -> None:
+    """Change a bit of a file: of a byte of it, by default that in its middle."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 if at is None else at] ^= 1
+    path.write_bytes(data)

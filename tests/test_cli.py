@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa, Outcome
+from folders import flip
 from mcap.reader import make_reader
 from run_data import VECTOR, write_run
 from waiting import started, wait_for
@@ -79,13 +81,11 @@ class TestJson:
         done = cdmisfa("info", killed)
         assert (done.code, "no module" in done.out) == (3, False)
         assert re.search(r"^not ended: \d+ iterations of 100 frames so far", done.out, re.MULTILINE)
-        torn = tmp_path / "x1.mcap"
-        data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())
-        data[len(data) // 2] ^= 0xFF
-        torn.write_bytes(data)
+        torn = Path(shutil.copy(oscillatory_recording / "x1.mcap", tmp_path))
+        flip(torn)
         done = cdmisfa("info", torn)
         assert (done.code, "checksums bad" in done.out) == (3, True)
-        torn.write_bytes(data[: len(data) // 3])
+        os.truncate(torn, torn.stat().st_size // 3)
         assert "None" not in cdmisfa("recover", torn, "-o", tmp_path / "new" / "x1.mcap").out
         assert (tmp_path / "new" / "x1.mcap").is_file()
 
@@ -250,10 +250,8 @@ class TestErrors:
     def test_a_damaged_recording(
         self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
     ) -> None:
-        path = tmp_path / "x1.mcap"
-        data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())
-        data[len(data) // 2] ^= 0xFF
-        path.write_bytes(data)
+        path = Path(shutil.copy(oscillatory_recording / "x1.mcap", tmp_path))
+        flip(path)
         done = cdmisfa("verify", path, "--json")
         assert (done.code, done.json["ok"]) == (3, False)
         assert all({"where", "what"} <= set(problem) for problem in done.json["problems"])

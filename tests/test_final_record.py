@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa
+from folders import flip
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.session import run
@@ -46,13 +47,6 @@ def edit(*keys: str, value: object) -> Callable[[Path], None]:
         (folder / "run.json").write_text(json.dumps(document))
 
     return edited
-
-
-def flip(folder: Path) -> None:
-    path = folder / "modules.npz"
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 4
-    path.write_bytes(data)
 
 
 def copied_log(folder: Path, *, drop: int = -1, final: bool = True) -> None:
@@ -102,7 +96,7 @@ def test_a_view_that_is_missing_comes_back_with_the_command_that_is_named(
         (edit("config", "learner", "nu", value=0.3), "run.json"),
         (edit("result", "signals_sha256", value="0" * 64), "run.json"),
         (edit("result", "iterations", value=3), "run.json"),
-        (flip, "modules.npz"),
+        (lambda folder: flip(folder / "modules.npz"), "modules.npz"),
         (lambda folder: (folder / "run.json").unlink(), "run.json"),
         (lambda folder: (folder / "modules.npz").unlink(), "modules.npz"),
         (lambda folder: (folder / "run.rrd").unlink(), "run.rrd"),

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import flip
 from message_files import write_mcap
 from PIL import Image
 
@@ -80,9 +81,7 @@ def learn(path: Path, out: Path, *sinks: Sink, **how: Any) -> RunResult:
 
 def damage(path: Path) -> None:
     """Change what only the checksum over all of the data protects: the name of what wrote it."""
-    raw = bytearray(path.read_bytes())
-    raw[raw.index(b"cdmisfa ")] ^= 1
-    path.write_bytes(raw)
+    flip(path, path.read_bytes().index(b"cdmisfa "))
 
 
 def test_a_run_begins_with_a_sample_and_ends_with_the_sha256(
@@ -180,9 +179,7 @@ def test_a_killed_run_goes_on_with_its_file_alone(recording: Path, tmp_path: Pat
     with pytest.raises(KilledError):
         learn(recording, tmp_path / "run", Then(killed, 7), keyframes=4)
     other = shutil.copytree(recording, tmp_path / "other")
-    raw = bytearray((other / "x2.mcap").read_bytes())
-    raw[10] ^= 1
-    (other / "x2.mcap").write_bytes(raw)
+    flip(other / "x2.mcap", 10)
     with pytest.raises(UsageError, match=r"source\.views.*sample_sha256"):
         learn(other, tmp_path / "run", resume=True)
     result = learn(recording, tmp_path / "run", resume=True)
@@ -315,8 +312,6 @@ def test_a_view_of_a_killed_run_takes_its_recording_alone(recording: Path, tmp_p
     with pytest.raises(KilledError):
         learn(recording, tmp_path / "run", Then(killed, 7))
     build_view(tmp_path / "run", tmp_path / "v.rrd", all_views=recording)
-    raw = bytearray((recording / "x1.mcap").read_bytes())
-    raw[10] ^= 1
-    (recording / "x1.mcap").write_bytes(raw)
+    flip(recording / "x1.mcap", 10)
     with pytest.raises(UsageError, match="not the recording"):
         build_view(tmp_path / "run", tmp_path / "w.rrd", all_views=recording)

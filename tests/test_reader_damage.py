@@ -12,6 +12,7 @@ from typing import Any
 
 import mcap_files as files
 import pytest
+from folders import flip
 from mcap.writer import CompressionType, IndexType
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -130,12 +131,11 @@ def test_a_file_that_is_not_there_is_a_wrong_path(tmp_path: Path) -> None:
 
 
 def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
-    raw, path = bytearray(KINDS["zstd"]), tmp_path / "log.mcap"
-    path.write_bytes(raw)
+    path = tmp_path / "log.mcap"
+    path.write_bytes(KINDS["zstd"])
     with LogReader(path) as reader:
         bad = reader.segments[1]
-    raw[bad.data_offset + bad.stored // 2] ^= 0xFF
-    path.write_bytes(raw)
+    flip(path, bad.data_offset + bad.stored // 2)
     with pytest.raises(LogDamagedError, match=rf"log time {bad.start} to {bad.end} ns"):
         read_all(path)
     lost = set(range(bad.start, bad.end + 1))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folders import flip
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
@@ -148,11 +149,9 @@ def test_what_does_not_belong_together_is_refused(vectors: Path, pictures: Path)
 
 def damage(path: Path) -> tuple[int, int]:
     """Flip a byte in the third chunk; give its first and last log time."""
-    raw = bytearray(path.read_bytes())
     with LogReader(path) as reader:
         chunk = reader.segments[2]
-    raw[chunk.data_offset + chunk.stored // 2] ^= 4
-    path.write_bytes(raw)
+    flip(path, chunk.data_offset + chunk.stored // 2)
     return chunk.start, chunk.end
 
 

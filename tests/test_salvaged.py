@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, PACKED, RAW, WIDTH, packed, pictures, raw
 from conftest import Cdmisfa
+from folders import flip
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import Writer
 from message_files import START, STEP, every, learned_alike, write_mcap
@@ -141,10 +142,8 @@ def test_what_is_not_read_is_no_damage(tmp_path: Path) -> None:
 
 def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", RAW, {"/cam": every(STEP, map(raw, pictures(40)))})
-    data = bytearray(path.read_bytes())
-    place = data.rfind((START + 3 * STEP).to_bytes(8, "little"))  # in the chunk's message index
-    data[place] ^= 1
-    path.write_bytes(data)
+    time = (START + 3 * STEP).to_bytes(8, "little")
+    flip(path, path.read_bytes().rfind(time))  # in the chunk's message index
     with (
         ForeignSource(path) as source,
         pytest.raises(LogDamagedError, match=r"other messages than the summary names.*--salvage"),
