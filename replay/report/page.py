@@ -40,7 +40,7 @@ def report_of_run(path: Path, proof: Proof | None = None) -> str:
     """
     page = ""
     for frames in DETAIL:
-        page = _rendered(run_content(read_told(path, frames=frames), proof))
+        page = rendered(run_content(read_told(path, frames=frames), proof))
         if len(page.encode()) < MOST_BYTES:
             break
     return page
@@ -64,7 +64,7 @@ def report_of_runs(
         UsageError: one is no run.
         LogDamagedError: one cannot be read.
     """
-    return _rendered(runs_content(paths, title, tables, names))
+    return rendered(runs_content(paths, title, tables, names))
 
 
 def report_of_recording(source: Any, paths: Sequence[Path]) -> str:
@@ -74,10 +74,11 @@ def report_of_recording(source: Any, paths: Sequence[Path]) -> str:
         source: a `StoredSource`, open.
         paths: what it reads.
     """
-    return _rendered(recording_content(source, paths))
+    return rendered(recording_content(source, paths))
 
 
-def _rendered(content: Mapping[str, Any]) -> str:
+def rendered(content: Mapping[str, Any]) -> str:
+    """A page of the template that `kind` names."""
     environment, style, script = _page()
     template = environment.get_template("page.html")
     policy = (

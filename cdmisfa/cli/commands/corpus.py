@@ -1,4 +1,4 @@
-"""Commands on many logs: their index, and questions to it."""
+"""Commands on many logs: their index, questions to it, and what to look at."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import click
 from cdmisfa.cli import completing, options
 from cdmisfa.cli.commands.info import in_bytes
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.making import flag, number
+from cdmisfa.cli.making import flag, number, word
 from cdmisfa.cli.printing import (
     print_columns,
     print_document,
@@ -23,9 +23,13 @@ from cdmisfa.cli.printing import (
     warn,
 )
 from cdmisfa.cli.progress import bar
+from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
     from replay.corpus.query import Summary
+
+MOST_RANKED = 20
+"""Logs that are listed of those with something new."""
 
 MOST_GONE = 5
 """Logs that are gone, of which so many are named."""
@@ -180,3 +184,74 @@ def _say_more(found: Summary, name: str, what: str) -> None:
 
 def _long(seconds: float | None) -> str:
     return "-" if seconds is None else str(timedelta(seconds=round(seconds)))
+
+
+@click.command("curate")
+@click.argument("corpus", shell_complete=completing.runs)
+@options.out("The folder of the segments and their page.", required=True)
+@options.path("--known", "A run: what its modules know is not chosen.", "RUN")
+@word("--budget", "TIME", "How long all is that is chosen.", default="10min", show_default=True)
+@options.server_limits
+@options.force
+@options.as_json
+def curate_command(
+    corpus: str, out: Path, known: Path | None, budget: str, force: bool, as_json: bool
+) -> None:
+    """Choose what to look at in many logs, within a budget of time.
+
+    CORPUS is what cdmisfa index indexed. Noise, doubles and, with --known, what the modules of a
+    run know are set apart; of the rest comes first what differs most from all chosen before. OUT
+    has a page of contact sheets, index.html, the segments for cdmisfa cut, segments.csv, and what
+    became of each block, blocks.parquet.
+    """
+    from cdmisfa.experiments.apply import Application
+    from replay.corpus.curate import curate
+    from replay.corpus.index import index_path
+
+    seconds = _seconds_of(budget)
+    with bar("judging", "logs") as shown:
+        found = curate(
+            index_path(corpus),
+            out,
+            known=None if known is None else Application(known),
+            known_as=known,
+            budget=seconds,
+            force=force,
+            told=shown.update,
+        )
+    for row in found.logs:
+        if row["problem"]:
+            tell(f"{row['log']}: {row['problem']}")
+    if as_json:
+        told = ("log", "start", "stop", "seconds", "new")
+        segments = [{name: segment[name] for name in told} for segment in found.segments]
+        print_document(out=out, logs=found.logs, seconds=found.seconds, segments=segments)
+        return
+    head = ("log", "new", "known, s", "novel, s", "noise, s")
+    rows = [[row[n] for n in ("log", "new", "known", "novel", "noise")] for row in found.logs]
+    print_table(head, rows[:MOST_RANKED])
+    if (more := len(rows) - MOST_RANKED) > 0:
+        print_line(f"and {more} more logs, in curated.json")
+    print_line(f"{len(found.segments)} segments of {found.chosen:.1f} s written to {out}")
+    tell(f"look at {out / 'index.html'}; cut them out: {_cut(out)}")
+
+
+def _cut(out: Path) -> str:
+    return f"cdmisfa cut --segments {quoted(out / 'segments.csv')} -o {quoted(out / 'cut')}"
+
+
+def _seconds_of(text: str) -> float:
+    """Read a budget, as "10min".
+
+    Raises:
+        UsageError: it is no duration.
+    """
+    from recorder.config import Split
+
+    try:
+        seconds = Split.parse(text).seconds
+    except UsageError:
+        seconds = None
+    if seconds is None:
+        raise UsageError(f"--budget is {text!r}: give a duration, as 90s, 10min or 2h")
+    return seconds
