@@ -194,19 +194,20 @@ class Origin:
         """A chunk as it is, where all of it is wanted and no id of it changes."""
         if not (self._same and chunk.chunked and not chunk.cut and chunk.size):
             return None
-        if not (self._vouched and chunk.indexes):
-            table = self.reader.table(chunk)
-            if table is None:
+        if self._vouched and chunk.indexes:
+            if not self._covers(chunk):
                 return None
-            if not chunk.indexes:
-                return self._indexed(chunk, table) if self._wants(table) else None
-        if not self._covers(chunk):
+            data = self._bytes(chunk)
+            pairs = _pairs(data, chunk)
+            return None if pairs is None else Whole(data, chunk, pairs)
+        table = self.reader.table(chunk)
+        if table is None or not self._wants(table):
             return None
         data = self._bytes(chunk)
         pairs = _pairs(data, chunk)
-        if pairs is None and (table := self.reader.table(chunk)) is not None:
-            return self._indexed(chunk, table) if self._wants(table) else None
-        return None if pairs is None else Whole(data, chunk, pairs)
+        if pairs is None or not table.agrees(list(pairs.items())):
+            return self._indexed(chunk, table)
+        return Whole(data, chunk, pairs)
 
     def as_json(self) -> dict[str, Any]:
         """What the log is, and what was wanted of it, as JSON values."""
