@@ -9,7 +9,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,12 +21,10 @@ from cdmisfa.agents.progress.judging import PRESENT, STRANGE
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, freeze
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
-from cdmisfa.core.options import option_name
 from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.options import LiveOptions
-from recorder.cameras.words import is_live, open_live
-from recorder.images.options import ImageOptions
+from recorder.cameras.words import is_live, live_options, open_live
 from replay.arrays import TAKES, are_arrays
 from replay.camera_logs.opening import ALL, log_format, only_foreign
 from replay.camera_logs.options import CameraOptions
@@ -102,7 +100,8 @@ class Application:
         """
         cameras, live = cameras or CameraOptions(), live or LiveOptions()
         if any(map(is_live, words)):
-            source = open_live(words, self._live(words, cameras, live), say=say)
+            made = replace(live_options(words, live, cameras), **self._made(cameras))
+            source = open_live(words, made, say=say)
         elif is_scene(words, cameras):
             source = configure(words[0], settings=of_scene((), cameras)).open_scene()
         else:
@@ -123,20 +122,6 @@ class Application:
         if recipe.size is not None:
             numbers = {"size": recipe.size, "fit": recipe.fit, "color": recipe.color}
         return {**numbers, "depth": options.depth or recipe.range}
-
-    def _live(self, words: Sequence[str], cameras: CameraOptions, live: LiveOptions) -> LiveOptions:
-        stored = [word for word in words if not is_live(word)]
-        if stored:
-            raise UsageError(f"{stored[0]} is no live stream, as the others are: name them apart")
-        of_images = {field.name for field in fields(ImageOptions)}
-        of_logs = [
-            option_name(field)
-            for field in fields(CameraOptions)
-            if field.name not in of_images and getattr(cameras, field.name) != field.default
-        ]
-        if of_logs:
-            raise UsageError(f"{words[0]} is a live stream: {', '.join(of_logs)} is for logs")
-        return replace(live, rate=cameras.rate, **self._made(cameras))
 
     def _log(self, words: Sequence[str], cameras: CameraOptions, **how: Any) -> FrameSource:
         places = locations(words)

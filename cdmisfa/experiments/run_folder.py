@@ -121,14 +121,12 @@ def with_recipes(
         described = source.origin()
 
     def recipe(stream: int) -> Recipe:
-        from replay.arrays import ArrayLog
         from replay.camera_logs.source import ForeignSource
 
         own = Recipe.of(described, source.spec.frame_shape, stream)
-        raw: Any = () if "size" in described else own.size or ()  # frames are the pictures
-        if isinstance(source, ForeignSource | ArrayLog):
-            raw = getattr(source.framings[stream], "first", ())
-        own = replace(own, raw=raw)
+        frames = () if "size" in described else own.size  # else they are the pictures
+        framings = getattr(source, "framings", [None] * len(source.spec.streams))
+        own = replace(own, raw=getattr(framings[stream], "first", frames) or ())
         stated = source.pixels(stream) if isinstance(source, ForeignSource) else ""
         return replace(own, pixels=stated) if stated.startswith("bayer_") else own
 

@@ -14,7 +14,7 @@ from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_setting
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from recorder.cameras.options import LiveOptions
-from recorder.cameras.words import CAMERAS, is_live, open_live
+from recorder.cameras.words import CAMERAS, is_live, live_options, open_live
 from recorder.config import RecordConfig, SceneConfig
 from recorder.images.options import ImageOptions
 from recorder.world.scenes import SCENES, open_scene
@@ -356,17 +356,7 @@ def open_cameras_now(
         UsageError: a word names no live stream or one that cannot be opened, or a wrong
             configuration.
     """
-    stored = [str(word) for word in words if not is_live(str(word))]
-    if stored:
-        raise UsageError(
-            f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
-            "and logs apart"
-        )
-    framing = {field.name: getattr(cameras, field.name) for field in fields(ImageOptions)}
-    theirs = ImageOptions(**framing).given()
-    if of_logs := [option for option in cameras.given() if option not in theirs]:
-        raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
-    live = replace(live, **framing)
+    live = live_options(words, live, cameras)
     told = log_settings(settings, words[0])
     source = open_live([str(word) for word in words], live, say=say)
     try:

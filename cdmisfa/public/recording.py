@@ -93,11 +93,6 @@ class Recording(Shown):
         streams = given if isinstance(given, Mapping) else {"stream": given}
         return ArrayLog(streams, self._options, loop=loop)
 
-    def arrays(self) -> Mapping[str, NDArray[Any]]:
-        """The arrays that were given, by the streams' names; none of logs."""
-        with self.source() as source:
-            return dict(source.arrays) if isinstance(source, ArrayLog) else {}
-
     def frames(
         self, stream: str | int = 0, start: int = 0, stop: int | None = None
     ) -> NDArray[Any]:

@@ -208,7 +208,8 @@ def _written(recording: Recording, folder: Path) -> Path:
     others = [path for path in folder.glob("*") if not path.match(f"{SOURCE}*.npz")]
     if others and not (folder / REQUEST).exists():
         raise UsageError(f"{folder} holds {others[0].name}, and no sweep: choose another folder")
-    arrays = recording.arrays()
+    with recording.source() as source:
+        arrays = source.arrays
     digest = hashlib.sha256()
     for name, array in arrays.items():
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from cdmisfa.core.blocks import FrameSource
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.names import stream_names
 from cdmisfa.core.registry import Registry
 from recorder.cameras.options import LiveOptions
-from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, Reading
+from recorder.images.options import (
+    COLOR_RECIPE,
+    NUMBERS_RECIPE,
+    RECIPE,
+    VIDEO_RECIPE,
+    ImageOptions,
+    Reading,
+)
 
 if TYPE_CHECKING:
     from recorder.cameras.readers import Camera
@@ -82,6 +89,30 @@ def is_live(word: str) -> bool:
     if scheme in ("http", "https"):
         return _split(word).path.lower().endswith(_STREAMED)
     return ":" in word and (scheme == "gym" or scheme in CAMERAS)
+
+
+def live_options(words: Sequence[Any], live: LiveOptions, cameras: ImageOptions) -> LiveOptions:
+    """How live streams are put on one clock and become frames.
+
+    Args:
+        words: a stream each.
+        live: how they are put on one clock.
+        cameras: how their images become frames.
+
+    Raises:
+        UsageError: a word names no live stream, or what is of logs alone is chosen.
+    """
+    stored = [str(word) for word in words if not is_live(str(word))]
+    if stored:
+        raise UsageError(
+            f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
+            "and logs apart"
+        )
+    framing = {field.name: getattr(cameras, field.name) for field in fields(ImageOptions)}
+    theirs = ImageOptions(**framing).given()
+    if of_logs := [option for option in cameras.given() if option not in theirs]:
+        raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
+    return replace(live, **framing)
 
 
 def open_live(
