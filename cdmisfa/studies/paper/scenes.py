@@ -87,15 +87,15 @@ class Scenes(Experiment):
                     blocks = [t.row["iterations"] for t in group if _ended(t)]
                     row += [of_all(away, n), mean_of(blocks, 0)]
             rows.append(row)
-        head = ("scene", "2.0: both objects", "object 1, 3", "progress: both objects")
-        found.table((*head, "object 1, 3", "center given up", "blocks until decided"), rows)
+        head = [f"{name}: {what}" for name in LEARNERS for what in ("both objects", "object 1, 3")]
+        found.table(("scene", *head, "center given up", "blocks until decided"), rows)
         n = len(cells["plain", "2.0"])
         found.notes.append(
             f"Trials of {n} with a module whose output follows the position of the object, |r| >= "
             f"{icub.FOLLOWS:g} on {icub.HELD_OUT} held-out frames. Live, the seed being that of "
             f"learner and scene; {icub.ITERATIONS:,} blocks at most. Each scene adds one thing to "
-            "the plain one, the last is the preset `icub-real`. Overlapping views are 30 degrees "
-            "apart instead of 45."
+            "the plain one, the last all that the preset `icub-real` does but the bent neck. "
+            "Overlapping views are 30 degrees apart instead of 45."
         )
         others = [learned[scene, "2.0"] for scene in ADDED if scene != "plain"]
         best, worst = max(others), min(learned[scene, "progress"] for scene in ADDED)
