@@ -94,6 +94,7 @@ def test_each_shell_is_told_how_to_ask(cdmisfa: Cdmisfa, shell: str) -> None:
     said = cdmisfa("completion", shell)
     assert (said.code, said.err) == (0, "")
     assert f"_CDMISFA_COMPLETE={shell}_complete" in said.out
+    assert "_path_files -f" not in said.out  # beside words of ours zsh drops what was typed
 
 
 def test_the_programs_help_has_every_command_below_a_heading(cdmisfa: Cdmisfa) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.cells import cell_len
 
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.cli import printing
@@ -52,6 +53,20 @@ def test_a_table_on_a_terminal_fits_and_loses_nothing(
     assert max(map(len, lines)) <= 24
     said = "".join(itertools.chain.from_iterable(line[6:].split() for line in lines[2:]))
     assert said == "".join(about.replace(" ", "") for _, about in rows)
+
+
+def test_wide_letters_and_accents_take_the_places_that_a_terminal_gives_them(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    print_table(("name", "next"), [("カメラ", "x"), ("e\u0301", "y")])
+    _, _, wide, accent = capsys.readouterr().out.splitlines()
+    assert (wide, accent) == ("カメラ  x", "e\u0301       y")
+    monkeypatch.setattr(printing.sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "12")
+    print_table(("a", "b"), [("左" * 12, "x")])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(cell_len, lines)) <= 12
+    assert "".join(lines).count("左") == 12
 
 
 class Seen(Bar):

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
-from click.shell_completion import BashComplete, CompletionItem, ShellComplete, get_completion_class
+from click.shell_completion import (
+    BashComplete,
+    CompletionItem,
+    ShellComplete,
+    ZshComplete,
+    get_completion_class,
+)
 
 Completer = Callable[[click.Context, click.Parameter, str], list[CompletionItem[Any]]]
 
@@ -29,9 +35,20 @@ class Bash(BashComplete):
     )
 
 
+class Zsh(ZshComplete):
+    """Zsh, where files are whole words, as runs are: beside its own it drops what was typed."""
+
+    source_template = ZshComplete.source_template.replace(
+        "_path_files -f", "compadd -U -S '' -- ${~words[CURRENT]}*(NM)"
+    )
+
+
+OURS: Mapping[str, type[ShellComplete]] = {"bash": Bash, "zsh": Zsh}
+
+
 def script(program: click.Command, shell: str) -> str:
     """What a shell reads to complete the commands of a program."""
-    made: type[ShellComplete] | None = Bash if shell == "bash" else get_completion_class(shell)
+    made = OURS.get(shell) or get_completion_class(shell)
     assert made is not None
     return made(program, {}, "cdmisfa", "_CDMISFA_COMPLETE").source()
 

@@ -7,7 +7,6 @@ import json
 import shlex
 import shutil
 import sys
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,20 +66,36 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     Where it does not, its widest cells go on in the next lines. What no terminal shows has a line
     a row, for other programs.
     """
+    from rich.cells import cell_len
+
     cells = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
     columns = list(zip(*cells, strict=True))
-    widths = [max(map(len, column)) for column in columns]
+    widths = [max(map(cell_len, column)) for column in columns]
     if sys.stdout.isatty():
         words = [
-            max(len(word) for cell in column for word in cell.split(" ")) for column in columns
+            max(cell_len(word) for cell in column for word in cell.split(" ")) for column in columns
         ]
         room = shutil.get_terminal_size().columns
         widths = fitting(fitting(widths, words, room), [NARROWEST] * len(widths), room)
     cells.insert(1, ["-" * width for width in widths])
     for row in cells:
-        parts = [textwrap.wrap(c, w) or [""] for c, w in zip(row, widths, strict=True)]
+        parts = [_wrapped(c, w) for c, w in zip(row, widths, strict=True)]
         for line in itertools.zip_longest(*parts, fillvalue=""):
-            print_line("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
+            filled = (c + " " * (w - cell_len(c)) for c, w in zip(line, widths, strict=True))
+            print_line("  ".join(filled).rstrip())
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Lines of a text, of so many places of a terminal: wide letters take two, accents none."""
+    from rich.cells import cell_len
+
+    if cell_len(text) <= width:
+        return [text]
+    from rich.console import Console
+    from rich.text import Text
+
+    lines = Text(text).wrap(Console(width=width), width)
+    return [line.plain.rstrip() for line in lines]
 
 
 def print_columns(columns: Mapping[str, Sequence[Any]]) -> None:
