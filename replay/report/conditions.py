@@ -174,8 +174,8 @@ def _of_progress(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> list[
         ),
         Condition(
             "change", "change c of its slowest output with a block",
-            "" if change is None else f"learned below {change:g}; sooner below less, by the tests "
-            f"there are; below {TURNING * change:g} where nothing is gained",
+            "" if change is None else f"learned below {change:g}, after few tests below less, and "
+            f"below {TURNING * change:g} where nothing is gained",
             np.where(untested, np.nan, lines["change"]), high=change, log=True, held=settled,
         ),
         Condition(
