@@ -111,6 +111,8 @@ def _objects(scene: IcubConfig, told: Mapping[str, Any]) -> tuple[Piece, ...]:
         ("cylinder", can_mesh(cylinder.radius, cylinder.height), cylinder.grey),
         ("ball", ball_mesh(ball.radius), ball.grey),
     )
+    if scene.physics:  # stripes that roll would hide how slowly the ball moves
+        told = {**told, "ball": {**told["ball"], "texture": "plaster", "count": 6}}
     return tuple(
         Piece(
             mesh,
