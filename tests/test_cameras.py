@@ -33,8 +33,8 @@ BOTH = ("--topic", "/cam_left", "--topic", "/cam_right")
 NO_IMAGES = "holds no images; numbers are taken with --field"
 REFUSED = {
     "learn oscillatory --topic /left": "is a scene: --topic is for cameras",
-    "learn oscillatory --range 0.3:5 --from 1 --stamp header --color": (
-        "a scene: --color, --range, --stamp and --from are for cameras"
+    "learn oscillatory --range 0.3:5 --from 1 --stamp header": (
+        "a scene: --range, --stamp and --from are for cameras"
     ),
     "learn oscillatory --size 12": "128x48",
     "learn pictures": "--rate",
