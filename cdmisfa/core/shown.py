@@ -78,7 +78,7 @@ def curves(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def weights(values: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Weights (rows, columns), blue below 0, white 0, red above, the largest in full colour."""
+    """Weights (rows, columns), blue below 0, white 0, orange above, the largest in full colour."""
     most = float(np.abs(values).max()) or 1.0
     rest = np.rint(255 * (1 - np.abs(values) / most)).astype(np.uint8)
     full, below = np.full_like(rest, 255), values < 0

@@ -138,7 +138,8 @@ def proof_of(run: Path) -> Proof:
             beginning.source  # noqa: B018, it is opened when it is asked for
             others = beginning.other_files()
     except CdmisfaError as error:
-        why = error.__cause__ if isinstance(error.__cause__, CdmisfaError) else error
+        why = str(error.__cause__ if isinstance(error.__cause__, CdmisfaError) else error)
+        why = why.partition(": did you mean")[0]  # what else lies here is no news of the run
         return Proof(False, f"It cannot be learned again here: {why}.", again)
     if others:
         return Proof(False, f"{', '.join(others)}: no longer what the run learned from.", again)

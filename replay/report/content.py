@@ -150,7 +150,7 @@ def _answers(told: RunTold, proof: Proof | None) -> list[tuple[str, str]]:
     against = [fact for fact in facts(told, None) if fact.kind == "bad"]
     if against:
         speak = "thing speaks" if len(against) == 1 else "things speak"
-        trusted = f"{len(against)} {speak} against it, see below; {trusted}"
+        trusted = f"{len(against)} {speak} against it, see below. {_sentence(trusted).rstrip('.')}."
     return [
         ("What did it learn?", _listed(what) or "nothing: no module was saved"),
         ("When?", f"at frame {_listed(when)} of {told.outline.end:,}" if when else "never"),

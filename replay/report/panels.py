@@ -22,6 +22,7 @@ from replay.report.drawing import (
     Axis,
     Label,
     Plot,
+    beside,
     colour_class,
     data_uri,
     number,
@@ -41,7 +42,7 @@ LANES = 60
 """Streams of the timeline: the most watched."""
 
 NAMED = 12
-"""Modules whose numbers are written where they were saved."""
+"""Modules whose numbers are written where they were saved; of more each has a line in its lane."""
 
 PIXELS = 96
 """Most pixels across or down of a frame that is shown where one points."""
@@ -80,18 +81,22 @@ def timeline(told: RunTold, frames: str) -> Plot:
         Axis(0, height, height),
         f"Which of {len(names)} streams was watched when, and when modules were saved",
         frames=frames,
-        names=[(names[s], colour_class(s)) for s in shown],
+        names=beside(names, shown),
     )
     _lanes_of_states(plot, told, row)
     for s in shown:
         plot.path(f"fill {colour_class(s)}", _attention(plot, told, s, row[s]))
+    few = len(outline.saved) <= NAMED
     for save in outline.saved:
-        plot.marks([save.t + outline.tau])
-        if save.stream in row and len(outline.saved) <= NAMED:
-            y = LANE * row[save.stream] + LANE - ROOM - 3
-            plot.word(save.t + outline.tau, y, f"module {save.module}", "back strong")
-    if (at := told.header.forked_at) is not None and at < outline.iterations:
-        t = int(outline.blocks.starts[at])
+        at, lane = save.t + outline.tau, LANE * row.get(save.stream, 0)
+        if few:
+            plot.marks([at])
+        if save.stream in row and few:
+            plot.word(at, lane + LANE - ROOM - 3, f"module {save.module}", "back strong")
+        elif save.stream in row:
+            plot.path("saved", f"M{number(float(plot.x(at)))} {lane}v{LANE - ROOM}")
+    if (fork := told.header.forked_at) is not None and fork < outline.iterations:
+        t = int(outline.blocks.starts[fork])
         plot.marks([t], "fork")
         plot.word(t, height - 4, "the fork begins")
     return plot

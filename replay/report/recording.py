@@ -15,6 +15,7 @@ from replay.report.drawing import (
     WIDE,
     Axis,
     Plot,
+    beside,
     colour_class,
     data_uri,
     padded,
@@ -54,7 +55,7 @@ def recording_content(source: Any, paths: Sequence[Path]) -> dict[str, Any]:
             streams.append(_stream(source, s, frames))
         except CdmisfaError as error:
             problems.append(f"{name} cannot be read to its end: {error}")
-    size = "x".join(map(str, spec.frame_shape))
+    size = "x".join(map(str, reversed(spec.frame_shape)))
     what = f"pictures of {size}" if spec.images else f"frames of {size} numbers"
     return {
         "kind": "recording",
@@ -89,7 +90,7 @@ def _lanes(source: Any) -> Plot:
         Axis(first, first + max(count, 1), WIDE),
         Axis(0, height, height),
         "Which frames each stream has",
-        names=[(spec.streams[s], colour_class(s)) for s in shown],
+        names=beside(spec.streams, shown),
     )
     for s in shown:
         top, high = LANE * s, LANE - ROOM

@@ -289,7 +289,7 @@ class Panels:
         return rrb.Horizontal(*columns, column_shares=[3, 4], name=name)
 
     def _weights_of(self, i: int) -> rrb.View:
-        colours = " (blue below 0, red above), each by its largest" if self._spec.images else ""
+        colours = " (blue below 0, orange above), each by its largest" if self._spec.images else ""
         return self._weights(f"/modules/{i}/weights", f"Weights of module {i}{colours}")
 
     def _output(
@@ -328,7 +328,7 @@ class Panels:
         """Input of the learner, what came of it, and weights; of many candidates they are apart."""
         shown: Views = [self._pictures(), rrb.TextDocumentView(origin="/summary", name="Summary")]
         if not self._header.by_progress:
-            colours = " (blue below 0, red above)" if self._spec.images else ""
+            colours = " (blue below 0, orange above)" if self._spec.images else ""
             shown.append(self._weights("/abstraction/phi", f"Weights φ{colours}"))
         return rrb.Vertical(*shown, row_shares=[3, 4, 2][: len(shown)])
 
