@@ -23,6 +23,7 @@ from run_data import (
 from view_data import View, scalars, tabs_of, views_of
 
 from cdmisfa.core.signals import NO_STATE
+from replay.palette import CYCLE, packed
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view.build import build_view
@@ -221,7 +222,9 @@ def test_a_module_hangs_its_weights_with_what_is_slow_and_frames_by_output(tmp_p
     view = View(tmp_path / "run.rrd")
     words = [view.static[f"/modules/1/weights/{j}/words"]["Points2D:labels"] for j in (1, 2)]
     assert words == [["1 slow"], ["2 not slow"]]
-    assert view.static["/modules/1/output"]["SeriesLines:names"] == ["left, output 1"]
+    output = view.static["/modules/1/output"]
+    assert output["SeriesLines:names"] == ["output 1"]
+    assert output["SeriesLines:colors"] == [packed(CYCLE[0])]  # of left, which its tab names
     rows = [f"/modules/1/sheet/{row}" for row in ("1_least", "2_middle", "3_greatest")]
     said = [view.static[f"{row}/words"]["Points2D:labels"][0] for row in rows]
     ends = [[float(x) for x in text.split(": ")[1].split(" to ")] for text in said]

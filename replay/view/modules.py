@@ -180,8 +180,7 @@ class ModulesView:
         slow = np.zeros(0) if module is None else module.slow
         shown = np.flatnonzero(slow) if slow.any() else np.arange(y.shape[1])
         if number not in self._columns:
-            name = label(self._target.spec.streams[stream])
-            names = [f"{name}, output {j + 1}" for j in shown.tolist()]
+            names = [f"output {j + 1}" for j in shown.tolist()]
             rgbs: list[Colour] = [colour(stream), *(faint(colour(stream)) for _ in shown[1:])]
             place = f"modules/{number}/output"
             self._columns[number] = self._target.lines(place, names, rgbs, within=self._tau)
