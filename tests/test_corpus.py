@@ -458,6 +458,10 @@ def test_the_commands_of_the_page_work(
         assert program == "cdmisfa"
         done = cdmisfa(*words)
         assert done.code == 0, done.err
+        if "AS hours" in words[-1]:  # as the summary says, not once a stream
+            (kind,) = cdmisfa("query", "recordings", "--json").json["kinds"]
+            (row,) = cdmisfa(*words, "--json").json["rows"]
+            assert row["hours"] == pytest.approx(kind["seconds"] / 3600)
     assert pq.read_table("broken.parquet").num_rows == 0
     columns = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| .* \|", page, re.MULTILINE))))
     assert set(SCHEMA.names) <= columns

@@ -450,6 +450,7 @@ class TestSegments:
         (["a.mcap", "full/a.mcap", "-o", "new"], "another log is called a.mcap, too"),
         (["a.mcap", "-o", "c.mcap", "--from", "5", "--to", "4"], "--from 5 is no earlier"),
         (["a.mcap", "-o", "c.mcap", "--topic", "/none"], "no message there is of these"),
+        (["a.mcap", "-o", "new", "--topic", "/none"], "no message there is of these"),
         (["a.mcap", "-o", "c.mcap", "--split", "3"], "--split is '3'"),
         (["film.mp4", "-o", "c.mcap"], "film.mp4 is no MCAP file, and others are not cut"),
         (["-o", "c.mcap"], "no log was named"),
@@ -469,6 +470,7 @@ def test_what_is_refused(
     assert (done.code, done.err.count("\n")) == (2, 1)
     assert said in done.err
     assert not Path("c.mcap").exists()
+    assert not Path("new").exists()
 
 
 def test_json_says_what_was_written(tmp_path: Path, cdmisfa: Cdmisfa) -> None:

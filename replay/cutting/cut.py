@@ -12,7 +12,6 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.files import (
     PARTIAL,
-    make_folder,
     refuse_existing,
     refuse_taken,
 )
@@ -207,7 +206,6 @@ def _copied(
                 problems.append(_problem(file, error))
             else:
                 stack.callback(origin.close)
-        make_folder(target.parent)
         with Output(target, origins, split, ends, force=force) as output:
             with contextlib.ExitStack() as read:
                 for origin in origins:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import UsageError
-from recorder.log.files import part_name
+from recorder.log.files import make_folder, part_name
 from recorder.log.logfile import LogFile
 from recorder.log.manifest import ViewMetadata, version
 from recorder.log.messages import RECORDING_METADATA, view_topic
@@ -166,6 +166,7 @@ class Output:
         return self._log
 
     def _begin(self) -> LogFile:
+        make_folder(self._path.parent)
         origins, ids = self._origins, self._ids
         number = None if self._split is None else len(self.parts)
         name = self._path.name if number is None else part_name(self._path.stem, number)
