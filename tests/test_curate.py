@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -180,3 +181,30 @@ def test_each_mode_is_chosen_before_any_is_chosen_twice() -> None:
     assert sorted(which[chosen[:6]].tolist()) == [0, 1, 2, 4, 5, 6]
     assert len(chosen) == len({*chosen})
     assert all(wanted[chosen])
+
+
+def test_it_says_what_is_left_of_the_budget_and_what_can_be_cut(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    still = np.random.default_rng(0).integers(0, 255, (1, 48, 64), np.uint8)
+    logs, out = tmp_path / "logs", tmp_path / "out"
+    logs.mkdir()
+    np.save(logs / "still.npy", still.repeat(100, axis=0))
+    (logs / "text.mcap").write_text("no log")
+    shutil.copy(logs / "still.npy", logs / "twice.npy")
+    cdmisfa("index", logs)
+    words = ("curate", logs, "--force", "-o")
+    done = cdmisfa(*words, out, "--budget", "60s")
+    assert done.code == 0, done.err
+    assert "s of the budget of 60.0 s: nothing else is new" in done.out
+    assert f"1 segment written to {out}" in done.out
+    assert re.search(r"^twice.npy +- +- +- +-$", done.out, re.MULTILINE)
+    assert "none can be cut out" in done.err
+    assert "cdmisfa cut" not in done.err + (out / "index.html").read_text("utf-8")
+    write_images(logs / "day.mcap", {"/camera": [(t * 50, still[0] // 2) for t in range(100)]})
+    cdmisfa("index", logs)
+    assert "cut out 1 of 2: cdmisfa cut" in cdmisfa(*words, out, "--budget", "60s").err
+    done = cdmisfa(*words, out, "--budget", "1s")
+    assert "0 segments" in done.out
+    assert "the next block does not fit" in done.out
+    assert "cut" not in done.err.replace(str(tmp_path), "")

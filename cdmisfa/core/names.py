@@ -1,4 +1,4 @@
-"""What a stream is called, whatever its log or its camera calls it."""
+"""What a stream is called, whatever its log or its camera calls it; how many there are."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from collections.abc import Iterable
 
 _OF_VIEWS = re.compile(r"(/view/|observation\.images\.)+(?=.)")
 _LONGEST = 64
+
+
+def counted(number: int, what: str, form: str = "") -> str:
+    """How many there are, as 1 block or 2 blocks; the number in such a format, as ','."""
+    return f"{number:{form}} {what}{'' if number == 1 else 's'}"
 
 
 def stream_name(said: str) -> str:

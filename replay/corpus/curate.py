@@ -127,12 +127,16 @@ class Curated:
         segments: a row a segment, in the order in which they were chosen.
         seconds: of all blocks by their verdict, streams together.
         chosen: seconds of the segments.
+        left: why no more were chosen, where the budget is longer; else empty.
+        to_cut: how many of the segments `cut` takes.
     """
 
     logs: list[dict[str, Any]]
     segments: list[dict[str, Any]]
     seconds: dict[str, float]
     chosen: float
+    left: str
+    to_cut: int
 
 
 def curate(
@@ -174,7 +178,7 @@ def curate(
     if not blocks.rows:
         why = next((f": {log.problem}" for log in logs if log.problem), "")
         raise UsageError(f"{index}: no log in it shows frames{why}")
-    chosen = _choose(logs, blocks, budget)
+    chosen, all_seen = _choose(logs, blocks, budget)
     segments = list(_segments(logs, chosen))
     order = sorted(logs, key=lambda log: (-log.gain, log.name))
     rows: list[dict[str, Any]] = [
@@ -187,12 +191,15 @@ def curate(
         for log in order
     ]
     total = {name: sum((log.seconds[name] for log in logs), 0.0) for name in VERDICTS}
-    found = Curated(rows, segments, total, sum(s["seconds"] for s in segments))
+    lasts = sum(s["seconds"] for s in segments)
+    left = "nothing else is new" if all_seen else "the next block does not fit into it"
+    to_cut = sum(any(map(_is_cut, s["files"])) for s in segments)
+    found = Curated(rows, segments, total, lasts, left if lasts < budget else "", to_cut)
     with atomic_write(out) as folder:
         folder.mkdir()
         _write(folder, out, found, blocks, budget, known_as)
         pictures = [_pictures(logs[s["number"]], s, known) for s in segments[:SHOWN]]
-        page = report_of_segments(rows, segments, pictures, total, budget, known_as)
+        page = report_of_segments(found, pictures, budget, known_as)
         (folder / "index.html").write_text(page, encoding="utf-8")
     return found
 
@@ -246,8 +253,13 @@ def _judged(source: Any, tau: int, application: Applies | None) -> Iterator[tupl
                 yield block, None
 
 
-def _choose(logs: Sequence[_Log], blocks: _Blocks, budget: float) -> list[tuple[int, int, float]]:
-    """The log and the number of each window that is chosen, and how far it is from the others."""
+def _choose(
+    logs: Sequence[_Log], blocks: _Blocks, budget: float
+) -> tuple[list[tuple[int, int, float]], bool]:
+    """The log and the number of each window that is chosen, and how far it is from the others.
+
+    Also whether there are no more that are new.
+    """
     width = max(map(len, blocks.features))
     features = np.array([np.pad(one, (0, width - len(one))) for one in blocks.features])
     groups = np.array(blocks.groups, np.int64)
@@ -262,10 +274,10 @@ def _choose(logs: Sequence[_Log], blocks: _Blocks, budget: float) -> list[tuple[
         assert log.spec is not None
         budget -= log.tau / log.spec.fps
         if budget < 0:
-            break
+            return found, False
         log.gain += far
         found.append((number, at, far))
-    return found
+    return found, True
 
 
 def _segments(
@@ -297,6 +309,11 @@ def _segments(
         }
 
 
+def _is_cut(file: str) -> bool:
+    """Whether `cut` takes a file."""
+    return file.endswith((".mcap", ".partial"))
+
+
 def _write(
     folder: Path, out: Path, found: Curated, blocks: _Blocks, budget: float, known: Path | None
 ) -> None:
@@ -306,7 +323,7 @@ def _write(
     rows.writerow(("path", "start", "stop"))
     for segment in found.segments:
         for file in segment["files"]:
-            if file.endswith((".mcap", ".partial")):
+            if _is_cut(file):
                 place = file if "://" in file else os.path.relpath(file, out)
                 rows.writerow((place, segment["start"], segment["stop"]))
     (folder / "segments.csv").write_text(listed.getvalue(), "utf-8")

@@ -4,53 +4,59 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from cdmisfa.core.names import counted
 from replay.report.drawing import data_uri, reduced, sheet
 from replay.report.page import rendered
 from replay.report.panels import PIXELS
+
+if TYPE_CHECKING:
+    from replay.corpus.curate import Curated
 
 MOST_LOGS = 200
 """Logs that are listed."""
 
 
 def report_of_segments(
-    logs: Sequence[Mapping[str, Any]],
-    segments: Sequence[Mapping[str, Any]],
+    found: Curated,
     pictures: Sequence[Sequence[tuple[str, Sequence[Any]]]],
-    seconds: Mapping[str, float],
     budget: float,
     known: Path | None,
 ) -> str:
     """The page of what was chosen.
 
     Args:
-        logs: `log`, `new`, seconds by verdict, and `problem` of each.
-        segments: `log`, `t`, `seconds` and `new` of each.
+        found: the logs and segments.
         pictures: of the first segments, by the names of their streams.
-        seconds: of all logs, by verdict.
         budget: in seconds.
         known: the run whose modules know what is known.
     """
-    chosen = sum(segment["seconds"] for segment in segments)
+    logs, segments, seconds = found.logs, found.segments, found.seconds
+    why = f": {found.left}" if found.left else ""
     by = f", {seconds['known']:,.1f} s are known to {known}" if known is not None else ""
     return rendered(
         {
             "kind": "curated",
-            "title": f"{len(segments)} segments of {len(logs)} logs",
-            "lead": f"{chosen:,.1f} s of a budget of {budget:,.1f} s. Of all streams together "
-            f"{seconds['novel']:,.1f} s are no noise{by}, {seconds['noise']:,.1f} s are noise.",
+            "title": f"{counted(len(segments), 'segment')} of {counted(len(logs), 'log')}",
+            "lead": f"{found.chosen:,.1f} s of a budget of {budget:,.1f} s{why}. Of all streams "
+            f"together {seconds['novel']:,.1f} s are no noise{by}, {seconds['noise']:,.1f} s are "
+            "noise.",
             "segments": [_segment(*pair) for pair in zip(segments, pictures, strict=False)],
             "more": max(len(segments) - len(pictures), 0),
-            "logs": [
-                (row["log"], f"{row['new']:.2f}", *(f"{row[n]:,.1f}" for n in seconds),
-                 row["problem"] or "")
-                for row in logs[:MOST_LOGS]
-            ],
-            "command": "cdmisfa cut --segments segments.csv -o cut",
+            "logs": [(*told(row), row["problem"] or "") for row in logs[:MOST_LOGS]],
+            "command": "cdmisfa cut --segments segments.csv -o cut" if found.to_cut else "",
             "frames": {},
         }
-    )  # fmt: skip
+    )
+
+
+def told(log: Mapping[str, Any]) -> list[str]:
+    """A log's name, how new it is, and its seconds by verdict; dashes, where it was not judged."""
+    seconds = [log[name] for name in ("known", "novel", "noise")]
+    if log["problem"] and not any(seconds):
+        return [log["log"], *"----"]
+    return [log["log"], f"{log['new']:.2f}", *(f"{value:,.1f}" for value in seconds)]
 
 
 def _segment(

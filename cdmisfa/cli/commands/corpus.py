@@ -24,6 +24,7 @@ from cdmisfa.cli.printing import (
 )
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import counted
 
 if TYPE_CHECKING:
     from replay.corpus.query import Summary
@@ -77,8 +78,10 @@ def index_command(
         told = {name: getattr(made, name) for name in ("logs", "streams", "read", "kept", "gone")}
         print_document(index=made.index, **told, broken=made.broken, complete=not made.stopped)
     else:
-        said = f"{made.logs} logs, {made.streams} streams: {made.read} read, {made.kept} as before"
-        print_line(f"{said}, {len(made.gone)} gone, {made.broken} with a problem")
+        said = f"{counted(made.logs, 'log')}, {counted(made.streams, 'stream')}: {made.read} read"
+        print_line(
+            f"{said}, {made.kept} as before, {len(made.gone)} gone, {made.broken} with a problem"
+        )
         for path in made.gone[:MOST_GONE]:
             print_line(f"gone: {path}")
         if (more := len(made.gone) - MOST_GONE) > 0:
@@ -130,7 +133,7 @@ def query_command(
         rows = [] if out is not None else [_plain(row) for row in answer.to_pylist()]
         print_document(columns=answer.column_names, rows=rows, file=out)
     elif out is not None:
-        print_line(f"{answer.num_rows} rows written to {out}")
+        print_line(f"{counted(answer.num_rows, 'row')} written to {out}")
     elif answer.num_columns:
         cells = [["" if v is None else v for v in row.values()] for row in answer.to_pylist()]
         print_table(answer.column_names, cells)
@@ -207,6 +210,7 @@ def curate_command(
     from cdmisfa.experiments.apply import Application
     from replay.corpus.curate import curate
     from replay.corpus.index import index_path
+    from replay.report.curated import told as told_of_log
 
     seconds = _seconds_of(budget)
     with bar("judging", "logs") as shown:
@@ -228,16 +232,21 @@ def curate_command(
         print_document(out=out, logs=found.logs, seconds=found.seconds, segments=segments)
         return
     head = ("log", "new", "known, s", "novel, s", "noise, s")
-    rows = [[row[n] for n in ("log", "new", "known", "novel", "noise")] for row in found.logs]
-    print_table(head, rows[:MOST_RANKED])
-    if (more := len(rows) - MOST_RANKED) > 0:
-        print_line(f"and {more} more logs, in curated.json")
-    print_line(f"{len(found.segments)} segments of {found.chosen:.1f} s written to {out}")
-    tell(f"look at {out / 'index.html'}; cut them out: {_cut(out)}")
-
-
-def _cut(out: Path) -> str:
-    return f"cdmisfa cut --segments {quoted(out / 'segments.csv')} -o {quoted(out / 'cut')}"
+    print_table(head, [told_of_log(row) for row in found.logs[:MOST_RANKED]])
+    if (more := len(found.logs) - MOST_RANKED) > 0:
+        print_line(f"and {counted(more, 'more log')}, in curated.json")
+    print_line(
+        "seconds of all streams of a log together; new is a sum of distances, without a unit"
+    )
+    lasts = f"{found.chosen:.1f} s of the budget of {seconds:.1f} s"
+    why = f": {found.left}" if found.left else ""
+    print_line(f"{counted(len(found.segments), 'segment')} written to {out}, {lasts}{why}")
+    tell(f"look at {out / 'index.html'}")
+    if found.to_cut:
+        cut = f"cdmisfa cut --segments {quoted(out / 'segments.csv')} -o {quoted(out / 'cut')}"
+        tell(f"cut out {found.to_cut} of {len(found.segments)}: {cut}")
+    elif found.segments:
+        tell("none can be cut out: only those of MCAP files can")
 
 
 def _seconds_of(text: str) -> float:
