@@ -251,6 +251,8 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
         ("apply RUN a.mcap --to tea", 2, "--to tea: name parquet, csv, mcap"),
         ("apply RUN a.mcap -o o.csv --to mcap", 2, "name it o.mcap"),
         ("apply RUN a.mcap -o there.csv", 2, "there.csv exists"),
+        ("apply RUN a.mcap -o v.xlsx", 2, "v.xlsx: name a file with .parquet, .csv, .mcap, .rrd,"),
+        ("apply RUN a.mcap -o v.pqt --to csv", 2, "v.pqt: name a file with .parquet, .csv"),
         ("apply RUN a.mcap --from 5 --to 3", 2, "--from 5 is no earlier than --to 3"),
         ("apply RUN RUN", 2, "is a run, not a recording"),
     ],
@@ -277,6 +279,7 @@ def test_what_cannot_be_applied_is_refused_in_a_line(
     assert re.search(why, done.err), done.err
     assert len(done.err.splitlines()) == 1
     assert (tmp_path / "there.csv").read_text() == "mine"
+    assert not list(tmp_path.glob("v.*"))
 
 
 def test_a_part_and_a_loop_are_applied(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -254,8 +254,8 @@ def places(
         force: replace existing files.
 
     Raises:
-        UsageError: a file for several logs, no form that it could have, no place to write it, or
-            it exists.
+        UsageError: a file for several logs, or of another ending, no form that it could have, no
+            place to write it, or it exists.
     """
     from recorder.log.files import refuse_taken
 
@@ -281,6 +281,9 @@ def _named(out: Path, form: str | None, logs: Sequence[str]) -> list[Path]:
                 f"{len(logs)} logs are a file each: name a folder with -o, without .{ending}"
             )
         return [out]
+    if ending and not out.is_dir():
+        endings = ", ".join(f".{one}" for one in OF_FILES)
+        raise UsageError(f"{out}: name a file with {endings}, or a folder without an ending")
     form = form or OF_FILES[0]
     found: list[Path] = []
     for log in logs:
