@@ -56,7 +56,7 @@ def learned(index: int, shape: tuple[int, ...] = SIZE) -> Module:
     made = module_of(index, index, phi)
     about: Any = {"eta": np.full(3, 0.02), "band_sd": np.full(3, np.nan)}
     about |= {"band_mean": about["eta"]}
-    recipe = Recipe(shape)
+    recipe = Recipe(shape, raw=(12, 16) if shape == SIZE else ())
     return replace(made, **about, recipe=recipe, frame_shape=shape, expansion="none", scale=1 / 255)
 
 
@@ -235,12 +235,9 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
         ("apply RUN oscillatory", 2, r"frames of \(2,\), and the modules learned from \(6, 8\)"),
         ("apply RUN small.mcap", 2, "smaller than 8x6"),
         ("apply RUN t.csv --rate 9", 2, "t.csv shows numbers, and the modules learned from pict"),
-        (
-            "apply RUN n.npy",
-            2,
-            r"n.npy shows frames of \(3,\), and the modules .* \(6, 8\)",
-        ),
+        ("apply RUN n.npy", 2, r"n.npy shows frames of \(3,\), and the modules .* \(6, 8\)"),
         ("apply RUN nan.npy", 2, "nan: row 1, counted from 0, holds what is no finite number"),
+        ("apply RUN upright.npy", 2, "upright.npy: a picture of 12x16 .* were of 16x12: turn it"),
         ("apply RUN text.npy", 2, "its values are of type <U1, no numbers"),
         ("apply RUN colour.npy", 2, r"colour: it has shape \(9, 3, 12, 16\), so move its colours"),
         ("apply RUN none.mcap", 2, "none.mcap: no such file"),
@@ -265,7 +262,8 @@ def test_what_cannot_be_applied_is_refused_in_a_line(
     write_images(tmp_path / "small.mcap", {"/cam": tiny})
     write_table(tmp_path / "t.csv", {"x": [1.0, float("nan"), 3.0]})
     arrays: dict[str, Any] = {"n": np.zeros((9, 3)), "nan": [[1.0], [float("nan")]]}
-    arrays |= {"text": ["a"], "colour": np.zeros((9, 3, 12, 16), np.uint8)}
+    arrays |= {"upright": np.zeros((9, 16, 12), np.uint8), "text": ["a"]}
+    arrays["colour"] = np.zeros((9, 3, 12, 16), np.uint8)
     for name, array in arrays.items():
         np.save(tmp_path / f"{name}.npy", array)
     (tmp_path / "empty.mcap").write_bytes(b"")

@@ -25,7 +25,7 @@ from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, live_options, open_live
-from replay.arrays import TAKES, are_arrays
+from replay.arrays import TAKES, ArrayLog, are_arrays
 from replay.camera_logs.opening import ALL, log_format, only_foreign
 from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import UnequalError
@@ -127,9 +127,14 @@ class Application:
         places = locations(words)
         if are_arrays(places):
             arrays = open_logs(words, cameras=cameras, **how)
-            if not arrays.spec.images or self.recipe.size is None:
+            if not isinstance(arrays, ArrayLog) or not arrays.spec.images or not self.recipe.size:
                 return arrays
             arrays.close()
+            try:
+                for array in arrays.arrays.values():
+                    self.recipe.refuse_turned((array.shape[1], array.shape[2]))
+            except UsageError as error:
+                raise UsageError(f"{words[0]}: {error}") from None
             taken = {name: value for name, value in self._made(cameras).items() if name in TAKES}
             return open_logs(words, cameras=replace(cameras, **taken), **how)
         if cameras == CameraOptions() and not any(map(only_foreign, places)):

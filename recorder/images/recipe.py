@@ -116,6 +116,19 @@ class Recipe:
             return None
         return self.shape[0], self.shape[1] // (3 if self.color else 1)
 
+    def refuse_turned(self, picture: Size) -> None:
+        """Refuse an array's picture that is upright where the source's lay, or lies.
+
+        Raises:
+            UsageError: it is.
+        """
+        height, width = picture
+        if self.raw and (height - width) * (self.raw[0] - self.raw[1]) < 0:
+            raise UsageError(
+                f"a picture of {width}x{height} given, and those learned from were of "
+                f"{self.raw[1]}x{self.raw[0]}: turn it, as by np.swapaxes(x, 0, 1), or crop it"
+            )
+
     def frames(self, pictures: Any) -> NDArray[Any]:
         """Raw pictures as frames; see `make_frame`.
 
@@ -208,11 +221,7 @@ def _image(array: NDArray[Any], recipe: Recipe) -> Shown:
     if known is None or array.ndim not in (2, 3):
         raise UsageError(f"pictures of {array.dtype} {array.shape} given: {_PICTURES}")
     height, width = array.shape[:2]
-    if recipe.raw and (height - width) * (recipe.raw[0] - recipe.raw[1]) < 0:
-        raise UsageError(
-            f"a picture of {width}x{height} given, and those learned from were of "
-            f"{recipe.raw[1]}x{recipe.raw[0]}: turn it, as by np.swapaxes(x, 0, 1), or crop it"
-        )
+    recipe.refuse_turned((height, width))
     little = "<f4" if known == "32FC1" else f"<{kind}"
     data = np.ascontiguousarray(array, little).tobytes()
     return raw_image(data, height, width, known, depth=recipe.range, color=recipe.color)
