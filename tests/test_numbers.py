@@ -287,6 +287,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
     [
         ({}, "tells no rate: set one with --rate, or name the column of its times with --time"),
         ({"fields": ["z"], "rate": 5}, "there is no column z; it has s, a, word"),
+        ({"fields": ["z [rad]"], "rate": 5}, r"there is no column z \[rad\]; it has s, a, w"),
         ({"fields": ["word"], "rate": 5}, "line 2: --field word is no number but a text"),
         ({"time": "z"}, "there is no column z; it has s, a, word"),
         ({"time": "word"}, "word holds string, as 'x', neither numbers nor dates"),

@@ -25,6 +25,11 @@ _PATH: Final = re.compile(rf"[^.\[\]]+(?:\.[^.\[\]]+|{_STEP.pattern.partition('|
 _Step = str | int | slice
 
 
+def is_path(text: str) -> bool:
+    """Whether a text can be a path to numbers in a message."""
+    return _PATH.fullmatch(text) is not None
+
+
 class Field:
     """Where numbers stand in a message: `position`, `pose.position.x`, `ranges[0:100]`, `p[2].x`.
 
@@ -41,7 +46,7 @@ class Field:
     def __init__(self, path: str, *, plain: bool = False) -> None:
         if not path:
             raise UsageError("--field is empty: name a field of the messages")
-        if not plain and not _PATH.fullmatch(path):
+        if not plain and not is_path(path):
             raise UsageError(
                 f"--field {path} is no field: write names with dots, an index or a part of "
                 "it, as pose.position.x or ranges[0:100]"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.fields import EXACT, Field, bounded
+from recorder.images.fields import EXACT, Field, bounded, is_path
 from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
 from recorder.images.pixels import Shown
 from replay.camera_logs.csv_table import LoadedTable, called, read_table
@@ -212,7 +212,7 @@ def _column(table: LoadedTable, name: str) -> FloatArray:
         UsageError: there is none in the table, or no number in it.
     """
     path, columns = table.path, table.columns
-    field = Field(name, plain=name in columns.column_names)
+    field = Field(name, plain=name in columns.column_names or not is_path(name))
     first = field.first
     if first not in columns.column_names:
         there = ", ".join(columns.column_names[:20])
