@@ -78,7 +78,10 @@ class WatchEnv(Env):
         **settings: Any,
     ) -> None:
         if not isinstance(source, FrameSource):
-            raise UsageError(f"{type(source).__name__} given: WatchEnv takes an open source")
+            raise UsageError(
+                f"{type(source).__name__} given: WatchEnv takes an open source, as "
+                "OscillatorySource(), ArraySource({name: frames}) or Recording(path).source()"
+            )
         if observe not in ("block", "outputs"):
             raise UsageError(f'observe={observe!r} given: it is "block" or "outputs"')
         if max_iterations is not None and not (

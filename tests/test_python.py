@@ -244,6 +244,11 @@ def test_a_run_gives_what_its_log_holds(tmp_path: Path) -> None:
     learn("oscillatory", tmp_path / "run", max_modules=1, sinks=[Rewards()])
     again = Run(tmp_path / "run")
     assert again.signals["reward"].tolist() == pytest.approx(rewards, nan_ok=True)
+    for ask in (again.signals.__getitem__, again.signals.to_arrow):
+        with pytest.raises(UsageError, match=r"^no signal 'rewards': did you mean reward") as found:
+            ask("rewards")
+        assert isinstance(found.value, KeyError)
+    assert "rewards" not in again.signals
     table = again.signals.to_arrow("iteration", "reward", "eta")
     assert table.num_rows == len(rewards)
     assert table["reward"].null_count == np.isnan(rewards).sum()

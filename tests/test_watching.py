@@ -155,6 +155,7 @@ def test_without_a_seed_episodes_differ_and_follow_from_the_first() -> None:
     ("make", "message"),
     [
         (lambda: WatchEnv(np.zeros((9, 2))), "ndarray given: WatchEnv takes an open source"),
+        (lambda: WatchEnv("oscillatory"), r"str given: .*, as OscillatorySource\(\), ArraySource"),  # type: ignore[arg-type]
         (lambda: WatchEnv(OscillatorySource(), "progres"), "progres"),
         (lambda: WatchEnv(OscillatorySource(), observe="frame"), '"block" or "outputs"'),
         (lambda: WatchEnv(OscillatorySource(), max_iterations=0), "max_iterations=0 given"),

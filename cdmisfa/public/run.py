@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Learner
+from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.shown import Shown
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.recompute import Run as RecomputedRun
@@ -22,6 +23,12 @@ from replay.runs.run import read_outline
 
 SCALARS = tuple(signal.name for signal in SIGNALS.values() if not signal.dims)
 """Signals of one number an iteration."""
+
+
+class UnknownSignalError(UsageError, KeyError):
+    """There is no signal of that name."""
+
+    __str__ = Exception.__str__  # a KeyError's is quoted
 
 
 class Signals(Shown, Mapping[str, "NDArray[Any]"]):
@@ -35,6 +42,7 @@ class Signals(Shown, Mapping[str, "NDArray[Any]"]):
         self._log, self._arrays = log, arrays
 
     def __getitem__(self, name: str) -> NDArray[Any]:
+        _refuse_unknown(name, self._arrays)
         return self._arrays[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -53,11 +61,13 @@ class Signals(Shown, Mapping[str, "NDArray[Any]"]):
             names: of signals; by default all of one number an iteration. Others are lists.
 
         Raises:
-            KeyError: there is no such signal.
+            UsageError: there is no such signal; it is a KeyError, too.
             LogDamagedError: the log cannot be read.
         """
         from replay.export.tables import signals_table
 
+        for name in names:
+            _refuse_unknown(name, SIGNALS)
         return signals_table(self._log, names or SCALARS)
 
     def to_pandas(self, *names: str) -> Any:
@@ -70,6 +80,11 @@ class Signals(Shown, Mapping[str, "NDArray[Any]"]):
         import polars
 
         return polars.from_arrow(self.to_arrow(*names))
+
+
+def _refuse_unknown(name: str, known: Collection[str]) -> None:
+    if name not in known:
+        raise UnknownSignalError(f"no signal {name!r}: {did_you_mean(str(name), known)}")
 
 
 class Run(Shown, RecomputedRun):
