@@ -32,7 +32,7 @@ from recorder.images.options import Reading
 from recorder.recording import record
 from replay.arrays import ArrayLog
 from replay.camera_logs.source import ForeignSource
-from replay.export.applied import written
+from replay.export.applied import Applied, written
 from replay.runs.modules import save_modules
 
 TAU = 20
@@ -394,3 +394,12 @@ def test_what_is_not_for_live_streams_is_refused(
         done = cdmisfa("apply", run, *(named.get(word, word) for word in words))
     assert done.code in (1, 2), done.err
     assert why in done.err.splitlines()[-1]
+
+
+def test_a_module_that_is_not_alive_knows_nothing() -> None:
+    source = ArraySource({"a": np.zeros((TAU, *SIZE), np.uint8)})
+    totals = Totals(source.spec, [learned(1), learned(2), learned(3)])
+    (block,) = source.take_all(TAU)
+    y, novelty = np.zeros((TAU, 9)), np.array([0.5, 0.5, 2.0])
+    totals.add(Applied(block, y, np.full(9, 0.1), np.array([True, False, True]), novelty))
+    assert [row["known"] for row in totals.rows()] == [1.0, 0.0, 0.0]

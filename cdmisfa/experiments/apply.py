@@ -343,7 +343,7 @@ class Totals:
         finite = np.isfinite(slowness)
         sums[0] += count
         sums[1] += count * applied.alive
-        sums[2] += count * (applied.novelty < 1)
+        sums[2] += count * (applied.alive & (applied.novelty < 1))
         sums[3] += count * np.where(finite, slowness, 0)
         sums[4] += count * finite
 

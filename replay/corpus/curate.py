@@ -93,7 +93,8 @@ class _Blocks:
         spec = log.spec
         assert spec is not None
         features, noise = described(block.frames)
-        nearest = None if novelty is None else int(np.argmin(novelty))
+        near = novelty is not None and np.isfinite(novelty).any()
+        nearest = int(np.argmin(novelty)) if near else None
         verdict, module = (NOISE if noise else NOVEL), None
         if nearest is not None and novelty[nearest] < 1:
             verdict, module = KNOWN, modules[nearest]
@@ -244,7 +245,7 @@ def _judge(number: int, log: _Log, application: Applies | None, blocks: _Blocks)
 def _judged(source: Any, tau: int, application: Applies | None) -> Iterator[tuple[Block, Any]]:
     if application is not None:
         for applied in application.to(source):
-            yield applied.block, applied.novelty
+            yield applied.block, np.where(applied.alive, applied.novelty, np.inf)
         return
     end = source.first_frame + source.frames
     with contextlib.suppress(LogExhaustedError):
