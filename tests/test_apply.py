@@ -233,7 +233,7 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
     ("words", "code", "why"),
     [
         ("apply RUN oscillatory", 2, r"frames of \(2,\), and the modules learned from \(6, 8\)"),
-        ("apply RUN small.mcap", 2, "smaller than 8x6"),
+        ("apply RUN small.mcap", 2, "4x4, cropped to 4x3, is smaller than 8x6: .* larger images$"),
         ("apply RUN t.csv --rate 9", 2, "t.csv shows numbers, and the modules learned from pict"),
         ("apply RUN n.npy", 2, r"n.npy shows frames of \(3,\), and the modules .* \(6, 8\)"),
         ("apply RUN nan.npy", 2, "nan: row 1, counted from 0, holds what is no finite number"),

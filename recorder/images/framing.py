@@ -171,10 +171,11 @@ def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> 
     """
     if image.shape == size:
         return image
+    whole = image.shape
     if fit == "crop":
         image = _middle(image, _largest_within(size_of(image), size))
     if fit != "pad":
-        return shrink(image, *size, enlarge=enlarge)
+        return shrink(image, *size, enlarge=enlarge, whole=whole)
     inner = _largest_within(size, size_of(image))
     frame = np.zeros(size, np.uint8)
     _middle(frame, inner)[:] = shrink(image, *inner, enlarge=enlarge)

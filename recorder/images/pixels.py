@@ -208,7 +208,18 @@ def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray
     return _by_bands(values, gray)
 
 
-def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) -> ByteArray:
+OR_SIZE: Final = ", or a smaller --size"
+"""The end of the error about a small image, which a command without --size leaves out."""
+
+
+def shrink(
+    image: ByteArray,
+    height: int,
+    width: int,
+    *,
+    enlarge: bool = False,
+    whole: tuple[int, ...] | None = None,
+) -> ByteArray:
     """Average the areas of a gray image into fewer pixels.
 
     Args:
@@ -216,6 +227,7 @@ def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) 
         height: rows of the result.
         width: columns of the result.
         enlarge: repeat the pixels of a smaller image instead of refusing it.
+        whole: shape of the picture that it was cropped from, for the error.
 
     Raises:
         UsageError: the image is smaller.
@@ -223,9 +235,11 @@ def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) 
     if image.shape == (height, width):
         return image
     if not enlarge and (image.shape[0] < height or image.shape[1] < width):
+        said = f"{image.shape[1]}x{image.shape[0]}"
+        if whole is not None and whole != image.shape:
+            said = f"{whole[1]}x{whole[0]}, cropped to {said},"
         raise UsageError(
-            f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
-            "choose larger images, or a smaller --size"
+            f"an image of {said} is smaller than {width}x{height}: choose larger images{OR_SIZE}"
         )
     small = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
     return np.asarray(small, np.uint8)
