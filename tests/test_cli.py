@@ -18,6 +18,9 @@ from mcap.reader import make_reader
 from run_data import VECTOR, write_run
 from waiting import started, wait_for
 
+from cdmisfa import Run
+from cdmisfa.core.names import counted
+
 SHORT = ("--max-iterations", "5", "--json")
 
 
@@ -60,6 +63,16 @@ class TestJson:
         for channel in document["channels"]:
             keys = {"topic", "encoding", "schema", "messages", "start_ns", "end_ns"}
             assert keys <= set(channel)
+
+    def test_one_is_no_plural(
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
+    ) -> None:
+        words = ("learn", oscillatory_recording, "--max-iterations", 1, "--no-rerun")
+        ended = "ended after 1 iteration"
+        assert f"{ended}: " in cdmisfa(*words, "-o", tmp_path / "run").out
+        assert f"{ended} of 100 frames: " in cdmisfa("info", tmp_path / "run").out
+        assert "** in 1 iteration (100 frames of 3 streams)" in Run(tmp_path / "run").summary()
+        assert [counted(n, "frame", ",") for n in (0, 1000)] == ["0 frames", "1,000 frames"]
 
     def test_info_in_words(
         self,

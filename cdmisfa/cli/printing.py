@@ -15,6 +15,7 @@ import click
 
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import counted
 from cdmisfa.core.untrusted import printable
 
 if TYPE_CHECKING:
@@ -164,8 +165,9 @@ def say_counts(source: FrameSource) -> None:
     what = "pictures" if source.spec.images else "messages"
     for name, counts in getattr(source, "alignment", {}).items():
         tell(
-            f"{name}: {counts['messages']} {what}; {counts['repeated']} frames repeated, "
-            f"{counts['missing']} missing; {what}: {counts['dropped']} between frames, "
+            f"{name}: {counts['messages']} {what}; "
+            f"{counted(counts['repeated'], 'frame')} repeated, {counts['missing']} missing; "
+            f"{what}: {counts['dropped']} between frames, "
             f"{counts['late']} late, {counts['disordered']} out of order, {counts['lost']} thrown "
             "away"
         )
@@ -184,7 +186,7 @@ def say_about(source: FrameSource) -> None:
     for name, counts in getattr(source, "alignment", {}).items():
         tell(
             f"{name}: {counts['messages']} {what}, "
-            f"{counts['repeated']} frames repeated, {counts['dropped']} {what} dropped"
+            f"{counted(counts['repeated'], 'frame')} repeated, {counts['dropped']} {what} dropped"
         )
 
 
@@ -238,7 +240,9 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
     ]  # fmt: skip
     print_table(head, cells)
     seconds = source.frames / source.spec.fps
-    print_line(f"{source.frames} frames at {source.spec.fps:g} a second, {seconds:.6g} s")
+    print_line(
+        f"{counted(source.frames, 'frame')} at {source.spec.fps:g} a second, {seconds:.6g} s"
+    )
     unknown = [row["stream"] for row in rows if row["size_changes"] is None]
     if unknown:
         said = "whether images change their size shows when they are read"
@@ -266,7 +270,7 @@ def outcome_line(outcome: Mapping[str, Any]) -> str:
     if outcome["slowness"] is not None:
         came += f", slowness {outcome['slowness']:.4f} on frames not learned from"
     because = f": {outcome['why']}" if outcome["why"] else ""
-    after = f"{outcome['blocks']} block{'' if outcome['blocks'] == 1 else 's'}"
+    after = counted(outcome["blocks"], "block")
     return f"{outcome['stream']}: {came}, after {after}{because}"
 
 
@@ -327,7 +331,7 @@ def print_result(result: RunResult, *, as_json: bool) -> None:
         print_line(f"not decided: {', '.join(result.undecided)}")
     if result.held_out:
         print_held_out(result.held_out)
-    print_line(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
+    print_line(f"ended after {counted(result.iterations, 'iteration')}: {ENDINGS[result.ended]}")
     print_line(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
         look = f"look at it: cdmisfa view {quoted(result.run)}"

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.names import counted
 from cdmisfa.core.signals import ACTIONS, STATES
 from replay.runs.run import Outline
 from replay.view.columns import MOST_STREAMS
@@ -138,8 +139,8 @@ def _unfinished(outline: Outline) -> str:
 
 
 def _opening(outline: Outline) -> str:
-    learned = f"{len(outline.saved)} module{'' if len(outline.saved) == 1 else 's'} learned"
+    learned = f"{counted(len(outline.saved), 'module')} learned"
     return (
-        f"**{learned}** in {outline.iterations:,} iterations "
-        f"({outline.frames:,} frames of {len(outline.names())} streams)."
+        f"**{learned}** in {counted(outline.iterations, 'iteration', ',')} "
+        f"({counted(outline.frames, 'frame', ',')} of {counted(len(outline.names()), 'stream')})."
     )

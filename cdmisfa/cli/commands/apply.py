@@ -26,6 +26,7 @@ from cdmisfa.cli.printing import (
 )
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.names import counted
 from cdmisfa.core.options import TIME
 from replay.camera_logs.options import CameraOptions
 
@@ -323,7 +324,7 @@ def print_applied(run: str, rows: Sequence[dict[str, Any]], *, as_json: bool) ->
     for row in rows:
         if not row["modules"]:
             continue
-        print_line(f"{row['log']}: {row['frames']} frames")
+        print_line(f"{row['log']}: {counted(row['frames'], 'frame')}")
         cells = [
             (
                 one["stream"],

@@ -17,6 +17,7 @@ from cdmisfa.cli.printing import (
     print_line,
     print_modules,
 )
+from cdmisfa.core.names import counted
 
 if TYPE_CHECKING:
     from replay.integrity.info import ChannelInfo, LogInfo, SizeInfo
@@ -84,14 +85,14 @@ def _print_run(found: LogInfo, run: RunInfo) -> None:
 
     more = len(run.streams) - MOST_NAMED
     named = ", ".join(run.streams[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
-    print_line(f"learner {run.algorithm}, {len(run.streams)} streams: {named}")
+    print_line(f"learner {run.algorithm}, {counted(len(run.streams), 'stream')}: {named}")
     if found.modules or found.ended is not None:  # else they are in its log alone
         print_modules(found.modules, policies=not run.outcomes)
     for outcome in run.outcomes:
         print_line(outcome_line(outcome))
     if found.held_out is not None:
         print_held_out(found.held_out)
-    done = f"{run.iterations} iterations of {run.tau} frames"
+    done = f"{counted(run.iterations, 'iteration')} of {counted(run.tau, 'frame')}"
     if found.ended is None:
         print_line(
             f"not ended: {done} so far; it learns, or was stopped before its modules were kept"
@@ -110,7 +111,8 @@ def _times(found: LogInfo) -> Iterator[str]:
         long += f" ({timedelta(seconds=round((end - start) / 1e9))})"
     kinds = {c.encoding for c in found.channels}
     shared = f"{kinds.pop()} " if len(kinds) == 1 else ""
-    yield f"{found.messages} {shared}messages, {long}, from {_clock(start)} to {_clock(end)}"
+    messages = counted(found.messages, f"{shared}message")
+    yield f"{messages}, {long}, from {_clock(start)} to {_clock(end)}"
 
 
 def _room(size: SizeInfo, library: str) -> Iterator[str]:
@@ -119,7 +121,9 @@ def _room(size: SizeInfo, library: str) -> Iterator[str]:
         return
     told = [in_bytes(size.file)]
     if size.compression:
-        chunks = (f"{count} {name} chunks" for name, count in sorted(size.compression.items()))
+        chunks = (
+            counted(count, f"{name} chunk") for name, count in sorted(size.compression.items())
+        )
         told.append(", ".join(chunks))
         if size.decompressed > size.stored:
             share = 1 - size.stored / size.decompressed

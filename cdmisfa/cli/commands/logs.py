@@ -23,6 +23,7 @@ from cdmisfa.cli.printing import (
 )
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
+from cdmisfa.core.names import counted
 from cdmisfa.core.options import TIME
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ def cut_command(log: tuple[str, ...], split: str | None, as_json: bool, **chosen
         for problem in found.problems:
             tell(f"{problem.where}: {problem.what}")
         for file in found.files:
-            print_line(f"{file.messages} messages written to {file.file}")
+            print_line(f"{counted(file.messages, 'message')} written to {file.file}")
     if found.problems:
         click.get_current_context().exit(LogDamagedError.exit_code)
 

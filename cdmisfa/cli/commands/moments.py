@@ -20,6 +20,7 @@ from cdmisfa.cli.printing import (
 )
 from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import NotReproducedError, UsageError
+from cdmisfa.core.names import counted
 
 source = word(
     "--source",
@@ -73,7 +74,9 @@ def at_command(
             arrays=state.arrays,
         )
         return
-    print_line(f"after {iterations} iterations: frame {t}, next {streams[learner.stream]}")
+    print_line(
+        f"after {counted(iterations, 'iteration')}: frame {t}, next {streams[learner.stream]}"
+    )
     learned = ", ".join(f"{m.index} {m.stream}" for m in learner.modules)
     print_line(f"modules: {learned or 'none'}")
     summary = learner.summary()
