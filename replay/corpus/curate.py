@@ -26,7 +26,7 @@ from replay.corpus.choosing import Features, described, scaled, spread_out
 from replay.corpus.index import read_index
 from replay.export.applied import Applied
 from replay.inputs import open_to_look
-from replay.report.curated import report_of_segments
+from replay.report.curated import Curated, report_of_segments
 from replay.storage.location import location
 
 SECONDS: Final = 2.0
@@ -117,27 +117,6 @@ class _Blocks:
                 "window": (number, block.t // log.tau),
             }
         )
-
-
-@dataclass(frozen=True, slots=True)
-class Curated:
-    """What came of it.
-
-    Attributes:
-        logs: a row a log, what is new in it first.
-        segments: a row a segment, in the order in which they were chosen.
-        seconds: of all blocks by their verdict, streams together.
-        chosen: seconds of the segments.
-        left: why no more were chosen, where the budget is longer; else empty.
-        to_cut: how many of the segments `cut` takes.
-    """
-
-    logs: list[dict[str, Any]]
-    segments: list[dict[str, Any]]
-    seconds: dict[str, float]
-    chosen: float
-    left: str
-    to_cut: int
 
 
 def curate(

@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cdmisfa.core.names import counted
 from replay.report.drawing import data_uri, reduced, sheet
 from replay.report.page import rendered
 from replay.report.panels import PIXELS
 
-if TYPE_CHECKING:
-    from replay.corpus.curate import Curated
-
 MOST_LOGS = 200
 """Logs that are listed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curated:
+    """What `replay.corpus.curate` chose.
+
+    Attributes:
+        logs: a row a log, what is new in it first.
+        segments: a row a segment, in the order in which they were chosen.
+        seconds: of all blocks by their verdict, streams together.
+        chosen: seconds of the segments.
+        left: why no more were chosen, where the budget is longer; else empty.
+        to_cut: how many of the segments `cut` takes.
+    """
+
+    logs: list[dict[str, Any]]
+    segments: list[dict[str, Any]]
+    seconds: dict[str, float]
+    chosen: float
+    left: str
+    to_cut: int
 
 
 def report_of_segments(
