@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import socket
 import sys
 import tempfile
 import time
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import cdmisfa
-from replay.viewer.program import running
+from replay.viewer.program import free_port, running
 from replay.viewer.web import HOST, POLICY, page_server
 
 project = "cdmisfa"
@@ -74,9 +73,7 @@ def add_the_viewer(app: Any, failure: Exception | None) -> None:
     folder = Path(app.outdir) / "_static" / "viewer"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    with socket.socket() as free:
-        free.bind((HOST, 0))
-        port = free.getsockname()[1]
+    port = free_port()
     with running(page_server(port)):
         for file in VIEWER:
             (folder / file).write_bytes(
@@ -101,9 +98,7 @@ def _fetched(address: str) -> bytes:
         try:
             with urllib.request.urlopen(address) as answer:
                 return bytes(answer.read())
-        except ConnectionError:
-            time.sleep(0.1)
-        except urllib.error.URLError:
+        except urllib.error.URLError:  # it is starting
             time.sleep(0.1)
     raise OSError(f"{address} does not answer")
 

@@ -307,14 +307,11 @@ def _write(
                 place = file if "://" in file else os.path.relpath(file, out)
                 rows.writerow((place, segment["start"], segment["stop"]))
     (folder / "segments.csv").write_text(listed.getvalue(), "utf-8")
-    kept = ("log", "start", "stop", "seconds", "new")
     document = {
         "schema": 1,
         "known": None if known is None else str(known),
         "budget": budget,
-        "seconds": found.seconds,
-        "logs": found.logs,
-        "segments": [{name: segment[name] for name in kept} for segment in found.segments],
+        **found.as_json(),
     }
     (folder / "curated.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
     names = ("log", "stream", "t", "start_ns", "end_ns", "verdict", "module", "novelty")

@@ -36,6 +36,12 @@ class Curated:
     left: str
     to_cut: int
 
+    def as_json(self) -> dict[str, Any]:
+        """What the command prints, and curated.json has."""
+        kept = ("log", "start", "stop", "seconds", "new")
+        segments = [{name: segment[name] for name in kept} for segment in self.segments]
+        return {"logs": self.logs, "seconds": self.seconds, "segments": segments}
+
 
 def report_of_segments(
     found: Curated,

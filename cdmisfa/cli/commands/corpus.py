@@ -227,9 +227,7 @@ def curate_command(
         if row["problem"]:
             tell(f"{row['log']}: {row['problem']}")
     if as_json:
-        told = ("log", "start", "stop", "seconds", "new")
-        segments = [{name: segment[name] for name in told} for segment in found.segments]
-        print_document(out=out, logs=found.logs, seconds=found.seconds, segments=segments)
+        print_document(out=out, **found.as_json())
         return
     head = ("log", "new", "known, s", "novel, s", "noise, s")
     print_table(head, [told_of_log(row) for row in found.logs[:MOST_RANKED]])
