@@ -44,6 +44,7 @@ COLOR = {
     "hue alone": seen(120 + 20 * WAVE, 120 * ONE, 120 - 20 * WAVE),
     "under noise": seen(120 + 20 * WAVE, 120 * ONE, 120 - 20 * WAVE, sd=20),
     "a ball as bright as what is behind": ball((170, 85, 60), (60, 130, 125)),
+    "red for green in grey frames": seen(120 + 59 * WAVE, 120 - 30 * WAVE, 120 * ONE),
     "a lamp": seen(120 + 60 * WAVE * LAMP, 120 * ONE, 120 - 60 * WAVE * LAMP),
 }
 GREY = {

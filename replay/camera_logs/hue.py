@@ -18,6 +18,13 @@ STEP: Final = 5
 _CELLS = 8
 """Parts of a picture's height, and of its width, whose mean colours are compared."""
 
+_BRIGHTNESS: Final = np.array((0.299, 0.587, 0.114))[:, None, None]
+"""Of red, green and blue, as grey frames show them."""
+
+_TOLD: Final = 2.0
+"""Change of red or blue over that of brightness, up to which grey shows it as well; a red ball on
+black comes to that."""
+
 _FEWEST = 20
 
 _SHARE = 0.1
@@ -51,8 +58,8 @@ def hue_varies(frames: NDArray[Any]) -> bool:
     """Whether hue varies where brightness does not, and lasts, as noise does not.
 
     In each of 8 x 8 cells hue is red and blue less brightness, without what brightness in the same
-    cell tells of it. Of that, as of brightness, the covariance of frames that follow one another
-    is taken, summed over the cells.
+    cell tells of it, at most `_TOLD` times itself. Of that, as of brightness, the covariance of
+    frames that follow one another is taken, summed over the cells.
 
     Args:
         frames: (n, height, 3 width) uint8, each in red, green and blue beside one another.
@@ -61,10 +68,10 @@ def hue_varies(frames: NDArray[Any]) -> bool:
         return False
     cells = np.stack([_in_cells(plane) for plane in np.split(frames, 3, axis=2)])
     cells -= cells.mean(axis=1, keepdims=True)
-    grey = cells.mean(axis=0)
+    grey = (_BRIGHTNESS * cells).sum(axis=0)
     hue = cells[[0, 2]] - grey
     along = (hue * grey).sum(axis=1) / np.maximum((grey * grey).sum(axis=0), 1e-9)
-    hue -= along[:, None] * grey
+    hue -= along.clip(-_TOLD, _TOLD)[:, None] * grey
     lasting = _lasting(hue) / len(grey.T)
     varies = max(
         _SHARE * _lasting(grey) / len(grey.T),
