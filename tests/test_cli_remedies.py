@@ -6,6 +6,7 @@ import importlib.util
 import json
 import re
 import shlex
+import tomllib
 from importlib import metadata
 from pathlib import Path
 
@@ -19,7 +20,8 @@ from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels import WIDE
 from replay.runs.folders import runs_in
 
-LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
+ROOT = Path(__file__).parents[1]
+LOGS = ROOT / "sample_logs" / "icub"
 SHORT = ("--set", "learner.tau=10", "--no-rerun")
 
 
@@ -179,10 +181,12 @@ def test_doctor_names_whose_package_has_the_name_of_ours(
 
 def test_what_to_cite_is_this_version_everywhere(cdmisfa: Cdmisfa) -> None:
     printed = cdmisfa("cite").out
-    card = (LOGS.parents[1] / "CITATION.cff").read_text("utf-8")
-    version = metadata.version("cdmisfa")
-    assert f"version = {{{version}}}" in printed
+    card = (ROOT / "CITATION.cff").read_text("utf-8")
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+    assert f"version = {{{metadata.version('cdmisfa')}}}" in printed
     assert f"\nversion: {version}\n" in card
+    log = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    assert re.findall(r"^## \[(.+?)\]", log, re.MULTILINE)[:2] == ["Unreleased", version]
     titles = re.findall(r"  title = \{(.+?)\},\n", printed, re.DOTALL)
     assert len(titles) == 2
     plain = " ".join(card.split())
