@@ -41,7 +41,7 @@ fuzz: $(INSTALLED)
 torture: $(INSTALLED) sanitized
 	test -e build/torture/streams || $(BIN)/cdmisfa arena small --learners progress \
 	    --seeds 0:2 --budget 2000 --jobs 2 -o build/torture/arena --streams build/torture/streams
-	$(BIN)/python -m tools.torture --seed $(or $(SEED),0) --page docs/reliability.md
+	$(BIN)/python -m tools.torture --seed $(or $(SEED),0) --page docs/results/reliability.md
 
 # Tests of what attacks the product, with some cases of each kind.
 attacks: $(INSTALLED)

@@ -20,8 +20,8 @@ from cdmisfa.experiments.documents import markdown
 
 RESULTS = Path(__file__).parent / "results"
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
-PAGE = Path(__file__).parent.parent / "docs" / "benchmarks.md"
-PICTURE = "images/benchmarks.png"
+PAGE = Path(__file__).parent.parent / "docs" / "results" / "benchmarks.md"
+PICTURE = "../images/benchmarks.png"
 """The figure of the history, from the page's folder."""
 
 
@@ -108,7 +108,7 @@ def section(document: Mapping[str, Any]) -> str:
 
 
 def write_page() -> Path:
-    """Write docs/benchmarks.md from the results there are.
+    """Write docs/results/benchmarks.md from the results there are.
 
     Raises:
         CdmisfaError: those of one contradict each other.

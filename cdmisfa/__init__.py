@@ -6,8 +6,8 @@ From arrays, logs, scenes or cameras to a run, its signals as a table, and what 
     table = run.signals.to_arrow()
     outputs = run.modules[0].transform(run.frames())
 
-docs/python.md shows more. `cdmisfa.experiments` has the loop of every run, `recorder` records
-sources, `replay` reads and shows what was logged.
+docs/how-to/python.md shows more. `cdmisfa.experiments` has the loop of every run, `recorder`
+records sources, `replay` reads and shows what was logged.
 """
 
 import os

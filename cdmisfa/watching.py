@@ -46,13 +46,13 @@ class WatchEnv(Env):
         observe: "block": the frames watched; "outputs": those of what is being learned there,
             NaN as 0. Zeros before the first step.
         max_iterations: steps of an episode at most.
-        settings: keys of the learner, `tau=20`; see docs/configuration.md.
+        settings: keys of the learner, `tau=20`; see docs/reference/configuration.md.
 
     Attributes:
         action_space: the streams' indices.
         observation_space: (tau, *frame_shape), or (tau, outputs).
         learner: the episode's; None before the first.
-        signals: of the last step, see docs/signals.md; None before the first of an episode.
+        signals: of the last step (docs/reference/signals.md); None before the first of an episode.
 
     Raises:
         UsageError: Gymnasium is missing, or there is no such learner, setting or observation.

@@ -65,7 +65,7 @@ def words_as_written(*event: Any) -> None:
 
 
 def readme_is_the_first_page(app: Any, name: str, text: list[str]) -> None:
-    text[0] = text[0].replace("](../README.md)", "](index.md)")
+    text[0] = text[0].replace("../README.md)", "index.md)")
 
 
 def add_the_viewer(app: Any, failure: Exception | None) -> None:

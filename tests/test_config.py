@@ -259,7 +259,7 @@ def test_fields_that_cannot_be_configured_are_a_programmers_error() -> None:
 
 
 def test_the_page_of_keys_explains_each() -> None:
-    page = (DOCS / "configuration.md").read_text("utf-8")
+    page = (DOCS / "reference" / "configuration.md").read_text("utf-8")
     assert [key for key in KEYS if f"| `{key}` |" not in page] == []
 
 

@@ -450,7 +450,7 @@ class TestQuery:
 def test_the_commands_of_the_page_work(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page = (ROOT / "docs" / "corpus.md").read_text("utf-8")
+    page = (ROOT / "docs" / "how-to" / "corpus.md").read_text("utf-8")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
     lines = "".join(re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)).splitlines()

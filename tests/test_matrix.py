@@ -233,7 +233,7 @@ def test_the_commands_of_the_page_work(
     write_pictures(Path("pictures"), COUNT)
     write_film(Path("film.mp4"))
     write_numbers(Path("data.csv"), Path("joints.mcap"))
-    page = (Path(__file__).parents[1] / "docs" / "logs.md").read_text("utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "how-to" / "logs.md").read_text("utf-8")
     lines = [
         line for block in page.split("```sh")[1:] for line in block.split("```")[0].split("\n")
     ]

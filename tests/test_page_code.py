@@ -34,7 +34,7 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ran]:
     def run(page: str, **given: Any) -> Ran:
         words = io.StringIO()
         with contextlib.redirect_stdout(words):
-            exec("\n".join(blocks(ROOT / "docs" / page)), given)
+            exec("\n".join(blocks(ROOT / "docs" / "how-to" / page)), given)
         return {**given, "printed": words.getvalue()}
 
     return run

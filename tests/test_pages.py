@@ -31,7 +31,7 @@ def test_files_that_a_page_names_are_there(page: Path) -> None:
 
 
 def test_every_guarantee_names_the_tests_that_hold_it() -> None:
-    text = (ROOT / "docs" / "guarantees.md").read_text("utf-8")
+    text = (ROOT / "docs" / "explanation" / "guarantees.md").read_text("utf-8")
     for section in re.split("^## ", text, flags=re.MULTILINE)[1:]:
         assert re.search(r"\b(tests|tools)/[\w/]+\.py", section), section.partition("\n")[0]
 

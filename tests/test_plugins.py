@@ -238,7 +238,7 @@ def test_plugins_exports_are_written(
 
 
 def test_the_page_shows_what_is_in_the_toy() -> None:
-    page = (ROOT / "docs" / "plugins.md").read_text("utf-8")
+    page = (ROOT / "docs" / "how-to" / "plugins.md").read_text("utf-8")
     files = [*TOY.rglob("*.py"), TOY / "pyproject.toml"]
     code = "\n".join(file.read_text("utf-8") for file in files)
     shown = re.findall(r"^```\w+\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)

@@ -15,7 +15,7 @@ from conftest import Cdmisfa
 from waiting import python
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("README.md", "docs/tour.md", "docs/applying.md")
+PAGES = ("README.md", "docs/how-to/tour.md", "docs/how-to/applying.md")
 README, TOUR, APPLYING = ((ROOT / name).read_text("utf-8") for name in PAGES)
 HAS_SIMULATOR = importlib.util.find_spec("pybullet") is not None
 

@@ -184,14 +184,16 @@ def test_every_command_has_help_that_the_group_repeats(name: str) -> None:
 
 
 def test_every_command_is_in_the_readme_or_the_tour() -> None:
-    text = "".join((ROOT / page).read_text("utf-8") for page in ("README.md", "docs/tour.md"))
+    text = "".join(
+        (ROOT / page).read_text("utf-8") for page in ("README.md", "docs/how-to/tour.md")
+    )
     assert [name for name in COMMANDS if f"cdmisfa {name}" not in text] == []
 
 
 def test_page_of_signals_is_what_the_command_prints(cdmisfa: Cdmisfa) -> None:
-    page = (ROOT / "docs" / "signals.md").read_text("utf-8")
+    page = (ROOT / "docs" / "reference" / "signals.md").read_text("utf-8")
     assert cdmisfa("signals", "--markdown").out == page, (
-        "make it again: cdmisfa signals --markdown > docs/signals.md"
+        "make it again: cdmisfa signals --markdown > docs/reference/signals.md"
     )
 
 

@@ -77,7 +77,7 @@ def learn(
         view: also write the view, run.rrd.
         sinks: told of every iteration; one that raises is let go with a warning.
         stop: asked before every iteration; true ends the run.
-        settings: keys of the learner: `tau=20`, `outputs=4`; see docs/configuration.md.
+        settings: keys of the learner: `tau=20`, `outputs=4`; see docs/reference/configuration.md.
 
     Raises:
         UsageError: a source, setting or folder that cannot be; the line names it.

@@ -57,7 +57,7 @@ KINDS: Final = (
     ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, LeRobot datasets, and arrays "
     "(.npy, .npz)"
 )
-"""What is read, for errors; docs/logs.md says more."""
+"""What is read, for errors; docs/how-to/logs.md says more."""
 
 
 def no_log(path: Place) -> CdmisfaError:

@@ -75,7 +75,7 @@ SCHEMA: Final = pa.schema(
     ],
     metadata={MARK: str(VERSION).encode()},
 )
-"""Columns of the index; docs/corpus.md says what each is."""
+"""Columns of the index; docs/how-to/corpus.md says what each is."""
 
 
 class Task(NamedTuple):

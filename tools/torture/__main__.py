@@ -139,7 +139,7 @@ def _git(*words: str) -> str:
 
 
 def _about() -> dict[str, str]:
-    others = (".", ":!docs/reliability.md", ":!docs/reliability.json")
+    others = (".", ":!docs/results/reliability.md", ":!docs/results/reliability.json")
     changed = _git("status", "--porcelain", "--untracked-files=no", "--", *others)
     commit = _git("rev-parse", "--short=7", "HEAD") or "unknown"
     return {

@@ -328,7 +328,7 @@ def _is_film(out: Path) -> bool:
 
 
 @click.command("signals")
-@flag("--markdown", "Print the page docs/signals.md.")
+@flag("--markdown", "Print the page docs/reference/signals.md.")
 @options.as_json
 def signals_command(markdown: bool, as_json: bool) -> None:
     """List every signal that a run records.

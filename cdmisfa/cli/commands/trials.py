@@ -298,9 +298,9 @@ def arena_command(
 ) -> None:
     """Compare learners on sets of streams: what they learn, and how soon.
 
-    SET is one of those that docs/arena.md lists, all, tuning, or reported: those on which nothing
-    was tuned, which are run where none is named, or, with --page, the page is made from the results
-    that are there. Most sets need the extra [arena]; the set small needs nothing.
+    SET is one of those that docs/results/arena.md lists, all, tuning, or reported: those on which
+    nothing was tuned, which are run where none is named, or, with --page, the page is made from
+    the results that are there. Most sets need the extra [arena]; the set small needs nothing.
     """
     from cdmisfa.studies.arena.arena import arena_results
     from cdmisfa.studies.arena.figure import draw_figure
