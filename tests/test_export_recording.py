@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import sys
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,18 +21,21 @@ from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.export import frames
 from replay.export.forms import export
+from replay.recordings.source import RecordedSource
 
+ROOT = Path(__file__).parents[1]
 FRAMES = 53
 FIRST = 7
 TRUTH = ("ball_x", "ball_y")
 
 
-def record_images(folder, shape=(24, 40), views=("left", "right"), fps=50.0):
+def record_images(folder, shape=(24, 40), views=("left", "right"), fps=50.0, *, inverted=False):
     """A recording of white noise: its pixels (views, frames, height, width), its truth."""
     folder.mkdir()
     spec = SourceSpec(views, shape, "uint8", TRUTH, fps, 10**18, None)
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (len(views), FRAMES, *shape), dtype=np.uint8)
+    pixels = 255 - pixels if inverted else pixels
     truth = rng.standard_normal((FRAMES, 2))
     for stream, view in enumerate(views):
         log = ViewLog(folder, view, RecordingSpec("test", 3, spec, {}), RecordConfig())
@@ -186,6 +192,7 @@ def test_rerun_opens_the_dataset(dataset):
     np.testing.assert_array_equal([known[t] for t in range(FRAMES)], truth.astype(np.float32))
 
 
+@pytest.mark.filterwarnings("ignore:The video decoding and encoding capabilities of torchvision")
 def test_lerobot_itself_loads_the_dataset(dataset):
     module = pytest.importorskip(
         "lerobot.datasets.lerobot_dataset",
@@ -204,11 +211,87 @@ def test_lerobot_itself_loads_the_dataset(dataset):
             np.testing.assert_array_equal(seen, np.stack([pixels[stream, t]] * 3))
         known = item["observation.environment_state"].numpy()
         np.testing.assert_array_equal(known, truth[t].astype(np.float32))
+    several = folder.parent / "several"
+    record_images(folder.parent / "inverted", inverted=True)
+    export([folder.parent / "r", folder.parent / "inverted"], several, "lerobot", lossless=True)
+    loaded = module.LeRobotDataset("cdmisfa/several", root=several, video_backend="pyav")
+    assert (len(loaded), loaded.num_episodes) == (2 * FRAMES, 2)
+    item = loaded[FRAMES + FIRST]
+    assert (int(item["episode_index"]), int(item["frame_index"])) == (1, FIRST)
+    seen = np.round(item["observation.images.left"].numpy() * 255)
+    np.testing.assert_array_equal(seen, np.stack([255 - pixels[0, FIRST]] * 3))
+
+
+def test_segments_of_recordings_become_episodes_of_a_dataset(cdmisfa, tmp_path):
+    pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
+    pixels = {name: record_images(tmp_path / name)[0] for name in ("one", "two")}
+    step = 10**9 // 50
+    rows = [  # of a recording the files of both views, of the other its folder
+        *((f"one/{view}.mcap", 30, 40, "one") for view in ("left", "right")),
+        ("two", 50, 99, ""),
+        *((f"one/{view}.mcap", 5, 15, "one") for view in ("left", "right")),
+    ]
+    times = [(path, 10**18 + a * step, 10**18 + b * step, log) for path, a, b, log in rows]
+    lines = [",".join(map(str, row)) for row in (("path", "start", "stop", "log"), *times)]
+    (tmp_path / "look.csv").write_text("\n".join(lines))
+    out = tmp_path / "robot"
+    words = ("--segments", tmp_path / "look.csv", "--lossless", "-o", out, "--json")
+    assert cdmisfa("export", "--to", "lerobot", *words).json["rows"] == 23
+    wanted = [("one", 30, 40), ("one", 5, 15), ("two", 50, 53)]
+    episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    data = pq.read_table(out / "data/chunk-000/file-000.parquet").to_pydict()
+    assert data["index"] == list(range(23))
+    assert data["episode_index"] == [0] * 10 + [1] * 10 + [2] * 3
+    assert data["frame_index"] == [*range(10), *range(10), *range(3)]
+    stats = json.loads((out / "meta/stats.json").read_text())
+    for stream, view in enumerate(("left", "right")):
+        key = f"observation.images.{view}"
+        own = [pixels[name][stream, low:high] for name, low, high in wanted]
+        for episode, expected in zip(episodes, own, strict=True):
+            chunk, file = (episode[f"videos/{key}/{what}_index"] for what in ("chunk", "file"))
+            found, _, _ = decoded(out / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4")
+            ends = [round(50 * episode[f"videos/{key}/{e}_timestamp"]) for e in ("from", "to")]
+            np.testing.assert_array_equal(found[slice(*ends)], expected)
+        every = np.concatenate(own) / 255
+        np.testing.assert_allclose(stats[key]["mean"], np.full((3, 1, 1), every.mean()))
+        np.testing.assert_allclose(stats[key]["std"], np.full((3, 1, 1), every.std()))
+    before = contents(out)
+    how = {"lossless": True, "segments": tmp_path / "look.csv"}
+    assert export([], out, "lerobot", force=True, **how) == 23
+    assert contents(out) == before
+    record_images(tmp_path / "three", (24, 42))
+    for text, why in {
+        f"path,start,stop\none,0,{10**18}": "one: no frame of it lies in its segments",
+        f"start,stop\n0,{10**19}": "a segment names no log: give each row a path",
+        f"path,start,stop\none,0,{10**19}\nthree,0,{10**19}": "three: its frame_shape is",
+    }.items():
+        (tmp_path / "wrong.csv").write_text(text)
+        with pytest.raises(UsageError, match=why):
+            export([], tmp_path / "out", "lerobot", segments=tmp_path / "wrong.csv")
+        assert not (tmp_path / "out").exists()
+    with pytest.raises(UsageError, match="mp4 is of one log: segments are for lerobot"):
+        export([], tmp_path / "out", "mp4", segments=tmp_path / "look.csv")
+
+
+def test_tasks_become_states_actions_and_episodes(cdmisfa, tmp_path):
+    pytest.importorskip("gymnasium", reason="pip install 'cdmisfa[gym]'")
+    pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
+    words = ("record", "gym:CartPole-v1", "--frames", 80, "--size", "40x30")
+    assert cdmisfa(*words, "-o", tmp_path / "r").code == 0
+    assert export(tmp_path / "r", tmp_path / "robot", "lerobot") == 80
+    with RecordedSource(tmp_path / "r") as source:
+        truth = source.take(0, 80).truth.astype(np.float32)
+    data = pq.read_table(tmp_path / "robot/data/chunk-000/file-000.parquet")
+    np.testing.assert_array_equal(data["observation.state"].to_pylist(), truth[:, :4])
+    np.testing.assert_array_equal(data["action"], truth[:, 4])
+    begins = data["frame_index"].to_numpy() == 0
+    np.testing.assert_array_equal(begins, truth[:, 5] == 1)
+    assert begins.sum() > 1
+    (task,) = pq.read_table(tmp_path / "robot/meta/tasks.parquet").to_pylist()
+    assert task == {"task_index": 0, "__index_level_0__": "CartPole-v1"}
 
 
 def test_values_become_a_dataset_without_videos(oscillatory_recording, tmp_path):
-    from replay.recordings.source import RecordedSource
-
     assert export(oscillatory_recording, tmp_path / "robot", "lerobot") == 2000
     info = json.loads((tmp_path / "robot/meta/info.json").read_text())
     assert info["video_path"] is None
@@ -284,3 +367,16 @@ def test_the_command_says_what_is_lost(cdmisfa, tmp_path):
     said = cdmisfa(*words, "--json")
     assert said.json["rows"] == FRAMES
     assert said.err == ""
+
+
+def test_every_command_of_the_page_on_datasets_works(cdmisfa, tmp_path, monkeypatch):
+    pytest.importorskip("gymnasium", reason="pip install 'cdmisfa[gym]'")
+    pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "how-to" / "viewing.md").read_text("utf-8")
+    _, _, section = page.partition("### A LeRobot dataset\n")
+    (block,) = re.findall(r"^```sh\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
+    for line in block.splitlines():
+        program, *words = shlex.split(line)
+        done = cdmisfa(*words)
+        assert (program, done.code) == ("cdmisfa", 0), f"{line}: {done.err}"

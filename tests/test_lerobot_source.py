@@ -15,6 +15,7 @@ from conftest import Cdmisfa
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.camera_logs.lerobot import PAUSE
 from replay.camera_logs.source import ForeignSource
+from replay.recordings.source import RecordedSource
 
 pytest.importorskip("av")
 
@@ -66,6 +67,43 @@ def test_episodes_follow_one_another_after_a_pause(dataset: Path, kept: str) -> 
     ]
     np.testing.assert_array_equal(np.concatenate([b.frames for b in blocks]), expected)
     source.close()
+
+
+def test_numbers_come_back_as_they_were_exported(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    frames = {"a": 60, "b": 41}
+    for seed, (name, count) in enumerate(frames.items()):
+        words = ["--frames", count, "--seed", seed, "-o", tmp_path / name]
+        assert cdmisfa("record", "oscillatory", *words).code == 0
+    out = tmp_path / "data"
+    words = ["--to", "lerobot", "--task", "oscillate", "-o", out, "--json"]
+    assert cdmisfa("export", tmp_path / "a", tmp_path / "b", *words).json["rows"] == 101
+    tasks = pq.read_table(out / "meta/tasks.parquet").to_pylist()
+    assert tasks == [{"task_index": 0, "__index_level_0__": "oscillate"}]
+    expected = []
+    for name, count in frames.items():
+        with RecordedSource(tmp_path / name) as one:
+            views = one.spec.streams
+            expected.append(np.hstack([block.frames for block in one.take_all(count)]))
+    fields = [f"observation.{view}" for view in views]
+    with ForeignSource(out, fields=fields) as source:
+        assert source.pauses == {"data": [(60, 60 + PAUSE)]}
+        found = [block.frames for block in source.take_all(101 + PAUSE)]
+    for block, numbers in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(block, numbers.astype(np.float32))
+    with pytest.raises(UsageError, match="no numbers state; it has observation"):
+        ForeignSource(out, fields=["state"])
+    table = out / "data/chunk-000/file-000.parquet"
+    rows = pq.read_table(table)
+    lacking = np.where(np.arange(101) == 7, np.nan, 0)
+    pq.write_table(rows.append_column("lacking", pa.array(lacking)), table)
+    info = json.loads((out / "meta/info.json").read_text())
+    info["features"]["lacking"] = {"dtype": "float64", "shape": [1]}
+    (out / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(UsageError, match="frame 7 lacks a number of lacking"):
+        ForeignSource(out, fields=["lacking"])
+    pq.write_table(rows.slice(0, 50), table)
+    with pytest.raises(LogDamagedError, match="LeRobot's layout"):
+        ForeignSource(out, fields=fields)
 
 
 def test_what_is_no_such_dataset_is_one_line(dataset: Path) -> None:

@@ -90,15 +90,22 @@ class TestValues(ForwardContract):
         return ArraySource({"values": np.random.default_rng(0).random((60, 3))}, fps=20)
 
 
-def test_a_task_shows_its_observations_as_truth() -> None:
+def test_a_task_shows_its_observations_and_actions_as_truth() -> None:
     with GymSource(["CartPole-v1"], size=(24, 32)) as source:
-        assert source.spec.truth == tuple(f"CartPole_v1_{i}" for i in range(4))
+        observed = [f"CartPole_v1_{i}" for i in range(4)]
+        assert source.spec.truth == (*observed, "action_CartPole_v1_0", "begins_CartPole_v1")
         assert source.spec.fps == 50
         block = source.take(0, 200)
     # the cart moves by its velocity times 0.02 s, within an episode
     position, velocity = block.truth[:-1, 0], block.truth[:-1, 1]
     moved = block.truth[1:, 0] - position
     assert np.median(np.abs(moved - 0.02 * velocity)) < 1e-6
+    # 1 pushes the cart to the right and makes it faster, 0 slower; an episode begins at rest
+    pushed, begins = block.truth[:-1, 4], block.truth[:, 5] == 1
+    within = ~begins[1:]
+    np.testing.assert_array_equal((np.diff(block.truth[:, 1]) > 0)[within], pushed[within] == 1)
+    assert begins.sum() > 3
+    assert np.abs(block.truth[begins][1:, :4]).max() <= 0.05
 
 
 def test_a_policy_is_given_the_observation() -> None:
@@ -110,7 +117,7 @@ def test_a_policy_is_given_the_observation() -> None:
 
     with GymSource(["CartPole-v1"], policy=policy, hold=4) as source:
         source.take(0, 8)
-    assert len(seen) == 2
+    assert len(seen) == 3  # for frame 8, which is the last, too
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:

@@ -174,7 +174,9 @@ def path_argument(name: str) -> Callable[[Command], Command]:
     return click.argument(name, type=OUT, shell_complete=completing.runs)
 
 
-def fetched_argument(name: str, *, nargs: int = 1) -> Callable[[Command], Command]:
+def fetched_argument(
+    name: str, *, nargs: int = 1, required: bool = True
+) -> Callable[[Command], Command]:
     """A path, or several; a log behind a URL is copied into a file while the command runs.
 
     What the command complains about then names the URL, not the copy.
@@ -193,7 +195,7 @@ def fetched_argument(name: str, *, nargs: int = 1) -> Callable[[Command], Comman
                 raise
 
         how: dict[str, Any] = {"callback": _fetched, "shell_complete": completing.runs}
-        argument = click.argument(name, nargs=nargs, required=True, **how)
+        argument = click.argument(name, nargs=nargs, required=required, **how)
         return cast(Command, argument(naming_the_url))
 
     return wrapped

@@ -1,4 +1,4 @@
-"""What a stream is called, whatever its log or its camera calls it; how many there are."""
+"""What streams and columns are called, whatever a log calls them; how many there are."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from collections.abc import Iterable
 
 _OF_VIEWS = re.compile(r"(/view/|observation\.images\.)+(?=.)")
 _LONGEST = 64
+
+ACTION, BEGINS, JOINT = "action_", "begins_", "head_"
+"""How a column of truth is called that is the action for a frame, that is 1 where an episode of a
+task begins, or that is a joint of the robot."""
 
 
 def counted(number: int, what: str, form: str = "") -> str:

@@ -9,7 +9,7 @@ import importlib
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
-from itertools import chain, islice
+from itertools import chain, count, islice
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +20,7 @@ from cdmisfa.core.arrays import ByteArray, FloatArray, as_array
 from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
+from cdmisfa.core.names import ACTION, BEGINS
 from cdmisfa.core.shown import MOST_STREAMS, beside
 from recorder.images.framing import framings
 from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
@@ -156,7 +157,8 @@ def _checked(name: str, frames: Iterable[Any], spec: SourceSpec) -> Iterator[Any
 class GymSource(SteppedSource):
     """Environments that render, one a stream, stepped together; the same seed shows the same.
 
-    An episode that ends is followed by another.
+    An episode that ends is followed by another. Their truth is the numbers of each one's
+    observation, of the action that it is followed by, and whether an episode begins with it.
 
     Args:
         tasks: the environments' ids, or environments made with `render_mode="rgb_array"`.
@@ -193,11 +195,17 @@ class GymSource(SteppedSource):
         ]
         tasks = [str(getattr(e.spec, "id", e)) for e in environments]
         names = tuple(names or tasks)
-        counts = [_numbers(e.observation_space) for e in environments]
-        truth = tuple(
-            f"{re.sub(r'[^0-9A-Za-z]', '_', name)}_{i}"
-            for name, count in zip(names, counts, strict=True)
-            for i in range(count)
+        plain = [re.sub(r"[^0-9A-Za-z]", "_", name) for name in names]
+        observed = [_numbers(e.observation_space) for e in environments]
+        acted = [_numbers(e.action_space) for e in environments]
+        truth = (
+            *(f"{name}_{i}" for name, n in zip(plain, observed, strict=True) for i in range(n)),
+            *(
+                f"{ACTION}{name}_{i}"
+                for name, n in zip(plain, acted, strict=True)
+                for i in range(n)
+            ),
+            *(f"{BEGINS}{name}" for name in plain),
         )
         fps = float(fps or environments[0].metadata.get("render_fps") or FPS)
         shown = np.asarray if color else gray_picture
@@ -206,10 +214,12 @@ class GymSource(SteppedSource):
             play(e, rng, hold, policy) for e, rng in zip(environments, generators, strict=True)
         ]
 
-        def step(seen: Sequence[Any]) -> Step:
-            known = [np.ravel(o) for o, count in zip(seen, counts, strict=True) if count]
+        def step(played: Sequence[tuple[Any, Any, bool]]) -> Step:
+            seen, actions, begins = zip(*played, strict=True)
+            known = [np.ravel(o) for o, n in zip(seen, observed, strict=True) if n]
+            known += [np.ravel(a) for a, n in zip(actions, acted, strict=True) if n]
             pictures = [shown(e.render()) for e in environments]
-            return pictures, np.concatenate([*known, np.empty(0)]).astype(np.float64)
+            return pictures, np.concatenate([*known, begins]).astype(np.float64)
 
         steps = map(step, zip(*played, strict=True))
         first = next(steps)
@@ -244,7 +254,7 @@ class GymSource(SteppedSource):
 
 def play(
     environment: Any, rng: np.random.Generator, hold: int, policy: Policy | None = None
-) -> Iterator[Any]:
+) -> Iterator[tuple[Any, Any, bool]]:
     """An environment's observations, step by step, for ever.
 
     Args:
@@ -252,18 +262,23 @@ def play(
         rng: gives its seed, and that of random actions.
         hold: steps for which an action is kept.
         policy: gives the action for an observation; by default actions are random.
+
+    Yields:
+        An observation, the action for it, and whether an episode begins with it.
     """
     seen, _ = environment.reset(seed=int(rng.integers(LARGEST_SEED)))
     environment.action_space.seed(int(rng.integers(LARGEST_SEED)))
-    t = 0
-    while True:
+    begins = True
+    for t in count():
         if t % hold == 0:
             action = environment.action_space.sample() if policy is None else policy(seen)
+        if t:
+            yield seen, action, begins
+            begins = False
         seen, _, ended, cut, _ = environment.step(action)
         if ended or cut:
             seen, _ = environment.reset()
-        yield seen
-        t += 1
+            begins = True
 
 
 def make_environment(task: str, **options: Any) -> Any:

@@ -1,22 +1,24 @@
-"""LeRobot datasets, layout v3.0: a camera's images of all episodes, one after the other.
+"""LeRobot datasets, layout v3.0: a camera's images, or numbers, of all episodes, in their order.
 
 The layout is read as it is published (github.com/huggingface/lerobot), with PyArrow and PyAV.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.arrays import ByteArray, FloatArray, IntArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, read_json
-from recorder.images.options import Size
-from recorder.images.pixels import compressed_image
+from recorder.images.fields import bounded
+from recorder.images.options import NUMBERS_RECIPE, Reading, Size
+from recorder.images.pixels import Shown, compressed_image
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.camera_logs.pictures import VideoImages
 from replay.camera_logs.stream import (
@@ -63,16 +65,10 @@ class LeRobotImages(ImageStream):
             self._files = [(int(row[keys[0]]), int(row[keys[1]])) for row in rows]
             scale = self._fps if self._video else 1
             self._first = [round(float(row[start]) * scale) for row in rows]
-            lengths = np.array([int(row["length"]) for row in rows], np.int64)
-            self._starts = np.concatenate([[0], np.cumsum(lengths)])
-            ticks = np.arange(self._starts[-1]) + np.repeat(np.arange(len(rows)) * PAUSE, lengths)
-            self.times = np.round(ticks * (NANOSECONDS / self._fps)).astype(np.uint64)
-        if not len(self.times):
-            raise UsageError(f"{path}: there is no frame in it")
+        self._starts, self.times = _clock(path, rows, self._fps)
         self._file: Path | None = None
         self._images: Any = None
-        if len(rows) > 1:
-            self.warnings = [f"{path}: {topic} is of {len(rows)} episodes, with pauses between"]
+        self.warnings = _of_episodes(path, topic, rows)
         if self._video:
             self.recipe = VideoImages.recipe
 
@@ -133,6 +129,48 @@ class LeRobotImages(ImageStream):
             return compressed_image(data, color=self._color)
 
 
+class LeRobotNumbers(ImageStream):
+    """Numbers of a dataset, as observation.state and action: those of each frame one message.
+
+    Raises:
+        UsageError: it has no such feature of numbers, or one of them is not finite.
+        LogDamagedError: its tables cannot be read, or contradict each other.
+    """
+
+    path: Path
+    recipe = NUMBERS_RECIPE
+
+    def __init__(self, path: Path, topic: str | None, reading: Reading) -> None:
+        self.path, self.topic, self.fields = path, path.resolve().name, reading.fields
+        if topic not in (None, self.topic):
+            raise UsageError(f"{path}: its numbers have no topics, leave {topic} out; see --field")
+        info, (known, _), what = _info(path), _features(path), ", ".join(reading.fields)
+        for name in reading.fields:
+            if name not in known:
+                raise UsageError(f"{path}: no numbers {name}; it has {', '.join(known)}")
+        rows = _episodes(path, ["episode_index", "length", "dataset_from_index"])
+        starts, self.times = _clock(path, rows, float(info["fps"]))
+        files = sorted((path / "data").rglob("*.parquet"))
+        if not files:
+            raise LogDamagedError(f"{path}: there is no table of its frames")
+        numbers = np.concatenate([_numbers(file, reading.fields) for file in files])
+        with explained(path, "LeRobot's layout", held=numbers.nbytes):
+            firsts = np.array([int(row["dataset_from_index"]) for row in rows]) - starts[:-1]
+            at = np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))
+            self._numbers = bounded(numbers[at], reading.depth)
+        if not (whole := np.isfinite(self._numbers).all(axis=1)).all():
+            frame = int(np.argmin(whole))
+            raise UsageError(
+                f"{path}: frame {frame} lacks a number of {what}, or has one that is not finite: "
+                "name others with --field"
+            )
+        self.warnings = _of_episodes(path, what, rows)
+
+    def image(self, row: int) -> Shown:
+        shown: Shown = self._numbers[row]
+        return shown
+
+
 def is_dataset(path: Path) -> bool:
     """Whether a folder is a LeRobot dataset."""
     return (path / INFO).is_file()
@@ -140,8 +178,7 @@ def is_dataset(path: Path) -> bool:
 
 def dataset_cameras(path: Path) -> list[str]:
     """The features of a dataset that are images."""
-    features = _info(path)["features"]
-    return [name for name, feature in features.items() if feature.get("dtype") in _IMAGES]
+    return _features(path)[1]
 
 
 def dataset_channels(path: Path) -> list[ChannelFacts]:
@@ -156,6 +193,50 @@ def dataset_channels(path: Path) -> list[ChannelFacts]:
 
 
 _IMAGES: Final = ("video", "image")
+
+
+def _features(path: Path) -> tuple[list[str], list[str]]:
+    """The features of a dataset that are numbers, and those that are images."""
+    kinds = {name: str(own.get("dtype")) for name, own in _info(path)["features"].items()}
+    numbers = [name for name, kind in kinds.items() if kind.startswith(("float", "int", "bool"))]
+    return numbers, [name for name, kind in kinds.items() if kind in _IMAGES]
+
+
+def _numbers(file: Path, names: Sequence[str]) -> FloatArray:
+    """The numbers of each frame in a table, one after the other, (n, I)."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    check_regular(file)
+    found = []
+    with arrow_explained(file, remedy="take fewer, with --field"):
+        table = pq.ParquetFile(file).read(columns=list(names), use_threads=False)
+        for name in names:
+            column = table[name].combine_chunks()
+            while pa.types.is_nested(column.type):
+                column = column.flatten()
+            flat = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+            found.append(flat.reshape(table.num_rows, -1))
+        return np.concatenate(found, axis=1)
+
+
+def _clock(
+    path: Path, rows: Sequence[Mapping[str, Any]], fps: float
+) -> tuple[IntArray, NDArray[np.uint64]]:
+    """Where each episode begins, and where the last ends; when each frame is, nanoseconds."""
+    with explained(path, "LeRobot's layout"):
+        lengths = np.array([int(row["length"]) for row in rows], np.int64)
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        ticks = np.arange(starts[-1]) + np.repeat(np.arange(len(rows)) * PAUSE, lengths)
+        times = np.round(ticks * (NANOSECONDS / fps)).astype(np.uint64)
+    if not len(times):
+        raise UsageError(f"{path}: there is no frame in it")
+    return starts, times
+
+
+def _of_episodes(path: Path, what: str, rows: Sequence[Any]) -> list[str]:
+    said = f"{path}: {what} is of {len(rows)} episodes, with pauses between"
+    return [said] if len(rows) > 1 else []
 
 
 def _info(path: Path) -> Any:

@@ -14,6 +14,7 @@ from recorder.images.videos import VideoPackets
 from replay.camera_logs.bag import BAGS, BagImages, bag_channels, bag_topics
 from replay.camera_logs.lerobot import (
     LeRobotImages,
+    LeRobotNumbers,
     dataset_cameras,
     dataset_channels,
     is_dataset,
@@ -120,8 +121,10 @@ def _open(
         return BagImages(path, topic, reading=reading)
     if kind == "table":
         return TableNumbers(path, topic, reading)
+    if kind == "dataset" and reading.fields:
+        return LeRobotNumbers(path, topic, reading)
     if reading.fields:
-        raise UsageError(f"{path} holds images: --field is for messages and tables")
+        raise UsageError(f"{path} holds images: --field is for messages, tables and datasets")
     if kind == "dataset":
         return LeRobotImages(path, topic, color=reading.color)
     if kind == "pictures":

@@ -300,12 +300,12 @@ def _write(
     """Write the segments for `cut`, all of it as JSON, and each block's verdict."""
     listed = io.StringIO()
     rows = csv.writer(listed, lineterminator="\n")
-    rows.writerow(("path", "start", "stop"))
+    rows.writerow(("path", "start", "stop", "log"))
     for segment in found.segments:
         for file in segment["files"]:
             if _is_cut(file):
                 place = file if "://" in file else os.path.relpath(file, out)
-                rows.writerow((place, segment["start"], segment["stop"]))
+                rows.writerow((place, segment["start"], segment["stop"], segment["log"]))
     (folder / "segments.csv").write_text(listed.getvalue(), "utf-8")
     document = {
         "schema": 1,

@@ -22,8 +22,8 @@ from recorder.mcap.tables import MessageTable, in_order, overlapping
 from replay.camera_logs.opening import only_foreign
 from replay.cutting.origin import Origin
 from replay.cutting.output import Output, Part
-from replay.cutting.selection import FOREVER, Segment, read_segments
 from replay.inputs import locations
+from replay.segments import FOREVER, Segment, read_segments
 from replay.storage.location import Location
 from replay.storage.opening import log_files, open_store
 

@@ -26,9 +26,9 @@ from recorder.mcap.records import (
 )
 from recorder.mcap.store import Store
 from recorder.mcap.tables import MessageTable
-from replay.cutting.selection import FOREVER, spans_of, within
-from replay.cutting.selection import Segment as Wanted
 from replay.runs.folders import RUN_METADATA
+from replay.segments import FOREVER, spans_of, within
+from replay.segments import Segment as Wanted
 from replay.storage.location import Location
 from replay.storage.opening import open_store
 from replay.stored import Span

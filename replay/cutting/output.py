@@ -23,7 +23,7 @@ from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.mcap.records import Segment
 from recorder.mcap.tables import MessageTable
 from replay.cutting.origin import Ids, Origin, Whole
-from replay.cutting.selection import FOREVER
+from replay.segments import FOREVER
 
 if TYPE_CHECKING:
     from recorder.config import Compression, Split

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,9 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry, did_you_mean
 from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
 from replay.camera_logs.options import CameraOptions
+from replay.export.episodes import logs_of_segments, opened_in_turn, recordings_apart
 from replay.export.frames import write_film, write_films, write_images
-from replay.export.lerobot import write_lerobot
+from replay.export.lerobot import write_dataset, write_lerobot
 from replay.export.tables import TABLES, export_signals
 from replay.inputs import About, holds_run, open_to_look
 from replay.storage.opening import no_such
@@ -31,12 +32,15 @@ class Form:
             `lossless` where `lossy` is set.
         unit: what is counted.
         lossy: whether it may lose a little of what was logged.
+        write_many: writes several logs, each open until the next is asked for and with the frames
+            [start, stop) that are wanted of it; None of a form that is of one.
     """
 
     of: Literal["run", "recording"]
     write: Callable[..., int]
     unit: str
     lossy: bool = False
+    write_many: Callable[..., int] | None = None
 
 
 def _table(form: str) -> Form:
@@ -49,7 +53,7 @@ FORMS: Registry[Form] = Registry(
         **{form: _table(form) for form in TABLES},
         "images": Form("recording", write_images, "images"),
         "mp4": Form("recording", write_films, "frames", lossy=True),
-        "lerobot": Form("recording", write_lerobot, "frames", lossy=True),
+        "lerobot": Form("recording", write_lerobot, "frames", lossy=True, write_many=write_dataset),
     },
     group="cdmisfa.exports",
 )
@@ -67,17 +71,23 @@ def export(
     force: bool = False,
     lossless: bool = False,
     cameras: CameraOptions | None = None,
+    segments: Path | None = None,
+    task: str | None = None,
     about: About = lambda source: None,
 ) -> int:
-    """Write a run's signals, or a recording's frames, in another form.
+    """Write a run's signals, or recordings' frames, in another form.
 
     Args:
-        path: a run; for a form of recordings a recording, or camera logs.
+        path: a run; for a form of recordings a recording, or camera logs; for one of several,
+            folders of recordings, too.
         out: the file; for those forms the folder, or for one view's video a file *.mp4.
         form: one of `FORMS`; see `export_signals`.
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images that become a video.
         cameras: which streams of camera logs; by default all of images.
+        segments: for a form of several logs, a list of what is wanted of which; see
+            `read_segments`.
+        task: for LeRobot, what is done, in words.
         about: given a recording or camera logs before they are written, to say what they are.
 
     Returns:
@@ -99,6 +109,16 @@ def export(
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     refuse_special(out)
     paths = [path] if isinstance(path, Path) else list(path)
+    if segments is not None:
+        if paths:
+            raise UsageError(f"{segments}: its segments name their logs: name no others beside it")
+        if described.write_many is None:
+            many = " or ".join(name for name, other in FORMS.items() if other.write_many)
+            raise UsageError(f"{form} is of one log: segments are for {many}")
+    elif not paths:
+        raise UsageError("name what is exported: a run, a recording, or camera logs")
+    if task is not None and form != "lerobot":
+        raise UsageError(f"{form} has no word for a task: --task is for lerobot")
     for named in paths:
         if not named.exists():
             raise no_such(named)
@@ -107,7 +127,18 @@ def export(
     elif form in ("images", "lerobot") or (form == "mp4" and out.suffix != ".mp4"):
         refuse_named_as_file(out)
     if described.of == "recording":
-        return _export_recording(paths, out, form, lossless, cameras, about)
+        words: dict[str, Any] = {"lossless": lossless} if described.lossy else {}
+        if form == "lerobot":
+            words |= {"name": out.name, "task": task}
+        logs = logs_of_segments(segments) if segments else recordings_apart(paths)
+        if described.write_many is None or not logs:
+            return _export_recording(paths, out, form, words, cameras, about)
+        _refuse_others(out)
+        with (
+            contextlib.closing(opened_in_turn(logs, cameras, about)) as opened,
+            atomic_write(out) as place,
+        ):
+            return described.write_many(opened, place, **words)
     if out.is_dir():
         raise UsageError(f"{out} is a folder: name the file to write")
     if not all(map(holds_run, paths)):
@@ -127,7 +158,7 @@ def _export_recording(
     paths: list[Path],
     out: Path,
     form: str,
-    lossless: bool,
+    words: Mapping[str, Any],
     cameras: CameraOptions | None,
     about: About,
 ) -> int:
@@ -142,15 +173,12 @@ def _export_recording(
                 raise UsageError(f"{path} has several views: name a folder, not {out.name}")
             about(source)
             with atomic_write(out) as film:
-                write_film(source, 0, film, lossless=lossless)
+                write_film(source, 0, film, **words)
             return source.frames
         _refuse_others(out)
         about(source)
-        options: dict[str, Any] = {"lossless": lossless} if FORMS[form].lossy else {}
-        if form == "lerobot":
-            options["name"] = out.name
         with atomic_write(out) as place:
-            return FORMS[form].write(source, place, **options)
+            return FORMS[form].write(source, place, **words)
 
 
 def _refuse_others(out: Path) -> None:

@@ -1,4 +1,4 @@
-"""A recording as a LeRobot dataset, layout v3.0: its views as videos, an episode without gaps.
+"""Recordings as a LeRobot dataset, layout v3.0: views as videos, an episode without gaps.
 
 The layout is written as it is published (github.com/huggingface/lerobot), with PyArrow and
 PyAV: the `lerobot` package itself pins a Rerun older than the viewer's and cannot be
@@ -7,8 +7,10 @@ installed beside it. `LeRobotDataset("name", root=FOLDER)` and Rerun open the fo
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +19,37 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.names import stream_names
+from cdmisfa.core.names import ACTION, BEGINS, JOINT, counted, stream_names
 from replay.export.frames import pieces, pixel_format, shared_spans, write_film
+from replay.export.statistics import (
+    Stats,
+    aggregated,
+    as_lists,
+    image_stats,
+    number_stats,
+    values_shown,
+)
 from replay.inputs import Logged
+from replay.recordings.source import RecordedSource
 from replay.stored import Span
 
 VERSION = "v3.0"
-FILE = "chunk-000/file-000"
-"""An export is one file of each kind, whatever its episodes."""
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+FILES = 1000
+"""Most files of a folder. A log is a video a view, whatever its episodes; numbers are one table."""
 
 KEY_EVERY = 2
 """Frames from a key frame to the next, as in LeRobot: training reads single frames."""
 
-QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-
-STATE = "observation.environment_state"
-"""What the world knows: LeRobot's name for ground truth."""
+ACTIONS, STATE, WORLD = "action", "observation.state", "observation.environment_state"
+"""LeRobot's names for what is done, for what a robot or an agent knows, and for ground truth."""
 
 ABOUT = """# {name}
 
-A recording of cdmisfa as a LeRobot dataset ({version}): {episodes}, {frames} frames at {fps}
-frames per second. `meta/info.json` names its features. `{state}` is the ground truth; there
-are no actions, because nothing in the recording was moved by what was seen.
+Made by cdmisfa, as a LeRobot dataset ({version}): {episodes} in all {frames} at {fps} frames per
+second. `meta/info.json` names its features.
 
 ```python
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -48,90 +58,229 @@ dataset = LeRobotDataset("cdmisfa/{name}", root="{name}")
 ```
 """
 
+Columns = dict[str, NDArray[Any]]
 Feature = dict[str, Any]
-Stats = dict[str, list[Any]]
 
 
-def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) -> int:
-    """Write a recording as a LeRobot dataset, and return how many frames it has.
+def write_lerobot(source: Logged, folder: Path, **how: Any) -> int:
+    """Write a recording, each stretch of frames that every view has as an episode.
 
-    Each stretch of frames that every view has is an episode: one, or several between gaps.
-    Images become videos `observation.images.VIEW`, values `observation.VIEW`; numbers become
-    float32, as LeRobot's own. The dataset's card calls it by `name`.
+    See `write_dataset`.
+    """
+    return write_dataset([(source, shared_spans(source))], folder, **how)
+
+
+def write_dataset(
+    logs: Iterable[tuple[Logged, Sequence[Span]]],
+    folder: Path,
+    *,
+    name: str,
+    lossless: bool,
+    task: str | None = None,
+) -> int:
+    """Write parts of recordings as a LeRobot dataset, and return how many frames it has.
+
+    Images become videos `observation.images.VIEW`, a file a log; values `observation.VIEW`, and
+    truths `action`, `observation.state` and `observation.environment_state`; numbers are float32,
+    as LeRobot's own. Where an episode of a recorded task begins, another one does.
+
+    Args:
+        logs: each open until the next is asked for, with the frames [start, stop) of episodes; of
+            the same streams, shape and rate.
+        folder: where to.
+        name: what the dataset's card calls it.
+        lossless: keep every pixel.
+        task: what is done in it, in words; by default what each log says it shows.
 
     Raises:
-        UsageError: the frame rate is not a whole number, which LeRobot's format asks for, or
-            PyAV is not installed.
+        UsageError: there is no frame, logs do not show the same, the frame rate is not a whole
+            number, which LeRobot's format asks for, or PyAV is not installed.
         CdmisfaError: a file cannot be written.
     """
-    fps = round(source.spec.fps)
-    if fps != source.spec.fps or fps < 1:
+    with contextlib.closing(_Dataset(folder, lossless=lossless)) as dataset:
+        for source, wanted in logs:
+            dataset.add(source, _episodes(source, wanted), task or _task(source))
+        return dataset.finish(name)
+
+
+class _Dataset:
+    """A dataset that is written log by log; what is kept of each episode is its row and statistics.
+
+    Raises:
+        UsageError, CdmisfaError: as `write_dataset`.
+    """
+
+    def __init__(self, folder: Path, *, lossless: bool) -> None:
+        self._folder = folder
+        self._film: dict[str, Any] = {"lossless": lossless, "key_every": KEY_EVERY}
+        self._table: pq.ParquetWriter | None = None
+        self._logs = self._fps = 0
+        self._tasks: dict[str, int] = {}
+        self._features: dict[str, Feature] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._stats: list[dict[str, Stats]] = []
+
+    @property
+    def _frames(self) -> int:
+        return int(self._rows[-1]["dataset_to_index"]) if self._rows else 0
+
+    def add(self, source: Logged, spans: Sequence[Span], task: str) -> None:
+        """Write the episodes of one more log, the frames [start, stop) of each."""
+        self._fps = fps = _whole_rate(source.spec)
+        ends = np.cumsum([0, *(high - low for low, high in spans)]).tolist()
+        parts = list(itertools.pairwise(ends))
+        columns = _numbers(source, spans, self._features)
+        within = np.concatenate([np.arange(high - low) for low, high in spans])
+        clock = {
+            "timestamp": (within / fps).astype(np.float32),
+            "frame_index": within,
+            "episode_index": len(self._rows) + np.repeat(np.arange(len(spans)), np.diff(ends)),
+            "index": self._frames + np.arange(ends[-1]),
+            "task_index": np.full(ends[-1], self._tasks.setdefault(task, len(self._tasks))),
+        }
+        for key, values in clock.items():
+            columns[key] = _described(self._features, key, values, None)
+        rows = [
+            {
+                "episode_index": len(self._rows) + i,
+                "tasks": [task],
+                "length": high - low,
+                **_numbered("data", 0),
+                "dataset_from_index": self._frames + low,
+                "dataset_to_index": self._frames + high,
+            }
+            for i, (low, high) in enumerate(parts)
+        ]
+        stats = [{key: number_stats(own[low:high]) for key, own in columns.items()}
+                 for low, high in parts]  # fmt: skip
+        for stream, key in enumerate(_videos(source.spec)):
+            self._features[key] = _video_feature(source.spec.frame_shape, fps)
+            file = _place(self._folder / "videos" / key, self._logs, "mp4")
+            write_film(source, stream, file, spans=spans, **self._film)
+            for (low, high), span, row, own in zip(parts, spans, rows, stats, strict=True):
+                row |= _numbered(f"videos/{key}", self._logs)
+                row[f"videos/{key}/from_timestamp"] = low / fps
+                row[f"videos/{key}/to_timestamp"] = high / fps
+                own[key] = image_stats(values_shown(source, stream, span), high - low)
+        table = _table(columns, self._features)
+        if self._table is None:
+            self._table = pq.ParquetWriter(
+                _place(self._folder / "data", 0, "parquet"), table.schema
+            )
+        self._table.write_table(table)
+        self._logs += 1
+        self._rows += rows
+        self._stats += stats
+
+    def finish(self, name: str) -> int:
+        """Write what describes all of it, and return how many frames there are."""
+        self.close()
+        meta = self._folder / "meta"
+        pq.write_table(self._episodes(), _place(meta / "episodes", 0, "parquet"))
+        pq.write_table(_tasks(self._tasks), meta / "tasks.parquet")
+        frames, episodes = self._frames, len(self._rows)
+        info = _info(episodes, frames, len(self._tasks), self._fps, self._features)
+        _write_json(meta / "info.json", info)
+        stats = {key: aggregated([own[key] for own in self._stats]) for key in self._features}
+        _write_json(meta / "stats.json", {key: as_lists(own) for key, own in stats.items()})
+        about = {"name": name, "version": VERSION, "episodes": counted(episodes, "episode")}
+        card = ABOUT.format(**about, frames=counted(frames, "frame"), fps=self._fps)
+        (self._folder / "README.md").write_text(card, "utf-8")
+        return frames
+
+    def close(self) -> None:
+        """Close the table of numbers."""
+        if self._table is not None:
+            self._table.close()
+
+    def _episodes(self) -> pa.Table:
+        """The table of episodes, a row each, with the statistics of each."""
+        return pa.Table.from_pylist(
+            [
+                row
+                | {f"stats/{k}/{n}": v for k, s in own.items() for n, v in as_lists(s).items()}
+                | _numbered("meta/episodes", 0)
+                for row, own in zip(self._rows, self._stats, strict=True)
+            ]
+        )
+
+
+def _whole_rate(spec: SourceSpec) -> int:
+    fps = round(spec.fps)
+    if fps != spec.fps or fps < 1:
         raise UsageError(
-            f"LeRobot knows whole frame rates only, not {source.spec.fps:g} per second: "
+            f"LeRobot knows whole frame rates only, not {spec.fps:g} per second: "
             "change it with cdmisfa convert --rate"
         )
-    spans = shared_spans(source)
-    lengths = [high - low for low, high in spans]
-    columns, features = _columns(source, spans, fps)
-    stats = {key: _number_stats(column) for key, column in columns.items()}
-    ends = np.cumsum(lengths)
-    own = [
-        {key: _number_stats(column[end - length : end]) for key, column in columns.items()}
-        for end, length in zip(ends, lengths, strict=True)
-    ]
-    videos = []
-    for stream, view in enumerate(stream_names(source.spec.streams) if source.spec.images else ()):
-        videos.append(key := f"observation.images.{view}")
-        file = _place(folder / "videos" / key, "mp4")
-        write_film(source, stream, file, lossless=lossless, key_every=KEY_EVERY, spans=spans)
-        features[key] = _video_feature(source.spec.frame_shape, fps)
-        values = [_values_shown(source, stream, span) for span in spans]
-        stats[key] = _image_stats(np.sum(values, axis=0), sum(lengths))
-        for episode, counts, length in zip(own, values, lengths, strict=True):
-            episode[key] = _image_stats(counts, length)
-    task = f"what {source.scene().get('scene', 'a recording')} shows"
-    pq.write_table(_table(columns, features), _place(folder / "data", "parquet"))
-    episodes = _episodes(lengths, fps, task, videos, own)
-    pq.write_table(episodes, _place(folder / "meta" / "episodes", "parquet"))
-    pq.write_table(_tasks(task), folder / "meta" / "tasks.parquet")
-    _write_json(folder / "meta" / "info.json", _info(lengths, fps, features))
-    _write_json(folder / "meta" / "stats.json", stats)
-    many = "one episode" if len(spans) == 1 else f"{len(spans)} episodes, split at its gaps"
-    about = {"name": name, "version": VERSION, "episodes": many, "state": STATE}
-    card = ABOUT.format(**about, frames=sum(lengths), fps=fps)
-    (folder / "README.md").write_text(card, "utf-8")
-    return sum(lengths)
+    return fps
 
 
-def _columns(
-    source: Logged, spans: Sequence[Span], fps: int
-) -> tuple[dict[str, NDArray[Any]], dict[str, Feature]]:
-    """All numbers, (n,) or (n, k), and what they are."""
-    spec, lengths = source.spec, [high - low for low, high in spans]
-    columns: dict[str, NDArray[Any]] = {}
-    features: dict[str, Feature] = {}
+def _task(source: Logged) -> str:
+    """What is done in a log, in words: the tasks that were played, or the scene that was seen."""
+    tasks = source.origin().get("tasks") if isinstance(source, RecordedSource) else None
+    if isinstance(tasks, list) and tasks:
+        return " and ".join(map(str, tasks))
+    return f"what {source.scene().get('scene', 'a recording')} shows"
 
-    def add(key: str, values: NDArray[Any], names: list[str] | None) -> None:
-        values = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
-        shape = list(values.shape[1:]) or [1]
-        columns[key] = values
-        features[key] = {"dtype": str(values.dtype), "shape": shape, "names": names}
 
+def _episodes(source: Logged, spans: Sequence[Span]) -> list[Span]:
+    """Spans of frames, parted where an episode of a task begins that was recorded."""
+    begins = [i for i, name in enumerate(source.spec.truth) if name.startswith(BEGINS)]
+    found: list[Span] = []
+    for low, high in spans:
+        edges = {low, high}
+        for block in pieces(source, 0, [(low, high)]) if begins else ():
+            edges |= {block.t + int(i) for i in np.flatnonzero(block.truth[:, begins].any(axis=1))}
+        found += itertools.pairwise(sorted(edges))
+    return found
+
+
+def _numbers(source: Logged, spans: Sequence[Span], features: dict[str, Feature]) -> Columns:
+    """What is known of each frame, and frames that are no images, (n,) or (n, k) float32."""
+    spec, found = source.spec, Columns()
     if spec.truth:
         truth = np.concatenate([block.truth for block in pieces(source, 0, spans)])
-        add(STATE, truth.astype(np.float32), list(spec.truth))
-    if not spec.images:
-        for stream, view in enumerate(stream_names(spec.streams)):
-            frames = np.concatenate([block.frames for block in pieces(source, stream, spans)])
-            names = [f"x{i + 1}" for i in range(frames.shape[1])]
-            add(f"observation.{view}", frames.astype(np.float32), names)
-    within = np.concatenate([np.arange(length, dtype=np.int64) for length in lengths])
-    add("timestamp", (within / fps).astype(np.float32), None)
-    add("frame_index", within, None)
-    add("episode_index", np.repeat(np.arange(len(lengths), dtype=np.int64), lengths), None)
-    add("index", np.arange(len(within), dtype=np.int64), None)
-    add("task_index", np.zeros(len(within), dtype=np.int64), None)
-    return columns, features
+        of_task = any(name.startswith(BEGINS) for name in spec.truth)
+        keys = [_known_as(name, of_task=of_task) for name in spec.truth]
+        for key in filter(None, dict.fromkeys(keys)):
+            own = [i for i, known_as in enumerate(keys) if known_as == key]
+            found[key] = _described(features, key, truth[:, own], [spec.truth[i] for i in own])
+    for stream, view in enumerate(() if spec.images else stream_names(spec.streams)):
+        frames = np.concatenate([block.frames for block in pieces(source, stream, spans)])
+        names = [f"x{i + 1}" for i in range(frames.shape[1])]
+        found[f"observation.{view}"] = _described(features, f"observation.{view}", frames, names)
+    return found
+
+
+def _known_as(truth: str, *, of_task: bool) -> str:
+    """The feature that a truth is one of the numbers of; "" of none."""
+    if truth.startswith(BEGINS):
+        return ""
+    if truth.startswith(ACTION):
+        return ACTIONS
+    return STATE if of_task or truth.startswith(JOINT) else WORLD
+
+
+def _described(
+    features: dict[str, Feature], key: str, values: NDArray[Any], names: list[str] | None
+) -> NDArray[Any]:
+    """Numbers as LeRobot has them, (n,) or (n, k), whose feature is told."""
+    values = values.astype(np.float32) if names is not None else values
+    values = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+    shape = list(values.shape[1:]) or [1]
+    features[key] = {"dtype": str(values.dtype), "shape": shape, "names": names}
+    return values
+
+
+def _videos(spec: SourceSpec) -> list[str]:
+    views = stream_names(spec.streams) if spec.images else ()
+    return [f"observation.images.{view}" for view in views]
+
+
+def _numbered(what: str, number: int) -> dict[str, int]:
+    """Which file of its kind it is."""
+    chunk, file = divmod(number, FILES)
+    return {f"{what}/chunk_index": chunk, f"{what}/file_index": file}
 
 
 def _video_feature(shape: tuple[int, ...], fps: int) -> Feature:
@@ -153,43 +302,6 @@ def _video_feature(shape: tuple[int, ...], fps: int) -> Feature:
     }
 
 
-def _number_stats(values: NDArray[Any]) -> Stats:
-    rows = values.astype(np.float64).reshape(len(values), -1)
-    stats = {
-        "min": rows.min(axis=0),
-        "max": rows.max(axis=0),
-        "mean": rows.mean(axis=0),
-        "std": rows.std(axis=0),
-        "count": np.array([len(rows)]),
-        **{key: np.quantile(rows, q, axis=0) for key, q in QUANTILES.items()},
-    }
-    return {key: value.tolist() for key, value in stats.items()}
-
-
-def _values_shown(source: Logged, stream: int, span: Span) -> NDArray[np.int64]:
-    """How often each value is a pixel of a view in some frames, (256,)."""
-    counts = np.zeros(256, dtype=np.int64)
-    for block in pieces(source, stream, [span]):
-        counts += np.bincount(block.frames.reshape(-1), minlength=256)
-    return counts
-
-
-def _image_stats(counts: NDArray[np.int64], frames: int) -> Stats:
-    """Statistics of pixels from 0 to 1, (3, 1, 1) each, from how often each value is."""
-    levels, total = np.arange(256) / 255, counts.sum()
-    seen, below = levels[counts > 0], np.cumsum(counts)
-    mean = (levels * counts).sum() / total
-    found = {
-        "min": seen[0],
-        "max": seen[-1],
-        "mean": mean,
-        "std": np.sqrt(((levels - mean) ** 2 * counts).sum() / total),
-        **{key: levels[np.searchsorted(below, q * total)] for key, q in QUANTILES.items()},
-    }
-    stats = {key: np.full((3, 1, 1), value).tolist() for key, value in found.items()}
-    return {**stats, "count": [frames]}
-
-
 def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Feature]) -> pa.Table:
     arrays = {}
     for key, values in columns.items():
@@ -199,42 +311,7 @@ def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Feature])
     return pa.table(arrays)
 
 
-def _episodes(
-    lengths: Sequence[int],
-    fps: int,
-    task: str,
-    videos: list[str],
-    stats: Sequence[Mapping[str, Stats]],
-) -> pa.Table:
-    """The table of episodes, a row each."""
-    rows, start = [], 0
-    for episode, (length, own) in enumerate(zip(lengths, stats, strict=True)):
-        stop = start + length
-        row: dict[str, Any] = {
-            "episode_index": episode,
-            "tasks": [task],
-            "length": length,
-            "data/chunk_index": 0,
-            "data/file_index": 0,
-            "dataset_from_index": start,
-            "dataset_to_index": stop,
-        }
-        for key in videos:
-            row |= {
-                f"videos/{key}/chunk_index": 0,
-                f"videos/{key}/file_index": 0,
-                f"videos/{key}/from_timestamp": start / fps,
-                f"videos/{key}/to_timestamp": stop / fps,
-            }
-        for key, values in own.items():
-            row |= {f"stats/{key}/{name}": value for name, value in values.items()}
-        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-        rows.append(row)
-        start = stop
-    return pa.Table.from_pylist(rows)
-
-
-def _tasks(task: str) -> pa.Table:
+def _tasks(tasks: Mapping[str, int]) -> pa.Table:
     """The table of tasks as pandas writes it: the text is the index of the row."""
     index = "__index_level_0__"
     text = {"name": None, "field_name": index, "pandas_type": "unicode", "metadata": None}
@@ -249,32 +326,34 @@ def _tasks(task: str) -> pa.Table:
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.0.0",
     }
-    table = pa.table({"task_index": pa.array([0], pa.int64()), index: pa.array([task])})
+    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks)})
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _info(lengths: Sequence[int], fps: int, features: Mapping[str, Feature]) -> dict[str, Any]:
-    place = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+def _info(
+    episodes: int, frames: int, tasks: int, fps: int, features: Mapping[str, Feature]
+) -> dict[str, Any]:
     videos = any(feature["dtype"] == "video" for feature in features.values())
     return {
         "codebase_version": VERSION,
         "robot_type": None,
-        "total_episodes": len(lengths),
-        "total_frames": sum(lengths),
-        "total_tasks": 1,
-        "chunks_size": 1000,
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": tasks,
+        "chunks_size": FILES,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": fps,
-        "splits": {"train": f"0:{len(lengths)}"},
-        "data_path": f"data/{place}.parquet",
-        "video_path": f"videos/{{video_key}}/{place}.mp4" if videos else None,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": f"data/{FILE}.parquet",
+        "video_path": f"videos/{{video_key}}/{FILE}.mp4" if videos else None,
         "features": features,
     }
 
 
-def _place(folder: Path, ending: str) -> Path:
-    file = folder / f"{FILE}.{ending}"
+def _place(folder: Path, number: int, ending: str) -> Path:
+    chunk, file_of_it = divmod(number, FILES)
+    file = folder / f"{FILE.format(chunk_index=chunk, file_index=file_of_it)}.{ending}"
     file.parent.mkdir(parents=True, exist_ok=True)
     return file
 

@@ -27,7 +27,6 @@ from cdmisfa.core.names import counted
 from cdmisfa.core.options import TIME
 
 if TYPE_CHECKING:
-    from replay.camera_logs.options import CameraOptions
     from replay.runs.compare import Row
 
 
@@ -273,7 +272,7 @@ def _forms() -> list[str]:
 
 
 @click.command("export")
-@options.fetched_argument("path", nargs=-1)
+@options.fetched_argument("path", nargs=-1, required=False)
 @option(
     "--to",
     "form",
@@ -284,6 +283,8 @@ def _forms() -> list[str]:
 )
 @uploads.out_option("The file to write, for a recording the folder, or s3://...", required=True)
 @flag("--lossless", "Keep every value of images in a video.")
+@options.path("--segments", "Export these of many logs: a list, as cdmisfa curate writes.", "FILE")
+@word("--task", "TEXT", "What is done in a LeRobot dataset; by default what a log says.")
 @options.look_options
 @options.server_limits
 @options.force
@@ -292,17 +293,17 @@ def export_command(
     path: tuple[Path, ...],
     form: str | None,
     out: Path,
-    lossless: bool,
     force: bool,
     as_json: bool,
-    cameras: CameraOptions,
+    **chosen: Any,
 ) -> None:
     """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
 
     Signals go to one file, Parquet, CSV, Arrow or NumPy's npz. CSV has no room for the
     outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
     PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
-    camera logs of others, several at once, too, and numbers in them with --field.
+    camera logs of others, several at once, too, and numbers in them with --field. Folders of
+    several recordings, or --segments of many logs, become episodes of one dataset.
     """
     from replay.export.forms import FORMS, export
     from replay.export.tables import CSV_LEAVES_OUT
@@ -310,14 +311,15 @@ def export_command(
     if str(out) == "-":
         raise click.UsageError("-o - would be a file of this name: name another")
     form = form or out.suffix.removeprefix(".")
-    rows = export(path, out, form, force=force, lossless=lossless, cameras=cameras, about=say_about)
+    rows = export(path, out, form, force=force, about=say_about, **chosen)
     if form == "csv":
         left_out = " and ".join(CSV_LEAVES_OUT)
         tell(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them")
-    if form in ("mp4", "lerobot") and not lossless and _is_film(out):
+    if form in ("mp4", "lerobot") and not chosen["lossless"] and _is_film(out):
         tell("H.264 changes pixels a little: --lossless keeps them all")
     if as_json:
-        print_document(path=" ".join(map(str, path)), file=str(out), rows=rows)
+        named = " ".join(map(str, path or [chosen["segments"]]))
+        print_document(path=named, file=str(out), rows=rows)
         return
     print_line(f"{rows} {FORMS[form].unit} written to {out}")
 

@@ -141,7 +141,7 @@ def _play(
     frames = np.empty((n, HEIGHT, WIDTH), np.uint8)
     state = np.empty((n, len(names)))
     with contextlib.closing(environment):
-        for t, seen in enumerate(islice(play(environment, rng, hold), n)):
+        for t, (seen, _, _) in enumerate(islice(play(environment, rng, hold), n)):
             frames[t], state[t] = look(seen)
     return Footage(frames, state, names)
 

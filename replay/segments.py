@@ -24,7 +24,7 @@ from replay.stored import Span
 FOREVER: Final = 2**64
 """Behind every log time, nanoseconds."""
 
-_FIELDS: Final = ("path", "start", "stop", "topic")
+_FIELDS: Final = ("path", "start", "stop", "topic", "log")
 _ISO: Final = re.compile(
     r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?(Z|[+-]\d\d:\d\d)?", re.ASCII
 )
@@ -33,11 +33,15 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """What is wanted of a log: log times [start, stop), nanoseconds, of the topics of a pattern."""
+    """What is wanted of a log: log times [start, stop), nanoseconds, of the topics of a pattern.
+
+    What is opened as one, as the views of a recording are, has one name, `log`.
+    """
 
     start: int = 0
     stop: int = FOREVER
     topic: str = "*"
+    log: str = ""
 
 
 def spans_of(segments: Iterable[Segment], topic: str) -> list[Span]:
@@ -59,10 +63,10 @@ def within(times: NDArray[np.uint64], spans: Sequence[Span]) -> NDArray[np.bool_
 
 
 def read_segments(path: Path) -> list[tuple[Location | None, Segment]]:
-    """The rows of a list of segments, CSV or JSON: `path`, `start`, `stop` and `topic`.
+    """The rows of a list of segments, CSV or JSON: `path`, `start`, `stop`, `topic` and `log`.
 
     Times are nanoseconds or dates (ISO 8601, UTC where they name no zone). A relative path is one
-    from the list's folder; a row may lack it, or the topic, which may be a pattern.
+    from the list's folder; a row may lack it, the topic, which may be a pattern, or the log.
 
     Raises:
         UsageError: it is no such list.
@@ -101,13 +105,13 @@ def _row(path: Path, where: str, row: Mapping[str, Any]) -> tuple[Location | Non
         raise UsageError(f"{path}: {where}: {error}") from None
     if not 0 <= start < stop <= FOREVER:
         raise UsageError(f"{path}: {where}: its times [{start}, {stop}) ns hold no moment of a log")
-    for name in ("path", "topic"):
+    for name in ("path", "topic", "log"):
         if not isinstance(row.get(name, ""), str):
             raise UsageError(f"{path}: {where}: its {name} is no text")
     place = location(row["path"]) if row.get("path") else None
     if place is not None and not isinstance(place, Url):
         place = path.parent / place
-    return place, Segment(start, stop, row.get("topic") or "*")
+    return place, Segment(start, stop, row.get("topic") or "*", row.get("log") or "")
 
 
 def _time(value: Any) -> int:
