@@ -177,10 +177,54 @@ def test_each_mode_is_chosen_before_any_is_chosen_twice() -> None:
     features = (modes[which] + rng.normal(0, 0.1, (300, 5))).astype(np.float32)
     groups, windows = np.zeros(300, np.int64), np.arange(300)
     wanted = which != 3
-    chosen = [window for window, _ in spread_out(features, groups, windows, wanted)]
+    found, all_seen = spread_out(features, groups, windows, wanted, np.ones(300))
+    chosen = [window for window, _ in found]
+    assert all_seen
     assert sorted(which[chosen[:6]].tolist()) == [0, 1, 2, 4, 5, 6]
     assert len(chosen) == len({*chosen})
     assert all(wanted[chosen])
+
+
+def test_what_does_not_fit_into_the_budget_is_passed_over_for_what_does() -> None:
+    features = np.array([[0], [9], [4], [1]], np.float32)
+    windows, seconds = np.array([0, 1, 2, 3]), np.array([2.0, 5.0, 2.0, 1.0])
+    known = features, np.zeros(4, np.int64), windows, np.ones(4, bool), seconds
+    assert spread_out(*known, 4.5) == ([(2, 1.0), (0, 4.0)], False)
+    assert spread_out(*known, 5.0) == ([(2, 1.0), (0, 4.0), (3, 1.0)], False)
+    assert spread_out(*known, 10.0) == ([(2, 1.0), (1, 5.0), (0, 4.0), (3, 1.0)], True)
+
+
+def test_how_many_processes_judge_changes_nothing(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    logs, found = tmp_path / "logs", []
+    for seed in range(5):
+        words = ("--frames", 600, "--seed", seed, "-o", logs / str(seed))
+        assert cdmisfa("record", "oscillatory", *words).code == 0
+    (logs / "3" / "x1.mcap").write_bytes((logs / "3" / "x1.mcap").read_bytes()[:5000])
+    cdmisfa("index", logs)
+    learned = ("--algorithm", "progress", "--no-rerun", "--no-report", "--max-iterations", 60)
+    assert cdmisfa("learn", logs / "0", *learned, "--loop", "-o", tmp_path / "run").code == 0
+    for jobs in (1, 2):
+        out = tmp_path / f"out-{jobs}"
+        words = ("curate", logs, "--known", tmp_path / "run", "--budget", "5s", "-o", out)
+        assert cdmisfa(*words, "--jobs", jobs).code == 0
+        found.append([(out / name).read_bytes() for name in ("blocks.parquet", "curated.json")])
+    assert found[0] == found[1]
+
+
+def test_a_double_by_its_messages_is_left_out_where_the_index_knows_them(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    logs = tmp_path / "logs"
+    cdmisfa("record", "oscillatory", "--frames", 300, "-o", logs / "a")
+    again = ("record", "oscillatory", "--frames", 300, "--set", "record.compression=lz4")
+    assert cdmisfa(*again, "-o", logs / "b").code == 0
+    for deep, problem in (((), None), (("--deep",), "holds the same as a")):
+        cdmisfa("index", logs, *deep)
+        done = cdmisfa("curate", logs, "-o", tmp_path / "out", "--force", "--json")
+        assert {row["log"]: row["problem"] for row in done.json["logs"]} == {
+            "a": None,
+            "b": problem,
+        }
 
 
 def test_it_says_what_is_left_of_the_budget_and_what_can_be_cut(
@@ -201,10 +245,10 @@ def test_it_says_what_is_left_of_the_budget_and_what_can_be_cut(
     assert re.search(r"^twice.npy +- +- +- +-$", done.out, re.MULTILINE)
     assert "none can be cut out" in done.err
     assert "cdmisfa cut" not in done.err + (out / "index.html").read_text("utf-8")
-    write_images(logs / "day.mcap", {"/camera": [(t * 50, still[0] // 2) for t in range(100)]})
+    write_images(logs / "day.mcap", {"/camera": [(t * 50, still[0] // 2) for t in range(80)]})
     cdmisfa("index", logs)
     assert "cut out 1 of 2: cdmisfa cut" in cdmisfa(*words, out, "--budget", "60s").err
     done = cdmisfa(*words, out, "--budget", "1s")
     assert "0 segments" in done.out
-    assert "the next block does not fit" in done.out
+    assert "no other block that is new fits" in done.out
     assert "cut" not in done.err.replace(str(tmp_path), "")

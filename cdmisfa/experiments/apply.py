@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import math
 import os
@@ -68,12 +69,17 @@ class Application:
 
     def __init__(self, path: str | Path) -> None:
         run = Run(path)
+        self._path = str(path)
         self.modules = run.modules
         if not self.modules:
             raise UsageError(f"{path} has no modules: learn longer, or name another run")
         self.tau = int(run.header.manifest["config"]["learner"]["tau"])
         self._stack = Stack(self.modules)
         self.recipe = self.modules[0].recipe or run.recipe()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process reads the run by itself, once."""
+        return _application, (os.path.abspath(self._path),)
 
     def open(
         self,
@@ -228,6 +234,11 @@ class Application:
             part = Block(block.stream, low, block.frames[own], block.truth[own])
             parts.append((part, y[own]))
         return parts
+
+
+@functools.lru_cache(1)
+def _application(path: str) -> Application:
+    return Application(path)
 
 
 def _reads(

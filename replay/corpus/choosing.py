@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -83,6 +83,8 @@ def scaled(features: Features, groups: NDArray[np.int64], pictures: Sequence[boo
     found = features.copy()
     for group, shows in enumerate(pictures):
         own = groups == group
+        if not own.any():
+            continue
         size = float(np.sqrt(2 * features[own].var(axis=0).sum()))
         least = STILL * np.sqrt(features.shape[1]) if shows else 0.0
         found[own] /= max(size, least) or 1.0
@@ -94,41 +96,56 @@ def spread_out(
     groups: NDArray[np.int64],
     windows: NDArray[np.int64],
     wanted: NDArray[np.bool_],
-) -> Iterator[tuple[int, float]]:
+    seconds: NDArray[np.float64],
+    budget: float = np.inf,
+) -> tuple[list[tuple[int, float]], bool]:
     """Windows in which more is seen with each than with any other: the farthest comes first.
 
     Of every group the block nearest to its mean is first, then always the block that is farthest
     from all that were chosen (Gonzalez, 1985: Clustering to minimize the maximum intercluster
     distance, Theoretical Computer Science 38). So no block is farther from one that was chosen
-    than twice what as many could come to. All blocks of a window are seen with it.
+    than twice what as many could come to. All blocks of a window are seen with it. A window that
+    does not fit into what is left of the budget is passed over.
 
     Args:
         features: (n, F), of blocks, as `scaled` gives them.
         groups: (n,), only blocks of one group are compared.
         windows: (n,), in which window each is.
         wanted: (n,), which may be chosen.
+        seconds: (W,), of windows.
+        budget: seconds of all that are chosen.
 
-    Yields:
-        A window, and how far it was from those before; 1 for the first of a group. It ends where
-        all others are `ALIKE`.
+    Returns:
+        The windows with how far each was from those before, 1 for the first of a group; and
+        whether all others are `ALIKE`, so that a longer budget would choose no more.
     """
     away = np.where(wanted, np.inf, -1.0)
-    of_window: dict[int, list[int]] = {}
-    for block, window in enumerate(windows.tolist()):
-        of_window.setdefault(window, []).append(block)
+    lasts = seconds[windows]
+    in_order = np.argsort(windows, kind="stable")
+    firsts = np.searchsorted(windows[in_order], np.arange(len(seconds) + 1))
     members = {group: np.flatnonzero(groups == group) for group in np.unique(groups).tolist()}
     first = np.zeros(len(features))
     for own in members.values():
         usual = features[own][wanted[own]]
         if len(usual):
             first[own] = -np.linalg.norm(features[own] - usual.mean(axis=0), axis=1)
-    while len(away) and (farthest := float(away.max())) > ALIKE:
+    found: list[tuple[int, float]] = []
+    all_seen = True
+    while len(away):
+        too_long = lasts > budget + 1e-9
+        all_seen = all_seen and not (away[too_long] > ALIKE).any()
+        away[too_long] = -1.0
+        farthest = float(away.max())
+        if farthest <= ALIKE:
+            break
         ties = np.flatnonzero(away == farthest)
-        block = int(ties[np.argmax(first[ties])])
-        yield int(windows[block]), 1.0 if farthest == np.inf else farthest
-        for seen in of_window[int(windows[block])]:
+        window = int(windows[ties[np.argmax(first[ties])]])
+        found.append((window, 1.0 if farthest == np.inf else farthest))
+        budget -= float(seconds[window])
+        for seen in in_order[firsts[window] : firsts[window + 1]].tolist():
             own = members[int(groups[seen])]
             if wanted[seen]:
                 near = np.linalg.norm(features[own] - features[seen], axis=1)
                 away[own] = np.minimum(away[own], near)
             away[seen] = -1.0
+    return found, all_seen

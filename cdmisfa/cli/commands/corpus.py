@@ -35,13 +35,15 @@ MOST_RANKED = 20
 MOST_GONE = 5
 """Logs that are gone, of which so many are named."""
 
+JOBS = number("--jobs", "Parallel processes; by default as many as there are processors.", 1, 1024)
+
 
 @click.command("index")
 @click.argument("corpus", nargs=-1, required=True, shell_complete=completing.runs)
 @options.out("The index, a .parquet file; by default corpus.parquet in the folder.")
 @flag("--deep", "Decode every log: checksums, gaps, shapes, and what is twice in other files.")
 @flag("--full", "Read every byte: what changed shows by SHA-256, not by size and time.")
-@number("--jobs", "Parallel processes; by default as many as there are processors.", 1, 1024)
+@JOBS
 @options.server_limits
 @options.as_json
 @click.pass_context
@@ -194,11 +196,18 @@ def _long(seconds: float | None) -> str:
 @options.out("The folder of the segments and their page.", required=True)
 @options.path("--known", "A run: what its modules know is not chosen.", "RUN")
 @word("--budget", "TIME", "How long all is that is chosen.", default="10min", show_default=True)
+@JOBS
 @options.server_limits
 @options.force
 @options.as_json
 def curate_command(
-    corpus: str, out: Path, known: Path | None, budget: str, force: bool, as_json: bool
+    corpus: str,
+    out: Path,
+    known: Path | None,
+    budget: str,
+    jobs: int | None,
+    force: bool,
+    as_json: bool,
 ) -> None:
     """Choose what to look at in many logs, within a budget of time.
 
@@ -220,6 +229,7 @@ def curate_command(
             known=None if known is None else Application(known),
             known_as=known,
             budget=seconds,
+            jobs=jobs or os.cpu_count() or 1,
             force=force,
             told=shown.update,
         )
