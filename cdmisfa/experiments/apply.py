@@ -47,7 +47,6 @@ WINDOW: Final = 2000
 READ: Final = 2**22
 """Bytes of frames and outputs of a log that are taken at once, about."""
 
-
 Part = tuple[Block, FloatArray]
 """Frames that follow one another within a block of the clock, and the outputs on them, (n, R)."""
 
