@@ -63,7 +63,7 @@ class WatchEnv(Env):
         >>> seen, info = env.reset(seed=0)
         >>> seen, reward, terminated, truncated, info = env.step(info["stream"])
         >>> seen.shape
-        (40, 1)
+        (40, 2)
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it

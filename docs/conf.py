@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
+import inspect
+import json
 import os
 import re
 import shutil
@@ -10,11 +14,15 @@ import tempfile
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import cdmisfa
+from cdmisfa.cli import interrupts
+from cdmisfa.core import errors
+from cdmisfa.experiments.documents import markdown
 from replay.viewer.program import free_port, running
 from replay.viewer.web import HOST, POLICY, page_server
 
@@ -64,8 +72,45 @@ def words_as_written(*event: Any) -> None:
             lines[at], code = lines[at] + ":", True
 
 
-def readme_is_the_first_page(app: Any, name: str, text: list[str]) -> None:
+def from_code(app: Any, name: str, text: list[str]) -> None:
+    """README is the first page, and lines such as {{ keys learner module.Class }} are tables."""
     text[0] = text[0].replace("../README.md)", "index.md)")
+    tables = {"keys": keys, "exit_codes": exit_codes}
+    text[0] = re.sub(
+        r"^\{\{ (\w+) ?(.*) \}\}$",
+        lambda match: tables[match[1]](*match[2].split()),
+        text[0],
+        flags=re.MULTILINE,
+    )
+
+
+def keys(prefix: str, name: str) -> str:
+    """A section's keys: the fields of its dataclass, with their defaults and docstrings."""
+    module, _, of = name.rpartition(".")
+    section = getattr(importlib.import_module(module), of)
+    return markdown(["key", "default", "meaning"], list(_keys(prefix, section())))
+
+
+def _keys(prefix: str, section: Any) -> Iterator[list[str]]:
+    told = "\n".join(inspect.getdoc(each) or "" for each in reversed(type(section).__mro__))
+    for field in dataclasses.fields(section):
+        value, key = getattr(section, field.name), f"{prefix}.{field.name}"
+        if dataclasses.is_dataclass(value):
+            yield from _keys(key, value)
+            continue
+        meaning = re.findall(rf"^    {field.name}: (.*(?:\n {{8}}.*)*)", told, re.MULTILINE)[-1]
+        default = "auto" if value is None else json.dumps(value).strip('"')
+        yield [f"`{key}`", f"`{default}`", " ".join(meaning.split())]
+
+
+def exit_codes() -> str:
+    """What a command ends with: the errors of the library, and signals."""
+    kinds = [errors.CdmisfaError, *errors.CdmisfaError.__subclasses__()]
+    kinds = [kind for kind in kinds if kind.__module__ == errors.__name__]
+    rows = [("0", "It is done.")]
+    rows += sorted((str(e.exit_code), (e.__doc__ or "").partition("\n")[0]) for e in kinds)
+    rows += [(str(128 + s), f"A signal ended it: {s.name}.") for s in interrupts.SIGNALS]
+    return markdown(["code", "what it says"], rows)
 
 
 def add_the_viewer(app: Any, failure: Exception | None) -> None:
@@ -107,5 +152,5 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-docstring", words_as_written, priority=100)
     for part in ("description", "arguments", "options", "epilog"):
         app.connect(f"sphinx-click-process-{part}", words_as_written)
-    app.connect("source-read", readme_is_the_first_page)
+    app.connect("source-read", from_code)
     app.connect("build-finished", add_the_viewer)

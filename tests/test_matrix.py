@@ -223,7 +223,10 @@ def test_a_log_and_its_conversion_are_learned_alike(
     assert {len(file.get("sha256", "x" * 64)) for file in run["source"]["files"]} == {64}
 
 
-def test_the_commands_of_the_page_work(
+PAGES = ("logs", "numbers", "cutting")
+
+
+def test_the_commands_of_the_pages_work(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -233,7 +236,8 @@ def test_the_commands_of_the_page_work(
     write_pictures(Path("pictures"), COUNT)
     write_film(Path("film.mp4"))
     write_numbers(Path("data.csv"), Path("joints.mcap"))
-    page = (Path(__file__).parents[1] / "docs" / "how-to" / "logs.md").read_text("utf-8")
+    pages = Path(__file__).parents[1] / "docs" / "how-to"
+    page = "".join((pages / f"{name}.md").read_text("utf-8") for name in PAGES)
     lines = [
         line for block in page.split("```sh")[1:] for line in block.split("```")[0].split("\n")
     ]

@@ -87,10 +87,10 @@ def of_a_box(out: str) -> cdmisfa.Run:
     return cdmisfa.learn(np.repeat(drift.astype(np.uint8), 48, axis=1), out, max_modules=1)
 
 
-def test_viewing(ran: Callable[..., Ran]) -> None:
+def test_export(ran: Callable[..., Ran]) -> None:
     (box,) = of_a_box("runs/icub").modules
     save_modules(Path("runs/icub/modules.npz"), [box, replace(box, index=2)])
-    assert len(ran("viewing.md")["run"].modules) == 2
+    assert len(ran("export.md")["run"].modules) == 2
 
 
 def test_applying(ran: Callable[..., Ran]) -> None:

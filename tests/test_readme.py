@@ -15,8 +15,11 @@ from conftest import Cdmisfa
 from waiting import python
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("README.md", "docs/how-to/tour.md", "docs/how-to/applying.md")
-README, TOUR, APPLYING = ((ROOT / name).read_text("utf-8") for name in PAGES)
+HOW_TO = ROOT / "docs" / "how-to"
+README = (ROOT / "README.md").read_text("utf-8")
+RECORD, TOUR, APPLYING = (
+    (HOW_TO / f"{name}.md").read_text("utf-8") for name in ("record", "tour", "applying")
+)
 HAS_SIMULATOR = importlib.util.find_spec("pybullet") is not None
 
 
@@ -25,7 +28,8 @@ def blocks(language: str, page: str = README) -> list[str]:
 
 
 def commands() -> list[list[str]]:
-    lines = "".join(blocks("sh") + blocks("sh", TOUR) + blocks("sh", APPLYING)).splitlines()
+    pages = (README, RECORD, TOUR, APPLYING)
+    lines = "".join(block for page in pages for block in blocks("sh", page)).splitlines()
     return [shlex.split(line, comments=True) for line in lines]
 
 

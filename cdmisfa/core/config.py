@@ -14,7 +14,7 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
@@ -58,8 +58,36 @@ MAX_TAU = 100_000
 class LearnerConfig:
     """Configuration of the paper's learners, 2.0 and 1.0 (keys `learner.*`).
 
-    The defaults are those of the oscillatory experiment; the presets hold every
-    value again with its source.
+    The defaults are those of the oscillatory experiment; the presets state the sources of values.
+
+    Attributes:
+        algorithm: `2.0`, or `1.0` for the older CD-MISFA it is compared with.
+        nu: ν, learning rate of the slow features; larger is faster and noisier.
+        tau: τ, frames of one block: the agent decides once a block.
+        sigma: σ, width of the expert reward: how small a change of φ is mastery; 0: none.
+        delta: δ, an abstraction is saved when its slowness changes by less than this (1/frame).
+        beta: β, weight of the expert reward; `auto`: ν ln 2 / (2 (n-1)) for n streams.
+        components: K, principal components kept when whitening; choose with care on images.
+        outputs: J, slow features of one abstraction.
+        expansion: `none`, or `quadratic`: inputs and all their products.
+        epsilon_start: ε, probability of a random action at first; above 1 counts as 1.
+        epsilon_decay: factor of ε in each iteration while it is above `epsilon_knee`.
+        epsilon_knee: below this value of ε the tail begins.
+        epsilon_tail_decay: factor of ε in each iteration of the tail.
+        gamma: γ, discount of future rewards.
+        mean_window: window of the input's running mean (frames).
+        slowness_window: N, of the mean squared derivative and the recent variance (frames).
+        eta_dot_window: w, of the change of slowness, and of `novel_share` (blocks).
+        gate_window: w_g, window of the band in which a module's slowness lies (blocks).
+        warm_up: novel blocks of a new abstraction before rewards begin.
+        min_variance: v_min, least recent variance of an output that may be saved.
+        novel_share: least share, of late, of novel blocks of the stream before, for a save.
+        patience: iterations without exploration after which a run gives up.
+        alpha: α, 1.0 only: rate of the tabular reward.
+        roc_centres: 1.0 only: cluster centres for each stream.
+        roc_radius: 1.0 only: an output this near to a centre moves it.
+        roc_memory: 1.0 only: blocks over which centres fade.
+        roc_error: 1.0 only: error below which a module is saved, or knows a block.
     """
 
     algorithm: str = "2.0"
@@ -245,24 +273,6 @@ def shown(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
-def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Turn `section.key=value` words into sections of texts.
-
-    Raises:
-        UsageError: a word of another form.
-    """
-    sections: dict[str, dict[str, str]] = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        section, dot, name = key.strip().partition(".")
-        if not (equals and section and dot and name):
-            raise UsageError(
-                f"--set {shown(word)}: write it as section.key=value, as learner.nu=0.02"
-            )
-        sections.setdefault(section, {})[name] = value.strip()
-    return sections
-
-
 def build(
     cls: type[Section], prefix: str, *layers: Mapping[str, Any], base: Section | None = None
 ) -> Section:
@@ -388,13 +398,3 @@ def section_table(section: Any) -> dict[str, Any]:
             plain = list(value) if isinstance(value, tuple) else value
             table[field.name] = "auto" if value is None else plain
     return table
-
-
-def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Where two JSON values differ: dotted key, the value before, the value now."""
-    if isinstance(before, Mapping) and isinstance(now, Mapping):
-        for name in sorted({*before, *now}):
-            where = f"{key}.{name}" if key else name
-            yield from differences(before.get(name), now.get(name), where)
-    elif before != now:
-        yield key, before, now

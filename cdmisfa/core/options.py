@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Real
 from typing import Any, Final
 
+from cdmisfa.core.config import shown
 from cdmisfa.core.errors import UsageError
 
 SIZE, TIME, RANGE = "WxH", "TIME", "LOW:HIGH"
@@ -99,3 +100,21 @@ def _all_numbers(values: Any, count: int, least: float, most: float = math.inf) 
         and all(isinstance(value, Real) for value in values)
         and all(math.isfinite(value) and least <= value <= most for value in values)
     )
+
+
+def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Turn `section.key=value` words into sections of texts.
+
+    Raises:
+        UsageError: a word of another form.
+    """
+    sections: dict[str, dict[str, str]] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not (equals and section and dot and name):
+            raise UsageError(
+                f"--set {shown(word)}: write it as section.key=value, as learner.nu=0.02"
+            )
+        sections.setdefault(section, {})[name] = value.strip()
+    return sections

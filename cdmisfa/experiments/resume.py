@@ -13,9 +13,10 @@ from typing import Any
 
 from cdmisfa.agents.learners import LEARNERS, open_learner
 from cdmisfa.core.blocks import SeekableSource, SourceSpec
-from cdmisfa.core.config import build, differences, parse_settings, section_table
+from cdmisfa.core.config import build, section_table
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
+from cdmisfa.core.options import parse_settings
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.names import placed, renamed, same_names
@@ -24,6 +25,7 @@ from recorder.cameras.words import is_live
 from recorder.log.files import found_path, partial_path, relative_path
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
+from replay.runs.compare import differences
 from replay.runs.folders import RUN_FILE
 from replay.runs.keyframes import read_keyframe
 from replay.runs.log import RunHeader, read_columns, read_header

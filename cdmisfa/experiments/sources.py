@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
-from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_settings, section_table
+from cdmisfa.core.config import LearnerConfig, build, load_preset, section_table
 from cdmisfa.core.errors import UsageError, are_for
+from cdmisfa.core.options import parse_settings
 from cdmisfa.core.registry import did_you_mean
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import CAMERAS, is_live, live_options, open_live

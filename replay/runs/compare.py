@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.config import differences
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SIGNALS, STATES
 from replay.runs.columns import SignalColumns
@@ -347,3 +346,13 @@ def told_apart(runs: Sequence[Path]) -> list[str]:
             few += 1
         names.append("/".join(folder[-few:]))
     return names
+
+
+def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two JSON values differ: dotted key, the value before, the value now."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for name in sorted({*before, *now}):
+            where = f"{key}.{name}" if key else name
+            yield from differences(before.get(name), now.get(name), where)
+    elif before != now:
+        yield key, before, now

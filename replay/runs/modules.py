@@ -135,7 +135,8 @@ class SlowFeatures:
         module: the frozen module.
 
     Example:
-        >>> module = Module(1, 0, 9, np.eye(1, 2), np.zeros(2), *[np.zeros(1)] * 3, np.zeros(1))
+        >>> rest = [np.zeros(1)] * 3 + [np.zeros(1, np.int64)]
+        >>> module = Module(1, "x1", 0, 9, np.eye(1, 2), np.zeros(2), *rest, scale=1.0)
         >>> SlowFeatures(module).transform([[3.0, 4.0], [5.0, 6.0]]).ravel().tolist()
         [3.0, 5.0]
     """

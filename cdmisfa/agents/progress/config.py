@@ -26,6 +26,27 @@ class ProgressConfig:
     """Everything the progress learner can be told; the defaults are those of `cameras`.
 
     No value depends on the units, the contrast or the noise of a camera.
+
+    Attributes:
+        algorithm: `progress`.
+        tau: frames of one block.
+        components: principal components whitened for each stream; twice as many are kept.
+        outputs: slow features of one module; the slowest is judged.
+        expansion: `none`, `quadratic`, or `auto`: quadratic where `components` hold all of it
+            (frames of 4 values), else none.
+        window: exponential window of the statistics of a stream (frames).
+        attention: how the stream to watch is chosen: `progress`, `random`, `robin`, `novel`,
+            `sticky`, `gamma`, `ucb`, `prediction`, `rnd`, `alp`, `lpm`.
+        visit: blocks that a stream being learned is watched at least.
+        explore: probability of any stream at a choice, of the rules that explore.
+        test_frames: window of the tests on frames not yet learned from; at least 20 blocks
+            (frames).
+        settled: mean change of the output with a block, below which it is settled.
+        agreement: most that tested and fitted slowness may differ, |ln| of their ratio.
+        slow: tested slowness over the stream's typical one, below which something in it is slow.
+        even: the same, above which nothing is.
+        looks: how often a stream is tried before it is given up for good.
+        watch: blocks to watch on when every stream is decided, in case one changes.
     """
 
     algorithm: str = "progress"

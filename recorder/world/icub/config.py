@@ -28,7 +28,14 @@ def later(default: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class TableConfig:
-    """The plain table top; wide enough to fill every eye image (keys `scene.table.*`)."""
+    """The plain table top; wide enough to fill every eye image (keys `scene.table.*`).
+
+    Attributes:
+        top: height of its surface in the root frame (m).
+        half_size: from its middle to each side (m).
+        thickness: of the top (m).
+        colour: red, green and blue, 0 to 1.
+    """
 
     top: float = -0.05
     half_size: float = 2.0
@@ -47,6 +54,21 @@ class EyesConfig:
 
     The eyes' places are iKin's for iCub v2.5, relative to the neck yaw joint. The angles are those
     of joints: `yaw` and `pitch` of the neck, to the left and upwards, and `tilt` of the eyes.
+
+    Attributes:
+        views: their names.
+        yaw: where the head is turned in each (degrees).
+        tilt: of the eyes (degrees).
+        vertical_fov: field of view (degrees).
+        width: of what one eye sees (pixels); the frame shows both, side by side.
+        height: the same (pixels).
+        forward: of the eyes before the joint (m).
+        up: of the eyes above it (m).
+        half_distance: of the eyes from their middle (m).
+        near: what is nearer is not seen (m).
+        far: what is farther is not seen (m).
+        light: the direction that it comes from.
+        pitch: of the neck (degrees).
     """
 
     views: tuple[str, ...] = ("left", "center", "right")
@@ -82,7 +104,15 @@ class EyesConfig:
 
 @dataclass(frozen=True, slots=True)
 class BoxConfig:
-    """Object 1: a box, x uniform, y toggling between two places (keys `scene.object1.*`)."""
+    """Object 1: a box, x uniform, y toggling between two places (keys `scene.object1.*`).
+
+    Attributes:
+        half_size: half the length of its edges (m).
+        grey: 0 black, 1 white.
+        x: from and to (m).
+        y: its two places (m).
+        toggle_every: frames between changes of place.
+    """
 
     half_size: float = 0.05
     grey: float = 0.1
@@ -98,7 +128,15 @@ class BoxConfig:
 
 @dataclass(frozen=True, slots=True)
 class CylinderConfig:
-    """Object 2: a cylinder, x and y uniform (keys `scene.object2.*`)."""
+    """Object 2: a cylinder, x and y uniform (keys `scene.object2.*`).
+
+    Attributes:
+        radius: (m).
+        height: (m).
+        grey: 0 black, 1 white.
+        x: from and to (m).
+        y: from and to (m).
+    """
 
     radius: float = 0.045
     height: float = 0.09
@@ -115,7 +153,16 @@ class CylinderConfig:
 
 @dataclass(frozen=True, slots=True)
 class SphereConfig:
-    """Object 3: a sphere on a reflecting walk, y slow against x (keys `scene.object3.*`)."""
+    """Object 3: a sphere on a reflecting walk, y slow against x (keys `scene.object3.*`).
+
+    Attributes:
+        radius: (m).
+        grey: 0 black, 1 white.
+        x: from and to (m).
+        y: from and to (m).
+        step_x: standard deviation of a step of x, one a frame (m).
+        step_y: the same of y (m).
+    """
 
     radius: float = 0.055
     grey: float = 0.2
