@@ -374,7 +374,7 @@ def test_every_command_of_the_page_on_datasets_works(cdmisfa, tmp_path, monkeypa
     pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "how-to" / "export.md").read_text("utf-8")
-    _, _, section = page.partition("### A LeRobot dataset\n")
+    _, _, section = page.partition("## A LeRobot dataset\n")
     (block,) = re.findall(r"^```sh\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
     for line in block.splitlines():
         program, *words = shlex.split(line)
