@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
-from cdmisfa.core.arrays import as_array, without_table
+from cdmisfa.core.arrays import as_array, centred, mean_of, without_table
 from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, expanded_size
@@ -80,7 +80,8 @@ class Module(Shown):
         Args:
             frames: (n, *frame_shape), or these as rows (n, I), uint8 or values, tables too; it
                 scales the former and expands both as it learned them. Where it has a recipe,
-                pictures of any size as the source gave them, too; see `make_frame`.
+                pictures of any size as the source gave them, too; see `make_frame`. Where that
+                centres episodes, one whole episode.
             outputs: which of the outputs, from 0, the slowest first: a number of one, a slice, or
                 a list of some; all where it is not given.
 
@@ -92,13 +93,23 @@ class Module(Shown):
             UsageError: these are no frames as it learned from, a value is no finite number, or it
                 has no such outputs.
         """
-        rows, expansion = self._inputs(frames)
+        rows, expansion = self._inputs(self._episode(frames))
         phi = np.ascontiguousarray(self._chosen(outputs), np.float64)
         return _projected(rows, expansion, phi, kernels.mean_output(phi, self._mean))
 
     @property
     def _mean(self) -> NDArray[np.float64]:
         return np.ascontiguousarray(self.mean, np.float64)
+
+    def _episode(self, given: Any) -> Any:
+        """The frames of an episode without its mean, where it learned from such."""
+        if self.recipe is None or self.recipe.centre == "run":
+            return given
+        given = without_table(given)
+        if getattr(given, "shape", ())[1:] == (prod(self.frame_shape),):
+            given = np.reshape(given, (-1, *self.frame_shape))
+        frames = self.recipe.frames(given)
+        return centred(frames, mean_of([frames])) if len(frames) else frames
 
     def _inputs(self, frames: Any) -> tuple[NDArray[Any], str]:
         """Frames or raw pictures as scaled rows, and how they are expanded; see `transform`."""
@@ -143,7 +154,8 @@ class Module(Shown):
         except ValueError:  # of several sizes
             return self.recipe.frames(given)
         shaped = array.shape[1:] in (own, (prod(own),)) or array.shape == own
-        bounded = self.recipe.size is None and self.recipe.range is not None
+        plain = self.recipe.size is not None or self.recipe.centre == "episode"
+        bounded = self.recipe.range is not None and not plain
         if shaped and (array.dtype == UINT8 or array.dtype.kind == "f") and not bounded:
             if self.recipe.size and array.dtype.kind == "f" and (array > 1).any():
                 raise UsageError(
@@ -225,7 +237,8 @@ class Stack:
         """Outputs of each module, one beside the other, (n, R), to the bit those that it gives.
 
         Args:
-            frames: see `Module.transform`, as for what it raises.
+            frames: see `Module.transform`, as for what it raises; without the mean of their
+                episode, where they learned from such.
         """
         rows, expansion = self.modules[0]._inputs(frames)
         return _projected(rows, expansion, self._phi, self._offset)

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import bisect
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar, get_args
 
-from cdmisfa.core.blocks import Block, ClockedSource, check_request
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import centred, mean_of
+from cdmisfa.core.blocks import Block, ClockedSource, check_request, freeze
 from cdmisfa.core.errors import LogExhaustedError, UsageError
+from recorder.images.options import Centre
 
 Span = tuple[int, int]
 """The frames [start, stop)."""
+
+PIECE = 64
+"""Frames of an episode that are held at once while its mean is taken."""
 
 
 class StoredSource(ClockedSource):
@@ -20,10 +29,13 @@ class StoredSource(ClockedSource):
     A class that derives from it sets `_spec`, `gaps` and, with gaps, `_held`, and has `describe`.
 
     Attributes:
+        centre: what every frame is shown without: "episode", the mean of its episode; see
+            `episode`.
         held_out: frames at the end that `take` does not give; see `hold_out`.
         more: what else than to begin again can be done where there are too few frames, in words.
     """
 
+    centre: Centre = "run"
     held_out: int = 0
     more: ClassVar[str] = ""
     _loop: bool
@@ -31,6 +43,7 @@ class StoredSource(ClockedSource):
     _count: int
     _held: Sequence[Sequence[Span]]
     """The frames that each stream has of the first lap."""
+    _means: dict[int, tuple[Span, NDArray[Any]]] | None = None
 
     @property
     def frames(self) -> int:
@@ -46,6 +59,16 @@ class StoredSource(ClockedSource):
     def end(self) -> int:
         """The frame after the last that `take` gives, of the first lap."""
         return self._first + self._count - self.held_out
+
+    def centre_by(self, centre: Centre) -> None:
+        """Show every frame as it is, or without the mean of its episode.
+
+        Raises:
+            UsageError: there is no such way.
+        """
+        if centre not in get_args(Centre):
+            raise UsageError(f"centre is {centre!r}: give {' or '.join(get_args(Centre))}")
+        self.centre = centre
 
     def hold_out(self, count: int) -> None:
         """Keep the last frames from `take`: what is learned is judged on them, see `pieces`.
@@ -68,7 +91,7 @@ class StoredSource(ClockedSource):
         """
         for low, high in self.spans(stream, start, stop):
             for t in range(low, high, n):
-                yield self._block(stream, t, min(n, high - t))
+                yield self._centred(stream, t, min(n, high - t))
 
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a stream shows at t .. t+n-1; moves t by n.
@@ -81,7 +104,7 @@ class StoredSource(ClockedSource):
             ValueError: no such stream, or n < 1.
         """
         check_request(self._spec, stream, n)
-        block = self._block(stream, self._unbroken(stream, n), n)
+        block = self._centred(stream, self._unbroken(stream, n), n)
         self._t = block.t + n
         return block
 
@@ -98,7 +121,7 @@ class StoredSource(ClockedSource):
         if not self._loop and stop > self.end:
             raise self._exhausted(n)
         blocks = tuple(
-            self._block(stream, low, high - low)
+            self._centred(stream, low, high - low)
             for stream in range(len(self._spec.streams))
             for low, high in self.spans(stream, self._t, stop)
         )
@@ -107,9 +130,27 @@ class StoredSource(ClockedSource):
 
     def spans(self, stream: int, start: int, stop: int) -> list[Span]:
         """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
+        return [*self._spans(stream, start, stop)]
+
+    def _spans(self, stream: int, start: int, stop: int) -> Iterable[Span]:
+        """See `spans`."""
         if not self.gaps:
             return [(start, stop)]
         return in_laps(self._held[stream], self._first, self._count, start, stop)
+
+    def episode(self, stream: int, t: int) -> Span:
+        """The episode [start, stop) that a frame is of, of the first lap.
+
+        Of what has no episodes of its own that is the stretch between two gaps.
+
+        Args:
+            stream: whose gaps count.
+            t: a frame that it has, of any lap.
+        """
+        if not self.gaps:
+            return self._first, self._first + self._count
+        held, t = self._held[stream], self._first + (t - self._first) % self._count
+        return held[bisect.bisect_right(held, t, key=lambda span: span[0]) - 1]
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t.
@@ -128,6 +169,35 @@ class StoredSource(ClockedSource):
             )
         self._t = t
 
+    def _centred(self, stream: int, t: int, n: int) -> Block:
+        """See `_block`; without the mean of its episode, where it is centred so."""
+        block = self._block(stream, t, n)
+        if self.centre == "run":
+            return block
+        shown, at = [], 0
+        while at < n:  # where one lap ends an episode does
+            place = (t + at - self._first) % self._count
+            count = min(n - at, self._count - place)
+            mean = self._mean(stream, self._first + place)
+            shown.append(centred(block.frames[at : at + count], mean))
+            at += count
+        frames = shown[0] if len(shown) == 1 else np.concatenate(shown)
+        return replace(block, frames=freeze(frames))
+
+    def _mean(self, stream: int, t: int) -> NDArray[Any]:
+        """The mean of the episode of a frame, for which all of it is read."""
+        self._means = self._means or {}
+        span = self.episode(stream, t)
+        known = self._means.get(stream)
+        if known is None or known[0] != span:
+            pieces = (
+                self._block(stream, at, min(PIECE, high - at)).frames
+                for low, high in self.spans(stream, *span)
+                for at in range(low, high, PIECE)
+            )
+            self._means[stream] = known = span, mean_of(pieces)
+        return known[1]
+
     @abstractmethod
     def _block(self, stream: int, t: int, n: int) -> Block:
         """The frames [t, t + n) of a stream, none of a gap; their numbers may be of a later lap."""
@@ -140,7 +210,7 @@ class StoredSource(ClockedSource):
         """Where the next n frames of a stream begin that follow one another."""
         # Looping, a stretch that holds them is in the rest of this lap or in the next two.
         end = self._t + 3 * self._count + n if self._loop else self.end
-        for low, high in self.spans(stream, self._t, end):
+        for low, high in self._spans(stream, self._t, end):
             if high - low >= n:
                 return low
         raise self._exhausted(n)

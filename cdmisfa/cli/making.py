@@ -135,10 +135,12 @@ def number(
     return option(name, type=kind(least, most), **told)
 
 
-def choice(name: str, about: str, values: Sequence[str]) -> Callable[[Command], Command]:
+def choice(
+    name: str, about: str, values: Sequence[str], **how: Any
+) -> Callable[[Command], Command]:
     """An option that is one of some words, by default the first."""
     kind = click.Choice(list(values))
-    return option(name, type=kind, default=values[0], show_default=True, help=about)
+    return option(name, type=kind, default=values[0], show_default=True, help=about, **how)
 
 
 def word(name: str, unit: str, about: str, **how: Any) -> Callable[[Command], Command]:

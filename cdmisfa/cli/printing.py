@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.run_folder import RunResult
     from cdmisfa.experiments.sources import Configuration
+    from replay.corpus.episodes import EpisodeSource
     from replay.integrity.learned import ModuleInfo
     from replay.viewer.broadcast import Broadcast
 
@@ -214,14 +215,35 @@ def say_changes(source: FrameSource) -> None:
         warn(line)
 
 
+def _print_episodes(source: EpisodeSource, *, as_json: bool) -> None:
+    """Print the episodes of a source in their order."""
+    rows, fps = source.plan(), source.spec.fps
+    if as_json:
+        size = list(source.spec.frame_shape)
+        plan = {"frames": source.frames, "rate": fps, "size": size, "episodes": rows}
+        print_document(**plan, warnings=list(source.warnings))
+        return
+    cells = [
+        (number, row["frames"][0], row["frames"][1] - row["frames"][0], row["log"])
+        for number, row in enumerate(rows)
+    ]
+    print_table(("episode", "from", "frames", "log"), cells)
+    for line in (*source.notes, *source.warnings):
+        print_line(line)
+
+
 def print_plan(source: FrameSource, *, as_json: bool) -> None:
-    """Print what would be read: streams, sizes, rates, gaps and drops.
+    """Print what would be read: streams, sizes, rates, gaps and drops; of episodes their order.
 
     Raises:
         UsageError: it is no camera log.
     """
     from replay.camera_logs.source import ForeignSource
+    from replay.corpus.episodes import EpisodeSource
 
+    if isinstance(source, EpisodeSource):
+        _print_episodes(source, as_json=as_json)
+        return
     if not isinstance(source, ForeignSource):
         raise UsageError("--dry-run is for camera logs: cdmisfa info says what is in a recording")
     rows = source.plan()

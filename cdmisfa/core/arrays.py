@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ from cdmisfa.core.errors import UsageError
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
+
+GRAY = 128
+"""What a pixel that is as in the mean of its episode becomes."""
 
 
 def as_array(given: Any, name: str = "frames") -> NDArray[Any]:
@@ -48,6 +52,45 @@ def without_table(given: Any, name: str = "frames") -> Any:
     if not columns:
         raise UsageError(f"{name}: a table without columns given")
     return np.column_stack([_column(name, *column) for column in columns])
+
+
+def mean_of(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
+    """The mean of the frames of an episode, the same bits however they are cut.
+
+    Args:
+        pieces: (n, *frame_shape) each, one frame at least in all, uint8 pixels or float64 values.
+
+    Returns:
+        (*frame_shape) int16 of pixels, rounded, half of one up; float64 of values.
+    """
+    total: Any = 0
+    count = 0
+    for frames in pieces:
+        count += len(frames)
+        if frames.dtype == np.uint8:
+            total = total + frames.sum(axis=0, dtype=np.int64)
+        else:
+            for frame in frames:  # one after the other: in what order numpy adds is its own
+                total = total + frame
+    if total.dtype == np.int64:
+        return np.asarray((2 * total + count) // (2 * count), np.int16)
+    return np.asarray(total / count)
+
+
+def centred(frames: NDArray[Any], mean: NDArray[Any]) -> NDArray[Any]:
+    """Frames of an episode without its mean.
+
+    Of pixels that is `GRAY` and how far each is from the mean, no darker than black and no
+    brighter than white. Where it was neither, centred once more they stay as they are.
+
+    Args:
+        frames: (n, *frame_shape) uint8 or float64.
+        mean: of the whole episode, see `mean_of`.
+    """
+    if frames.dtype != np.uint8:
+        return np.asarray(frames - mean)
+    apart = frames - (mean - np.int16(GRAY))
+    return np.clip(apart, 0, 255, out=apart).astype(np.uint8)
 
 
 def _column(name: str, key: str, given: Any) -> NDArray[Any]:

@@ -124,6 +124,14 @@ class Application:
                 f"{words[0]} shows frames of {source.spec.frame_shape}, and the modules learned "
                 f"from {shape}: choose what is as large, as with --field for numbers"
             )
+        if self.recipe.centre == "episode":
+            if not isinstance(source, StoredSource):
+                source.close()
+                raise UsageError(
+                    f"{words[0]} is live: the modules learned from frames without the mean of "
+                    "their episode, which is known when it is over: record it first"
+                )
+            source.centre_by("episode")
         return source
 
     def _made(self, options: Any) -> dict[str, Any]:

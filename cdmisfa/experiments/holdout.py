@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,8 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.modules import Module
+from replay.storage.identity import LoggedSource
 from replay.stored import StoredSource
-
-if TYPE_CHECKING:
-    from replay.camera_logs.source import ForeignSource
 
 PIECE = 256
 """Frames that are held at once."""
@@ -33,12 +31,6 @@ class _StoppedError(Exception):
     """The run is to end."""
 
 
-def _of_cameras(source: FrameSource) -> TypeGuard[ForeignSource]:
-    from replay.camera_logs.source import ForeignSource
-
-    return isinstance(source, ForeignSource)
-
-
 def hold_out(source: FrameSource, share: float | None, *, judged: bool) -> None:
     """Keep the last frames of a camera log from what learns, which is judged on them at its end.
 
@@ -52,19 +44,20 @@ def hold_out(source: FrameSource, share: float | None, *, judged: bool) -> None:
     """
     if share == 0.0:
         return
-    if not judged or source.spec.length is None or not _of_cameras(source):
+    logged = source if isinstance(source, LoggedSource) and source.to_judge else None
+    if not judged or logged is None or logged.spec.length is None:
         if share is not None:
             raise UsageError(
                 "--holdout is for camera logs that the progress learner learns from once: leave it "
                 "out, or leave out --loop and --algorithm"
             )
         return
-    count = int(source.frames * (HOLDOUT if share is None else share))
+    count = int(logged.frames * (HOLDOUT if share is None else share))
     if count >= FEWEST:
-        source.hold_out(count)
+        logged.hold_out(count)
     else:
-        said = f"{count} of {source.frames} frames are too few to judge on: none are held out"
-        source.notes = (*source.notes, f"{said} (--holdout)")
+        said = f"{count} of {logged.frames} frames are too few to judge on: none are held out"
+        logged.notes = (*logged.notes, f"{said} (--holdout)")
 
 
 def judged(

@@ -6,10 +6,14 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cdmisfa.core.blocks import Block, FrameSource, turn_to
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
+from replay.stored import StoredSource
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
@@ -29,6 +33,12 @@ ENDINGS: Mapping[str, str] = {
     INTERRUPTED: "it was interrupted",
 }
 """Why a run ended, in words."""
+
+SAMPLED = 4
+"""Frames of a block of which the variance between episodes is taken."""
+
+FEWEST_EPISODES = 8
+"""Episodes that tell of it."""
 
 EVERY = 100
 """Iterations between two keyframes, where nothing else is said and the log has room for them."""
@@ -67,6 +77,7 @@ def learn_blocks(
         given = f"{type(source).__name__} and {type(learner).__name__}"
         raise UsageError(f"{given} given: learn_blocks takes a source that is open, then a learner")
     modules = learner.max_modules if max_modules is None else max_modules
+    sinks = [BetweenEpisodes(source, sinks), *sinks]
     while True:
         ended = ending(learner, modules, max_iterations) or (INTERRUPTED if stop() else "")
         if ended:
@@ -167,6 +178,81 @@ class Keyframes(Sink):
         # A camera's own t may lie behind the last block, where it ended within the next one.
         t = self._source.t if self._t is None else self._t
         return Keyframe(learner.iteration, t, learner.state, self._versions, taken)
+
+
+class BetweenEpisodes(Sink):
+    """Tells of each stream of logs whether it differs more between episodes than within them.
+
+    That is the intraclass correlation of a few frames of each block, of all pixels together.
+
+    Args:
+        source: what is learned from.
+        others: all sinks of the run, which are told at its end.
+    """
+
+    def __init__(self, source: FrameSource, others: Sequence[Sink]) -> None:
+        logs = source if isinstance(source, StoredSource) and source.gaps else None
+        self._source = None if logs is None or logs.centre == "episode" else logs
+        self._others = others
+        self._streams: dict[int, _Spread] = {}
+        self._at = 0, 0
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        if self._source is not None:
+            self._at = block.t, signals.iteration
+            spread = self._streams.setdefault(block.stream, _Spread())
+            episode = self._source.episode(block.stream, block.t)
+            spread.add(episode, block.frames[:: max(len(block) // SAMPLED, 1)])
+
+    def finish(self) -> None:
+        """See `Sink`."""
+        for stream, spread in sorted(self._streams.items()):
+            if self._source is not None and (share := spread.between()) > 0.5:
+                name = self._source.spec.streams[stream]
+                said = f"{name}: {share:.0%} of its variance is between episodes, not within"
+                for other in self._others:
+                    other.event(*self._at, f"{said}; --centre episode leaves it out", "WARNING")
+
+
+class _Spread:
+    """How frames are spread within episodes and between them."""
+
+    def __init__(self) -> None:
+        self._episode: tuple[int, int] | None = None
+        self._count = self._episodes = self._frames = 0
+        self._sum: Any = 0.0
+        self._total: Any = 0.0
+        self._squares = self._of_means = 0.0
+
+    def add(self, episode: tuple[int, int], frames: NDArray[Any]) -> None:
+        """Take frames of an episode in."""
+        if episode != self._episode:
+            self._end()
+            self._episode, self._count, self._sum = episode, 0, 0.0
+        x = frames.reshape(len(frames), -1).astype(np.float64)
+        self._count += len(x)
+        self._sum = self._sum + x.sum(axis=0)
+        self._squares += float((x * x).sum())
+
+    def between(self) -> float:
+        """The share of the variance that is between episodes; 0 where these are too few."""
+        self._end()
+        if self._episodes < FEWEST_EPISODES or self._frames <= self._episodes:
+            return 0.0
+        within = (self._squares - self._of_means) / (self._frames - self._episodes)
+        means = self._of_means - float((self._total * self._total).sum()) / self._frames
+        between = means / (self._episodes - 1) - within
+        between = max(between, 0.0) * self._episodes / self._frames
+        return between / (between + within) if between else 0.0
+
+    def _end(self) -> None:
+        if self._count:
+            self._episodes += 1
+            self._frames += self._count
+            self._of_means += float((self._sum * self._sum).sum()) / self._count
+            self._total = self._total + self._sum
+            self._count = 0
 
 
 class BestEffort(Sink):

@@ -153,6 +153,10 @@ def proof_of(run: Path) -> Proof:
     )
 
 
+PLAIN = (("seed", 0), ("centre", "run"))
+"""Options of a command that say what is so without them."""
+
+
 def command_again(run: Path) -> str:
     """The command that begins a run anew, for a shell; "" where the run does not say."""
     try:
@@ -162,7 +166,7 @@ def command_again(run: Path) -> str:
     fields = {field.name for field in dataclasses.fields(CameraOptions)}
     said = option_words(CameraOptions(**{k: v for k, v in options.items() if k in fields}))
     for name, value in options.items():
-        if name in fields or value in (None, False, ()) or (name, value) == ("seed", 0):
+        if name in fields or value in (None, False, ()) or (name, value) in PLAIN:
             continue
         flag = "--set" if name == "settings" else f"--{name.replace('_', '-')}"
         if value is True:

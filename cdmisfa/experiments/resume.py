@@ -45,6 +45,8 @@ OPTIONS = (
     "algorithm",
     "loop",
     "salvage",
+    "episodes",
+    "centre",
     "follow",
     "holdout",
     *CAMERAS,
@@ -158,8 +160,8 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     kept = () if not as_begun and _is_recording(words) else CAMERAS
     cameras = CameraOptions(**{name: begun[name] for name in kept if name in begun})
     if words[0] not in SCENES:
-        loop, salvage = bool(begun.get("loop")), bool(begun.get("salvage"))
-        return open_logs(words, loop=loop, salvage=salvage, cameras=cameras)
+        how: dict[str, Any] = {n: bool(begun.get(n)) for n in ("loop", "salvage", "episodes")}
+        return open_logs(words, cameras=cameras, centre=begun.get("centre", "run"), **how)
     settings = list(begun.get("settings", ()))
     if begun.get("algorithm"):
         settings.append(f"learner.algorithm={begun['algorithm']}")

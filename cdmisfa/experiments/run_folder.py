@@ -33,6 +33,7 @@ from replay.runs.folders import MODULES_FILE, REPORT_FILE, RUN_FILE, RUN_JSON, V
 from replay.runs.modules import save_modules
 from replay.runs.run import final_record
 from replay.runs.writer import RunWriter
+from replay.storage.identity import LoggedSource
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,13 +122,12 @@ def with_recipes(
         described = source.origin()
 
     def recipe(stream: int) -> Recipe:
-        from replay.camera_logs.source import ForeignSource
-
         own = Recipe.of(described, source.spec.frame_shape, stream)
         frames = () if "size" in described else own.size  # else they are the pictures
         framings = getattr(source, "framings", [None] * len(source.spec.streams))
         own = replace(own, raw=getattr(framings[stream], "first", frames) or ())
-        stated = source.pixels(stream) if isinstance(source, ForeignSource) else ""
+        own = replace(own, centre=getattr(source, "centre", "run"))
+        stated = source.pixels(stream) if isinstance(source, LoggedSource) else ""
         return replace(own, pixels=stated) if stated.startswith("bayer_") else own
 
     return tuple(replace(module, recipe=recipe(module.stream_index)) for module in modules)

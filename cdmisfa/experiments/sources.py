@@ -17,13 +17,15 @@ from cdmisfa.core.registry import did_you_mean
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import CAMERAS, is_live, live_options, open_live
 from recorder.config import RecordConfig, SceneConfig
-from recorder.images.options import ImageOptions
+from recorder.images.options import Centre, ImageOptions
 from recorder.world.scenes import SCENES, open_scene
 from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
     from recorder.recording import ViewRecording
+    from replay.corpus.logs import Told
     from replay.storage.identity import LoggedSource
+    from replay.stored import StoredSource
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
@@ -222,35 +224,31 @@ def open_source(
     preset: str | None = None,
     settings: Sequence[str] = (),
     seed: int = 0,
-    loop: bool = False,
-    salvage: bool = False,
     cameras: CameraOptions | None = None,
-    follow: float | None = None,
     resumed: bool = False,
+    **how: Any,
 ) -> tuple[SeekableSource, Configuration]:
     """Open a live scene by its name, a recording, or other people's camera logs.
 
     Args:
-        words: the name of a scene, or paths or URLs: the folder of a recording or its views'
-            files, or camera logs of others, or patterns of their names.
+        words: the name of a scene, or those of `open_logs`.
         preset: instead of the source's own.
         settings: `section.key=value` words.
         seed: of the scene, where `scene.seed` is not set.
-        loop: start a recording again at its end.
-        salvage: pass over the damaged parts of a recording.
-        cameras: how images of others become frames; given, the paths are taken as such logs.
-        follow: wait so many seconds for more frames of a recording that is being written.
+        cameras: see `open_logs`.
         resumed: the settings are those of a run that is resumed; see `log_settings`.
+        how: further arguments of `open_logs`.
 
     Raises:
-        UsageError: neither a scene nor a path that exists, or a wrong configuration.
-        CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
+        CdmisfaError: there is no such scene, log or setting, or a log is damaged.
     """
-    if follow is None and is_scene(words, cameras):
+    if how.get("follow") is None and is_scene(words, cameras):
+        if how.get("episodes") or how.get("centre", "run") != "run":
+            raise UsageError(f"{words[0]} is a scene: episodes are of logs, as of recordings of it")
         scene = configure(str(words[0]), preset, of_scene(settings, cameras), seed)
         return scene.open_scene(), scene
     told = log_settings(settings, None if resumed else words[0])
-    source = open_logs(words, loop=loop, salvage=salvage, cameras=cameras, follow=follow)
+    source = open_logs(words, cameras=cameras, **how)
     try:
         described = description(source, at_once=True)
         configuration = configure_for(source.spec, described, preset, told, seed)
@@ -286,16 +284,23 @@ def open_logs(
     salvage: bool = False,
     cameras: CameraOptions | None = None,
     follow: float | None = None,
+    episodes: bool = False,
+    centre: Centre = "run",
+    told: Told = lambda done, total: None,
     goal: tuple[str, str] = ("learn", "RUN"),
 ) -> SeekableSource:
-    """Open a recording, or other people's camera logs, as `open_source`, without a configuration.
+    """Open a recording, other people's camera logs, or many of both as episodes.
 
     Args:
-        words: see `open_source`, as are the next ones.
-        loop: see there.
-        salvage: see there.
-        cameras: see there.
-        follow: see there.
+        words: paths, URLs or patterns: the folder of a recording, or its views' files, or camera
+            logs of others; or an index of many, or a folder that has one.
+        loop: start again at the end.
+        salvage: pass over damaged parts.
+        cameras: how images of others become frames; given, the paths are taken as such logs.
+        follow: wait so many seconds for more frames of a recording being written.
+        episodes: each path is an episode of its own; those of an index always are.
+        centre: see `StoredSource.centre_by`.
+        told: how many of the episodes were opened.
         goal: see `open_log`.
 
     Raises:
@@ -304,11 +309,14 @@ def open_logs(
     """
     cameras = cameras or CameraOptions()
     if follow is not None and (
-        len(words) > 1 or words[0] in SCENES or loop or salvage or cameras != CameraOptions()
+        len(words) > 1
+        or words[0] in SCENES
+        or any((loop, salvage, episodes, centre != "run", cameras != CameraOptions()))
     ):
         raise UsageError("--follow takes the folder of one recording, and neither loops nor skips")
     if scene := next((word for word in words if word in SCENES and not Path(word).exists()), None):
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
+    from replay.corpus.finding import may_be_corpus
     from replay.inputs import locations, open_log
     from replay.storage.location import Url
     from replay.storage.opening import no_such
@@ -326,7 +334,15 @@ def open_logs(
             scenes = SCENES.names()
             raise no_such(path, [*scenes, *kinds], f"the scenes are {', '.join(scenes)}")
     if follow is None:
-        return open_log(paths, cameras, loop=loop, salvage=salvage, goal=goal)
+        source: StoredSource | None = None
+        if episodes or may_be_corpus(words):
+            from replay.corpus.episodes import open_episodes
+
+            how: Any = {"loop": loop, "salvage": salvage, "told": told}
+            source = open_episodes(words, paths if episodes else None, cameras, **how)
+        source = source or open_log(paths, cameras, loop=loop, salvage=salvage, goal=goal)
+        source.centre_by(centre)
+        return source
     from replay.recordings.followed import FollowedSource
 
     if isinstance(paths[0], Url):
@@ -354,8 +370,7 @@ def open_cameras_now(
         say: told in a line when a camera's state changes.
 
     Raises:
-        UsageError: a word names no live stream or one that cannot be opened, or a wrong
-            configuration.
+        UsageError: a word names no live stream that can be opened, or a wrong configuration.
     """
     live = live_options(words, live, cameras)
     told = log_settings(settings, words[0])
@@ -369,10 +384,7 @@ def open_cameras_now(
 
 
 def convert(source: LoggedSource, folder: Path, **options: Any) -> list[ViewRecording]:
-    """Write every stream of a source as a view of a recording.
-
-    The recording has the source's frames at its times and rate; the logs they came from, with
-    their checksums and how images became frames, stand in its config.json.
+    """Write every stream of a source as a view of a recording, whose config.json states it.
 
     Args:
         source: does not loop; left open.
@@ -380,9 +392,7 @@ def convert(source: LoggedSource, folder: Path, **options: Any) -> list[ViewReco
         options: those of `record`.
 
     Raises:
-        UsageError: the source loops, its images are too small, or as for `record`.
-        LogDamagedError: an image cannot be read.
-        LogWriteError: the disk does not take it.
+        CdmisfaError: the source loops, its images are too small or damaged, or as for `record`.
     """
     from recorder.recording import record
 

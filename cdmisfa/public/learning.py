@@ -31,8 +31,9 @@ from cdmisfa.public.recording import Given, Recording
 from cdmisfa.public.run import Run
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live
-from recorder.images.options import ImageOptions
+from recorder.images.options import Centre, ImageOptions
 from replay.arrays import ArrayLog
+from replay.stored import StoredSource
 
 
 def learn(
@@ -46,6 +47,8 @@ def learn(
     preset: str | None = None,
     holdout: float | None = None,
     loop: bool = False,
+    episodes: bool = False,
+    centre: Centre = "run",
     force: bool = False,
     view: bool = False,
     sinks: Sequence[Sink] = (),
@@ -73,6 +76,8 @@ def learn(
         holdout: the share of a camera log, at its end, that is kept from the progress learner, to
             judge on it what was learned; by default a tenth.
         loop: begin logs or arrays again at their end.
+        episodes: see `Recording`.
+        centre: see `Recording`.
         force: replace an existing run.
         view: also write the view, run.rrd.
         sinks: told of every iteration; one that raises is let go with a warning.
@@ -95,7 +100,8 @@ def learn(
         words.append(f"learner.algorithm={algorithm}")
     how: dict[str, Any] = {"preset": preset, "settings": words, "seed": seed}
     limits: dict[str, Any] = {"max_iterations": max_iterations, "max_modules": max_modules}
-    with _opened(source, loop, how) as (frames, configuration, told), _folder(out) as folder:
+    logs: dict[str, Any] = {"loop": loop, "episodes": episodes, "centre": centre}
+    with _opened(source, logs, how) as (frames, configuration, told), _folder(out) as folder:
         by_progress = configuration.learner.algorithm == OF_CAMERAS
         hold_out(frames, holdout, judged=by_progress)
         limits["holdout"] = holdout
@@ -141,18 +147,21 @@ Told = tuple[Sequence[str], dict[str, Any]] | None
 
 @contextlib.contextmanager
 def _opened(
-    source: Given, loop: bool, how: dict[str, Any]
+    source: Given, logs: dict[str, Any], how: dict[str, Any]
 ) -> Iterator[tuple[FrameSource, Configuration, Told]]:
     """A source, open, with its configuration and what names it; closed unless it was open."""
-    words = [source] if isinstance(source, str) else []
-    if isinstance(source, list | tuple) and all(isinstance(one, str) for one in source):
-        words = list(source)
-    if words and is_scene(words):
-        found, configuration = open_source(words, **how)
+    words = [str(source)] if isinstance(source, str | Path) else []
+    if isinstance(source, list | tuple) and all(isinstance(one, str | Path) for one in source):
+        words = list(map(str, source))
+    if words and not all(map(is_live, words)):
+        found, configuration = open_source(words, **how, **logs)
         with contextlib.closing(found):
-            yield found, configuration, (words, {})
+            yield found, configuration, (words, {} if is_scene(words) else logs)
         return
-    if words and all(map(is_live, words)):
+    asked = [name for name in ("episodes", "centre") if logs[name] not in (False, "run")]
+    if asked and (words or not isinstance(source, Recording | StoredSource)):
+        raise UsageError(f"{asked[0]} is for logs: record or write what is shown first")
+    if words:
         live = LiveOptions(seed=how["seed"])
         cameras = ImageOptions()
         told = {"preset": how["preset"], "settings": how["settings"]}
@@ -160,6 +169,8 @@ def _opened(
         with contextlib.closing(streams):
             yield streams, configuration, (words, {})
         return
+    if isinstance(source, StoredSource) and "centre" in asked:
+        source.centre_by(logs["centre"])
     if isinstance(source, FrameSource):
         yield source, _configured(source, how), None
         return
@@ -171,8 +182,13 @@ def _opened(
             yield made, _configured(made, how), None
         return
     recording = Recording.of(source)
-    with recording.source(loop=loop) as frames:
-        options = {"loop": loop or recording.loop, "salvage": recording.salvage}
+    if "episodes" in asked:
+        raise UsageError("episodes is of a recording: learn(Recording(source, episodes=True))")
+    with recording.source(loop=logs["loop"]) as frames:
+        if "centre" in asked:
+            frames.centre_by(logs["centre"])
+        options = {"loop": logs["loop"] or recording.loop, "centre": frames.centre}
+        options |= {"salvage": recording.salvage, "episodes": recording.episodes}
         options |= recording.options
         named = (recording.words, options) if recording.words else None
         yield frames, _configured(frames, how), named

@@ -16,6 +16,7 @@ from cdmisfa.core.shown import Shown
 from cdmisfa.experiments.resume import CAMERAS
 from cdmisfa.experiments.sources import open_logs
 from cdmisfa.public.shown import view
+from recorder.images.options import Centre
 from replay.arrays import ArrayLog
 from replay.camera_logs.options import CameraOptions
 
@@ -34,6 +35,9 @@ class Recording(Shown):
             pictures, (n, height, width) or (n, height, width, 3), the i-th of all at once.
         loop: begin again at the end.
         salvage: leave out what is damaged.
+        episodes: each path is an episode, one after the other; those of a corpus, a folder that
+            cdmisfa index indexed, always are.
+        centre: "episode" shows frames without the mean of their episode.
         options: which streams, and how they become frames, as those of `cdmisfa learn`: `topics`,
             `size`, `fit`, `rate`, `color`, `fields`, `time`, `align`, `start`, `stop`, `gaps`,
             `depth` (--range), `stamp`.
@@ -47,7 +51,13 @@ class Recording(Shown):
     """
 
     def __init__(
-        self, *given: Given, loop: bool = False, salvage: bool = False, **options: Any
+        self,
+        *given: Given,
+        loop: bool = False,
+        salvage: bool = False,
+        episodes: bool = False,
+        centre: Centre = "run",
+        **options: Any,
     ) -> None:
         unknown = [name for name in options if name not in CAMERAS]
         if unknown:
@@ -57,9 +67,12 @@ class Recording(Shown):
         lists = {k: tuple(v) for k, v in options.items() if isinstance(v, list)}
         self._options = CameraOptions(**{**options, **lists})
         self._given = given
-        self.loop, self.salvage = loop, salvage
+        self.loop, self.salvage, self.episodes = loop, salvage, episodes
+        self.centre: Centre = centre
         words = all(isinstance(one, str | Path) for one in given)
         self.words: tuple[str, ...] = tuple(map(str, given)) if words else ()
+        if episodes and not words:
+            raise UsageError("episodes are logs: name them, or give one array")
         if not words and len(given) > 1:
             raise UsageError("several arrays given: name each, as {'left': one, 'right': two}")
         with self.source() as source:
@@ -88,10 +101,13 @@ class Recording(Shown):
         """
         loop = loop or self.loop
         if self.words:
-            return open_logs(self.words, loop=loop, salvage=self.salvage, cameras=self._options)
+            how: dict[str, Any] = {"loop": loop, "salvage": self.salvage, "centre": self.centre}
+            return open_logs(self.words, cameras=self._options, episodes=self.episodes, **how)
         (given,) = self._given
         streams = given if isinstance(given, Mapping) else {"stream": given}
-        return ArrayLog(streams, self._options, loop=loop)
+        source = ArrayLog(streams, self._options, loop=loop)
+        source.centre_by(self.centre)
+        return source
 
     def frames(
         self, stream: str | int = 0, start: int = 0, stop: int | None = None

@@ -43,6 +43,9 @@ Color = bool | Literal["auto"]
 Fit = Literal["crop", "pad", "stretch"]
 """How an image of another ratio of the sides becomes a frame: see `fitted`."""
 
+Centre = Literal["run", "episode"]
+"""What frames are shown without before anything is learned: nothing, or each episode's mean."""
+
 Clock = Literal["log", "header"]
 """Which time of a message counts: when it was logged, or that in its header."""
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import UsageError
 from recorder.images.fields import bounded
 from recorder.images.framing import Framing
-from recorder.images.options import Depth, Fit, Size
+from recorder.images.options import Centre, Depth, Fit, Size
 from recorder.images.pixels import Shown, compressed_image, raw_image
 from recorder.images.whole import MalformedImage
 
@@ -41,6 +41,7 @@ class Recipe:
         fields: the numbers that were taken, by the names that they had.
         pixels: the format of one colour a pixel that the source has, as bayer_rggb8; "" of others.
         raw: (height, width) of the source's pictures; empty where it did not say.
+        centre: "episode" where frames lack the mean of their episode; see `centred`.
     """
 
     shape: tuple[int, ...]
@@ -50,6 +51,7 @@ class Recipe:
     fields: tuple[str, ...] = ()
     pixels: str = ""
     raw: tuple[int, ...] = ()
+    centre: Centre = "run"
 
     @classmethod
     def of(cls, described: Mapping[str, Any], shape: tuple[int, ...], stream: int = 0) -> Self:
@@ -70,6 +72,7 @@ class Recipe:
             "color" in described,
             tuple(bounds) if bounds else None,
             tuple(named),
+            centre=described.get("centre", "run"),
         )
 
     @classmethod
@@ -96,6 +99,7 @@ class Recipe:
             and len(recipe.raw) in (0, 2)
             and all(type(side) is int and side > 0 for side in (*recipe.shape, *recipe.raw))
             and recipe.fit in get_args(Fit)
+            and recipe.centre in get_args(Centre)
             and isinstance(recipe.color, bool)
             and (recipe.range is None or len(bounds) == 2)
             and all(isinstance(bound, int | float) for bound in bounds)
@@ -130,7 +134,7 @@ class Recipe:
             )
 
     def frames(self, pictures: Any) -> NDArray[Any]:
-        """Raw pictures as frames; see `make_frame`.
+        """Raw pictures as frames; see `make_frame`. The mean of their episode stays in them.
 
         Args:
             pictures: an array with a first axis of n, or any iterable of n pictures.

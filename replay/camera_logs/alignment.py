@@ -18,7 +18,7 @@ MAX_FRAMES: Final = 2**31
 """Most frames that streams are aligned to."""
 GAP_STEPS: Final = 10
 """A pause between two images of more than so many median steps is a gap."""
-_UNEVEN: Final = 0.01
+UNEVEN: Final = 0.01
 """By how much of itself a rate may differ from another that counts as the same."""
 _JITTER: Final = 0.75
 """By how much of a frame the time of an image may differ from that of its frame."""
@@ -86,7 +86,7 @@ def overlap(streams: Sequence[Times]) -> tuple[int, int]:
 def of_other_rate(times: Times, fps: float) -> bool:
     """Whether a stream has a rate that differs from another by more than a hundredth."""
     step = step_of(times)
-    return step > 0 and abs(step * fps - 1) > _UNEVEN
+    return step > 0 and abs(step * fps - 1) > UNEVEN
 
 
 def unlike(first: Times, times: Times) -> str:
@@ -158,7 +158,7 @@ def retimed(times: Times, rows: Rows, fps: float) -> str:
     lacks = _lacks(times)
     lacks[pauses(times) - 1] = 0
     lost = int(lacks.sum())
-    allowed = _JITTER / fps + (0 if lost else _UNEVEN) * since
+    allowed = _JITTER / fps + (0 if lost else UNEVEN) * since
     if (np.abs(since - frame / fps) <= allowed).all():
         return ""
     lasts, become = since[-1] + 1 / fps, len(rows) / fps

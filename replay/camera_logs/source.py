@@ -84,6 +84,8 @@ class ForeignSource(LoggedSource):
             that are shown at other times than their own.
     """
 
+    to_judge = True
+
     def __init__(
         self,
         paths: str | Location | Sequence[str | Location],
@@ -213,7 +215,7 @@ class ForeignSource(LoggedSource):
         }
 
     def pixels(self, stream: int) -> str:
-        """The format of pixels that a stream's messages state, "" where they state none."""
+        """See `LoggedSource`."""
         return self._streams[stream].pixels() or ""
 
     def plan(self) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from replay.camera_logs.opening import WHOLE_FILES, log_format
 from replay.camera_logs.pictures import PICTURES
 from replay.inputs import locations
 from replay.runs.folders import RUN_FILE
-from replay.storage.location import Location, Url
+from replay.storage.location import Location, Url, location
 from replay.storage.uploads import objects_below
 
 INDEX: Final = "corpus.parquet"
@@ -61,6 +61,14 @@ def found_logs(words: Sequence[str | Location]) -> Iterator[Found]:
             yield from _below(str(place), seen)
         else:
             yield _file(place)
+
+
+def may_be_corpus(words: Sequence[str | Location]) -> bool:
+    """Whether words are a folder that has an index, or a file that may be one."""
+    place = location(words[0]) if len(words) == 1 else None
+    if not isinstance(place, Path):
+        return False
+    return (place / INDEX).is_file() or (place.suffix == ".parquet" and place.is_file())
 
 
 def state_of_log(place: Location) -> tuple[int, str]:

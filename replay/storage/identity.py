@@ -8,7 +8,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import check_regular
@@ -218,12 +218,14 @@ class LoggedSource(StoredSource):
     """A source of frames in logs, identified by their bytes.
 
     Attributes:
+        to_judge: whether its last frames are held out where nothing is said; see `hold_out`.
         left_out: a line for each log that could not be read, and is no part of it.
         copies: a line for each stream that shows the same as one of another log.
         notes: a line for each thing that was chosen where it was not said.
         warnings: what the user should know.
     """
 
+    to_judge: ClassVar[bool] = False
     left_out: tuple[str, ...] = ()
     copies: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -237,6 +239,10 @@ class LoggedSource(StoredSource):
     @abstractmethod
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """What the source is, with what is known of each log."""
+
+    def pixels(self, stream: int) -> str:
+        """The format of pixels that a stream's messages state, "" where they state none."""
+        return ""
 
     def scene(self) -> Mapping[str, str]:
         """What was recorded, where the logs say so."""
@@ -260,14 +266,18 @@ class LoggedSource(StoredSource):
             if size > AT_ONCE:
                 told(done, size)
 
-        return self._described([log.whole(counted) for log in logs])
+        return self._with_centre([log.whole(counted) for log in logs])
 
     def describe_at_once(self) -> Mapping[str, Any]:
         """See `cdmisfa.core.blocks.LongSource`."""
         logs = self._known_logs()
         if sum(log.size for log in logs) <= AT_ONCE:
             return self.describe()
-        return self._described([log.sample() for log in logs])
+        return self._with_centre([log.sample() for log in logs])
+
+    def _with_centre(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+        described = self._described(logs)
+        return described if self.centre == "run" else {**described, "centre": self.centre}
 
     def _known_logs(self) -> Sequence[Identity]:
         if self._identities is None:

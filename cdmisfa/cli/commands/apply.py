@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from cdmisfa.experiments.apply import Application, Totals
     from recorder.cameras.options import LiveOptions
     from replay.export.applied import AppliedSink
+    from replay.storage.location import Location
 
 OF_FILES = ("parquet", "csv", "mcap", "rrd")
 STDOUT, FOXGLOVE = AS_THEY_COME = ("stdout", "foxglove")
@@ -99,7 +100,7 @@ def apply_command(
 
     outlet, logs = outlet_of(ctx, to, port), logs_of(source)
     refuse_unfit(source, outlet, live, again=loop or salvage, as_json=as_json)
-    outs = places(out, outlet.form, [words[0] for words in logs], force=force)
+    outs = places(out, outlet.form, list(map(name_of, logs)), force=force)
     application = Application(run)
     told: dict[str, Any] = {"cameras": replace(cameras, stop=outlet.until), "live": live}
     told |= {"loop": loop, "salvage": salvage, "say": tell}
@@ -298,9 +299,13 @@ def _named(out: Path, form: str | None, logs: Sequence[str]) -> list[Path]:
 
 
 def logs_of(source: Sequence[str]) -> list[list[str]]:
-    """The words of each log, of a pattern those that match it; live streams are together."""
+    """The words of each log, of a pattern those that match it; live streams are together.
+
+    Of a corpus they are those of each log in its index.
+    """
     from recorder.cameras.words import is_live
     from recorder.world.scenes import SCENES
+    from replay.corpus.finding import may_be_corpus
     from replay.inputs import locations
     from replay.storage.location import Url
 
@@ -310,10 +315,20 @@ def logs_of(source: Sequence[str]) -> list[list[str]]:
     for word in source:
         if word in SCENES:
             found.append([word])
-        else:
-            places = locations([word])
-            found += [[p.address if isinstance(p, Url) else str(p)] for p in places]
+            continue
+        logs: Sequence[Sequence[Location]] | None = None
+        if may_be_corpus([word]):
+            from replay.corpus.logs import logs_of_corpus
+
+            logs = logs_of_corpus([word])
+        for log in logs or [[place] for place in locations([word])]:
+            found.append([p.address if isinstance(p, Url) else str(p) for p in log])
     return found
+
+
+def name_of(words: Sequence[str]) -> str:
+    """What the file of a log is called after: of the views of a recording their folder."""
+    return words[0] if len(words) == 1 or "://" in words[0] else str(Path(words[0]).parent)
 
 
 def print_applied(run: str, rows: Sequence[dict[str, Any]], *, as_json: bool) -> None:

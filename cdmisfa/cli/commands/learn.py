@@ -13,7 +13,7 @@ import click
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import completing, options, uploads
 from cdmisfa.cli.commands.report import report_beside
-from cdmisfa.cli.making import flag, grouped, number, option, word
+from cdmisfa.cli.making import choice, flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     announce,
     print_plan,
@@ -26,7 +26,7 @@ from cdmisfa.cli.printing import (
     say_counts,
     tell,
 )
-from cdmisfa.cli.progress import learning
+from cdmisfa.cli.progress import bar, learning
 from cdmisfa.core.errors import LogDamagedError, UsageError, are_for
 
 if TYPE_CHECKING:
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from cdmisfa.experiments.sources import Configuration
     from recorder.cameras.options import LiveOptions
     from replay.camera_logs.options import CameraOptions
+
+OPENED = ("preset", "seed", "loop", "salvage", "episodes", "centre")
+"""Options that say how a source is opened."""
 
 KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 """Options that are handed on to the run as they are."""
@@ -67,6 +70,14 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 @flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
 @options.no_report
+@flag("--episodes", "Take each log as an episode, one after the other.", group="Source")
+@choice(
+    "--centre",
+    "Learn from frames as they are over the run, or without the mean of their episode, a log or "
+    "what lies between two gaps: what differs between episodes alone is not learned then.",
+    ("run", "episode"),
+    group="Source",
+)
 @flag("--follow", "Wait for the frames of a recording being written.", group="Source")
 @number(
     "--follow-timeout",
@@ -116,6 +127,9 @@ def learn_command(
 
     SOURCE is a live scene (icub, oscillatory), the folder of a recording, or the MCAP
     files of its views. The same seed gives the same signals, bit for bit, from each.
+
+    Or it is a corpus, a folder that cdmisfa index indexed: its logs are episodes, one after the
+    other by when each begins and then by its path, and nothing is learned across two of them.
 
     Or it is other people's logs: MCAP files, ROS bags, LeRobot datasets, tables of numbers (CSV,
     Parquet), or a video or a folder of pictures for each stream. Logs may be URLs: s3://, http://
@@ -199,14 +213,16 @@ def opened_logs(
     options.refuse_live_options(live, source)
     if told["record_to"] is not None:
         raise UsageError("--record is for live streams: leave it out, or see cdmisfa record")
-    frames, configuration = open_source(
-        source,
-        settings=settings_of(told),
-        cameras=cameras,
-        follow=told["follow_timeout"] if told["follow"] else None,
-        resumed=told["resume"],
-        **{name: told[name] for name in ("preset", "seed", "loop", "salvage")},
-    )
+    with bar("opening", "logs") as shown:
+        frames, configuration = open_source(
+            source,
+            settings=settings_of(told),
+            cameras=cameras,
+            follow=told["follow_timeout"] if told["follow"] else None,
+            resumed=told["resume"],
+            told=shown.update,
+            **{name: told[name] for name in OPENED},
+        )
     with contextlib.closing(frames):
         progress = configuration.learner.algorithm == OF_CAMERAS
         hold_out(frames, told["holdout"], judged=progress)
@@ -230,11 +246,11 @@ def opened_live(
     from recorder.live import RecordedWhileWatched
     from recorder.log.files import refuse_existing
 
-    refused = ("resume", "loop", "salvage", "follow", "dry_run", "holdout")
-    if any(told[name] for name in refused):
+    refused = ("resume", "loop", "salvage", "episodes", "follow", "dry_run", "holdout")
+    if any(told[name] for name in refused) or told["centre"] == "episode":
         raise UsageError(
-            "live streams cannot go back: leave out --resume, --loop, --salvage, --follow, "
-            "--dry-run and --holdout, or learn from a recording of them"
+            "live streams cannot go back: leave out --resume, --loop, --salvage, --episodes, "
+            "--centre, --follow, --dry-run and --holdout, or learn from a recording of them"
         )
     out, record_to, force = told["out"], told["record_to"], told["force"]
     for folder in (out, record_to):

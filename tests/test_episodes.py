@@ -1,0 +1,376 @@
+"""Many logs as episodes of one source, and what differs between them alone left out."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import START_MS, write_images
+from conftest import Cdmisfa
+from folders import flip
+from message_files import write_table
+from waiting import running, wait_for
+
+import cdmisfa as package
+from cdmisfa.core.arrays import GRAY, centred, mean_of
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.camera_logs.lerobot import PAUSE
+from replay.corpus.episodes import EpisodeSource
+from replay.inputs import locations
+from replay.runs.keyframes import read_keyframe
+
+STEP_MS = 50
+SIZE = 16, 24
+QUICK = ("--set", "learner.tau=10", "--no-rerun", "--no-report")
+
+
+def scenes(count: int, frames: int, seed: int = 0) -> list[np.ndarray]:
+    """Episodes of a square that moves before a background, in each another one, and noise."""
+    rng, t = np.random.default_rng(seed), np.arange(frames)
+    found = []
+    for _ in range(count):
+        background = rng.uniform(20, 200, (SIZE[0] // 2, SIZE[1] // 2))
+        shown = np.repeat(np.kron(background, np.ones((2, 2)))[None], frames, axis=0)
+        left = (9 + 9 * np.sin(rng.uniform(0, 2 * np.pi) + t / 12)).astype(int)
+        for i, at in enumerate(left):
+            shown[i, 5:11, at : at + 6] += 70
+        shown += rng.normal(0, 6, shown.shape)
+        found.append(np.clip(shown, 0, 255).astype(np.uint8))
+    return found
+
+
+def write_log(path: Path, images: np.ndarray, first: int = 0, topic: str = "/cam") -> Path:
+    """A log whose first image is the so manieth since its start."""
+    path.parent.mkdir(exist_ok=True)
+    each = ((START_MS + (first + i) * STEP_MS, image) for i, image in enumerate(images))
+    return write_images(path, {topic: each})
+
+
+def corpus(
+    cdmisfa: Cdmisfa, folder: Path, episodes: Sequence[np.ndarray], name: str = "ep{}.mcap"
+) -> Path:
+    """An indexed folder of logs that begin in the order of the episodes."""
+    for i, images in enumerate(episodes):
+        write_log(folder / name.format(i), images, i * 1000)
+    assert cdmisfa("index", folder).code == 0
+    return folder
+
+
+def opened(*paths: Path, **how: bool) -> EpisodeSource:
+    return EpisodeSource([[place] for place in locations(paths)], **how)
+
+
+def test_episodes_are_learned_as_one_log_with_pauses_is(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    episodes = scenes(4, 45)
+    folder = corpus(cdmisfa, tmp_path / "logs", episodes)
+    first = [i * (45 + PAUSE) for i in range(4)]
+    each = zip(first, episodes, strict=True)
+    times = [(START_MS + (at + i) * STEP_MS, x) for at, own in each for i, x in enumerate(own)]
+    one = write_images(tmp_path / "one.mcap", {"/cam": times})
+    run = tmp_path / "run"
+    learned = cdmisfa("learn", folder, *QUICK, "--json", "-o", run)
+    alike = cdmisfa("learn", one, *QUICK, "--json")
+    assert (learned.code, learned.json["iterations"]) == (0, 16)
+    assert learned.json["signals_sha256"] == alike.json["signals_sha256"]
+    assert "4 episodes, by when each begins, then by its path: ep0.mcap to ep3.mcap" in learned.err
+    source = json.loads((run / "run.json").read_text())["source"]
+    assert [(file["file"], file["frames"]) for file in source["files"]] == [
+        (f"ep{i}.mcap", [at, at + 45]) for i, at in enumerate(first)
+    ]
+    assert cdmisfa("check", run).code == 0
+    named = cdmisfa("learn", "--episodes", *sorted(folder.glob("*.mcap"))[::-1], *QUICK, "--json")
+    assert named.json["signals_sha256"] == learned.json["signals_sha256"]
+    by_index = cdmisfa("learn", folder / "corpus.parquet", *QUICK, "--json", "--dry-run").json
+    assert [row["frames"][0] for row in by_index["episodes"]] == first
+    assert "ep3.mcap" in cdmisfa("learn", folder, "--dry-run").out
+    found = package.learn(str(folder), tau=10)
+    assert found.result["signals_sha256"] == learned.json["signals_sha256"]
+
+
+def test_logs_of_the_same_time_are_ordered_by_their_paths_as_numbers(tmp_path: Path) -> None:
+    images = scenes(1, 12)[0]
+    names = [f"{day}/{i}.mcap" for day in ("d2", "d10") for i in (2, 10)]
+    paths = [write_log(tmp_path / name, images) for name in reversed(names)]
+    with opened(*paths) as source:
+        assert [row["log"] for row in source.plan()] == names
+        assert len(source.copies) == 3
+
+
+def test_streams_of_the_same_name_are_one_and_a_missing_one_is_a_gap(tmp_path: Path) -> None:
+    one, two = scenes(2, 30)
+    first = write_log(tmp_path / "1.mcap", one)
+    second = tmp_path / "2.mcap"
+    times = [START_MS + (1000 + i) * STEP_MS for i in range(30)]
+    each = {"/cam": zip(times, two, strict=True), "/other": zip(times, one, strict=True)}
+    write_images(second, each)
+    cameras = package.Recording(first, second, episodes=True, topics=["/*"])
+    assert (cameras.spec.streams, cameras.spec.length) == (("cam", "other"), 60 + PAUSE)
+    with cameras.source() as source:
+        assert source.spans(0, 0, 80) == [(0, 30), (50, 80)]
+        assert source.spans(1, 0, 80) == [(50, 80)]
+        assert (source.take(1, 5).t, source.t) == (50, 55)
+        source.seek(0)
+        both = source.take_all(60)
+        assert [(b.stream, b.t, len(b)) for b in both] == [(0, 0, 30), (0, 50, 10), (1, 50, 10)]
+        np.testing.assert_array_equal(both[2].frames, one[:10])
+
+
+def test_films_and_tables_are_one_stream_whatever_their_files_are_called(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).normal(size=(40, 2))
+    for name in ("a", "b"):
+        columns = {"t": np.arange(40) / 20, "x": values[:, 0], "y": values[:, 1]}
+        write_table(tmp_path / f"{name}.csv", columns)
+    found = package.Recording(*sorted(tmp_path.iterdir()), episodes=True, time="t")
+    assert (found.spec.streams, found.spec.length) == (("stream",), 80 + PAUSE)
+    np.testing.assert_array_equal(found.frames("stream", 60), values)
+
+
+def test_of_episodes_one_log_is_open_at_a_time(tmp_path: Path) -> None:
+    paths = [write_log(tmp_path / f"{i}.mcap", x, i * 100) for i, x in enumerate(scenes(30, 12))]
+    with opened(*paths) as source:
+        for _ in range(30):
+            source.take(0, 12)
+            held = [os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")
+                    if os.path.exists(f"/proc/self/fd/{fd}")]  # fmt: skip
+            assert sum(str(tmp_path) in path for path in held) <= 1
+
+
+def test_a_looped_corpus_has_a_gap_before_it_begins_again(tmp_path: Path) -> None:
+    one, two = scenes(2, 30)
+    paths = write_log(tmp_path / "1.mcap", one), write_log(tmp_path / "2.mcap", two, 1000)
+    with opened(*paths, loop=True) as source:
+        lap = 2 * (30 + PAUSE)
+        starts = [source.take(0, 20).t for _ in range(5)]
+        assert starts == [0, 50, lap, lap + 50, 2 * lap]
+        source.centre_by("episode")
+        source.seek(lap)
+        mean = mean_of([one])
+        np.testing.assert_array_equal(source.take(0, 20).frames, centred(one, mean)[:20])
+
+
+# What is left out
+
+
+def test_bad_logs_are_left_out_and_said_and_the_rest_is_learned(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    episodes = scenes(5, 45)
+    folder = corpus(cdmisfa, tmp_path / "logs", episodes)
+    whole = cdmisfa("learn", folder, *QUICK, "--json").json
+    write_log(folder / "large.mcap", np.zeros((20, 32, 48), np.uint8), 9000)
+    write_table(folder / "table.csv", {"text": ["a", "b"]})
+    write_log(folder / "gone.mcap", episodes[0], 9100)
+    (folder / "text.mcap").write_text("no log")
+    assert cdmisfa("index", folder).code == 0
+    (folder / "gone.mcap").unlink()
+    done = cdmisfa("learn", folder, *QUICK, "--json")
+    assert done.code == 3
+    assert done.json["signals_sha256"] == whole["signals_sha256"]
+    for name in ("large.mcap", "table.csv", "gone.mcap", "text.mcap"):
+        assert f"{name}" in done.err
+    assert done.err.count("left out") == 4
+    assert "Traceback" not in done.err
+
+
+def test_a_log_damaged_in_the_middle_is_left_out_from_there_on(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    folder = corpus(cdmisfa, tmp_path / "logs", scenes(4, 60))
+    damaged = folder / "ep1.mcap"
+    flip(damaged, damaged.stat().st_size // 2)
+    run = tmp_path / "run"
+    done = cdmisfa("learn", folder, *QUICK, "--json", "-o", run)
+    assert done.code == 3, done.err
+    assert "what follows in it is left out" in done.err
+    assert 18 <= done.json["iterations"] < 24
+    assert cdmisfa("check", run).code == 0
+    centre = ("--centre", "episode", "--json")
+    without = cdmisfa("learn", folder, *QUICK, *centre)
+    assert (without.code, without.json["iterations"]) == (3, 18)  # its mean is not known
+    assert "the log is left out" in without.err
+
+
+def test_a_log_that_changes_meanwhile_is_left_out(tmp_path: Path) -> None:
+    one, two = scenes(2, 30)
+    paths = write_log(tmp_path / "1.mcap", one), write_log(tmp_path / "2.mcap", two, 1000)
+    with opened(*paths) as source:
+        write_log(paths[0], two)
+        assert source.take(0, 10).t == 50
+        assert "it was changed since it was first opened" in source.salvaged()[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("oscillatory", "--centre", "episode"), "oscillatory is a scene"),
+        (("oscillatory", "--episodes"), "oscillatory is a scene"),
+        (("av:lavfi:testsrc", "--centre", "episode"), "live streams cannot go back"),
+        (("CORPUS", "--color", "auto"), "--color auto looks at one log"),
+        (("CORPUS", "--topic", "/no"), "no topic /no"),
+        (("CORPUS", "--follow", "--episodes"), "--follow takes the folder of one recording"),
+        (("CORPUS", "--holdout", "0.5", "--loop"), "--holdout is for camera logs"),
+        (
+            ("--episodes", "CORPUS/ep0.mcap", "CORPUS/none.mcap"),
+            "none.mcap: no such file or folder",
+        ),
+    ],
+)
+def test_what_episodes_cannot_be_is_refused_in_a_line(
+    cdmisfa: Cdmisfa, tmp_path: Path, words: Sequence[str], said: str
+) -> None:
+    folder = corpus(cdmisfa, tmp_path / "logs", scenes(1, 12))
+    done = cdmisfa("learn", *(word.replace("CORPUS", str(folder)) for word in words))
+    assert done.code == 2
+    assert said in done.err
+    assert len(done.err.splitlines()) == 1
+
+
+def test_python_refuses_another_centre_and_episodes_of_arrays(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "1.mcap", scenes(1, 12)[0])
+    with pytest.raises(UsageError, match="centre is 'all': give run or episode"):
+        package.learn(str(path), centre="all")
+    with pytest.raises(UsageError, match="episodes are logs"):
+        package.Recording(np.zeros((10, 2)), episodes=True)
+    with pytest.raises(UsageError, match="oscillatory is a scene"):
+        package.learn("oscillatory", centre="episode")
+    torn = tmp_path / "2.mcap"
+    torn.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(LogDamagedError):
+        package.learn([str(torn)], episodes=True)
+
+
+# Killed and resumed
+
+
+def test_killed_in_the_middle_of_many_episodes_it_is_resumed_with_the_same_signals(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    rng, t = np.random.default_rng(0), np.arange(25)
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for i in range(150):
+        x = np.stack([np.sin((t + 40 * i) / 30), *rng.normal(size=(3, 25))]) + rng.normal()
+        np.save(folder / f"ep{i}.npy", x.T)
+    assert cdmisfa("index", folder).code == 0
+    words = (folder, *QUICK, "--set", "learner.watch=9999", "--centre", "episode")
+    words = (*words, "--keyframes", 20, "--holdout", 0)
+    whole = cdmisfa("learn", *words, "--json").json
+    assert whole["iterations"] == 300
+    run = tmp_path / "run"
+    log = run / "run.mcap.partial"
+
+    def far() -> bool:
+        kept = read_keyframe(log) if log.exists() else None
+        return kept is not None and kept.iteration >= 100
+
+    slowed = "import sys, time; from cdmisfa.cli import run; from cdmisfa.agents.progress import "
+    slowed += "learner as own; step = own.ProgressLearner.step; own.ProgressLearner.step = "
+    slowed += "lambda *a: (time.sleep(.002), step(*a))[1]; sys.exit(run(sys.argv[1:]))"
+    with running("-c", slowed, "learn", *map(str, words), "-o", str(run)) as process:
+        wait_for(far, 60, process)
+        os.kill(process.pid, signal.SIGKILL)
+    kept = read_keyframe(log)
+    assert kept is not None
+    assert 100 <= kept.iteration < 300
+    done = cdmisfa("learn", "--resume", "-o", run, "--json", "--no-rerun", "--no-report")
+    assert done.code == 0, done.err
+    assert done.json["signals_sha256"] == whole["signals_sha256"]
+    np.save(folder / "ep149.npy", np.zeros((25, 4)))
+    changed = cdmisfa("learn", "--resume", "-o", run)
+    assert changed.code == 2
+    assert "source.files" in changed.err
+
+
+# The mean of an episode
+
+
+def test_the_mean_of_an_episode_does_not_depend_on_how_it_is_read() -> None:
+    rng = np.random.default_rng(3)
+    for frames in (rng.integers(70, 190, (50, 3, 4), np.uint8), rng.normal(size=(50, 7))):
+        whole = mean_of([frames])
+        for cut in (1, 7, 49):
+            pieces = [frames[at : at + cut] for at in range(0, 50, cut)]
+            np.testing.assert_array_equal(mean_of(pieces), whole)
+        np.testing.assert_allclose(whole, frames.mean(axis=0), atol=0.5 + 1e-9)
+        once = centred(frames, whole)
+        np.testing.assert_allclose(centred(once, mean_of([once])), once, atol=1e-12)
+    assert mean_of([np.array([[0], [1]], np.uint8)]).tolist() == [1]
+    shown = centred(np.array([[0], [100], [255]], np.uint8), np.array([100], np.int16))
+    assert shown.ravel().tolist() == [28, GRAY, 255]
+
+
+@pytest.fixture(scope="module")
+def backgrounds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A corpus of scenes, and the run learned from them without their means."""
+    from cdmisfa.cli import run
+
+    folder = tmp_path_factory.mktemp("backgrounds")
+    for i, images in enumerate(scenes(110, 45)):
+        write_log(folder / "logs" / f"ep{i}.mcap", images, i * 1000)
+    assert run(["index", str(folder / "logs")]) == 0
+    words = ["learn", str(folder / "logs"), "--centre", "episode", "-o", str(folder / "run")]
+    assert run([*words, "--no-rerun", "--no-report"]) == 0
+    return folder
+
+
+def test_centred_episodes_show_what_moves_before_backgrounds_that_change(
+    cdmisfa: Cdmisfa, backgrounds: Path, tmp_path: Path
+) -> None:
+    plain = cdmisfa("learn", backgrounds / "logs")
+    assert plain.code == 0
+    assert "no module was learned" in plain.out
+    assert "of its variance is between episodes, not within; --centre episode" in plain.err
+    run = backgrounds / "run"
+    (module,) = package.Run(run).modules
+    assert module.recipe is not None
+    assert (module.recipe.centre, module.slow[0]) == ("episode", 1)
+    assert cdmisfa("check", run).code == 0
+    (new,) = scenes(1, 200, seed=9)
+    log = write_log(tmp_path / "new.mcap", new)
+    assert cdmisfa("apply", run, log, "-o", tmp_path / "out.csv").code == 0
+    applied = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)["module1_y0"]
+    y = module.transform(new)[:, 0]
+    np.testing.assert_array_equal(applied, y)
+    shown = package.Recording(log, centre="episode").frames()
+    for same in (shown, new.reshape(200, -1), new / 255):
+        np.testing.assert_array_equal(module.transform(same)[:, 0], y)
+    t = np.arange(200) / 12
+    waves = np.stack([np.sin(t), np.cos(t), np.ones(200)], axis=1)
+    rest = y - waves @ np.linalg.lstsq(waves, y, rcond=None)[0]
+    assert rest.var() < 0.2 * y.var()  # it tells where the square is
+    live = cdmisfa("apply", run, "av:lavfi:testsrc=size=24x16")
+    assert live.code == 2
+    assert "without the mean of their episode, which is known when it is over" in live.err
+
+
+def test_apply_takes_each_log_of_a_corpus_as_an_episode(
+    cdmisfa: Cdmisfa, backgrounds: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = ("apply", backgrounds / "run")
+    document = cdmisfa(*words, backgrounds / "logs", "-o", out, "--json").json
+    assert len(document["logs"]) == len([*out.iterdir()]) == 110
+    one = cdmisfa(*words, backgrounds / "logs" / "ep7.mcap", "--json").json
+    row = next(row for row in document["logs"] if "ep7." in row["log"])
+    assert row["modules"] == one["logs"][0]["modules"]
+
+
+def test_recordings_of_scenes_are_episodes(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    for seed in (1, 0):
+        words = ("--seed", seed, "--frames", 300, "-o", folder / f"rec{seed}")
+        assert cdmisfa("record", "oscillatory", *words).code == 0
+    assert cdmisfa("index", folder).code == 0
+    run = tmp_path / "run"
+    learned = cdmisfa("learn", folder, "-o", run, "--json", "--no-rerun", "--no-report").json
+    assert [file["file"] for file in learned["source"]["files"]] == ["rec0", "rec1"]
+    assert learned["source"]["scene"] == "oscillatory"
+    assert json.loads((run / "run.json").read_text())["config"]["learner"]["algorithm"] == "2.0"
+    assert cdmisfa("check", run).code == 0
+    assert cdmisfa("index", folder / "rec0").code == 0  # it stays one recording
+    assert cdmisfa("learn", folder / "rec0", "--json").json["source"]["kind"] == "recording"
