@@ -90,7 +90,7 @@ def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) 
     said = {"shape": [8, 8], "fit": "stretch", "color": False, "range": None, "fields": []}
     stated = json.loads((out / "run.json").read_text())["result"]["modules"]
     assert [module["recipe"] for module in stated] == [
-        {**said, "pixels": "", "raw": [12, 16], "centre": "run"}
+        {**said, "pixels": "", "raw": [12, 16]}
     ] * len(stated)
     module = Run(out).modules[0]
     assert module.recipe == load_modules(out)[0].recipe == Recipe((8, 8), "stretch", raw=(12, 16))

@@ -110,8 +110,11 @@ class Recipe:
         return recipe
 
     def as_json(self) -> dict[str, Any]:
-        """The recipe as JSON values."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+        """The recipe as JSON values; without `centre` where it says nothing."""
+        stated = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+        if self.centre == "run":
+            del stated["centre"]
+        return stated
 
     @property
     def size(self) -> Size | None:
