@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import centred, mean_of
-from cdmisfa.core.blocks import Block, ClockedSource, check_request, freeze
+from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, check_request, freeze
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.images.options import Centre
 
@@ -223,6 +223,23 @@ class StoredSource(ClockedSource):
             f"{self._name()}: {left} frames are left at frame {self._t}{held}, {n} are needed"
             f"{unbroken}; {self.more}begin again at its end with --loop"
         )
+
+
+def centre_as(centre: Centre, source: FrameSource, name: str) -> FrameSource:
+    """A source that shows frames as modules learned from them; see `StoredSource.centre_by`.
+
+    Raises:
+        UsageError: its episodes are not over, and so have no mean; the source is closed.
+    """
+    if isinstance(source, StoredSource):
+        source.centre_by(centre)
+    elif centre == "episode":
+        source.close()
+        raise UsageError(
+            f"{name} is live: the modules learned from frames without the mean of their episode, "
+            "which is known when it is over: record it first"
+        )
+    return source
 
 
 def merged(spans: Iterable[Span]) -> list[Span]:

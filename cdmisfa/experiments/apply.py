@@ -36,7 +36,7 @@ from replay.inputs import locations
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
 from replay.runs.run import Run
-from replay.stored import StoredSource
+from replay.stored import StoredSource, centre_as
 
 KNOWN_WITHIN: Final = 2.0
 """Standard deviations of a module's slowness within which it knows a block, as its learner says."""
@@ -124,15 +124,7 @@ class Application:
                 f"{words[0]} shows frames of {source.spec.frame_shape}, and the modules learned "
                 f"from {shape}: choose what is as large, as with --field for numbers"
             )
-        if self.recipe.centre == "episode":
-            if not isinstance(source, StoredSource):
-                source.close()
-                raise UsageError(
-                    f"{words[0]} is live: the modules learned from frames without the mean of "
-                    "their episode, which is known when it is over: record it first"
-                )
-            source.centre_by("episode")
-        return source
+        return centre_as(self.recipe.centre, source, words[0])
 
     def _made(self, options: Any) -> dict[str, Any]:
         """The recipe, as options of images."""
