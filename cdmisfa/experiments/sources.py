@@ -292,11 +292,10 @@ def open_logs(
     """Open a recording, other people's camera logs, or many of both as episodes.
 
     Args:
-        words: paths, URLs or patterns: the folder of a recording, or its views' files, or camera
-            logs of others; or an index of many, or a folder that has one.
+        words: paths, URLs or patterns: of a recording, logs of others, or an index of many.
         loop: start again at the end.
         salvage: pass over damaged parts.
-        cameras: how images of others become frames; given, the paths are taken as such logs.
+        cameras: how images of others become frames; given, paths are taken as such logs.
         follow: wait so many seconds for more frames of a recording being written.
         episodes: each path is an episode of its own; those of an index always are.
         centre: see `StoredSource.centre_by`.
@@ -334,13 +333,13 @@ def open_logs(
             scenes = SCENES.names()
             raise no_such(path, [*scenes, *kinds], f"the scenes are {', '.join(scenes)}")
     if follow is None:
+        how: Any = {"loop": loop, "salvage": salvage}
         source: StoredSource | None = None
         if episodes or may_be_corpus(words):
             from replay.corpus.episodes import open_episodes
 
-            how: Any = {"loop": loop, "salvage": salvage, "told": told}
-            source = open_episodes(words, paths if episodes else None, cameras, **how)
-        source = source or open_log(paths, cameras, loop=loop, salvage=salvage, goal=goal)
+            source = open_episodes(words, episodes and paths, cameras, told=told, **how)
+        source = source or open_log(paths, cameras, goal=goal, **how)
         source.centre_by(centre)
         return source
     from replay.recordings.followed import FollowedSource

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -37,7 +37,7 @@ _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "ti
 
 def open_episodes(
     words: Sequence[str | Location],
-    paths: Sequence[Location] | None,
+    paths: Sequence[Location] | Literal[False],
     cameras: CameraOptions | None = None,
     **how: Any,
 ) -> EpisodeSource | None:
@@ -45,7 +45,7 @@ def open_episodes(
 
     Args:
         words: what was named.
-        paths: what the words stand for, where they are taken whatever they are.
+        paths: what the words stand for, where each is an episode whatever it is.
         cameras: see `EpisodeSource`.
         how: see there.
 
@@ -56,7 +56,7 @@ def open_episodes(
         UsageError: an index holds no logs, or as for `EpisodeSource`.
         LogDamagedError: the same.
     """
-    logs = logs_of_corpus(words) or (None if paths is None else [[path] for path in paths])
+    logs = logs_of_corpus(words) or ([[path] for path in paths] if paths else None)
     return None if logs is None else EpisodeSource(logs, cameras, **how)
 
 
