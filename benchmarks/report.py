@@ -97,14 +97,18 @@ def save(
     print(section(document))
 
 
-def section(document: Mapping[str, Any]) -> str:
-    """The part of the page that shows one benchmark's results."""
+def section(document: Mapping[str, Any], data: str = "") -> str:
+    """One benchmark's results; where its data is linked, with its first table alone."""
     tables = [markdown(t["header"], t["rows"]) for t in document["tables"]]
     facts = ", ".join(f"{key} {value}" for key, value in document["platform"].items())
     of = f" {document['code']}" if "code" in document else ""
-    return "\n\n".join(
-        [f"## {document['title']}", document["note"], *tables, f"Measured{of} on: {facts}."]
-    )
+    end = f"Measured{of} on: {facts}."
+    if data:
+        others = f" {len(tables) - 1} more {'tables' if tables[2:] else 'table'} and" * bool(
+            tables[1:]
+        )
+        tables, end = tables[:1], f"Measured{of};{others} the machine: [{Path(data).name}]({data})."
+    return "\n\n".join([f"## {document['title']}", document["note"], *tables, end])
 
 
 def write_page() -> Path:
@@ -129,7 +133,8 @@ def write_page() -> Path:
         "Below each part stands the commit that it measured: parts of different commits are not "
         "to be compared with each other."
     )
-    parts = [head, *map(section, documents)]
+    results = os.path.relpath(RESULTS, PAGE.parent)
+    parts = [head, *(section(each, f"{results}/{each['benchmark']}.json") for each in documents)]
     if (PAGE.parent / PICTURE).exists():
         parts.insert(
             1,

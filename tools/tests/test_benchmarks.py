@@ -174,7 +174,7 @@ def test_results_are_kept_only_of_code_that_a_commit_holds(results: Path, tmp_pa
     told = json.loads(path.read_text())
     assert told["commit"].startswith(path.stem)
     page = report.write_page().read_text(encoding="utf-8")
-    assert f"Measured at {told['commit'][:7]} on: " in page
+    assert f"Measured at {told['commit'][:7]};" in page
     assert told["ratios"] == {"Projecting on modules, times faster: 10, vs a matrix product": 1.38}
     (tmp_path / "cdmisfa" / "code.py").write_text("2\n")
     assert history.keep("modules", tmp_path) is None
