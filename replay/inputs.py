@@ -190,6 +190,23 @@ def holds_run(path: Path) -> bool:
     return not only_foreign(path) and not are_arrays([path]) and is_run(path)
 
 
+def is_recording(words: Sequence[str]) -> bool:
+    """Whether what words name is one of our recordings.
+
+    Raises:
+        UsageError: there is no such log.
+        LogDamagedError: a log is damaged.
+    """
+    places = locations(words)
+    if are_arrays(places) or any(map(only_foreign, places)):
+        return False
+    try:
+        RecordedSource(places).close()
+    except NoRecordingError:
+        return False
+    return True
+
+
 def refuse_what_is_no_log(path: Location) -> None:
     """Refuse a run, or a file that is no log.
 

@@ -20,17 +20,17 @@ from cdmisfa.core.options import parse_settings
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.names import placed, renamed, same_names
-from cdmisfa.experiments.sources import CLOCK, open_logs, open_source
+from cdmisfa.experiments.sources import CLOCK, configure, open_logs
 from recorder.cameras.words import is_live
+from recorder.config import RecordConfig
 from recorder.log.files import found_path, partial_path, relative_path
-from recorder.world.scenes import SCENES
+from recorder.world.scenes import SCENES, open_scene
 from replay.camera_logs.options import CameraOptions
 from replay.runs.compare import differences
 from replay.runs.folders import RUN_FILE
 from replay.runs.keyframes import read_keyframe
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.run import known_to_both, stated_source
-from replay.storage.location import location
 
 COMMAND = "command"
 """Key of a manifest: the command that began the run, which may differ when it is resumed."""
@@ -152,27 +152,18 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     words = tuple(words) or named
     if is_live(words[0]):
         raise UsageError(f"{words[0]} was live: name what learn --record wrote of it")
-    kept = () if not as_begun and _is_recording(words) else CAMERAS
+    from replay.inputs import is_recording  # not needed to begin a run
+
+    kept = () if not as_begun and is_recording(words) else CAMERAS
     cameras = CameraOptions(**{name: begun[name] for name in kept if name in begun})
     if words[0] not in SCENES:
         how: dict[str, Any] = {n: bool(begun.get(n)) for n in ("loop", "salvage", "episodes")}
         return open_logs(words, cameras=cameras, centre=begun.get("centre", "run"), **how)
-    settings = list(begun.get("settings", ()))
-    if begun.get("algorithm"):
-        settings.append(f"learner.algorithm={begun['algorithm']}")
-    preset, seed = begun.get("preset"), begun.get("seed", 0)
-    return open_source(words, preset=preset, settings=settings, seed=seed, cameras=cameras)[0]
-
-
-def _is_recording(words: Sequence[str]) -> bool:
-    from replay.recordings.source import RecordedSource  # not needed to begin a run
-    from replay.recordings.view_file import NoRecordingError
-
-    try:
-        RecordedSource([location(word) for word in words]).close()
-    except NoRecordingError:
-        return False
-    return True
+    told = read_header(log_to_resume(run)).manifest.get("config", {})
+    if told.get("scene", {}).get("kind") != words[0]:
+        return configure(words[0], seed=begun.get("seed", 0)).open_scene()
+    scene = build(SCENES[words[0]].config, "scene", told["scene"])
+    return open_scene(words[0], scene, build(RecordConfig, "record", told.get("record", {})))
 
 
 FORK = "fork"
