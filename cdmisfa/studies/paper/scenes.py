@@ -102,8 +102,8 @@ class Scenes(Experiment):
         found.short = (
             f"**Beyond the paper's scene** 2.0 learns both objects in {learned['plain', '2.0']} of "
             f"{n} plain scenes, in {learned[ALL, '2.0']} of {n} furnished ones, and in at most "
-            f"{best} of {n} with one thing added; the progress learner in at least {worst} "
-            f"of {n} of every scene."
+            f"{best} of {n} with one thing added; the progress learner in "
+            f"{'all' if worst == n else f'at least {worst} of {n}'} of every scene."
         )
 
 

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
+
+import numpy as np
 
 PERIOD = 1.6
 """Metres after which the texture of a box repeats."""
 
 AROUND = 16
 """Corners of a circle."""
+
+_STEPS = np.array(
+    sorted(itertools.product(range(-3, 4), repeat=3), key=lambda steps: sum(map(abs, steps))),
+    np.float32,
+)
+"""Steps of a last digit to try in x, y and z, the smallest first."""
 
 
 @dataclass(slots=True)
@@ -69,13 +78,28 @@ def round_mesh(rings: Sequence[tuple[float, float, float, float, float]]) -> Mes
             turn = 2 * math.pi * (j % AROUND) / AROUND
             c, s = round(math.cos(turn), 9), round(math.sin(turn), 9)
             mesh.vertices.append([radius * c, radius * s, height])
-            mesh.normals.append([out * c, out * s, up])
+            mesh.normals.append(steady((out * c, out * s, up)))
             mesh.uvs.append([j / AROUND, v])
             if i and j:
                 a = i * (AROUND + 1) + j
                 b = a - AROUND - 1
                 mesh.indices += [b - 1, b, a, b - 1, a, a - 1]
     return mesh
+
+
+def steady(normal: Sequence[float]) -> list[float]:
+    """The normal of float32 near a unit normal that stays as it is when it is normalised again.
+
+    Bullet's renderer does so in place each time that it draws a corner. Others go to and fro by a
+    last digit, and what is seen then depends on how often it was drawn before.
+    """
+    near = np.asarray(normal, np.float32)
+    for steps in _STEPS:
+        found = near + np.spacing(near) * steps * (near != 0)
+        x, y, z = found * found
+        if x + y + z == x + z + y == y + z + x == 1:
+            return [float(part) for part in found]
+    raise ValueError(f"{normal} is no unit normal")
 
 
 def can_mesh(radius: float, height: float) -> Mesh:
