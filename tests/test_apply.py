@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import socket
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,18 +13,17 @@ import numpy as np
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
+from applied_data import SIZE, TAU, camera, learned, make_run
 from camera_files import pictures, write_images, write_pictures
 from conftest import Cdmisfa
 from mcap.reader import make_reader
 from message_files import write_table
-from run_data import module_of
 from view_data import View, scalars
 from waiting import started
 
-from cdmisfa import Recipe, Run
+from cdmisfa import Run
 from cdmisfa.core.errors import LogWriteError
 from cdmisfa.experiments.apply import Application, Totals, follow
-from cdmisfa.modules import Module
 from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
 from recorder.images.options import Reading
@@ -35,36 +33,11 @@ from replay.camera_logs.source import ForeignSource
 from replay.export.applied import Applied, written
 from replay.runs.modules import save_modules
 
-TAU = 20
-SIZE = (6, 8)
-
 
 @pytest.fixture
 def run(cdmisfa: Cdmisfa, tmp_path: Path) -> Path:
-    """A run of one stream with two modules of three outputs, of frames 8x6."""
-    out = tmp_path / "run"
-    log = camera(tmp_path / "learned.mcap", 100, 9)
-    quick = ("--set", f"learner.tau={TAU}", "--max-iterations", 3, "--no-rerun", "-o", out)
-    done = cdmisfa("learn", log, "--size", "8x6", *quick)
-    assert done.code == 0, done.err
-    save_modules(out / "modules.npz", [learned(i) for i in (1, 2)])
-    return out
-
-
-def learned(index: int, shape: tuple[int, ...] = SIZE) -> Module:
-    phi = np.random.default_rng(index).normal(size=(3, int(np.prod(shape))))
-    made = module_of(index, index, phi)
-    about: Any = {"eta": np.full(3, 0.02), "band_sd": np.full(3, np.nan)}
-    about |= {"band_mean": about["eta"]}
-    recipe = Recipe(shape, raw=(12, 16) if shape == SIZE else ())
-    return replace(made, **about, recipe=recipe, frame_shape=shape, expansion="none", scale=1 / 255)
-
-
-def camera(path: Path, count: int, seed: int = 0, gap: int = 0) -> Path:
-    """A log of pictures 16x12, 50 a second; `gap` seconds are missing in its middle."""
-    late = [1000 * gap * (i >= count // 2) for i in range(count)]
-    images = [(1000 + 20 * i + late[i], image) for i, image in enumerate(pictures(count, seed))]
-    return write_images(path, {"/cam": images})
+    """See `make_run`."""
+    return make_run(cdmisfa, tmp_path)
 
 
 def outputs(table: Any, module: int) -> np.ndarray:
@@ -153,8 +126,8 @@ def test_several_logs_are_a_file_each_and_a_bad_one_does_not_end_the_rest(
     said = done.json["logs"]
     assert [one["frames"] for one in said] == [60, 0, 60, 60, 0]
     assert [one["error"] is None for one in said] == [True, False, True, True, False]
-    found = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert found == ["a.parquet", "c.parquet", "d.parquet"]
+    found = sorted(path.name for path in (tmp_path / "out").glob("*.parquet"))
+    assert found == ["a.mcap.parquet", "c.mcap.parquet", "d.mcap.parquet"]
     refused = cdmisfa("apply", run, *logs, "-o", tmp_path / "out.csv")
     assert (refused.code, "a file each" in refused.err) == (2, True)
 

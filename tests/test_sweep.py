@@ -9,11 +9,9 @@ import json
 import os
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -292,32 +290,6 @@ def test_local_processes_give_the_same_rows_though_one_is_killed(
     assert killed
     assert report.failed == ()
     assert rows_of(tmp_path) == local
-
-
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A dask scheduler and two worker processes on loopback, as a user would start them."""
-    pytest.importorskip("distributed")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
-    dask = [sys.executable, "-m", "dask"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    port = address.rpartition(":")[2]
-    started = [
-        subprocess.Popen(
-            [*dask, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"], **quiet
-        )
-    ]
-    for _ in range(2):
-        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
-        started.append(subprocess.Popen([*dask, "worker", address, *options], **quiet))
-    try:
-        yield address, started[1:]
-    finally:
-        for process in started:
-            process.kill()
-            process.wait()
 
 
 def test_dask_gives_the_same_rows_though_a_worker_is_killed(

@@ -50,6 +50,12 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 _starting = threading.Lock()
 
 
+def thread_count() -> int:
+    """Threads that this process may use at once: as many as processors, or OMP_NUM_THREADS says."""
+    said = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return int(said) if said.isdecimal() and 0 < int(said) < 1000 else os.cpu_count() or 1
+
+
 class EngineError(CdmisfaError):
     """An engine is out of reach or went away; finished trials are kept."""
 

@@ -93,7 +93,8 @@ class TrialStore:
                 make_folder(folder)
             opened.enter_context(held(folder))
             refuse_special(self._path)
-            self.rows, size = _read(self._path)
+            self._of_logs: dict[str, str] = {}
+            self.rows, size = _read(self._path, self._of_logs)
             with self._telling():
                 # Unbuffered: what a disk refused once is not tried again when it is closed.
                 self._file = opened.enter_context(open(self._path, "ab", buffering=0))
@@ -108,7 +109,7 @@ class TrialStore:
         with self._telling():
             while data:
                 data = data[self._file.write(data) :]
-        self.rows[row["id"]] = json.loads(line)
+        _put(self.rows, self._of_logs, json.loads(line))
 
     def close(self) -> None:
         """Let the disk have the rows, and let go of the folder."""
@@ -135,8 +136,27 @@ def read_rows(folder: Path) -> Iterator[dict[str, Any]]:
     yield from _read(folder / ROWS)[0].values()
 
 
-def _read(path: Path) -> tuple[dict[str, dict[str, Any]], int]:
+def _put(rows: dict[str, dict[str, Any]], of_logs: dict[str, str], row: dict[str, Any]) -> None:
+    """Take the row of a trial in; that of another one whose log it replaced counts no more.
+
+    Args:
+        rows: by the identities of trials.
+        of_logs: the identity of the trial that each log is of, by the log's name.
+        row: the next one.
+    """
+    if row.get("run"):
+        name = Path(row["run"]).name
+        if of_logs.get(name, row["id"]) != row["id"]:
+            rows.pop(of_logs[name], None)
+        of_logs[name] = row["id"]
+    rows[row["id"]] = row
+
+
+def _read(
+    path: Path, of_logs: dict[str, str] | None = None
+) -> tuple[dict[str, dict[str, Any]], int]:
     """The last row of every trial, by its identity, and the bytes of whole lines."""
+    of_logs = {} if of_logs is None else of_logs
     rows: dict[str, dict[str, Any]] = {}
     size = 0
     if not path.exists():
@@ -149,7 +169,8 @@ def _read(path: Path) -> tuple[dict[str, dict[str, Any]], int]:
                     break
                 try:
                     row = parse_json(line, MAX_LIST)
-                    rows[row["id"]] = {**row, "status": row["status"], "point": dict(row["point"])}
+                    checked = {"status": row["status"], "point": dict(row["point"])}
+                    _put(rows, of_logs, {**row, "id": row["id"], **checked})
                 except (ValueError, KeyError, TypeError) as error:
                     raise LogDamagedError(
                         f"{path} line {number} is no trial's row: remove the line"
@@ -255,13 +276,18 @@ def answer(
         trial: the trial.
         version: of the code that is here.
         compute: how; whatever it raises is the answer.
+
+    Raises:
+        LogWriteError: the disk does not take what it writes, so it would take no other's either.
     """
     if trial.code != version:
         return {"error": f"the worker has cdmisfa {version}, not {trial.code}: install the same"}
     try:
         return compute(trial)
+    except LogWriteError:
+        raise
     except CdmisfaError as error:
-        return {"error": str(error)}
+        return {"error": str(error), "exit_code": error.exit_code}
     except Exception as error:
         # Whatever breaks in one trial must not end a sweep of thousands.
         return {"error": f"{type(error).__name__}: {error}"}
@@ -278,7 +304,7 @@ def _row(trial: StoredTrial, result: Mapping[str, Any] | WorkerDied) -> dict[str
         "seed": trial.seed,
         "code": trial.code,
         "run": str(trial.log) if trial.log is not None and not failed else None,
-        **({"error": result["error"]} if failed else {"result": result}),
+        **(result if failed else {"result": result}),
     }
 
 

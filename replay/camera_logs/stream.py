@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.processes import thread_count
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
 from recorder.images.messages import PACKED, SCHEMAS, Decoder, packed_picture, stated_format
@@ -30,7 +30,7 @@ class UnreadableError(LogDamagedError):
     """A library cannot read a file."""
 
 
-CORES: Final = os.cpu_count() or 1
+CORES: Final = thread_count()
 """Images of a stream that are decoded at once."""
 
 LAST_NS: Final = 2**62
@@ -218,13 +218,13 @@ def decoding_ahead(
 ) -> Iterator[int]:
     """Rows in their order, of which the next are decoded in threads meanwhile.
 
-    No more than two images a processor are held; with one processor none is begun.
+    No more than two images a thread are held; with one thread none is begun.
 
     Args:
         images: the stream.
         rows: of it.
         shown: the row that is decoded already.
-        threads: as many as there are processors.
+        threads: `CORES`.
     """
     coming = iter([row for row in dict.fromkeys(rows) if row != shown] if CORES > 1 else ())
     count = 2 * CORES

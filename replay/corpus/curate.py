@@ -22,7 +22,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.processes import WorkerDied, run_all
 from recorder.log.files import atomic_write, refuse_existing
 from replay.corpus.choosing import scaled, spread_out
-from replay.corpus.index import read_index
+from replay.corpus.index import indexed_logs
 from replay.corpus.judging import NONE, NOVEL, VERDICTS, Applies, Judged, judge, open_log
 from replay.report.curated import Curated, report_of_segments
 
@@ -161,19 +161,14 @@ def curate(
 
 def _logs(index: Path) -> list[_Log]:
     """What is opened as one, of each log of an index but runs."""
-    wanted = ["log", "path", "kind", "identity", "contents", "number"]
-    rows = [row for row in read_index(index).select(wanted).to_pylist() if row["number"] == 0]
-    found: dict[str, _Log] = {}
+    found: list[_Log] = []
     first: dict[str, str] = {}
-    for row in rows:
-        if row["kind"] in ("foreign", "recording"):
-            path = row["path"]
-            opened = path if "://" in path else str(index.parent / path)
-            name = row["log"] if row["kind"] == "recording" and row["log"] != "." else path
-            log = found.setdefault(name, _Log(name))
-            log.files.append(opened)
-            log.doubles.append(first.setdefault(row["contents"] or row["identity"] or path, name))
-    return list(found.values())
+    for name, kind, files, _, identities in indexed_logs(index):
+        if kind is not None:
+            pairs = zip(identities, files, strict=True)
+            doubles = [first.setdefault(identity or file, name) for identity, file in pairs]
+            found.append(_Log(name, files, doubles))
+    return found
 
 
 def _choose(logs: Sequence[_Log], budget: float) -> tuple[list[_Window], bool]:

@@ -9,13 +9,13 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_line
 from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.untrusted import check_regular
 from recorder.log.files import atomic_write, held, make_folder, refuse_unless
@@ -58,6 +58,55 @@ class Indexed:
     broken: int = 0
     anew: str = ""
     stopped: bool = False
+
+
+class IndexedLog(NamedTuple):
+    """What is opened as one: a recording by its files, or a log of others.
+
+    Attributes:
+        name: as the index has it, relative to its folder.
+        kind: "recording" or "foreign"; None where it could not be read.
+        files: as they are opened.
+        states: bytes of each, and what differs when it was written again, as `Found` has them.
+        identities: what another file with the same messages has, too; None where it could not be
+            read.
+    """
+
+    name: str
+    kind: str | None
+    files: list[str]
+    states: list[tuple[int, str]]
+    identities: list[str | None]
+
+
+def indexed_logs(index: Path) -> list[IndexedLog]:
+    """The logs of an index but runs, in the order of their first files.
+
+    Raises:
+        UsageError: it is no index, or one of another version.
+        LogDamagedError: it is damaged.
+    """
+    columns = ["log", "path", "kind", "bytes", "changed", "identity", "contents"]
+    table = read_index(index)
+    table = table.filter(pc.equal(table["number"], 0)).select(columns)
+    found: dict[str, IndexedLog] = {}
+    for row in table.to_pylist():
+        if row["kind"] != "run":
+            path = row["path"]
+            name = row["log"] if row["kind"] == "recording" and row["log"] != "." else path
+            log = found.setdefault(name, IndexedLog(name, row["kind"], [], [], []))
+            log.files.append(path if "://" in path else str(index.parent / path))
+            log.states.append((row["bytes"], row["changed"]))
+            log.identities.append(row["contents"] or row["identity"])
+    return list(found.values())
+
+
+def is_index(path: Path) -> bool:
+    """Whether a file is an index."""
+    try:
+        return path.suffix == ".parquet" and path.is_file() and _version(path) > 0
+    except CdmisfaError:
+        return False
 
 
 def index_path(place: str | Path) -> Path:

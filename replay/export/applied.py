@@ -76,16 +76,27 @@ class TableSink:
     """A table with a row a frame of a stream, Parquet or CSV by the name of the file.
 
     What has no value is null, or nothing between two commas.
+
+    Args:
+        path: of the file.
+        form: "parquet" or "csv".
+        spec: of the frames.
+        modules: in their order.
+        log: what is said in a first column, where the table is one of many logs' tables.
     """
 
-    def __init__(self, path: Path, form: str, spec: SourceSpec, modules: Sequence[Module]) -> None:
+    def __init__(
+        self, path: Path, form: str, spec: SourceSpec, modules: Sequence[Module], log: str | None
+    ) -> None:
         import pyarrow as pa
         import pyarrow.csv as pacsv
         import pyarrow.parquet as pq
 
-        self._pa, self._spec = pa, spec
+        self._pa, self._spec, self._log = pa, spec, log
         self._modules = list(columns_of(modules))
         fields = [("log_time", pa.int64()), ("t", pa.int64()), ("stream", pa.string())]
+        if log is not None:
+            fields.insert(0, ("log", pa.string()))
         plain = ["log_time", "t"]
         for module, own in self._modules:
             name, outputs = f"module{module.index}", range(own.stop - own.start)
@@ -135,7 +146,8 @@ class TableSink:
         slowness = of_block([one.slowness for one in waiting])
         alive = of_block([one.alive for one in waiting])
         novelty = of_block([one.novelty for one in waiting])
-        columns: list[Any] = [pa.array(times_of(t, spec.fps, spec.start_ns)), pa.array(t)]
+        columns: list[Any] = [] if self._log is None else [pa.repeat(self._log, len(t))]
+        columns += [pa.array(times_of(t, spec.fps, spec.start_ns)), pa.array(t)]
         columns.append(pa.array(np.repeat(names, lengths), pa.string()))
         for i, (_, own) in enumerate(self._modules):
             columns += [pa.array(y[:, j]) for j in range(own.start, own.stop)]
@@ -303,7 +315,7 @@ class LinesSink:
 
 @contextlib.contextmanager
 def written(
-    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool
+    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool, log: str | None = None
 ) -> Iterator[AppliedSink]:
     """A file for what modules give, whole when the body has ended.
 
@@ -312,6 +324,7 @@ def written(
         spec: of the source.
         modules: in their order.
         force: replace an existing file.
+        log: see `TableSink`.
 
     Raises:
         UsageError: it exists.
@@ -321,16 +334,16 @@ def written(
     refuse_special(out)
     refuse_taken(out, force=force)
     if form == "mcap":
-        log = LogSink(out, spec, modules, force=force)
+        sink = LogSink(out, spec, modules, force=force)
         try:
-            yield log
+            yield sink
         except BaseException:
-            log.abandon()
+            sink.abandon()
             raise
-        log.close()
+        sink.close()
         return
     with atomic_write(out) as partial:
-        table = TableSink(partial, form, spec, modules)
+        table = TableSink(partial, form, spec, modules, log)
         try:
             yield table
         except BaseException:

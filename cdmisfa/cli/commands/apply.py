@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,8 +34,12 @@ if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.apply import Application, Totals
     from recorder.cameras.options import LiveOptions
-    from replay.export.applied import AppliedSink
     from replay.storage.location import Location
+
+COMMANDLINE = click.core.ParameterSource.COMMANDLINE
+
+MOST_SAID = 20
+"""Logs of which is said what went wrong."""
 
 OF_FILES = ("parquet", "csv", "mcap", "rrd")
 STDOUT, FOXGLOVE = AS_THEY_COME = ("stdout", "foxglove")
@@ -47,12 +51,12 @@ log_options = options_of(
 )
 
 
-@grouped("apply", common=("out", "to", "frames", "loop"))
+@grouped("apply", common=("out", "to", "frames", "loop", "jobs"))
 @options.path_argument("run")
 @click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
 @uploads.out_option(
-    "The file of one log, .parquet, .csv, .mcap or .rrd (a view); of several the folder of theirs. "
-    "Or s3://..."
+    "The file of one log, .parquet, .csv, .mcap or .rrd (a view); or a folder, of a file a log. Or "
+    "s3://..."
 )
 @option(
     "--to",
@@ -67,6 +71,9 @@ log_options = options_of(
 @options.salvage
 @log_options
 @options.live_options
+@options.jobs
+@options.engine
+@options.retry_failed
 @options.server_limits
 @options.force
 @options.as_json
@@ -86,6 +93,7 @@ def apply_command(
     live: LiveOptions,
     force: bool,
     as_json: bool,
+    **where: Any,
 ) -> None:
     """Apply the modules of a run to other logs.
 
@@ -94,19 +102,33 @@ def apply_command(
     run did. A row a frame has the outputs of each module, their slowness within the block, whether
     the module is alive there, and how novel the block is: from 1 on the module does not know it.
 
+    With a folder as -o, SOURCE is also a folder with many logs, or an index of them: OUT gets a
+    file a log, which together are one table. The same command does what is missing.
+
     A log that cannot be read does not end the rest; the exit code is then 3, or 2.
     """
     from cdmisfa.experiments.apply import Application
 
-    outlet, logs = outlet_of(ctx, to, port), logs_of(source)
+    outlet = outlet_of(ctx, to, port)
     refuse_unfit(source, outlet, live, again=loop or salvage, as_json=as_json)
-    outs = places(out, outlet.form, list(map(name_of, logs)), force=force)
+    cameras = replace(cameras, stop=outlet.until)
+    if out is not None and is_folder(out) and are_logs(source):
+        if outlet.way == STDOUT:
+            raise UsageError("--to stdout is for what is applied at once: leave out -o FOLDER")
+        where |= {"form": outlet.form or OF_FILES[0], "cameras": cameras, "force": force}
+        where |= {"frames": frames, "loop": loop, "salvage": salvage}
+        _apply_to_many(ctx, run, source, out, as_json=as_json, **where)
+        return
+    if given := [name for name in where if ctx.get_parameter_source(name) == COMMANDLINE]:
+        raise UsageError(f"--{given[0].replace('_', '-')} goes with logs, and a folder as -o")
+    logs = logs_of(source)
+    place = place_of(out, outlet.form, logs, force=force)
     application = Application(run)
-    told: dict[str, Any] = {"cameras": replace(cameras, stop=outlet.until), "live": live}
+    told: dict[str, Any] = {"cameras": cameras, "live": live}
     told |= {"loop": loop, "salvage": salvage, "say": tell}
     rows, failed = list[dict[str, Any]](), list[CdmisfaError]()
     with stoppable() as stop:
-        for words, place in zip(logs, outs, strict=True):
+        for words in logs:
             row: dict[str, Any] = {"log": " ".join(words), "out": place and str(place)}
             try:
                 with contextlib.closing(application.open(words, **told)) as opened:
@@ -131,6 +153,48 @@ def apply_command(
         ctx.exit(stop.exit_code)
     if failed:
         ctx.exit(max(error.exit_code for error in failed))
+
+
+def _apply_to_many(
+    ctx: click.Context, run: Path, source: Sequence[str], out: Path, *, as_json: bool, **how: Any
+) -> None:
+    """Apply modules to each of many logs, into a folder, and print what became of them."""
+    from cdmisfa.experiments.apply.corpus import apply_to_logs
+
+    calls = itertools.count()
+    with bar("indexing", "logs") as shown:
+
+        def progress(finished: int, failed: int, total: int) -> None:
+            if next(calls) == 0:
+                shown.turn_to("applying", "logs")
+            shown.update(finished, total, f"{failed} failed" if failed else "")
+
+        try:
+            found = apply_to_logs(run, source, out, **how, indexing=shown.update, progress=progress)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"{out} keeps the outputs that are finished: say the same again to go on"
+            ) from None
+    said = (f"{row['log']}: {line}" for row in found.logs for line in row["warnings"])
+    for line in itertools.islice(said, MOST_SAID):
+        warn(line)
+    if as_json:
+        counts = {name: getattr(found, name) for name in ("computed", "skipped", "anew")}
+        rows = [{k: v for k, v in row.items() if k != "exit_code"} for row in found.logs]
+        print_document(run=run, out=found.out, **counts, logs=rows)
+    else:
+        again = f" ({found.anew} again: the log or the code has changed)" if found.anew else ""
+        print_line(
+            f"{counted(len(found.logs), 'log')}: {found.computed} applied to now{again}, "
+            f"{found.skipped} before, {len(found.failed)} not, or not to the end"
+        )
+        for row in found.failed[:MOST_SAID]:
+            print_line(f"failed: {row['log']}: {row['error']}")
+        if (more := len(found.failed) - MOST_SAID) > 0:
+            print_line(f"failed: {more} more, which --json lists")
+        print_line(f"outputs {out}")
+    if found.exit_code:
+        ctx.exit(found.exit_code)
 
 
 def refuse_unfit(
@@ -167,7 +231,7 @@ def applied(
     force: bool,
 ) -> Totals:
     """Apply modules to an open source, into its file and to where blocks go as they come."""
-    from cdmisfa.experiments.apply import Totals, follow
+    from cdmisfa.experiments.apply import Totals, follow, written_to
     from replay.export.applied import LinesSink
 
     live = hasattr(source, "stop")
@@ -196,17 +260,6 @@ def applied(
     else:
         say_changes(source)
     return totals
-
-
-def written_to(place: Path, *about: Any, force: bool) -> AbstractContextManager[AppliedSink]:
-    """What writes a file of outputs, by its name."""
-    if place.suffix.lower() == ".rrd":
-        from replay.view.applied import written_view  # takes half a second
-
-        return written_view(place, *about, force=force)
-    from replay.export.applied import written
-
-    return written(place, *about, force=force)
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,58 +297,61 @@ def outlet_of(ctx: click.Context, words: Sequence[str], port: int | None) -> Out
     return found
 
 
-def places(
-    out: Path | None, form: str | None, logs: Sequence[str], *, force: bool
-) -> list[Path | None]:
-    """The file of each log that is written: one, or one each in a folder.
+def place_of(
+    out: Path | None, form: str | None, logs: Sequence[Sequence[str]], *, force: bool
+) -> Path | None:
+    """The file that is written of one log; None where nothing is.
 
     Args:
-        out: the file of one log, or the folder.
-        form: as asked for; else by the name of the file, Parquet in a folder.
-        logs: as named.
-        force: replace existing files.
+        out: the file.
+        form: as asked for; else by the name of the file.
+        logs: the words of each.
+        force: replace an existing file.
 
     Raises:
-        UsageError: a file for several logs, or of another ending, no form that it could have, no
-            place to write it, or it exists.
+        UsageError: a file for several logs, or of another ending, no place to write it, or it
+            exists.
     """
     from recorder.log.files import refuse_taken
 
     if out is None:
         if form is not None:
             raise UsageError(f"--to {form} is written to a file: name it with -o")
-        return [None] * len(logs)
-    found = _named(out, form, logs)
-    for place in found:
-        refuse_taken(place, force=force)
-    return [*found]
-
-
-def _named(out: Path, form: str | None, logs: Sequence[str]) -> list[Path]:
-    from cdmisfa.core.names import stream_name
-
+        return None
     ending = out.suffix.lower().removeprefix(".")
-    if ending in OF_FILES and not out.is_dir():
-        if form not in (None, ending):
-            raise UsageError(f"{out}: as {form} it is written, name it {out.stem}.{form}")
-        if len(logs) > 1:
-            raise UsageError(
-                f"{len(logs)} logs are a file each: name a folder with -o, without .{ending}"
-            )
-        return [out]
-    if ending and not out.is_dir():
+    if is_folder(out):
+        raise UsageError(f"{out}: name a file, {' '.join(logs[0])} is none of many logs")
+    if form not in (None, ending):
+        raise UsageError(f"{out}: as {form} it is written, name it {out.stem}.{form}")
+    if len(logs) > 1:
+        raise UsageError(
+            f"{len(logs)} logs are a file each: name a folder with -o, without .{ending}"
+        )
+    refuse_taken(out, force=force)
+    return out
+
+
+def is_folder(out: Path) -> bool:
+    """Whether what is written is a folder, by its name.
+
+    Raises:
+        UsageError: it has the ending of something else.
+    """
+    ending = out.suffix.lower().removeprefix(".")
+    if out.is_dir() or not ending:
+        return True
+    if ending not in OF_FILES:
         endings = ", ".join(f".{one}" for one in OF_FILES)
         raise UsageError(f"{out}: name a file with {endings}, or a folder without an ending")
-    form = form or OF_FILES[0]
-    found: list[Path] = []
-    for log in logs:
-        name = base = stream_name(Path(log.rstrip("/")).name.partition(".mcap")[0])
-        number = 1
-        while out / f"{name}.{form}" in found:
-            number += 1
-            name = f"{base}-{number}"
-        found.append(out / f"{name}.{form}")
-    return found
+    return False
+
+
+def are_logs(source: Sequence[str]) -> bool:
+    """Whether all of a source is stored."""
+    from recorder.cameras.words import is_live
+    from recorder.world.scenes import SCENES
+
+    return not any(is_live(word) or word in SCENES for word in source)
 
 
 def logs_of(source: Sequence[str]) -> list[list[str]]:
@@ -324,11 +380,6 @@ def logs_of(source: Sequence[str]) -> list[list[str]]:
         for log in logs or [[place] for place in locations([word])]:
             found.append([p.address if isinstance(p, Url) else str(p) for p in log])
     return found
-
-
-def name_of(words: Sequence[str]) -> str:
-    """What the file of a log is called after: of the views of a recording their folder."""
-    return words[0] if len(words) == 1 or "://" in words[0] else str(Path(words[0]).parent)
 
 
 def print_applied(run: str, rows: Sequence[dict[str, Any]], *, as_json: bool) -> None:

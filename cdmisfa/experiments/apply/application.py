@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import itertools
+import json
 import math
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +24,7 @@ from cdmisfa.agents.progress.judging import PRESENT, STRANGE
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, freeze
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.options import LiveOptions
@@ -31,11 +34,13 @@ from replay.arrays import TAKES, ArrayLog, are_arrays
 from replay.camera_logs.opening import ALL, log_format, only_foreign
 from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import UnequalError
-from replay.export.applied import Applied, AppliedSink
+from replay.export.applied import Applied
 from replay.inputs import locations
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
+from replay.runs.folders import MODULES_FILE
 from replay.runs.run import Run
+from replay.storage.identity import file_sha256
 from replay.stored import StoredSource, centre_as
 
 KNOWN_WITHIN: Final = 2.0
@@ -75,10 +80,18 @@ class Application:
         self.tau = int(run.header.manifest["config"]["learner"]["tau"])
         self._stack = Stack(self.modules)
         self.recipe = self.modules[0].recipe or run.recipe()
+        self._folder = run.log.parent
+
+    @functools.cached_property
+    def identity(self) -> str:
+        """What is another one where the run has other modules, or applies them otherwise."""
+        modules = file_sha256(self._folder / MODULES_FILE)
+        text = json.dumps([modules, self.tau, self.recipe.as_json()])
+        return hashlib.sha256(text.encode()).hexdigest()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Another process reads the run by itself, once."""
-        return _application, (os.path.abspath(self._path),)
+        return _application, (os.path.abspath(self._path), self.identity)
 
     def open(
         self,
@@ -208,8 +221,8 @@ class Application:
         return max(READ // each // self.tau, 1) * self.tau
 
     def _ahead(self, reads: Iterator[Sequence[Block]]) -> Iterator[list[Part]]:
-        """What is read in a thread, and projected in as many as there are processors."""
-        cores = os.cpu_count() or 1
+        """What is read in a thread, and projected in as many as it may use."""
+        cores = thread_count()
 
         def read() -> Future[list[Part]] | None:
             blocks = next(reads, None)
@@ -236,8 +249,11 @@ class Application:
 
 
 @functools.lru_cache(1)
-def _application(path: str) -> Application:
-    return Application(path)
+def _application(path: str, identity: str) -> Application:
+    application = Application(path)
+    if application.identity != identity:
+        raise UsageError(f"{path} has other modules where a worker is: share one folder")
+    return application
 
 
 def _reads(
@@ -329,72 +345,3 @@ class _Judge:
             for i, turn in self._turns.items():
                 novelty[i] = abs(log_ratio(sizes[i], turn)) / STRANGE
         return Applied(block, y, slowness, alive, novelty)
-
-
-class Totals:
-    """What modules came to on the streams of a source.
-
-    Args:
-        spec: of the source.
-        modules: in their order.
-
-    Attributes:
-        frames: of all streams.
-        damaged: why the log was not applied to its end; None where it was.
-    """
-
-    def __init__(self, spec: SourceSpec, modules: Sequence[Module]) -> None:
-        self.frames = 0
-        self.damaged: LogDamagedError | None = None
-        self._spec, self._modules = spec, modules
-        self._firsts = [own.start for _, own in columns_of(modules)]
-        self._sums: dict[int, FloatArray] = {}
-
-    def add(self, applied: Applied) -> None:
-        """Take a block in."""
-        count = len(applied.block)
-        self.frames += count
-        sums = self._sums.setdefault(applied.block.stream, np.zeros((5, len(self._modules))))
-        slowness = applied.slowness[self._firsts]
-        finite = np.isfinite(slowness)
-        sums[0] += count
-        sums[1] += count * applied.alive
-        sums[2] += count * (applied.alive & (applied.novelty < 1))
-        sums[3] += count * np.where(finite, slowness, 0)
-        sums[4] += count * finite
-
-    def rows(self) -> list[dict[str, Any]]:
-        """A row a stream and module, as JSON values: shares of its frames, mean slowness."""
-        return [
-            {
-                "stream": self._spec.streams[stream],
-                "module": module.index,
-                "frames": int(frames),
-                "slowness": slowness / counted if counted else None,
-                "alive": alive / frames,
-                "known": known / frames,
-            }
-            for stream, sums in sorted(self._sums.items())
-            for module, (frames, alive, known, slowness, counted) in zip(
-                self._modules, sums.T.tolist(), strict=True
-            )
-        ]
-
-
-def follow(
-    applied: Iterable[Applied],
-    sinks: Sequence[AppliedSink],
-    totals: Totals,
-    told: Callable[[], None] = lambda: None,
-) -> None:
-    """Hand every block to sinks and totals; damage of the log ends it and is noted."""
-    try:
-        for one in applied:
-            for sink in sinks:
-                sink.add(one)
-            totals.add(one)
-            told()
-    except LogDamagedError as error:
-        if not totals.frames:
-            raise
-        totals.damaged = error

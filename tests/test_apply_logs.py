@@ -1,0 +1,322 @@
+"""Modules are applied to each of many logs once, whoever does it and whatever dies meanwhile."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from applied_data import camera, make_run
+from camera_files import pictures
+from conftest import Cdmisfa
+from engine_tasks import apply_or_die
+from test_sweep import busiest_worker
+from waiting import started, wait_for
+
+from cdmisfa import Run
+from cdmisfa.core.errors import UsageError
+from cdmisfa.experiments.apply import corpus as applying
+from cdmisfa.experiments.apply.corpus import STORE, AppliedLogs, apply_to_logs
+from recorder.recording import record
+from replay.arrays import ArrayLog
+
+NAMES = ["a.mcap", "night/b.mcap", "night/c.mcap", "night/copy.mcap"]
+
+
+@pytest.fixture
+def run(cdmisfa: Cdmisfa, tmp_path: Path) -> Path:
+    """See `make_run`."""
+    return make_run(cdmisfa, tmp_path)
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    """A folder with four logs, of which two are alike, beneath one another."""
+    folder = tmp_path / "logs"
+    (folder / "night").mkdir(parents=True)
+    for seed, name in enumerate(NAMES[:3]):
+        camera(folder / name, 90, seed)
+    shutil.copyfile(folder / "night" / "c.mcap", folder / "night" / "copy.mcap")
+    return folder
+
+
+def files(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.iterdir() if path.name != STORE}
+
+
+def applied_now(found: AppliedLogs) -> tuple[int, int, int]:
+    return found.computed, found.skipped, found.anew
+
+
+def y(table: Any, log: str) -> np.ndarray:
+    own = table.filter(np.array(table["log"].to_pylist()) == log)
+    return np.stack([own[f"module1_y{j}"].to_numpy() for j in range(3)], axis=1)
+
+
+def test_a_folder_of_logs_becomes_one_table(
+    run: Path, logs: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    shown = np.stack(list(pictures(50)))
+    record(ArrayLog({"cam": shown, "other": shown[::-1].copy()}), logs / "rec")
+    shutil.copytree(run, logs / "learned")
+    (logs / "broken.mcap").write_bytes(b"nothing")
+    (logs / "unlike.csv").write_text("x\n1\n2\n")
+    out = tmp_path / "out"
+    done = cdmisfa("apply", run, logs, "-o", out, "--json")
+    assert done.code == 3, done.err
+    said = {row["log"]: row for row in done.json["logs"]}
+    assert sorted(said) == sorted([*NAMES, "broken.mcap", "rec", "unlike.csv"])
+    assert [name for name, row in said.items() if row["error"]] == ["broken.mcap", "unlike.csv"]
+    table = pq.read_table(out)
+    assert set(table["log"].to_pylist()) == {*NAMES, "rec"}
+    module = Run(run).modules[0]
+    for seed, name in enumerate([*NAMES[:3], NAMES[2]]):
+        expected = module.transform(np.stack(list(pictures(90, [0, 1, 2, 2][seed]))))
+        np.testing.assert_array_equal(y(table, NAMES[seed]), expected)
+        assert pq.read_table(said[name]["out"]).num_rows == said[name]["frames"] == 90
+    found = duckdb.sql(
+        f"SELECT log, stream, count(*) FROM '{out}/*.parquet' GROUP BY ALL ORDER BY ALL"
+    ).fetchall()
+    assert found == [
+        *((name, "cam", 90) for name in NAMES),
+        ("rec", "cam", 50),
+        ("rec", "other", 50),
+    ]
+    told = cdmisfa("apply", run, logs, "-o", out)
+    assert told.code == 3
+    assert "7 logs: 0 applied to now, 7 before, 2 not, or not to the end" in told.out
+    assert "failed: broken.mcap: " in told.out
+
+
+def test_the_same_bytes_come_of_every_engine_though_workers_are_killed(
+    run: Path, logs: Path, tmp_path: Path, cluster: tuple[str, list[subprocess.Popen[bytes]]]
+) -> None:
+    for seed in range(8):
+        camera(logs / f"more-{seed}.mcap", 300, seed)
+    apply_to_logs(run, [str(logs)], tmp_path / "here")
+    killed: list[int] = []
+
+    def kill_local(*_: int) -> None:
+        if not killed:
+            killed.append(busiest_worker())
+            os.kill(killed[0], signal.SIGKILL)
+
+    there = apply_to_logs(run, [str(logs)], tmp_path / "two", jobs=2, progress=kill_local)
+    assert (applied_now(there), there.failed) == ((12, 0, 0), [])
+    address, workers = cluster
+    where: dict[str, Any] = {"engine": "dask", "scheduler": address}
+    far = apply_to_logs(
+        run, [str(logs)], tmp_path / "far", **where, progress=lambda *_: workers[0].kill()
+    )
+    assert workers[0].wait() == -signal.SIGKILL
+    assert (applied_now(far), far.failed) == ((12, 0, 0), [])
+    assert files(tmp_path / "here") == files(tmp_path / "two") == files(tmp_path / "far")
+
+
+def test_a_log_that_kills_its_workers_is_a_row_and_the_rest_is_done(
+    run: Path, logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deadly = camera(logs / "deadly.mcap", 30)
+    monkeypatch.setattr(applying, "compute", apply_or_die)
+    found = apply_to_logs(run, [str(logs)], tmp_path / "out", jobs=2)
+    assert [(row["log"], row["error"][:26]) for row in found.failed] == [
+        ("deadly.mcap", "every worker that tried it")
+    ]
+    assert found.exit_code == 1
+    assert Path(f"{deadly}.deaths").read_text() == "..."
+    assert len(files(tmp_path / "out")) == 4
+    monkeypatch.undo()
+    again = apply_to_logs(run, [str(logs)], tmp_path / "out")
+    assert (applied_now(again), len(again.failed)) == ((0, 5, 0), 1)
+    last = apply_to_logs(run, [str(logs)], tmp_path / "out", retry_failed=True)
+    assert (applied_now(last), last.failed) == ((1, 4, 0), [])
+
+
+def test_only_what_is_missing_or_has_changed_is_done(
+    run: Path, logs: Path, cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+
+    def again(*words: Path, **how: Any) -> tuple[int, int, int]:
+        return applied_now(apply_to_logs(run, [str(w) for w in words or (logs,)], out, **how))
+
+    assert again() == (4, 0, 0)
+    whole = files(out)
+    assert again() == (0, 4, 0)
+    monkeypatch.chdir(logs)
+    assert again(Path("night"), Path("*.mcap")) == (0, 4, 0)
+    assert cdmisfa("index", logs).code == 0
+    assert again(logs / "corpus.parquet") == (0, 4, 0)
+    camera(logs / "d.mcap", 40)
+    assert again() == (1, 4, 0)
+    (out / "d.mcap.parquet").unlink()
+    assert again() == (1, 4, 0)
+
+    before = (logs / "a.mcap").stat()
+    kept = shutil.copy2(logs / "a.mcap", tmp_path / "kept.mcap")
+    camera(logs / "a.mcap", 60, 5)
+    assert again() == (1, 4, 1)
+    assert files(out)["a.mcap.parquet"] != whole["a.mcap.parquet"]
+    shutil.copy2(kept, logs / "a.mcap")
+    assert (logs / "a.mcap").stat().st_mtime_ns == before.st_mtime_ns
+    assert again() == (1, 4, 1)
+    assert files(out)["a.mcap.parquet"] == whole["a.mcap.parquet"]
+
+    monkeypatch.setattr(applying, "code", lambda *more: "0.0+other")
+    assert again() == (5, 0, 5)
+
+
+def test_other_outputs_are_replaced_only_by_force(
+    run: Path, logs: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = ("apply", run, logs, "-o", out)
+    assert cdmisfa(*words).code == 0
+    refused = cdmisfa(*words, "--frames", 30)
+    assert (refused.code, refused.err.count("\n")) == (2, 1)
+    assert "holds what was made with other options: choose another folder, or" in refused.err
+    (logs / "a.mcap").unlink()
+    forced = cdmisfa(*words, "--frames", 30, "--force", "--to", "csv")
+    assert forced.code == 0, forced.err
+    assert sorted(name.rpartition(".")[2] for name in files(out)) == ["csv"] * 3
+    shutil.copytree(run, tmp_path / "moved")
+    moved = cdmisfa("apply", tmp_path / "moved", logs, "-o", out, "--frames", 30, "--to", "csv")
+    assert "3 logs: 0 applied to now, 3 before" in moved.out
+    other = Run(run).modules
+    from replay.runs.modules import save_modules
+
+    save_modules(run / "modules.npz", other[:1])
+    refused = cdmisfa(*words, "--frames", 30, "--to", "csv")
+    assert "holds what was made with other modules" in refused.err
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "x.txt").write_text("mine")
+    refused = cdmisfa("apply", run, logs, "-o", tmp_path / "mine")
+    assert (refused.code, "mine exists: choose another folder" in refused.err) == (2, True)
+
+
+def test_two_at_once_are_refused(run: Path, logs: Path, tmp_path: Path) -> None:
+    def second(*_: int) -> None:
+        with pytest.raises(UsageError, match="in use by another process"):
+            apply_to_logs(run, [str(logs)], tmp_path / "out")
+
+    assert apply_to_logs(run, [str(logs)], tmp_path / "out", progress=second).computed == 4
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_is_finished_is_kept_when_it_is_stopped(
+    jobs: int, run: Path, logs: Path, tmp_path: Path
+) -> None:
+    for seed in range(60):
+        shutil.copyfile(logs / "a.mcap", logs / f"more-{seed}.mcap")
+    out = tmp_path / "out"
+    with started("apply", run, logs, "-o", out, "--jobs", jobs) as process:
+        wait_for(lambda: len(list(out.glob("*.parquet"))) >= 3, seconds=100)
+        process.terminate()
+        complaint = process.communicate(timeout=30)[1]
+    assert process.returncode == 143
+    assert complaint.splitlines()[-1] == (
+        f"cdmisfa: interrupted: {out} keeps the outputs that are finished: "
+        "say the same again to go on"
+    )
+    done = len(files(out))
+    assert pq.read_table(out).num_rows == 90 * done
+    assert not (out / STORE / "parts").exists()
+    found = apply_to_logs(run, [str(logs)], out)
+    assert done - jobs <= found.skipped <= done < 64 == len(files(out))
+
+
+def test_a_full_disk_is_a_line_and_the_files_before_are_kept(
+    run: Path, logs: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    for name in NAMES[1:]:
+        (logs / name).unlink()
+    camera(logs / "long.mcap", 4000)
+    out = tmp_path / "out"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, hard))
+    try:
+        done = cdmisfa("apply", run, logs, "-o", out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (done.code, done.err.count("\n")) == (1, 1), done.err
+    assert "long.mcap.parquet cannot be written: " in done.err
+    assert "File too large" in done.err
+    assert list(files(out)) == ["a.mcap.parquet"]
+    assert "1 applied to now, 1 before" in cdmisfa("apply", run, logs, "-o", out).out
+
+
+def test_odd_names_are_as_they_were_in_the_table(run: Path, logs: Path, tmp_path: Path) -> None:
+    odd = [
+        "_hidden",
+        ".dot",
+        "1",
+        "-x",
+        "a=b",
+        "x y",
+        "schön",
+        "夜" * 60,
+        "a.b",
+        "A.b",
+        "%2F",
+        "a/b",
+    ]
+    for name in odd:
+        (logs / name).parent.mkdir(exist_ok=True)
+        shutil.copyfile(logs / "a.mcap", logs / f"{name}.mcap")
+    apply_to_logs(run, [str(logs)], tmp_path / "out")
+    table = pq.read_table(tmp_path / "out")
+    assert set(table["log"].to_pylist()) == {*NAMES, *(f"{name}.mcap" for name in odd)}
+    assert table.num_rows == 90 * (len(NAMES) + len(odd))
+
+
+def test_a_log_damaged_half_way_is_named_each_time(
+    run: Path, logs: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log = camera(logs / "half.mcap", 3000)
+    data = bytearray(log.read_bytes())
+    half = len(data) // 2
+    data[half : half + 40] = bytes(40)
+    log.write_bytes(data)
+    for now in (5, 0):
+        done = cdmisfa("apply", run, logs, "-o", tmp_path / "out", "--json")
+        assert (done.code, done.json["computed"]) == (3, now)
+        (row,) = (row for row in done.json["logs"] if row["error"])
+        assert (row["log"], 1000 < row["frames"] < 2000) == ("half.mcap", True)
+        assert pq.read_table(row["out"]).num_rows == row["frames"]
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("LOGS --jobs 2", "--jobs goes with logs, and a folder as -o"),
+        ("LOGS -o out --to stdout", "leave out -o FOLDER"),
+        ("none -o out", "none: no such file"),
+        ("none*.mcap -o out", "no file or folder matches"),
+        ("EMPTY -o out", "there is no log"),
+        ("oscillatory --frames 5 -o out", "out: name a file, oscillatory is none of many logs"),
+        ("LOGS -o out --scheduler tcp://x:1", "needs --engine dask"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_line(
+    words: str,
+    why: str,
+    run: Path,
+    logs: Path,
+    cdmisfa: Cdmisfa,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    named = {"LOGS": logs, "EMPTY": tmp_path / "empty"}
+    done = cdmisfa("apply", run, *(named.get(word, word) for word in words.split()))
+    assert done.code == 2
+    assert why in done.err + done.out
