@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import resource
+import shlex
 import shutil
 import signal
+import socket
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -19,7 +23,7 @@ from camera_files import pictures
 from conftest import Cdmisfa
 from engine_tasks import apply_or_die
 from test_sweep import busiest_worker
-from waiting import started, wait_for
+from waiting import running, started, wait_for
 
 from cdmisfa import Run
 from cdmisfa.core.errors import UsageError
@@ -28,6 +32,7 @@ from cdmisfa.experiments.apply.corpus import STORE, AppliedLogs, apply_to_logs
 from recorder.recording import record
 from replay.arrays import ArrayLog
 
+ROOT = Path(__file__).parents[1]
 NAMES = ["a.mcap", "night/b.mcap", "night/c.mcap", "night/copy.mcap"]
 
 
@@ -291,6 +296,28 @@ def test_a_log_damaged_half_way_is_named_each_time(
         (row,) = (row for row in done.json["logs"] if row["error"])
         assert (row["log"], 1000 < row["frames"] < 2000) == ("half.mcap", True)
         assert pq.read_table(row["out"]).num_rows == row["frames"]
+
+
+def test_the_commands_of_the_page_work(
+    run: Path, cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    page = (ROOT / "docs" / "how-to" / "clusters.md").read_text("utf-8")
+    (block,) = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
+    (tmp_path / "runs").mkdir()
+    run.rename("runs/cameras")
+    with contextlib.ExitStack() as ended:
+        for program, *words in map(shlex.split, block.replace("8786", port).splitlines()):
+            if program == "dask":
+                ended.enter_context(running("-m", "dask", *words, "--no-dashboard"))
+                continue
+            done = cdmisfa(*words)
+            assert done.code == 0, done.err
+    assert pq.read_table("applied/there")["log"].unique().to_pylist() == ["icub"]
 
 
 @pytest.mark.parametrize(

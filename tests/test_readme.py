@@ -62,7 +62,7 @@ def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
         "scene.png",
         "runs/icub/run.rrd",
         "applied/view.rrd",
-        "applied/each/left.csv",
+        "applied/all/icub.parquet",
     ):
         assert (elsewhere / made).stat().st_size > 0
     assert list((elsewhere / "figures").glob("*.png"))

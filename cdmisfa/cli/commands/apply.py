@@ -300,16 +300,10 @@ def outlet_of(ctx: click.Context, words: Sequence[str], port: int | None) -> Out
 def place_of(
     out: Path | None, form: str | None, logs: Sequence[Sequence[str]], *, force: bool
 ) -> Path | None:
-    """The file that is written of one log; None where nothing is.
-
-    Args:
-        out: the file.
-        form: as asked for; else by the name of the file.
-        logs: the words of each.
-        force: replace an existing file.
+    """The file that is written of one log, in the form asked for; None where nothing is.
 
     Raises:
-        UsageError: a file for several logs, or of another ending, no place to write it, or it
+        UsageError: a file for several logs, or of another form, a form without a file, or it
             exists.
     """
     from recorder.log.files import refuse_taken
