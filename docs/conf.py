@@ -42,8 +42,10 @@ html_favicon = "images/icon.svg"
 html_title = f"cdmisfa {release}"
 html_show_sourcelink = False
 smartquotes = False
+highlight_language = "none"
 myst_heading_anchors = 4
 napoleon_use_ivar = True
+nb_merge_streams = True
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
@@ -73,7 +75,7 @@ def words_as_written(*event: Any) -> None:
 
 
 def from_code(app: Any, name: str, text: list[str]) -> None:
-    """README is the first page, and lines such as {{ keys learner module.Class }} are tables."""
+    """README is the first page, and lines such as {{ keys module.Class }} are tables."""
     text[0] = text[0].replace("../README.md)", "index.md)")
     tables = {"keys": keys, "exit_codes": exit_codes}
     text[0] = re.sub(
@@ -84,19 +86,19 @@ def from_code(app: Any, name: str, text: list[str]) -> None:
     )
 
 
-def keys(prefix: str, name: str) -> str:
+def keys(name: str) -> str:
     """A section's keys: the fields of its dataclass, with their defaults and docstrings."""
     module, _, of = name.rpartition(".")
     section = getattr(importlib.import_module(module), of)
-    return markdown(["key", "default", "meaning"], list(_keys(prefix, section())))
+    return markdown(["key", "default", "meaning"], list(_keys("", section())))
 
 
 def _keys(prefix: str, section: Any) -> Iterator[list[str]]:
     told = "\n".join(inspect.getdoc(each) or "" for each in reversed(type(section).__mro__))
     for field in dataclasses.fields(section):
-        value, key = getattr(section, field.name), f"{prefix}.{field.name}"
+        value, key = getattr(section, field.name), prefix + field.name
         if dataclasses.is_dataclass(value):
-            yield from _keys(key, value)
+            yield from _keys(f"{key}.", value)
             continue
         meaning = re.findall(rf"^    {field.name}: (.*(?:\n {{8}}.*)*)", told, re.MULTILINE)[-1]
         default = "auto" if value is None else json.dumps(value).strip('"')
