@@ -106,5 +106,8 @@ def test_the_former_key_of_portable_bits_is_accepted(cdmisfa: Cdmisfa) -> None:
     words = ("learn", "oscillatory", "--max-iterations", "2", "--json")
     plain = cdmisfa(*words).json["signals_sha256"]
     for former in (("--portable",), ("--set", "learner.portable=true")):
-        assert cdmisfa(*words, *former).json["signals_sha256"] == plain
+        done = cdmisfa(*words, *former)
+        assert done.json["signals_sha256"] == plain
+        name = former[-1].removesuffix("=true")
+        assert done.err.startswith(f"warning: {name} does nothing any more, and the next version")
     assert "portable" not in cdmisfa("learn", "--help").out

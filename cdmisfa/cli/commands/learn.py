@@ -56,7 +56,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
     group="Learner",
     shell_complete=completing.among(LEARNERS.names),
 )
-@option("--portable", is_flag=True, expose_value=False, hidden=True)  # of older scripts
+@options.deprecated("--portable")
 @options.end_after("iterations", "End after so many iterations.")
 @options.end_after(
     "modules",
