@@ -4,10 +4,12 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 KERNELS := $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/kernels/b*.py)
 
+RELEASE := build/release
 SANITIZED := build/sanitized
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
 
-.PHONY: demo test suite lint bench docs pictures fuzz torture attacks sanitized clean install
+.PHONY: demo test suite lint bench docs pictures fuzz torture attacks sanitized release \
+    clean install
 
 demo: $(INSTALLED)
 	$(BIN)/cdmisfa demo --jobs 2
@@ -54,6 +56,24 @@ sanitized: $(INSTALLED)
 	LD_PRELOAD="$$(gcc -print-file-name=libasan.so)" ASAN_OPTIONS=detect_leaks=0 \
 	    $(BIN)/pytest -q -o "pythonpath=$(SANITIZED)/lib ." $(wildcard tests/test_kernels*.py) \
 	    tests/test_incsfa.py tests/test_recursive_sfa.py tests/test_chunks.py
+
+# What a release is, in dist/, made of the commit alone: docs/how-to/release.md.
+release: $(INSTALLED)
+	rm -rf $(RELEASE) dist
+	mkdir -p $(RELEASE)/source dist
+	git archive HEAD | tar -x -C $(RELEASE)/source
+	export PATH="$(CURDIR)/$(BIN):$$PATH" SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) && \
+	    python -m build --outdir $(RELEASE) $(RELEASE)/source && \
+	    auditwheel repair --wheel-dir dist $(RELEASE)/*.whl
+	mv $(RELEASE)/*.tar.gz dist
+	for log in $(RELEASE)/source/sample_logs/icub/*; do cp $$log dist/icub-$${log##*/}; done
+	$(PYTHON) -m venv --without-pip $(RELEASE)/environment
+	$(BIN)/python -m pip --python $(RELEASE)/environment install --quiet dist/*.whl
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible \
+	    --output-file dist/sbom.cdx.json $(RELEASE)/environment/bin/python
+	$(BIN)/python tools/installed.py $(RELEASE)/environment
+	$(BIN)/twine check --strict dist/*.whl dist/*.tar.gz
+	cd dist && sha256sum * > SHA256SUMS
 
 install: $(INSTALLED)
 

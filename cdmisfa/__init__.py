@@ -46,11 +46,16 @@ if TYPE_CHECKING:
     __version__: str
 
 _home = os.path.dirname(os.path.dirname(__file__))
-for _name in ("recorder", "replay"):  # another project's package of that name has none of ours
-    if (_spec := find_spec(_name)) and os.path.dirname(_spec.origin or "") != f"{_home}/{_name}":
-        raise ImportError(
-            f"{_name} is not cdmisfa's: {_spec.origin}; give cdmisfa an environment of its own"
-        )
+for _name in ("recorder", "replay"):  # another project's package hides ours, or lies over it
+    if _spec := find_spec(_name):
+        _ours = os.path.dirname(_spec.origin or "") == f"{_home}/{_name}"
+        if _ours:
+            with open(_spec.origin or "", "rb") as _file:
+                _ours = b"from cdmisfa" in _file.read()
+        if not _ours:
+            raise ImportError(
+                f"{_name} is not cdmisfa's: {_spec.origin}; give cdmisfa an environment of its own"
+            )
 
 _load, __dir__, __all__ = exports(
     __name__,

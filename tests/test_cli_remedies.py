@@ -6,6 +6,7 @@ import importlib.util
 import json
 import re
 import shlex
+import shutil
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -149,6 +150,27 @@ def test_demo_replaces_an_earlier_one(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
         assert Path(file).stat().st_size > 0
 
 
+def test_demo_without_the_simulator_shows_a_sample(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdmisfa.studies.demo.find_spec", lambda _: None)
+    done = cdmisfa("demo", "-o", tmp_path, "--json")
+    assert "pybullet is not installed: the sample of the oscillatory streams stands in" in done.err
+    assert "live and recorded signals of 20 iterations are the same" in done.err
+    assert done.json["recording"] == str(ROOT / "sample_logs" / "oscillatory")
+    followed = [(module["view"], module["follows"]) for module in done.json["modules"]]
+    assert followed == [(f"x{n}", f"sin({5 - n} theta + c)") for n in (1, 2, 3)]
+    assert min(module["correlation"] for module in done.json["modules"]) > 0.99
+    assert Path(done.json["report"]).parent == tmp_path / "runs" / "demo-oscillatory"
+
+
+def test_the_contract_tests_without_their_extra_name_it(tmp_path: Path) -> None:
+    (tmp_path / "pytest.py").write_text("raise ImportError\n")
+    done = python("-c", "import cdmisfa.testing", env={"PYTHONPATH": f"{tmp_path}:{ROOT}"})
+    said = "cdmisfa.testing needs pytest, which is missing: pip install 'cdmisfa[testing]'"
+    assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
+
+
 def test_a_scheduler_without_an_address_is_one_line_to_the_end_of_the_process(
     tmp_path: Path,
 ) -> None:
@@ -165,6 +187,16 @@ def test_another_package_of_the_name_of_ours_is_named(tmp_path: Path) -> None:
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import cdmisfa"
     done = python("-c", code, cwd=tmp_path)
     said = f"replay is not cdmisfa's: {other}; give cdmisfa an environment of its own"
+    assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
+
+
+def test_another_package_that_was_installed_over_ours_is_named(tmp_path: Path) -> None:
+    for package in ("cdmisfa", "recorder", "replay"):
+        shutil.copytree(ROOT / package, tmp_path / package)
+    ours = tmp_path / "replay" / "__init__.py"
+    ours.write_text("from setuptools import find_packages\n")
+    done = python("-m", "cdmisfa", "doctor", cwd=tmp_path)
+    said = f"replay is not cdmisfa's: {ours}; give cdmisfa an environment of its own"
     assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -47,3 +48,16 @@ def test_every_picture_is_small_accounted_for_and_shown() -> None:
         assert picture.stat().st_size < MOST_BYTES
         assert f"`{picture.name}`" in card
         assert any(f"images/{picture.name})" in text for text in pages.values())
+
+
+@pytest.mark.parametrize("source", [None, "https://forge.example/of/us"])
+def test_readme_has_whole_addresses_where_its_files_are_elsewhere(
+    source: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("setuptools.setup", lambda **_: None)
+    text = runpy.run_path("setup.py")["described"](source)
+    links = re.findall(r"\]\(([^)]*)\)", text)
+    assert [link for link in links if not link.startswith("https://")] == []
+    assert (f"]({source}/raw/v" in text, "![" in text) == (source is not None,) * 2
+    assert len(text) > 5000

@@ -1,10 +1,14 @@
-"""The demonstration: record the furnished iCub scene, learn from the log, check, and show."""
+"""The demonstration: record the furnished iCub scene, learn from the log, check, and show.
+
+Where there is no simulator, the sample of the oscillatory streams stands for what is recorded.
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +18,17 @@ from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.reports import write_report
-from cdmisfa.experiments.results import correlation
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure, open_source
 from cdmisfa.modules import Module
+from cdmisfa.studies.samples import samples_here
+from replay.following import OutputHistory
 
 SCENE, PRESET = "icub", "icub-real"
+
+STAND_IN = "oscillatory"
+"""Scene that needs no simulator, and the sample of it."""
 
 CHECKED_ITERATIONS = 200
 """Length of the stretch on which live and recorded signals are compared."""
@@ -39,9 +47,9 @@ def demo(
 
     Args:
         out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
-        preset: of scene and learner; by default `PRESET`.
+        preset: of scene and learner; by default `PRESET`, or that of the scene that stands in.
         seed: of world and learner.
-        frames: of the recording; the learner starts it again at its end.
+        frames: of the recording, where one is made; the learner starts it again at its end.
         jobs: processes that render.
         stage: opens each stage's report of progress.
 
@@ -49,15 +57,18 @@ def demo(
         What `demo --json` prints: files, and each module with the true quantity it follows.
 
     Raises:
-        CdmisfaError: there is no simulator, or files cannot be written.
+        CdmisfaError: files cannot be written.
         NotReproducedError: live and recorded signals differ.
     """
     from recorder.recording import record_scene
     from replay.export.figures import draw_figures
+    from replay.recordings.source import RecordedSource
 
-    preset = preset or PRESET
-    configuration = configure(SCENE, preset, seed=seed)
-    recording, folder = out / "recordings" / "demo-icub", out / "runs" / "demo-icub"
+    missing = [name for name in ("pybullet", "icub_models") if find_spec(name) is None]
+    scene = STAND_IN if missing else SCENE
+    preset = preset or (None if missing else PRESET)
+    configuration = configure(scene, preset, seed=seed)
+    recording, folder = out / "recordings" / f"demo-{scene}", out / "runs" / f"demo-{scene}"
 
     def learn(bar: Any, word: str | Path, out: Path | None, most: int | None) -> RunResult:
         with _opened(word, preset, seed) as source:
@@ -72,22 +83,29 @@ def demo(
                 max_iterations=most,
             )
 
-    with stage(f"1/4 recording three views, {frames} frames each", "frames") as bar:
-        record_scene(
-            SCENE,
-            recording,
-            configuration.scene,
-            configuration.record,
-            frames=frames,
-            jobs=jobs,
-            force=True,
-            progress=lambda done: bar.update(done, frames),
-        )
+    if missing:
+        said = f"{missing[0]} is not installed: the sample of the {scene} streams stands in"
+        with stage(f"1/4 no recording: {said}", "frames"):
+            recording = samples_here() / scene
+            with contextlib.closing(RecordedSource(recording)) as sample:
+                frames = sample.frames
+    else:
+        with stage(f"1/4 recording three views, {frames} frames each", "frames") as bar:
+            record_scene(
+                scene,
+                recording,
+                configuration.scene,
+                configuration.record,
+                frames=frames,
+                jobs=jobs,
+                force=True,
+                progress=lambda done: bar.update(done, frames),
+            )
     with stage("2/4 learning from the recording", "blocks") as bar:
         result = learn(bar, recording, folder, None)
     with stage("3/4 checking live against recorded", "blocks") as bar:
-        most = min(CHECKED_ITERATIONS, frames // 40)
-        live, recorded = (learn(bar, w, None, most).signals_sha256 for w in (SCENE, recording))
+        most = min(CHECKED_ITERATIONS, frames // configuration.learner.tau)
+        live, recorded = (learn(bar, w, None, most).signals_sha256 for w in (scene, recording))
         if live != recorded:
             raise NotReproducedError(
                 f"live and recorded signals differ within {most} iterations of seed {seed}: "
@@ -107,22 +125,25 @@ def demo(
         }
 
 
-def _opened(word: str | Path, preset: str, seed: int) -> AbstractContextManager[SeekableSource]:
+def _opened(
+    word: str | Path, preset: str | None, seed: int
+) -> AbstractContextManager[SeekableSource]:
     return contextlib.closing(open_source([word], preset=preset, seed=seed, loop=True)[0])
 
 
 def followed_by(module: Module, source: SeekableSource) -> dict[str, Any]:
-    """A module, and the true quantity that its first output on its own view follows best."""
+    """A module, and what of the truth its first output on its own view follows best."""
     source.seek(0)
     block = source.take(module.stream_index, SCORED_FRAMES)
     y = module.transform(block.frames)[:, 0]
-    r = [correlation(y, column) for column in block.truth.T]
-    best = int(np.argmax(r))
+    times = np.arange(len(y))
+    shown = OutputHistory(module.index, module.stream_index, times, y, block.truth)
+    best = shown.best_fit(source.spec.truth)
     return {
         "module": module.index,
         "view": module.stream,
         "policy": [ACTIONS[action] for action in module.policy],
         "iteration": module.iteration,
-        "follows": source.spec.truth[best],
-        "correlation": r[best],
+        "follows": best.function if best else "",
+        "correlation": best.r if best else 0.0,
     }

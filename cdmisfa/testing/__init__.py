@@ -1,6 +1,11 @@
 """What each interface promises, as tests for pytest: derive a class, and say what to open."""
 
-import pytest
+try:
+    import pytest
+except ImportError:
+    raise ImportError(
+        "cdmisfa.testing needs pytest, which is missing: pip install 'cdmisfa[testing]'"
+    ) from None
 
 from cdmisfa.core.exports import exports
 
