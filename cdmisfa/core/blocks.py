@@ -7,7 +7,7 @@ whichever is watched, as the channels of a television do.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -344,11 +344,31 @@ def take_unbroken(source: FrameSource, stream: int, n: int) -> Block:
                 run, held = [], 0
             run.append(block)
             held += len(block)
+    return _as_one(run)
+
+
+def unbroken(blocks: Iterable[Block]) -> list[Block]:
+    """The unbroken stretches of streams that were read in pieces.
+
+    Args:
+        blocks: those of each stream in order of time.
+    """
+    found: dict[int, list[list[Block]]] = {}
+    for block in blocks:
+        runs = found.setdefault(block.stream, [[]])
+        if runs[-1] and runs[-1][-1].t + len(runs[-1][-1]) != block.t:
+            runs.append([])
+        runs[-1].append(block)
+    return [_as_one(run) for runs in found.values() for run in runs]
+
+
+def _as_one(run: Sequence[Block]) -> Block:
+    """Blocks of a stream that follow one another, as one."""
     if len(run) == 1:
         return run[0]
     frames = freeze(np.concatenate([block.frames for block in run]))
     truth = freeze(np.concatenate([block.truth for block in run]))
-    return Block(stream, run[0].t, frames, truth)
+    return Block(run[0].stream, run[0].t, frames, truth)
 
 
 def check_frame(t: int) -> None:

@@ -59,17 +59,29 @@ def disorder(values: NDArray[np.float64]) -> float:
     return float((steps * steps).mean()) / (2 * variance) if variance else 0.0
 
 
-def described(frames: NDArray[Any]) -> tuple[Features, bool]:
-    """What a block shows and how it moves, (2 cells,), and whether it is nothing but noise.
+def described(frames: NDArray[Any]) -> tuple[Features, bool, bool]:
+    """What a block shows and how it moves, (2 cells,); whether it is noise, and whether still.
 
     Args:
         frames: (n, height, width) uint8 or (n, I), n above 1.
     """
     values = cells(frames)
     spread = values.std(axis=0)
-    moves = frames.ndim == 2 or float(np.sqrt((spread * spread).mean())) > STILL
-    noise = moves and disorder(values) > RANDOM
-    return np.concatenate([values.mean(axis=0), spread]).astype(np.float32), noise
+    still = float(np.sqrt((spread * spread).mean())) <= (0 if frames.ndim == 2 else STILL)
+    noise = not still and disorder(values) > RANDOM
+    return np.concatenate([values.mean(axis=0), spread]).astype(np.float32), noise, still
+
+
+def usual_distance(variance: float, width: int, *, pictures: bool) -> float:
+    """The root mean square distance of two blocks.
+
+    Args:
+        variance: of their features, summed.
+        width: how many features they have.
+        pictures: whether they are of pictures, which differ by `STILL` at least.
+    """
+    least = STILL * np.sqrt(width) if pictures else 0.0
+    return float(max(np.sqrt(2 * variance), least)) or 1.0
 
 
 def scaled(features: Features, groups: NDArray[np.int64], pictures: Sequence[bool]) -> Features:
@@ -85,9 +97,8 @@ def scaled(features: Features, groups: NDArray[np.int64], pictures: Sequence[boo
         own = groups == group
         if not own.any():
             continue
-        size = float(np.sqrt(2 * features[own].var(axis=0).sum()))
-        least = STILL * np.sqrt(features.shape[1]) if shows else 0.0
-        found[own] /= max(size, least) or 1.0
+        variance = float(features[own].var(axis=0).sum())
+        found[own] /= usual_distance(variance, features.shape[1], pictures=shows)
     return found
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,52 @@ class Applies(Protocol):
 
     def to(self, source: Any) -> Iterator[Applied]:
         """Apply the modules to them, block by block."""
+
+    def judge(self, spec: SourceSpec) -> Callable[[Sequence[Block]], Iterator[Applied]]:
+        """What applies them to blocks that are handed to it one after the other."""
+
+
+class Verdict(NamedTuple):
+    """What a block is.
+
+    Attributes:
+        kind: one of `VERDICTS`, by its place there.
+        still: whether nothing moves in it.
+        features: see `described`.
+        module: index of the one that knows it, or `NONE`.
+        novelty: to the module to which it is least, NaN where there is none.
+    """
+
+    kind: int
+    still: bool
+    features: Features
+    module: int = NONE
+    novelty: float = np.nan
+
+
+def verdict_on(block: Block, applied: Applied | None, modules: Sequence[Module]) -> Verdict:
+    """Judge a block of `LEAST` frames or more.
+
+    Args:
+        block: as its stream shows it.
+        applied: what the modules of a run give on it, where there is a run.
+        modules: of the run.
+    """
+    features, noise, still = described(block.frames)
+    verdict = Verdict(NOISE if noise else NOVEL, still, features)
+    if applied is None:
+        return verdict
+    near = np.where(applied.alive, applied.novelty, np.inf)
+    nearest = int(np.argmin(near))
+    novelty = float(near[nearest])
+    if novelty < 1:
+        return Verdict(KNOWN, still, features, modules[nearest].index, novelty)
+    return verdict._replace(novelty=novelty) if np.isfinite(novelty) else verdict
+
+
+def frames_of_block(spec: SourceSpec, known: Applies | None) -> int:
+    """Frames of the blocks that are judged: as the run had them, or `SECONDS`."""
+    return known.tau if known else max(round(SECONDS * spec.fps), LEAST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,32 +144,26 @@ def judge(files: Sequence[str], known: Applies | None) -> Judged | str:
 
 def _judged(source: Any, known: Applies | None) -> Judged:
     spec = source.spec
-    tau = known.tau if known else max(round(SECONDS * spec.fps), LEAST)
+    tau, modules = frames_of_block(spec, known), known.modules if known else ()
     rows: list[tuple[int, int, int, int, int, float]] = []
     features: list[Features] = []
-    for block, novelty in _blocks(source, tau, known):
-        if len(block) < LEAST:
-            continue
-        own, noise = described(block.frames)
-        verdict, module, least = (NOISE if noise else NOVEL), NONE, np.nan
-        if known is not None and np.isfinite(novelty).any():
-            nearest = int(np.argmin(novelty))
-            least = float(novelty[nearest])
-            if least < 1:
-                verdict, module = KNOWN, known.modules[nearest].index
-        rows.append((block.stream, block.t, len(block), verdict, module, least))
-        features.append(own)
+    for block, applied in _blocks(source, tau, known):
+        if len(block) >= LEAST:
+            found = verdict_on(block, applied, modules)
+            about = found.kind, found.module, found.novelty
+            rows.append((block.stream, block.t, len(block), *about))
+            features.append(found.features)
     columns = np.array(rows, np.float64).reshape(-1, 6).T
     stream, t, frames, verdict, module = columns[:5].astype(np.int64)
     shown = np.array(features, np.float32).reshape(len(rows), -1 if rows else 0)
     return Judged(spec, tau, stream, t, frames, verdict, module, columns[5], shown)
 
 
-def _blocks(source: Any, tau: int, known: Applies | None) -> Iterator[tuple[Block, Any]]:
-    """Each unbroken stretch of a stream within a block of the clock, and its novelty."""
+def _blocks(source: Any, tau: int, known: Applies | None) -> Iterator[tuple[Block, Applied | None]]:
+    """Each unbroken stretch of a stream within a block of the clock, and what modules give."""
     if known is not None:
         for applied in known.to(source):
-            yield applied.block, np.where(applied.alive, applied.novelty, np.inf)
+            yield applied.block, applied
         return
     end = source.first_frame + source.frames
     with contextlib.suppress(LogExhaustedError):

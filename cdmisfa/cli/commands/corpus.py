@@ -12,7 +12,7 @@ import click
 from cdmisfa.cli import completing, options
 from cdmisfa.cli.commands.info import in_bytes
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.making import flag, number, word
+from cdmisfa.cli.making import WRITTEN, flag, number, word
 from cdmisfa.cli.printing import (
     print_columns,
     print_document,
@@ -23,8 +23,8 @@ from cdmisfa.cli.printing import (
     warn,
 )
 from cdmisfa.cli.progress import bar
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import counted
+from cdmisfa.core.options import DURATION
 
 if TYPE_CHECKING:
     from replay.corpus.query import Summary
@@ -195,7 +195,14 @@ def _long(seconds: float | None) -> str:
 @click.argument("corpus", shell_complete=completing.runs)
 @options.out("The folder of the segments and their page.", required=True)
 @options.path("--known", "A run: what its modules know is not chosen.", "RUN")
-@word("--budget", "TIME", "How long all is that is chosen.", default="10min", show_default=True)
+@word(
+    "--budget",
+    "TIME",
+    "How long all is that is chosen.",
+    type=WRITTEN[DURATION],
+    default="10min",
+    show_default=True,
+)
 @JOBS
 @options.server_limits
 @options.force
@@ -204,7 +211,7 @@ def curate_command(
     corpus: str,
     out: Path,
     known: Path | None,
-    budget: str,
+    budget: float,
     jobs: int | None,
     force: bool,
     as_json: bool,
@@ -221,14 +228,13 @@ def curate_command(
     from replay.corpus.index import index_path
     from replay.report.curated import told as told_of_log
 
-    seconds = _seconds_of(budget)
     with bar("judging", "logs") as shown:
         found = curate(
             index_path(corpus),
             out,
             known=None if known is None else Application(known),
             known_as=known,
-            budget=seconds,
+            budget=budget,
             jobs=jobs or os.cpu_count() or 1,
             force=force,
             told=shown.update,
@@ -246,7 +252,7 @@ def curate_command(
     print_line(
         "seconds of all streams of a log together; new is a sum of distances, without a unit"
     )
-    lasts = f"{found.chosen:.1f} s of the budget of {seconds:.1f} s"
+    lasts = f"{found.chosen:.1f} s of the budget of {budget:.1f} s"
     why = f": {found.left}" if found.left else ""
     print_line(f"{counted(len(found.segments), 'segment')} written to {out}, {lasts}{why}")
     tell(f"look at {out / 'index.html'}")
@@ -255,20 +261,3 @@ def curate_command(
         tell(f"cut out {found.to_cut} of {len(found.segments)}: {cut}")
     elif found.segments:
         tell("none can be cut out: only those of MCAP files can")
-
-
-def _seconds_of(text: str) -> float:
-    """Read a budget, as "10min".
-
-    Raises:
-        UsageError: it is no duration.
-    """
-    from recorder.config import Split
-
-    try:
-        seconds = Split.parse(text).seconds
-    except UsageError:
-        seconds = None
-    if seconds is None:
-        raise UsageError(f"--budget is {text!r}: give a duration, as 90s, 10min or 2h")
-    return seconds

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,20 +13,21 @@ import click
 from click.core import ParameterSource
 
 from cdmisfa.cli import completing, options, uploads
+from cdmisfa.cli.commands.streams import print_recording, record_streams, refuse_logs
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     print_document,
     print_plan,
-    print_table,
     refuse_copies,
     say_about,
     say_changes,
-    say_counts,
     tell,
 )
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.options import given, option_name
+from recorder.cameras.options import TriggerOptions
 
 if TYPE_CHECKING:
     from recorder.cameras.options import LiveOptions
@@ -74,6 +75,7 @@ LIVE = ("cameras", "gym")
 @options.fsync_every
 @options.image_options
 @options.live_options
+@options.trigger_options
 @options.force
 @options.as_json
 @click.pass_context
@@ -89,6 +91,7 @@ def record_command(
     as_json: bool,
     images: ImageOptions,
     live: LiveOptions,
+    trigger: TriggerOptions,
     **writing: Any,
 ) -> None:
     """Record what a scene or cameras show, one MCAP file per view.
@@ -98,6 +101,10 @@ def record_command(
 
     Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
     av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. Logs of others are written by cdmisfa convert.
+
+    With --when novel a recording holds only what is new, of all streams at once, and what was 5 s
+    before and after it: what no module of --known RUN knows, or else what differs from all that was
+    new before. Noise and what stands still are never new.
     """
     from cdmisfa.experiments.sources import configure, is_scene, of_scene
     from recorder.cameras.words import is_live
@@ -105,18 +112,21 @@ def record_command(
     from recorder.recording import recorded, save_picture
     from recorder.world.scenes import SCENES
 
-    if any(map(is_live, source)):
+    if trigger.when is None and (vain := given(trigger)):
+        raise UsageError(f"{option_name(vain[0])} goes with --when novel")
+    if any(map(is_live, source)) or trigger.when is not None:
         views, jobs, resume = (writing.pop(name) for name in ("views", "jobs", "resume"))
         if resume or views or jobs > 1 or scene_picture is not None:
+            what = "live streams" if trigger.when is None else "what is recorded when it is novel"
             raise UsageError(
-                "live streams cannot go back, and are recorded all: leave out --resume, --view, "
+                f"{what} cannot go back, and all of it is recorded: leave out --resume, --view, "
                 "--jobs and --scene-picture"
             )
         live = dataclasses.replace(live, seed=seed)
         writing |= {"preset": preset, "settings": settings, "as_json": as_json}
-        record_streams(ctx, source, _folder(out), live, images, **writing)
+        record_streams(ctx, source, _folder(out), live, images, trigger, **writing)
         return
-    _refuse_logs(source)
+    refuse_logs(source)
     resumed = out if writing["resume"] else None
     start = RecordingStart() if resumed is None else _start(resumed)
     named = "".join(source) or start.scene
@@ -167,18 +177,6 @@ def _start(folder: Path) -> RecordingStart:
     return start
 
 
-def _refuse_logs(words: tuple[str, ...]) -> None:
-    """Refuse what is recorded already, and more than one scene."""
-    from recorder.world.scenes import SCENES
-
-    logs = [w for w in words if w and w not in SCENES and (Path(w).exists() or set("*?:") & set(w))]
-    if logs:
-        convert = f"cdmisfa convert {shlex.join(logs)} -o REC"
-        raise UsageError(f"{logs[0]} is a log, no scene: write it as a recording with {convert}")
-    if len(words) > 1:
-        raise UsageError(f"{' '.join(words)}: record one scene at a time")
-
-
 def _record_scene(
     ctx: click.Context,
     configuration: Any,
@@ -208,57 +206,6 @@ def _record_scene(
             progress=lambda done: report(done, max(done, frames or DEFAULT_FRAMES)),
             **how,
         )
-
-
-def record_streams(
-    ctx: click.Context,
-    words: Sequence[str],
-    out: Path,
-    live: LiveOptions,
-    images: ImageOptions,
-    *,
-    as_json: bool,
-    force: bool,
-    fsync_every: float | None,
-    frames: int | None = None,
-    split: str | None = None,
-    preset: str | None = None,
-    settings: Sequence[str] = (),
-) -> None:
-    """Record live streams until there are so many frames, they end, or Ctrl-C."""
-    from cdmisfa.experiments.sources import open_cameras_now
-    from recorder.config import Split
-    from recorder.live import RecordedWhileWatched, record_watched
-    from recorder.log.files import refuse_existing
-    from recorder.recording import DEFAULT_FRAMES
-
-    refuse_existing(out, force=force, goes_on=False)
-    how: dict[str, Any] = {"preset": preset, "settings": settings}
-    source, configuration = open_cameras_now(words, live, cameras=images, say=tell, **how)
-    notice = "finishing the recording; again to stop at once\n"
-    with contextlib.closing(source), stoppable(notice=notice) as stop:
-        recorded = RecordedWhileWatched(
-            source,
-            out,
-            settings=configuration.record,
-            split=None if split is None else Split.parse(split),
-            fsync_every=fsync_every,
-            force=force,
-        )
-        frames = frames or (None if recorded.gaps else DEFAULT_FRAMES)
-        with bar("recording", "frames") as shown:
-            record_watched(
-                recorded,
-                frames=frames,
-                stop=stop,
-                progress=lambda done: shown.update(done, frames),
-            )
-    if recorded.ended and not stop():
-        tell(f"ended at frame {recorded.t}: {recorded.ended}")
-    say_counts(recorded)
-    print_recording(out, recorded.files, as_json=as_json)
-    if stop() and frames is not None and recorded.t < frames:
-        ctx.exit(stop.exit_code)
 
 
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
@@ -309,7 +256,8 @@ def convert_command(
             raise UsageError(
                 "live streams cannot go back: leave out --resume, --salvage and --dry-run"
             )
-        record_streams(ctx, source, out, live, cameras, as_json=as_json, **writing)
+        trigger = TriggerOptions()
+        record_streams(ctx, source, out, live, cameras, trigger, as_json=as_json, **writing)
         return
     options.refuse_live_options(live, source)
     named = locations(source)
@@ -367,16 +315,3 @@ def recording(
             ctx.exit(stop.exit_code)
     if nothing_left:
         say_complete(out)
-
-
-def print_recording(folder: Path, files: Sequence[ViewRecording], *, as_json: bool) -> None:
-    """Say what was written: each view's file."""
-    if as_json:
-        frames = sum(file.frames for file in files if file.name == files[0].name)
-        rows = [file.as_json() for file in files]
-        print_document(recording=str(folder), frames=frames, views=rows)
-        return
-    print_table(
-        ("view", "file", "frames", "bytes", "sha256"),
-        [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files],
-    )

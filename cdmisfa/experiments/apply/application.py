@@ -22,7 +22,7 @@ from cdmisfa import kernels
 from cdmisfa.agents.progress.candidate import log_ratio
 from cdmisfa.agents.progress.judging import PRESENT, STRANGE
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, freeze
+from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, unbroken
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
@@ -119,7 +119,7 @@ class Application:
         """
         cameras, live = cameras or CameraOptions(), live or LiveOptions()
         if any(map(is_live, words)):
-            made = replace(live_options(words, live, cameras), **self._made(cameras))
+            made = replace(live_options(words, live, cameras), **self.made(cameras))
             source = open_live(words, made, say=say)
         elif is_scene(words, cameras):
             source = configure(words[0], settings=of_scene((), cameras)).open_scene()
@@ -139,8 +139,8 @@ class Application:
             )
         return centre_as(self.recipe.centre, source, words[0])
 
-    def _made(self, options: Any) -> dict[str, Any]:
-        """The recipe, as options of images."""
+    def made(self, options: Any) -> dict[str, Any]:
+        """The recipe, as options of images; what it leaves open is that of others."""
         recipe = self.recipe
         numbers: dict[str, Any] = {"fields": options.fields or recipe.fields}
         if recipe.size is not None:
@@ -159,7 +159,7 @@ class Application:
                     self.recipe.refuse_turned((array.shape[1], array.shape[2]))
             except UsageError as error:
                 raise UsageError(f"{words[0]}: {error}") from None
-            taken = {name: value for name, value in self._made(cameras).items() if name in TAKES}
+            taken = {name: value for name, value in self.made(cameras).items() if name in TAKES}
             return open_logs(words, cameras=replace(cameras, **taken), **how)
         if cameras == CameraOptions() and not any(map(only_foreign, places)):
             with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
@@ -174,7 +174,7 @@ class Application:
                 f"{words[0]} shows numbers, and the modules learned from pictures of "
                 f"{width}x{height}: choose pictures"
             )
-        cameras = replace(cameras, **self._made(cameras))
+        cameras = replace(cameras, **self.made(cameras))
         if not cameras.topics and not cameras.fields:
             cameras = replace(cameras, topics=ALL)
         try:
@@ -205,14 +205,34 @@ class Application:
         Raises:
             LogDamagedError: the log is damaged there; all before was given.
         """
-        judges = [_Judge(self.modules) for _ in source.spec.streams]
         stored = isinstance(source, StoredSource)
         reads = _reads(source, self._step(source.spec) if stored else self.tau, self.tau, frames)
+        judged = self._judged(source.spec)
         for found in self._ahead(reads) if stored else map(self._projected, reads):
-            for part, y in sorted(found, key=lambda one: (one[0].t, one[0].stream)):
-                yield judges[part.stream].judge(part, y)
+            yield from judged(found)
             if stop():
                 return
+
+    def judge(self, spec: SourceSpec) -> Callable[[Sequence[Block]], Iterator[Applied]]:
+        """What gives as `to`, of blocks of the clock that are handed to it one after the other.
+
+        Raises:
+            UsageError: the modules do not take these frames, nor larger ones.
+        """
+        self.recipe.of_frames(np.zeros((1, *spec.frame_shape), spec.dtype))
+        judged, made = self._judged(spec), self.recipe.of_frames
+        return lambda blocks: judged(
+            self._projected([replace(b, frames=made(b.frames)) for b in blocks])
+        )
+
+    def _judged(self, spec: SourceSpec) -> Callable[[Sequence[Part]], Iterator[Applied]]:
+        judges = [_Judge(self.modules) for _ in spec.streams]
+
+        def judged(found: Sequence[Part]) -> Iterator[Applied]:
+            for part, y in sorted(found, key=lambda one: (one[0].t, one[0].stream)):
+                yield judges[part.stream].judge(part, y)
+
+        return judged
 
     def _step(self, spec: SourceSpec) -> int:
         """Frames of a log that are read at once, whole blocks."""
@@ -288,20 +308,11 @@ def _reads(
 
 def _rest(source: FrameSource) -> Sequence[Block]:
     """The last frames of a source that has too few for a block, or none that are whole."""
-    found: dict[int, list[Block]] = {}
+    blocks: list[Block] = []
     with contextlib.suppress(LogExhaustedError, LogDamagedError):
         while True:
-            for block in source.take_all(1):
-                found.setdefault(block.stream, []).append(block)
-    rest = []
-    for stream, blocks in found.items():
-        unbroken = itertools.groupby(enumerate(blocks), lambda one: one[1].t - one[0])
-        for _, those in unbroken:
-            run = [block for _, block in those]
-            frames = freeze(np.concatenate([block.frames for block in run]))
-            truth = freeze(np.concatenate([block.truth for block in run]))
-            rest.append(Block(stream, run[0].t, frames, truth))
-    return rest
+            blocks += source.take_all(1)
+    return unbroken(blocks)
 
 
 class _Judge:
