@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
+import shlex
 import signal
 import time
 from collections.abc import Iterator, Sequence
@@ -30,6 +32,7 @@ from replay.integrity.info import describe
 from replay.integrity.verify import check_log
 from replay.recordings.source import RecordedSource
 
+ROOT = Path(__file__).parents[1]
 FPS = 30
 TAU = 2 * FPS
 TEST = "av:lavfi:testsrc=size=160x120:rate=30"
@@ -329,3 +332,16 @@ def test_a_disk_that_is_full_is_one_line(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
     with RecordedSource(tmp_path / "rec") as source:
         assert source.frames > 0
+
+
+def test_the_commands_of_the_page_work(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (ROOT / "docs" / "how-to" / "cameras.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    lines = "".join(re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)).splitlines()
+    assert lines
+    for program, *words in map(shlex.split, lines):
+        assert program == "cdmisfa"
+        done = cdmisfa(*words)
+        assert done.code == 0, done.err
