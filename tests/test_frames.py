@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.progress.config import ProgressConfig
-from cdmisfa.core.blocks import Block, SourceSpec, as_frames
+from cdmisfa.core.arrays import as_frames
+from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion, expand, quadratic

@@ -14,6 +14,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
 
+_TYPES = (np.dtype(np.float64), np.dtype(np.uint8))
+
 GRAY = 128
 """What a pixel that is as in the mean of its episode becomes."""
 
@@ -111,3 +113,33 @@ def _column(name: str, key: str, given: Any) -> NDArray[Any]:
             f"{name}: the column {key} is of type {held}, no numbers: choose the columns of numbers"
         )
     return numbers
+
+
+def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
+    """Frames as rows of uint8 pixels or float64 values, in C order and not to be written.
+
+    Args:
+        frames: (n, I).
+        size: the I that there must be; None for any.
+
+    Returns:
+        The frames, a view, or a copy where they lie in another order.
+
+    Raises:
+        UsageError: they are of another shape or type.
+    """
+    array = frames if type(frames) is np.ndarray else as_array(frames)
+    if array.dtype not in _TYPES:
+        raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float64 values")
+    if array.ndim != 2 or (size is not None and array.shape[1] != size):
+        wanted = "values" if size is None else size
+        raise UsageError(f"frames of shape {array.shape} given: give (n, {wanted}), a row a frame")
+    flags = array.flags
+    if not (flags.c_contiguous and flags.aligned):
+        array = array.copy(order="C")
+    elif flags.writeable:
+        array = array.view()
+    else:
+        return array
+    array.setflags(write=False)
+    return array

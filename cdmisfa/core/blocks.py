@@ -14,7 +14,6 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import as_array
 from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time_of, times_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.shown import MOST, MOST_STREAMS, Shown, beside, curves
@@ -24,8 +23,6 @@ UINT8 = np.dtype(np.uint8)
 
 PIXEL = 1.0 / 255.0
 """What one step of a uint8 pixel counts."""
-
-_TYPES = (np.dtype(np.float64), UINT8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,34 +381,4 @@ def check_frame(t: int) -> None:
 def freeze(array: NDArray[Any]) -> NDArray[Any]:
     """Mark an array as never to be written again, and return it."""
     array.flags.writeable = False
-    return array
-
-
-def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
-    """Frames as rows of uint8 pixels or float64 values, in C order and not to be written.
-
-    Args:
-        frames: (n, I).
-        size: the I that there must be; None for any.
-
-    Returns:
-        The frames, a view, or a copy where they lie in another order.
-
-    Raises:
-        UsageError: they are of another shape or type.
-    """
-    array = frames if type(frames) is np.ndarray else as_array(frames)
-    if array.dtype not in _TYPES:
-        raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float64 values")
-    if array.ndim != 2 or (size is not None and array.shape[1] != size):
-        wanted = "values" if size is None else size
-        raise UsageError(f"frames of shape {array.shape} given: give (n, {wanted}), a row a frame")
-    flags = array.flags
-    if not (flags.c_contiguous and flags.aligned):
-        array = array.copy(order="C")
-    elif flags.writeable:
-        array = array.view()
-    else:
-        return array
-    array.setflags(write=False)
     return array

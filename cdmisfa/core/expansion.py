@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import PIXEL, UINT8, as_frames
+from cdmisfa.core.arrays import as_frames
+from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.registry import Registry
 
 

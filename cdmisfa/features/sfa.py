@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.blocks import as_frames
+from cdmisfa.core.arrays import FloatArray, as_frames
 
 EXTRA, ROUNDS = 8, 20
 """Directions beyond those wanted, and rounds, of the subspace iteration."""

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.blocks import UINT8, as_frames
+from cdmisfa.core.arrays import FloatArray, as_frames
+from cdmisfa.core.blocks import UINT8
 from cdmisfa.core.errors import CdmisfaError, UsageError
 
 try:

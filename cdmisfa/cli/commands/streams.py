@@ -56,6 +56,10 @@ def record_streams(
         if images.size is None:
             images = dataclasses.replace(images, **known.made(images))
     source, configuration = _opened(words, live, images, **how)
+    if known is not None:
+        from replay.stored import centre_as
+
+        centre_as(known.recipe.centre, source, words[0])
     triggered = None
     notice = "finishing the recording; again to stop at once\n"
     with contextlib.closing(source), stoppable(notice=notice) as stop:
