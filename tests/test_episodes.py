@@ -360,6 +360,42 @@ def test_apply_takes_each_log_of_a_corpus_as_an_episode(
     assert row["modules"] == one["logs"][0]["modules"]
 
 
+def test_episodes_of_a_dataset_are_its_own(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    episodes = scenes(3, 30)
+    each = zip((0, 1000, 2000), episodes, strict=True)
+    times = [(START_MS + (at + i) * STEP_MS, x) for at, own in each for i, x in enumerate(own)]
+    write_images(tmp_path / "log.mcap", {"/cam": times})
+    assert cdmisfa("convert", tmp_path / "log.mcap", "-o", tmp_path / "rec").code == 0
+    words = ("--to", "lerobot", "--lossless", "-o", tmp_path / "data")
+    assert cdmisfa("export", tmp_path / "rec", *words).code == 0
+    wanted = np.concatenate([centred(one, mean_of([one])) for one in episodes])
+    for logs in ([tmp_path / "data"], [tmp_path / "log.mcap"]):
+        shown = package.Recording(*logs, centre="episode").frames()
+        np.testing.assert_array_equal(shown, wanted)
+    both = package.Recording(tmp_path / "data", tmp_path / "data", episodes=True, centre="episode")
+    np.testing.assert_array_equal(both.frames("cam"), np.concatenate([wanted, wanted]))
+
+
+def test_what_is_held_out_are_whole_episodes_where_one_fits(tmp_path: Path) -> None:
+    paths = [write_log(tmp_path / f"{i}.mcap", x, i * 100) for i, x in enumerate(scenes(6, 30))]
+    with opened(*paths) as source:
+        source.hold_out(110)
+        assert (source.held_out, source.end) == (80, 4 * (30 + PAUSE))
+        source.hold_out(20)
+        assert source.held_out == 20
+        assert [len(b) for b in source.pieces(0, 260, 280, 16)] == [16, 4]
+
+
+def test_a_run_lists_so_many_episodes_and_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [write_log(tmp_path / f"{i}.mcap", x, i * 100) for i, x in enumerate(scenes(3, 12))]
+    monkeypatch.setattr("replay.corpus.episodes.MOST", 2)
+    with pytest.raises(UsageError, match="3 logs are more episodes than one run lists, 2"):
+        opened(*paths)
+
+
 def test_recordings_of_scenes_are_episodes(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     for seed in (1, 0):

@@ -31,6 +31,9 @@ from replay.stored import Span
 SAID: Final = 5
 """Lines of a kind, as of logs that are left out, that are said."""
 
+MOST: Final = 20_000
+"""Episodes of one source: so many are listed in the files of a run."""
+
 _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "time", "stamp")
 """What logs state of how images became frames, the same of all."""
 
@@ -100,6 +103,10 @@ class EpisodeSource(LoggedSource):
         """
         if cameras is not None and cameras.color == "auto":
             raise UsageError("--color auto looks at one log: say --color or not, for all episodes")
+        if len(logs) > MOST:
+            raise UsageError(
+                f"{len(logs):,} logs are more episodes than one run lists, {MOST:,}: index fewer"
+            )
         self._cameras, self._loop, self._salvage = cameras, loop, salvage
         self._open_now: tuple[int, Logged] | None = None
         self._reading = 0, 0
@@ -165,10 +172,10 @@ class EpisodeSource(LoggedSource):
         return list(_few(self._lost))
 
     def hold_out(self, count: int) -> None:
-        """Keep whole episodes at the end from `take`, as many as there are in so many frames."""
-        least = bisect.bisect_left(self._starts, self._count - count)
-        least = min(least, len(self._starts) - 1)
-        super().hold_out(self._count - self._starts[least] if least else 0)
+        """Keep the last episodes from `take` that lie within so many frames, or else these."""
+        first = bisect.bisect_left(self._starts, self._count - count)
+        whole = first < len(self._starts)
+        super().hold_out(self._count - self._starts[first] if whole else count)
 
     def episode(self, stream: int, t: int) -> Span:
         """The log [start, stop) that a frame is of, or the episode of a dataset."""

@@ -6,7 +6,7 @@ import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -133,6 +133,10 @@ def _lost(key: str, value: Any) -> bool:
     return key != "messages" and isinstance(value, int) and value > 0
 
 
+MOST_FILES: Final = 100
+"""Files of a source that are listed."""
+
+
 def provenance(told: RunTold, proof: Proof | None) -> list[tuple[str, str]]:
     """What made a run, by names."""
     document, manifest = told.document, told.header.manifest
@@ -144,7 +148,10 @@ def provenance(told: RunTold, proof: Proof | None) -> list[tuple[str, str]]:
         ("learned from", source.get("kind")),
     ]
     for key in ("files", "views"):
-        for file in source.get(key) or () if isinstance(source.get(key), Sequence) else ():
+        files = source.get(key) or () if isinstance(source.get(key), Sequence) else ()
+        if len(files) > MOST_FILES:
+            found.append((key, f"the first {MOST_FILES} of {len(files):,}; run.json lists all"))
+        for file in files[:MOST_FILES]:
             if isinstance(file, Mapping):
                 name = str(file.get("file", file.get("name", "file")))
                 known = next((k for k in ("sha256", "sample_sha256") if k in file), None)

@@ -76,7 +76,7 @@ def is_run(path: Path) -> bool:
 def read_run_json(folder: Path) -> Mapping[str, Any]:
     """The run.json of a run; empty where there is none that can be read."""
     try:
-        document = read_json(folder / RUN_JSON, "learn again")
+        document = read_json(folder / RUN_JSON, "learn again", most=MAX_LIST)
     except CdmisfaError:
         return {}
     return document if isinstance(document, Mapping) else {}

@@ -18,7 +18,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.core.untrusted import parse_json
+from cdmisfa.core.untrusted import MAX_LIST, parse_json
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Channel
 from recorder.mcap.store import PARTIAL
@@ -146,7 +146,7 @@ def read_header(path: Path) -> RunHeader:
         spec = parse_json(found["spec"])
         for name in ("streams", "frame_shape", "truth"):
             spec[name] = tuple(spec[name])
-        return RunHeader(schema, SourceSpec(**spec), parse_json(found["manifest"]))
+        return RunHeader(schema, SourceSpec(**spec), parse_json(found["manifest"], MAX_LIST))
     except (KeyError, TypeError, ValueError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
