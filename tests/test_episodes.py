@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from camera_files import START_MS, write_images
 from conftest import Cdmisfa
@@ -213,6 +214,7 @@ def test_a_log_that_changes_meanwhile_is_left_out(tmp_path: Path) -> None:
         (("CORPUS", "--color", "auto"), "--color auto looks at one log"),
         (("CORPUS", "--topic", "/no"), "no topic /no"),
         (("CORPUS", "--follow", "--episodes"), "--follow takes the folder of one recording"),
+        (("CORPUS/../broken",), "corpus.parquet is damaged"),
         (("CORPUS", "--holdout", "0.5", "--loop"), "--holdout is for camera logs"),
         (
             ("--episodes", "CORPUS/ep0.mcap", "CORPUS/none.mcap"),
@@ -224,8 +226,10 @@ def test_what_episodes_cannot_be_is_refused_in_a_line(
     cdmisfa: Cdmisfa, tmp_path: Path, words: Sequence[str], said: str
 ) -> None:
     folder = corpus(cdmisfa, tmp_path / "logs", scenes(1, 12))
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "corpus.parquet").write_text("no index")
     done = cdmisfa("learn", *(word.replace("CORPUS", str(folder)) for word in words))
-    assert done.code == 2
+    assert done.code in (2, 3)
     assert said in done.err
     assert len(done.err.splitlines()) == 1
 
@@ -265,7 +269,7 @@ def test_killed_in_the_middle_of_many_episodes_it_is_resumed_with_the_same_signa
     log = run / "run.mcap.partial"
 
     def far() -> bool:
-        kept = read_keyframe(log) if log.exists() else None
+        kept = read_keyframe(log) if log.exists() and log.stat().st_size > 9999 else None
         return kept is not None and kept.iteration >= 100
 
     slowed = "import sys, time; from cdmisfa.cli import run; from cdmisfa.agents.progress import "
@@ -352,12 +356,11 @@ def test_apply_takes_each_log_of_a_corpus_as_an_episode(
     cdmisfa: Cdmisfa, backgrounds: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    words = ("apply", backgrounds / "run")
-    document = cdmisfa(*words, backgrounds / "logs", "-o", out, "--json").json
-    assert len(document["logs"]) == len([*out.iterdir()]) == 110
-    one = cdmisfa(*words, backgrounds / "logs" / "ep7.mcap", "--json").json
-    row = next(row for row in document["logs"] if "ep7." in row["log"])
-    assert row["modules"] == one["logs"][0]["modules"]
+    done = cdmisfa("apply", backgrounds / "run", backgrounds / "logs", "-o", out, "--json")
+    assert (done.code, len(done.json["logs"])) == (0, 110)
+    y = pq.read_table(out / "ep7.mcap.parquet")["module1_y0"].to_numpy()
+    (module,) = package.Run(backgrounds / "run").modules
+    np.testing.assert_array_equal(module.transform(scenes(8, 45)[7])[:, 0], y)
 
 
 def test_episodes_of_a_dataset_are_its_own(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -11,16 +11,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import pyarrow.parquet as pq
-
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.arrays import are_arrays
 from replay.camera_logs.opening import log_format
 from replay.camera_logs.pictures import by_number
 from replay.corpus.finding import INDEX, may_be_corpus
-from replay.corpus.index import read_index
-from replay.corpus.rows import MARK
+from replay.corpus.index import indexed_logs, is_index
 from replay.inputs import Logged
 from replay.recordings.source import RecordedSource
 from replay.storage.identity import Identity, LoggedSource
@@ -54,27 +51,18 @@ def logs_of_corpus(words: Sequence[str | Location]) -> list[Log] | None:
         return None
     place = Path(str(words[0]))
     index = place / INDEX if place.is_dir() else place
-    if not _is_index(index):
-        return None
+    if not place.is_dir() and not is_index(index):
+        return None  # it is a table
     found: dict[str, list[Location]] = {}
-    for row in read_index(index).select(["log", "path", "kind", "number"]).to_pylist():
-        if row["number"] == 0 and row["kind"] != "run":
-            path = row["path"]
-            log = (row["log"] if row["kind"] == "recording" else None) or path
-            opened = location(path if "://" in path else index.parent / path)
-            found.setdefault(log, []).append(opened)
+    for log in indexed_logs(index):
+        files = [location(file) for file in log.files]
+        here = log.kind == "recording" and files[0].parent == index.parent
+        found.setdefault(os.curdir if here else log.name, []).extend(files)
     if place.is_dir() and [*found] == [os.curdir]:
         return None  # the folder is one recording, which was indexed
     if not found:
         raise UsageError(f"{index} holds no log to learn from: index a folder of logs")
     return list(found.values())
-
-
-def _is_index(path: Path) -> bool:
-    try:
-        return MARK in (pq.read_schema(path).metadata or {})
-    except (OSError, ValueError):  # who reads tables says so
-        return False
 
 
 @dataclass(slots=True)
