@@ -43,9 +43,9 @@ class Bar:
         """A line that stays, above the bar."""
         tell(line)
 
-    def sink(self, spec: SourceSpec, max_iterations: int | None) -> Sink:
+    def sink(self, spec: SourceSpec, max_iterations: int | None, *, events: bool = True) -> Sink:
         """A sink that shows a run; see `Reporter`."""
-        return Reporter(self, spec, max_iterations)
+        return Reporter(self, spec, max_iterations, events=events)
 
 
 @contextlib.contextmanager
@@ -119,20 +119,24 @@ class Reporter(Sink):
         shown: where.
         spec: of what is learned from.
         max_iterations: after which the run ends.
+        events: each is said, as a module that is saved.
 
     Attributes:
         told: whether any block was learned.
     """
 
-    def __init__(self, shown: Bar, spec: SourceSpec, max_iterations: int | None) -> None:
+    def __init__(
+        self, shown: Bar, spec: SourceSpec, max_iterations: int | None, *, events: bool = True
+    ) -> None:
         self.told = self._hashing = False
+        self._events = events
         self._shown, self._spec, self._max_iterations = shown, spec, max_iterations
         self._next = 0.0
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
         self.told = True
-        for text in learner.events:
+        for text in learner.events if self._events else ():
             self._shown.say(f"iteration {signals.iteration}: {text}")
         now = time.monotonic()
         if now >= self._next:

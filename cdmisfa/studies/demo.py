@@ -79,7 +79,7 @@ def demo(
                 seed=seed,
                 sections=configuration.tables(),
                 force=True,
-                sinks=(bar.sink(source.spec, most),),
+                sinks=(bar.sink(source.spec, most, events=out is not None),),
                 max_iterations=most,
             )
 
