@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 from importlib import metadata
@@ -206,3 +207,11 @@ def test_sources_without_compiled_kernels_say_so(tmp_path: Path) -> None:
     assert done.stderr.startswith("cdmisfa: ")
     assert "holds no compiled kernels: install cdmisfa" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_commits_are_checked_as_make_lint_checks() -> None:
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text("utf-8")
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    linted = re.findall(r"^\t\$\(BIN\)/(ruff|mypy|lint-imports)", makefile, re.MULTILINE)
+    hooked = re.findall(r"entry: \.venv/bin/(\S+)", hooks)
+    assert list(dict.fromkeys(hooked)) == linted
