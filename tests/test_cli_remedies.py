@@ -155,7 +155,7 @@ def test_demo_without_the_simulator_shows_a_sample(
 ) -> None:
     monkeypatch.setattr("cdmisfa.studies.demo.find_spec", lambda _: None)
     done = cdmisfa("demo", "-o", tmp_path, "--json")
-    assert "pybullet is not installed: the sample of the oscillatory streams stands in" in done.err
+    assert "as pybullet is not installed: the sample of the oscillatory streams stands" in done.err
     assert "live and recorded signals of 20 iterations are the same" in done.err
     assert done.json["recording"] == str(ROOT / "sample_logs" / "oscillatory")
     followed = [(module["view"], module["follows"]) for module in done.json["modules"]]

@@ -84,8 +84,8 @@ def demo(
             )
 
     if missing:
-        said = f"{missing[0]} is not installed: the sample of the {scene} streams stands in"
-        with stage(f"1/4 no recording: {said}", "frames"):
+        why = f"as {missing[0]} is not installed: the sample of the {scene} streams stands in"
+        with stage(f"1/4 no recording, {why}", "frames"):
             recording = samples_here() / scene
             with contextlib.closing(RecordedSource(recording)) as sample:
                 frames = sample.frames

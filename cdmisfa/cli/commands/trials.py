@@ -358,7 +358,8 @@ def _run_arena(
 def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
     """Record, learn, check and show: the whole story in minutes.
 
-    What an earlier demo left in the same folder is replaced.
+    What an earlier demo left in the same folder is replaced. Without PyBullet, which has wheels
+    for Python 3.11 and older, a sample stands in for the recording.
     """
     from cdmisfa.studies.demo import demo
 
