@@ -16,7 +16,7 @@ from conftest import Cdmisfa
 
 from cdmisfa import Run
 from recorder.mcap.reader import LogReader
-from replay.corpus.choosing import described, disorder, spread_out
+from replay.corpus.choosing import described, disorder, rarity, scale, spread_out
 
 FPS = 20
 SECONDS = 30
@@ -166,8 +166,8 @@ def test_noise_has_no_order_and_what_moves_has() -> None:
     assert disorder(np.cumsum(white, axis=0)) < 0.05
     assert disorder(np.ones((5, 3))) == 0
     still = np.clip(100 + rng.normal(0, 4, (40, 48, 64)), 0, 255).astype(np.uint8)
-    assert not described(still)[1]  # a sensor's noise on what stands still
-    assert described(rng.integers(0, 256, (40, 48, 64), np.uint8))[1]
+    assert not described(still).noise  # a sensor's noise on what stands still
+    assert described(rng.integers(0, 256, (40, 48, 64), np.uint8)).noise
 
 
 def test_each_mode_is_chosen_before_any_is_chosen_twice() -> None:
@@ -177,7 +177,10 @@ def test_each_mode_is_chosen_before_any_is_chosen_twice() -> None:
     features = (modes[which] + rng.normal(0, 0.1, (300, 5))).astype(np.float32)
     groups, windows = np.zeros(300, np.int64), np.arange(300)
     wanted = which != 3
-    found, all_seen = spread_out(features, groups, windows, wanted, np.ones(300))
+    rare, unknown = rarity(features, groups, wanted), np.full(300, np.inf)
+    found, all_seen = spread_out(
+        features, groups, windows, wanted, rare, unknown, np.ones(300), np.inf
+    )
     chosen = [window for window, _ in found]
     assert all_seen
     assert sorted(which[chosen[:6]].tolist()) == [0, 1, 2, 4, 5, 6]
@@ -185,10 +188,45 @@ def test_each_mode_is_chosen_before_any_is_chosen_twice() -> None:
     assert all(wanted[chosen])
 
 
+def test_what_is_rare_comes_before_what_is_as_far_and_common() -> None:
+    features = np.array([*[[0.1 * i] for i in range(20)], [4.0]], np.float32)
+    groups, wanted = np.zeros(21, np.int64), np.ones(21, bool)
+    rare = rarity(features, groups, wanted)
+    assert rare[:20] == pytest.approx([0.3, 0.2, *[0.2] * 16, 0.2, 0.3], abs=1e-3)
+    assert rare[20] == pytest.approx(2.3, abs=1e-3)
+
+
+def test_noise_is_no_measure_of_what_differs() -> None:
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(50, 4)).astype(np.float32)
+    with_noise = np.concatenate([features, 1000 * features[:9]])
+    wanted, groups = np.arange(59) < 50, np.zeros(59, np.int64)
+    scale(features, groups[:50], wanted[:50], [False])
+    scale(with_noise, groups, wanted, [False])
+    assert np.array_equal(with_noise[:50], features)
+    assert 2 * features.var(axis=0).sum() == pytest.approx(1, abs=1e-5)
+
+
+def test_what_looks_as_what_a_run_watched_comes_last(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    rng, logs = np.random.default_rng(0), tmp_path / "logs"
+    logs.mkdir()
+    for name, event in (("usual", None), ("again", None), ("event", 200)):
+        ms = ((t * 1000 // FPS, frame) for t, frame in enumerate(scene(rng, event)))
+        write_images(logs / f"{name}.mcap", {"/camera": ms})
+    words = ("--loop", "--max-iterations", 200, "--no-rerun", "--no-report", "-o", tmp_path / "run")
+    assert cdmisfa("learn", logs / "usual.mcap", "--topic", "/camera", *words).code == 0
+    cdmisfa("index", logs)
+    words = ("--known", tmp_path / "run", "--budget", "4s", "-o", tmp_path / "out", "--json")
+    done = cdmisfa("curate", logs, *words)
+    assert done.code == 0, done.err
+    assert done.json["segments"][0]["log"] == "event.mcap"
+
+
 def test_what_does_not_fit_into_the_budget_is_passed_over_for_what_does() -> None:
     features = np.array([[0], [9], [4], [1]], np.float32)
     windows, seconds = np.array([0, 1, 2, 3]), np.array([2.0, 5.0, 2.0, 1.0])
-    known = features, np.zeros(4, np.int64), windows, np.ones(4, bool), seconds
+    groups, wanted, unknown = np.zeros(4, np.int64), np.ones(4, bool), np.full(4, np.inf)
+    known = features, groups, windows, wanted, np.zeros(4), unknown, seconds
     assert spread_out(*known, 4.5) == ([(2, 1.0), (0, 4.0)], False)
     assert spread_out(*known, 5.0) == ([(2, 1.0), (0, 4.0), (3, 1.0)], False)
     assert spread_out(*known, 10.0) == ([(2, 1.0), (1, 5.0), (0, 4.0), (3, 1.0)], True)

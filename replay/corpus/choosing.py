@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-CELLS: Final = (6, 8)
-"""Rows and columns of areas whose mean brightness describes a picture."""
+AREAS: Final = (6, 8)
+"""Rows and columns of areas by whose mean brightness noise is told, and known pictures are."""
+
+CELLS: Final = (12, 16)
+"""The same of what describes a block."""
 
 RANDOM: Final = 0.8
 """Share of what frames without any order have, above which those of a block have none."""
@@ -20,25 +23,42 @@ STILL: Final = 1.0
 ALIKE: Final = 0.1
 """Two blocks are alike below this share of what blocks of their stream differ by in the mean."""
 
+SMALL: Final = 0.5
+"""Steps of gray: a feature of pictures that differs by more counts as much as any other."""
+
+NEAR: Final = 3
+"""How rare a block is: how far the one is that is the third nearest to it."""
+
+COMPARED: Final = 2000
+"""Blocks of a kind of stream, evenly, that all others are compared with for that."""
+
+AT_ONCE: Final = 4096
+"""Blocks that are compared at once."""
+
+EVERY: Final = 10
+"""One frame in so many of a block is compared with pictures that a run watched."""
+
 Features = NDArray[np.float32]
 
 
-def cells(frames: NDArray[Any]) -> NDArray[np.float64]:
+def areas(frames: NDArray[Any], grid: tuple[int, int]) -> NDArray[np.float64]:
     """Mean brightness of areas of pictures, (n, height, width), or numbers as they are, (n, I).
 
+    Args:
+        frames: of either.
+        grid: at most so many rows and columns.
+
     Returns:
-        (n, cells).
+        (n, rows, columns) or (n, I).
     """
-    if frames.ndim == 2:
-        return frames.astype(np.float64)
     found = frames.astype(np.float64)
-    for axis, parts in zip((1, 2), CELLS, strict=True):
+    for axis, parts in zip((1, 2), grid if frames.ndim == 3 else (), strict=False):
         size = found.shape[axis]
         starts = np.unique(np.arange(parts) * size // parts)
         widths = np.diff([*starts, size])
         shape = [-1 if i == axis else 1 for i in range(3)]
         found = np.add.reduceat(found, starts, axis=axis) / widths.reshape(shape)
-    return found.reshape(len(found), -1)
+    return found
 
 
 def disorder(values: NDArray[np.float64]) -> float:
@@ -59,17 +79,40 @@ def disorder(values: NDArray[np.float64]) -> float:
     return float((steps * steps).mean()) / (2 * variance) if variance else 0.0
 
 
-def described(frames: NDArray[Any]) -> tuple[Features, bool, bool]:
-    """What a block shows and how it moves, (2 cells,); whether it is noise, and whether still.
+class Described(NamedTuple):
+    """What a block shows, how it moves, and what it is without order.
+
+    Attributes:
+        features: (2 areas,) mean and standard deviation over time of each of `AREAS`.
+        cells: (3 cells,) mean, standard deviation and mean step of each of `CELLS`.
+        looks: (n, areas) its frames in `AREAS`.
+        noise: whether it is nothing but noise.
+        still: whether nothing moves in it.
+    """
+
+    features: Features
+    cells: Features
+    looks: NDArray[np.float64]
+    noise: bool
+    still: bool
+
+
+def described(frames: NDArray[Any]) -> Described:
+    """What a block shows.
 
     Args:
         frames: (n, height, width) uint8 or (n, I), n above 1.
     """
-    values = cells(frames)
-    spread = values.std(axis=0)
+    fine = areas(frames, CELLS)
+    looks = areas(fine, AREAS).reshape(len(fine), -1)
+    spread = looks.std(axis=0)
     still = float(np.sqrt((spread * spread).mean())) <= (0 if frames.ndim == 2 else STILL)
-    noise = not still and disorder(values) > RANDOM
-    return np.concatenate([values.mean(axis=0), spread]).astype(np.float32), noise, still
+    noise = not still and disorder(looks) > RANDOM
+    values = fine.reshape(len(fine), -1)
+    steps = np.abs(np.diff(values, axis=0)).mean(axis=0)
+    features = np.concatenate([looks.mean(axis=0), spread])
+    cells = np.concatenate([values.mean(axis=0), values.std(axis=0), steps])
+    return Described(features.astype(np.float32), cells.astype(np.float32), looks, noise, still)
 
 
 def usual_distance(variance: float, width: int, *, pictures: bool) -> float:
@@ -84,21 +127,71 @@ def usual_distance(variance: float, width: int, *, pictures: bool) -> float:
     return float(max(np.sqrt(2 * variance), least)) or 1.0
 
 
-def scaled(features: Features, groups: NDArray[np.int64], pictures: Sequence[bool]) -> Features:
-    """Blocks of each group with distances that are 1 in the mean square of two of them.
+def scale(
+    features: Features,
+    groups: NDArray[np.int64],
+    wanted: NDArray[np.bool_],
+    pictures: Sequence[bool],
+) -> None:
+    """Make distances of blocks of a group 1 in the mean square of two, each feature as much.
 
     Args:
-        features: (n, F), of blocks.
+        features: (n, F), of blocks; changed.
         groups: (n,), of which kind of stream each is.
-        pictures: of each group, whether it shows pictures, which differ by `STILL` at least.
+        wanted: (n,), which count; noise would be the measure of all else.
+        pictures: of each group, whether it shows pictures: they differ by `STILL` at least, and a
+            feature of them by `SMALL`.
     """
-    found = features.copy()
     for group, shows in enumerate(pictures):
-        own = groups == group
-        if not own.any():
+        own = np.flatnonzero((groups == group) & wanted)
+        if not len(own):
             continue
-        variance = float(features[own].var(axis=0).sum())
-        found[own] /= usual_distance(variance, features.shape[1], pictures=shows)
+        part = features[own]
+        spread = part.std(axis=0)
+        squares = float((spread * spread).sum())
+        part /= np.maximum(spread, SMALL) if shows else np.where(spread > 0, spread, 1)
+        size = float(np.sqrt(2 * part.var(axis=0).sum())) or 1.0
+        if squares:  # what hardly differs at all is alike
+            size *= usual_distance(squares, part.shape[1], pictures=shows) / np.sqrt(2 * squares)
+        features[own] = part / size
+
+
+def rarity(
+    features: Features, groups: NDArray[np.int64], wanted: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """How far each block is from its group's third nearest to it, of those that are wanted.
+
+    A distance to the k-th nearest neighbour tells outliers from what differs only as all do
+    (Ramaswamy, Rastogi, Shim, 2000: Efficient algorithms for mining outliers from large data sets,
+    SIGMOD).
+
+    Args:
+        features: (n, F), of blocks, as `scale` makes them.
+        groups: (n,), only blocks of one group are compared.
+        wanted: (n,), which count.
+
+    Returns:
+        (n,), 0 where nothing is wanted, and where a group has too few.
+    """
+    found = np.zeros(len(features))
+    for group in np.unique(groups).tolist():
+        own = np.flatnonzero((groups == group) & wanted)
+        others = own[np.unique(np.linspace(0, len(own) - 1, COMPARED).astype(int))]
+        if len(others) <= NEAR + 1:
+            continue
+        for at in range(0, len(own), AT_ONCE):
+            some = own[at : at + AT_ONCE]
+            away = distances(features[some], features[others])
+            itself = np.isin(some, others)
+            nearest = np.partition(away, (NEAR - 1, NEAR), axis=1)
+            found[some] = nearest[np.arange(len(some)), NEAR - 1 + itself]
+    return found
+
+
+def distances(some: NDArray[Any], others: NDArray[Any]) -> NDArray[Any]:
+    """Of each of (n, F) to each of (m, F), (n, m)."""
+    squares = (some * some).sum(axis=1)[:, None] + (others * others).sum(axis=1)
+    found: NDArray[Any] = np.sqrt(np.maximum(squares - 2 * some @ others.T, 0))
     return found
 
 
@@ -107,30 +200,33 @@ def spread_out(
     groups: NDArray[np.int64],
     windows: NDArray[np.int64],
     wanted: NDArray[np.bool_],
+    rare: NDArray[np.float64],
+    strange: NDArray[np.float64],
     seconds: NDArray[np.float64],
     budget: float = np.inf,
 ) -> tuple[list[tuple[int, float]], bool]:
     """Windows in which more is seen with each than with any other: the farthest comes first.
 
-    Of every group the block nearest to its mean is first, then always the block that is farthest
+    Of every group the block nearest to its mean is first, then always the one that is farthest
     from all that were chosen (Gonzalez, 1985: Clustering to minimize the maximum intercluster
-    distance, Theoretical Computer Science 38). So no block is farther from one that was chosen
-    than twice what as many could come to. All blocks of a window are seen with it. A window that
-    does not fit into what is left of the budget is passed over.
+    distance, Theoretical Computer Science 38) and rarest, the sum of both. All blocks of a window
+    are seen with it. A window that does not fit into what is left of the budget is passed over.
 
     Args:
-        features: (n, F), of blocks, as `scaled` gives them.
+        features: (n, F), of blocks, as `scale` makes them.
         groups: (n,), only blocks of one group are compared.
         windows: (n,), in which window each is.
         wanted: (n,), which may be chosen.
+        rare: (n,), see `rarity`.
+        strange: (n,), how far each is from what is known before, infinite where nothing is.
         seconds: (W,), of windows.
         budget: seconds of all that are chosen.
 
     Returns:
-        The windows with how far each was from those before, 1 for the first of a group; and
-        whether all others are `ALIKE`, so that a longer budget would choose no more.
+        The windows with that sum, 1 for the first of a group; and whether all others are `ALIKE`
+        to those, so that a longer budget would choose no more.
     """
-    away = np.where(wanted, np.inf, -1.0)
+    away = np.where(wanted, strange, -1.0)
     lasts = seconds[windows]
     in_order = np.argsort(windows, kind="stable")
     firsts = np.searchsorted(windows[in_order], np.arange(len(seconds) + 1))
@@ -146,10 +242,11 @@ def spread_out(
         too_long = lasts > budget + 1e-9
         all_seen = all_seen and not (away[too_long] > ALIKE).any()
         away[too_long] = -1.0
-        farthest = float(away.max())
-        if farthest <= ALIKE:
+        new = np.where(away > ALIKE, away + rare, -1.0)
+        farthest = float(new.max())
+        if farthest < 0:
             break
-        ties = np.flatnonzero(away == farthest)
+        ties = np.flatnonzero(new == farthest)
         window = int(windows[ties[np.argmax(first[ties])]])
         found.append((window, 1.0 if farthest == np.inf else farthest))
         budget -= float(seconds[window])

@@ -1,4 +1,4 @@
-"""Which parts of many logs to look at: what no module knows, noise set apart, within a budget."""
+"""Which parts of many logs to look at: what is rare and new, noise set apart, within a budget."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ import pyarrow.parquet as pq
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.processes import WorkerDied, run_all
 from recorder.log.files import atomic_write, refuse_existing
-from replay.corpus.choosing import scaled, spread_out
+from replay.corpus.choosing import rarity, scale, spread_out
 from replay.corpus.index import indexed_logs
-from replay.corpus.judging import NONE, NOVEL, VERDICTS, Applies, Judged, judge, open_log
+from replay.corpus.judging import NOISE, NONE, VERDICTS, Applies, Judged, Watched, judge, open_log
 from replay.report.curated import Curated, report_of_segments
 
 SHOWN: Final = 60
@@ -108,8 +108,8 @@ def curate(
     Args:
         index: of the logs, up to date.
         out: the folder.
-        known: modules of a run; what they know is not chosen.
-        known_as: the run.
+        known: modules of a run.
+        known_as: the run; what looks as what it watched comes last.
         budget: seconds of all segments together.
         jobs: processes; what is chosen does not depend on them.
         force: replace the folder.
@@ -122,7 +122,8 @@ def curate(
     refuse_existing(out, force=force, goes_on=False)
     logs = _logs(index)
     judged = [log for log in logs if not log.left_out]
-    work = functools.partial(judge, known=known)
+    watched = None if known_as is None else Watched.by(known_as)
+    work = functools.partial(judge, known=known, watched=watched)
     found = run_all(work, [log.files for log in judged], jobs=min(jobs, len(judged)))
     for done, (number, one) in enumerate(found, 1):
         if isinstance(one, Judged):
@@ -187,7 +188,8 @@ def _choose(logs: Sequence[_Log], budget: float) -> tuple[list[_Window], bool]:
     for stop, one in zip(np.cumsum(counts).tolist(), all_of, strict=True):
         features[stop - len(one.t) : stop, : one.features.shape[1]] = one.features
     of_group = np.concatenate(groups)
-    features = scaled(features, of_group, [kind[2] for kind in kinds])
+    wanted = np.concatenate([one.verdict for one in all_of]) != NOISE
+    scale(features, of_group, wanted, [kind[2] for kind in kinds])
     places = np.stack(
         [np.repeat(numbers, counts), np.concatenate([one.t // one.tau for one in all_of])], axis=1
     )
@@ -197,8 +199,11 @@ def _choose(logs: Sequence[_Log], budget: float) -> tuple[list[_Window], bool]:
     np.minimum.at(start, windows, np.concatenate([one.t for one in all_of]))
     np.maximum.at(stop, windows, np.concatenate([one.t + one.frames for one in all_of]))
     fps = np.array([logs[number].found.spec.fps for number in names[:, 0]])
-    wanted = np.concatenate([one.verdict for one in all_of]) == NOVEL
-    chosen, all_seen = spread_out(features, of_group, windows, wanted, (stop - start) / fps, budget)
+    strange = np.concatenate([one.strange for one in all_of])
+    rare, seconds = rarity(features, of_group, wanted), (stop - start) / fps
+    chosen, all_seen = spread_out(
+        features, of_group, windows, wanted, rare, strange, seconds, budget
+    )
     for window, far in chosen:
         logs[names[window, 0]].gain += far
     found = [

@@ -292,7 +292,7 @@ class _Novelty:
             judged = verdict_on(block, applied, self._modules)
             if judged.kind != NOVEL:
                 continue
-            novel = not judged.still
+            novel = not judged.shown.still
             novelty = None if math.isnan(judged.novelty) else judged.novelty
             if applied is None:
                 novel, novelty = self._seen[block.stream].judge(judged)
@@ -313,12 +313,12 @@ class _Seen:
 
     def judge(self, found: Verdict) -> tuple[bool, float | None]:
         """Whether a block is new, and its distance to the nearest that was, 1 at the bound."""
-        features = found.features.astype(np.float64)
+        features = found.shown.features.astype(np.float64)
         self._count += 1
         away = features - self._mean
         self._mean = self._mean + away / self._count
         self._squares = self._squares + away * (features - self._mean)
-        if found.still:
+        if found.shown.still:
             return False, None
         novelty = None
         if self._new:
@@ -327,7 +327,7 @@ class _Seen:
             novelty = float(np.linalg.norm(np.array(self._new) - features, axis=1).min()) / bound
             if novelty < 1:
                 return False, novelty
-        self._new.append(found.features)
+        self._new.append(found.shown.features)
         return True, novelty
 
 

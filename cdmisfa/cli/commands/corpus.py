@@ -194,7 +194,7 @@ def _long(seconds: float | None) -> str:
 @click.command("curate")
 @click.argument("corpus", shell_complete=completing.runs)
 @options.out("The folder of the segments and their page.", required=True)
-@options.path("--known", "A run: what its modules know is not chosen.", "RUN")
+@options.path("--known", "A run: what looks as what it watched comes last.", "RUN")
 @word(
     "--budget",
     "TIME",
@@ -218,10 +218,10 @@ def curate_command(
 ) -> None:
     """Choose what to look at in many logs, within a budget of time.
 
-    CORPUS is what cdmisfa index indexed. Noise, doubles and, with --known, what the modules of a
-    run know are set apart; of the rest comes first what differs most from all chosen before. OUT
-    has a page of contact sheets, index.html, the segments for cdmisfa cut, segments.csv, and what
-    became of each block, blocks.parquet.
+    CORPUS is what cdmisfa index indexed. Noise and doubles are set apart; of the rest comes first
+    what is rare and differs most from all chosen before and, with --known, from what a run watched.
+    OUT has a page of contact sheets, index.html, the segments for cdmisfa cut, segments.csv, and
+    what became of each block, blocks.parquet.
     """
     from cdmisfa.experiments.apply import Application
     from replay.corpus.curate import curate
