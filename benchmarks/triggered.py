@@ -16,6 +16,7 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.experiments.apply import Application
 from cdmisfa.experiments.session import run
 from recorder.cameras.stepped import ArraySource, GymSource
+from recorder.world.oscillatory import OscillatorySource
 from replay.corpus.triggered import TriggeredSource
 
 TASKS = ("CartPole-v1", "Pendulum-v1", "Acrobot-v1", "ALE/Pong-v5")
@@ -29,7 +30,14 @@ AROUND = 5.0
 QUIET = 40
 """Seconds before the first event."""
 
+WAVES = {"x1": "x3", "x2": "x3"}
+"""Streams of the scene oscillatory, and which other shows in an event."""
+
+OF_WAVES = ("another stream", "half as large", "twice as fast")
+
 Frames = NDArray[np.uint8]
+Events = list[tuple[int, int]]
+"""Where they are, [start, stop)."""
 
 
 def shown(task: str, seed: int, count: int) -> tuple[Frames, float]:
@@ -39,19 +47,21 @@ def shown(task: str, seed: int, count: int) -> tuple[Frames, float]:
         return np.concatenate(parts), source.spec.fps
 
 
-def planted(
-    frames: Frames, other: Frames, fps: float, seed: int
-) -> tuple[Frames, list[tuple[int, int]]]:
-    """Frames with an event of each kind, and where they are, [start, stop)."""
-    rng, frames = np.random.default_rng([77, seed]), frames.copy()
-    length, first = round(SECONDS * fps), round(QUIET * fps)
-    room = (len(frames) - first) // len(KINDS)
-    events = []
-    for number, kind in enumerate(KINDS):
-        start = first + number * room + int(rng.integers(room - length))
-        own = frames[start : start + length]
+def places(frames: int, fps: float, kinds: int, seed: int) -> Events:
+    """Where events are, one of each kind."""
+    rng, length, first = np.random.default_rng([77, seed]), round(SECONDS * fps), round(QUIET * fps)
+    room = (frames - first) // kinds
+    starts = [first + number * room + int(rng.integers(room - length)) for number in range(kinds)]
+    return [(start, start + length) for start in starts]
+
+
+def planted(frames: Frames, other: Frames, fps: float, seed: int) -> tuple[Frames, Events]:
+    """Frames of a task with an event of each kind."""
+    frames, events = frames.copy(), places(len(frames), fps, len(KINDS), seed)
+    for (start, stop), kind in zip(events, KINDS, strict=True):
+        own, length = frames[start:stop], stop - start
         if kind == "another task":
-            own[:] = other[start : start + length]
+            own[:] = other[start:stop]
         elif kind == "half the light":
             own //= 2
         for k, frame in enumerate(own):
@@ -62,16 +72,29 @@ def planted(
                 column = k * (SIZE[1] - 14) // length
                 part = frame[20:34, column : column + 14]
                 part[:] = 255 - part
-        events.append((start, start + length))
+    return frames, events
+
+
+def waves(name: str, count: int) -> NDArray[np.float64]:
+    """Frames of a stream of the scene."""
+    return OscillatorySource([name]).take(0, count).frames
+
+
+def planted_in_waves(name: str, seed: int) -> tuple[NDArray[np.float64], Events]:
+    """Frames of such a stream with an event of each kind."""
+    frames, events = waves(name, FRAMES).copy(), places(FRAMES, 50.0, len(OF_WAVES), seed)
+    another, fast = waves(WAVES[name], FRAMES), waves(name, 2 * FRAMES)[::2]
+    for (start, stop), shown in zip(events, (another, frames / 2, fast), strict=True):
+        frames[start:stop] = shown[start:stop]
     return frames, events
 
 
 def kept(
-    frames: Frames, fps: float, known: Application | None, events: list[tuple[int, int]]
+    frames: NDArray[Any], fps: float, known: Application | None, events: Events
 ) -> tuple[float, list[bool]]:
     """The share of frames that is kept, and which events are, whole."""
     source = TriggeredSource(
-        ArraySource({"task": frames}, fps=fps), before=AROUND, after=AROUND, known=known
+        ArraySource({"stream": frames}, fps=fps), before=AROUND, after=AROUND, known=known
     )
     with contextlib.suppress(LogExhaustedError):
         while True:
@@ -81,40 +104,55 @@ def kept(
     return told["share"], whole
 
 
+def learned(streams: dict[str, Any], fps: float, folder: Path) -> dict[str, Application | None]:
+    """No run, and one learned from streams where any module was."""
+    run(ArraySource(streams, fps=fps), ProgressConfig(), folder, rerun=False)
+    found: dict[str, Application | None] = {"none": None}
+    with contextlib.suppress(UsageError):
+        found["of the usual"] = Application(folder)
+    return found
+
+
 def main(*, quick: bool = False, full: bool = False) -> None:
-    """Measure each task, without a run and with one learned on the same task."""
+    """Measure each task and stream, without a run and with one learned from the usual."""
     rows: list[list[Any]] = []
+
+    def add(what: str, seed: int, fps: float, frames: Any, events: Events, kinds: Any) -> None:
+        around = len(events) * (SECONDS + 2 * AROUND) * fps / len(frames)
+        for name, known in runs.items():
+            share, whole = kept(frames, fps, known, events)
+            missed = [kind for kind, found in zip(kinds, whole, strict=True) if not found]
+            share_of = f"{share:.0%}", f"{around:.0%}"
+            counted = f"{sum(whole)} of {len(whole)}"
+            rows.append([what, seed, name, *share_of, counted, ", ".join(missed) or "-"])
+            print(*rows[-1], flush=True)
+
+    seeds = SEEDS[: 1 if quick else None]
+    with tempfile.TemporaryDirectory() as folder:
+        usual = {name: waves(name, FRAMES) for name in ("x1", "x2", "x3")}
+        runs = learned(usual, 50.0, Path(folder) / "run")
+        for name in WAVES:
+            for seed in seeds:
+                add(f"oscillatory {name}", seed, 50.0, *planted_in_waves(name, seed), OF_WAVES)
     for number, task in enumerate(TASKS):
         with tempfile.TemporaryDirectory() as folder:
             frames, fps = shown(task, 200, FRAMES)
-            learned = ArraySource({"task": frames}, fps=fps)
-            run(learned, ProgressConfig(), Path(folder) / "run", rerun=False)
-            runs: dict[str, Application | None] = {"none": None}
-            with contextlib.suppress(UsageError):  # nothing was learned
-                runs["of the task"] = Application(Path(folder) / "run")
-            for seed in SEEDS[: 1 if quick else None]:
-                frames, fps = shown(task, seed, FRAMES)
+            runs = learned({"stream": frames}, fps, Path(folder) / "run")
+            for seed in seeds:
                 other = shown(TASKS[(number + 1) % len(TASKS)], seed, FRAMES)[0]
-                frames, events = planted(frames, other, fps, seed)
-                around = len(events) * (SECONDS + 2 * AROUND) * fps / len(frames)
-                for name, known in runs.items():
-                    share, whole = kept(frames, fps, known, events)
-                    rows.append(
-                        [
-                            *(task, seed, name),
-                            *(f"{share:.0%}", f"{around:.0%}", f"{sum(whole)} of {len(whole)}"),
-                            ", ".join(k for k, found in zip(KINDS, whole, strict=True) if not found)
-                            or "-",
-                        ]
-                    )
-                    print(*rows[-1], flush=True)
-    head = ("task", "seed", "run", "frames kept", "by a perfect trigger", "events kept", "missed")
+                add(
+                    *(task, seed, fps),
+                    *planted(shown(task, seed, FRAMES)[0], other, fps, seed),
+                    KINDS,
+                )
+    head = ("stream", "seed", "run", "kept", "by a perfect trigger", "events kept", "missed")
     save(
         "triggered",
         "Recording what is novel",
-        f"Tasks of Gymnasium and Atari played at random, {FRAMES:,} frames of 85x57, with an event "
-        f"of each of four kinds of {SECONDS} s ({', '.join(KINDS)}); kept with {AROUND:g} s before "
-        "and after it. Of a task without a second row no module was learned in as many frames.",
+        f"The scene oscillatory, and tasks of Gymnasium and Atari played at random, {FRAMES:,} "
+        f"frames each, with an event of each kind of {SECONDS} s ({', '.join(OF_WAVES)}; "
+        f"{', '.join(KINDS)}); kept with {AROUND:g} s before and after it. Where there is no row "
+        "with a run no module was learned.",
         [(head, rows)],
     )
 
