@@ -38,7 +38,7 @@ def log_files(paths: str | Location | Iterable[str | Location]) -> list[Location
             if not found:
                 raise UsageError(
                     f"{path}: no log in this folder; {KINDS}; record or learn first, or name each "
-                    "video, bag, table or folder of pictures in it"
+                    "video, bag, table or folder of pictures in it, or cdmisfa index all of them"
                 )
             files += found
         elif path.exists():
