@@ -186,7 +186,7 @@ def open_arrays(
     try:
         return ArrayLog(streams, options, loop=loop, files=files)
     except UsageError as error:
-        raise UsageError(f"{', '.join(map(str, paths))}: {error}") from None
+        raise type(error)(f"{', '.join(map(str, paths))}: {error}") from None
 
 
 def _refuse_options(options: CameraOptions) -> None:

@@ -24,7 +24,7 @@ from cdmisfa.cli.making import (
 )
 from cdmisfa.cli.printing import warn_deprecated
 from cdmisfa.core.config import FORMER
-from cdmisfa.core.errors import CdmisfaError, UsageError, are_for
+from cdmisfa.core.errors import CdmisfaError, TooSmallError, UsageError, are_for
 from recorder.cameras.options import LiveOptions, TriggerOptions
 from recorder.images.options import ImageOptions
 from replay.camera_logs.options import CameraOptions
@@ -50,10 +50,26 @@ OUT = LocalPath(path_type=Path)
 """Type of every option that says where something is written, and of what is read from no URL."""
 
 
-image_options = options_of(ImageOptions, "images")
+def _with_size(made: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Options of which --size is one, which an error about small images then names."""
+
+    def wrapped(command: Command) -> Command:
+        @functools.wraps(command)
+        def naming_size(*args: Any, **values: Any) -> Any:
+            try:
+                return command(*args, **values)
+            except TooSmallError as error:
+                raise UsageError(f"{error}, or a smaller --size") from None
+
+        return made(cast(Command, naming_size))
+
+    return wrapped
+
+
+image_options = _with_size(options_of(ImageOptions, "images"))
 """How images of cameras, live or stored, become frames."""
 
-log_options = options_of(CameraOptions, "cameras")
+log_options = _with_size(options_of(CameraOptions, "cameras"))
 """What of camera logs becomes frames, and how."""
 
 look_options = options_of(CameraOptions, "cameras", "topics", "fields", "time", "rate", "depth")

@@ -121,7 +121,7 @@ class CameraFrames:
         try:
             return framing.frame(image)
         except UsageError as error:
-            raise UsageError(f"{name}: {error}") from None
+            raise type(error)(f"{name}: {error}") from None
 
     def _begin(self, name: str, first: Shown) -> Framing | Vector:
         """How a camera's images become frames, by the first of them."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import TooSmallError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.options import Depth
 from recorder.images.whole import MalformedImage, load_picture, open_picture
@@ -208,10 +208,6 @@ def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray
     return _by_bands(values, gray)
 
 
-OR_SIZE: Final = ", or a smaller --size"
-"""The end of the error about a small image, which a command without --size leaves out."""
-
-
 def shrink(
     image: ByteArray,
     height: int,
@@ -230,7 +226,7 @@ def shrink(
         whole: shape of the picture that it was cropped from, for the error.
 
     Raises:
-        UsageError: the image is smaller.
+        TooSmallError: the image is smaller.
     """
     if image.shape == (height, width):
         return image
@@ -238,8 +234,8 @@ def shrink(
         said = f"{image.shape[1]}x{image.shape[0]}"
         if whole is not None and whole != image.shape:
             said = f"{whole[1]}x{whole[0]}, cropped to {said},"
-        raise UsageError(
-            f"an image of {said} is smaller than {width}x{height}: choose larger images{OR_SIZE}"
+        raise TooSmallError(
+            f"an image of {said} is smaller than {width}x{height}: choose larger images"
         )
     small = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
     return np.asarray(small, np.uint8)

@@ -306,7 +306,7 @@ class ForeignSource(LoggedSource):
         try:
             frame = framing.frame(image)
         except UsageError as error:
-            raise UsageError(f"{self._streams[stream].path}: {error}") from None
+            raise type(error)(f"{self._streams[stream].path}: {error}") from None
         self._shown[stream] = (row, frame)
         return frame
 

@@ -29,7 +29,6 @@ from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live, live_options, open_live
-from recorder.images.pixels import OR_SIZE
 from replay.arrays import TAKES, ArrayLog, are_arrays
 from replay.camera_logs.opening import ALL, log_format, only_foreign
 from replay.camera_logs.options import CameraOptions
@@ -124,12 +123,7 @@ class Application:
         elif is_scene(words, cameras):
             source = configure(words[0], settings=of_scene((), cameras)).open_scene()
         else:
-            try:
-                source = self._log(words, cameras, loop=loop, salvage=salvage)
-            except UsageError as error:
-                if not str(error).endswith(OR_SIZE):
-                    raise
-                raise UsageError(str(error).removesuffix(OR_SIZE)) from None
+            source = self._log(words, cameras, loop=loop, salvage=salvage)
         shape = self.recipe.shape
         if source.spec.frame_shape != shape:
             source.close()
