@@ -174,6 +174,20 @@ def test_folders_of_pictures_keep_their_names(tmp_path: Path, cdmisfa: Cdmisfa) 
     assert cdmisfa("check", tmp_path / "elsewhere" / "f.zip").code == 0
 
 
+def test_logs_of_an_index_are_learned_again(
+    tmp_path: Path, cdmisfa: Cdmisfa, oscillatory_recording: Path
+) -> None:
+    logs, out = tmp_path / "logs", tmp_path / "f.zip"
+    for name in ("a", "b"):
+        shutil.copytree(oscillatory_recording, logs / name)
+    assert cdmisfa("index", logs).code == 0
+    assert cdmisfa("learn", logs, *SHORT, "-o", tmp_path / "run").code == 0
+    assert cdmisfa("bundle", tmp_path / "run", "-o", out).code == 0
+    shutil.rmtree(logs)
+    done = cdmisfa("check", out)
+    assert (done.code, done.err) == (0, "")
+
+
 def test_a_scene_is_computed_with_what_its_preset_said(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
     preset = tmp_path / "own.toml"
     preset.write_text('[scene]\nkind = "oscillatory"\nstreams = ["x2", "x1", "x3"]\n')

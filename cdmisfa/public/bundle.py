@@ -22,6 +22,7 @@ from cdmisfa.public.crate import LEARNED, METADATA, RUN, SOURCE, About, descript
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from recorder.world.scenes import SCENES
 from replay.camera_logs.opening import image_logs
+from replay.corpus.finding import may_be_corpus
 from replay.inputs import locations
 from replay.integrity.verify import check_logs
 from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, run_log
@@ -186,7 +187,8 @@ def _source_files(run: Path, source: Sequence[str]) -> dict[str, dict[str, Path]
     above = os.path.commonpath([place.parent for place in places])
     found = {}
     for place in places:
-        files = itertools.chain.from_iterable(map(_files_of, image_logs([place])))
+        logs = [place] if may_be_corpus([str(place)]) else image_logs([place])
+        files = itertools.chain.from_iterable(map(_files_of, logs))
         word = SOURCE + os.path.relpath(place, above) + ("/" if place.is_dir() else "")
         found[word] = {SOURCE + os.path.relpath(file, above): file for file in files}
     return found

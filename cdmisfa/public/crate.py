@@ -58,7 +58,7 @@ def description(
 ) -> Mapping[str, Any]:
     """The JSON-LD document of a bundle."""
     document = read_run_json(run)
-    versions, result = document["versions"], document["result"]
+    versions, result = document.get("versions", {}), document["result"]
     when = about.date or datetime.fromtimestamp((run / RUN_JSON).stat().st_mtime, UTC).date()
     people = [_entity(f"#author/{quote(name)}", "Person", name) for name in about.authors]
     maker = _entity("#maintainers", "Organization", AUTHOR)
@@ -107,7 +107,7 @@ def description(
         "#cdmisfa",
         "SoftwareApplication",
         TITLE,
-        softwareVersion=versions["cdmisfa"],
+        softwareVersion=versions.get("cdmisfa", "unknown"),
         license="Apache-2.0",
         author=_ref(maker),
         citation={"@id": PAPER},
