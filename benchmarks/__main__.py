@@ -7,12 +7,13 @@ import importlib
 import pkgutil
 
 import benchmarks
+from benchmarks.curation import page as curation
 from benchmarks.history import draw, keep
 from benchmarks.report import PAGE, PICTURE, write_page
 
 
 def main() -> None:
-    """Run benchmarks one after another; each writes results/NAME.json, `page` the page.
+    """Run benchmarks one after another; each writes results/NAME.json, `page` the pages.
 
     The ratios of a run that is not quick are kept under the commit, too.
     """
@@ -29,6 +30,7 @@ def main() -> None:
         if name == "page":
             draw(PAGE.parent / PICTURE)
             print(write_page())
+            print(curation.write_page())
             continue
         if name not in names:
             parser.error(f"no benchmark {name}: there are {', '.join(names)}")
