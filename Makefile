@@ -62,7 +62,7 @@ release: $(INSTALLED)
 	rm -rf $(RELEASE) dist
 	mkdir -p $(RELEASE)/source dist
 	git archive HEAD | tar -x -C $(RELEASE)/source
-	export PATH="$(CURDIR)/$(BIN):$$PATH" SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) && \
+	umask 022 && export PATH="$(CURDIR)/$(BIN):$$PATH" SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) && \
 	    python -m build --outdir $(RELEASE) $(RELEASE)/source && \
 	    auditwheel repair --wheel-dir dist $(RELEASE)/*.whl
 	mv $(RELEASE)/*.tar.gz dist
