@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +19,7 @@ from cdmisfa.core.errors import UsageError, are_for
 from recorder.images.framing import Framing, framings
 from recorder.images.pixels import Shown, raw_image
 from recorder.images.recipe import pixels_of
+from replay.camera_logs.hue import CHOSEN, shows_hue
 from replay.camera_logs.opening import fits_topic
 from replay.camera_logs.options import CameraOptions
 from replay.storage.arrays import load_numbers
@@ -61,6 +62,7 @@ class ArrayLog(LoggedSource):
     Attributes:
         arrays: of each stream by its name, what it shows as it was given, frames first.
         framings: for each stream how a picture becomes a frame.
+        color: whether frames show colours; see `shows_hue` of "auto".
 
     Raises:
         UsageError: they are no such arrays, or hold what is no finite number.
@@ -76,6 +78,10 @@ class ArrayLog(LoggedSource):
     ) -> None:
         options = options or CameraOptions()
         _refuse_options(options)
+        if options.color == "auto":
+            shown = type(self)(streams, replace(options, color=True), loop=loop, files=files)
+            options = replace(options, color=shows_hue(shown))
+            self.notes = (CHOSEN[options.color is True],)
         if not streams:
             raise UsageError("no array given: name one at least")
         self._loop, self._files = loop, tuple(files)
@@ -83,13 +89,13 @@ class ArrayLog(LoggedSource):
         shown = list(self.arrays.values())
         firsts = [_pixels(array[:1])[0] for array in shown]
         _refuse_unlike(dict(zip(self.arrays, firsts, strict=True)))
-        self._color = options.color is True
-        self.framings = framings(firsts, options.size, options.fit, color=self._color)
+        self.color = options.color is True
+        self.framings = framings(firsts, options.size, options.fit, color=self.color)
         self._count = min(map(len, shown))
         self._about = {
             "size": list(self.framings[0].shape),
             "fit": options.fit,
-            **({"color": "red, green and blue beside one another"} if self._color else {}),
+            **({"color": "red, green and blue beside one another"} if self.color else {}),
             "recipe": RECIPE,
         }
         kind = "uint8" if isinstance(self.framings[0], Framing) else "float64"
@@ -136,7 +142,7 @@ class ArrayLog(LoggedSource):
 
     def _image(self, picture: Shown) -> Shown:
         """A picture in gray, or in colours where these are wanted."""
-        if picture.ndim == 2 or self._color:
+        if picture.ndim == 2 or self.color:
             return picture
         data = np.ascontiguousarray(picture).reshape(-1).data
         return raw_image(data, picture.shape[0], picture.shape[1], "rgb8")

@@ -134,3 +134,31 @@ def test_what_has_no_first_frames_or_colours_to_look_at_is_refused(
         assert remedy in refused.err
     with pytest.raises(UsageError, match="give on, off or auto"):
         ImageOptions(color="red")  # type: ignore[arg-type]
+
+
+def test_arrays_of_pictures_are_looked_at_as_logs_are(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    for name, frames in (("turns", COLOR["hue alone"]), ("grey", GREY["grey"])):
+        pictures = np.stack(np.split(np.repeat(frames, 5, axis=0), 3, axis=2), axis=3)
+        np.save(tmp_path / f"{name}.npy", pictures)
+    np.save(tmp_path / "numbers.npy", np.arange(200.0))
+    how = (
+        "--color",
+        "auto",
+        "--no-rerun",
+        "--max-iterations",
+        "2",
+        "--force",
+        "-o",
+        tmp_path / "r",
+    )
+    for name, said, width in (
+        ("turns", "frames show red, green and blue", 3 * W),
+        ("grey", "frames are grey", W),
+    ):
+        assert said in cdmisfa("learn", tmp_path / f"{name}.npy", *how).err
+        run = json.loads((tmp_path / "r" / "run.json").read_text())
+        assert run["source"]["size"] == [H, width]
+        assert run["command"]["color"] is (width == 3 * W)
+    refused = cdmisfa("learn", tmp_path / "numbers.npy", *how)
+    assert refused.code == 2
+    assert "--color is for images" in refused.err
