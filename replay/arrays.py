@@ -79,8 +79,8 @@ class ArrayLog(LoggedSource):
         options = options or CameraOptions()
         _refuse_options(options)
         if options.color == "auto":
-            shown = type(self)(streams, replace(options, color=True), loop=loop, files=files)
-            options = replace(options, color=shows_hue(shown))
+            colors = type(self)(streams, replace(options, color=True), loop=loop, files=files)
+            options = replace(options, color=shows_hue(colors))
             self.notes = (CHOSEN[options.color is True],)
         if not streams:
             raise UsageError("no array given: name one at least")
