@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import threading
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +20,11 @@ from message_files import every, write_mcap
 from cdmisfa.core.errors import LogDamagedError
 from recorder.images import pixels
 from recorder.images.decoding import MessageKind
-from replay.camera_logs import stream
+from replay.camera_logs import ahead, stream
 from replay.camera_logs.source import ForeignSource
 
 COUNT = 90
-BROKEN = (0, 17, 18, 60)
+BROKEN = (0, 17, 18, 21, 60)
 
 
 def messages(*broken: int) -> list[bytes]:
@@ -71,7 +74,7 @@ def test_threads_change_no_frame_and_no_error(
     log = write(tmp_path / "log.mcap" if write.__name__ == "write" else tmp_path / "log", *broken)
     found = {}
     for cores in (1, 2, 5):
-        monkeypatch.setattr(stream, "CORES", cores)
+        monkeypatch.setattr(ahead, "CORES", cores)
         found[cores] = shown(log, salvage=salvage)
     frames, said, error = found[1]
     assert (len(frames) == -(-COUNT // 7)) == (salvage or not broken)
@@ -84,15 +87,16 @@ def test_threads_change_no_frame_and_no_error(
 def test_few_pictures_are_held_and_each_is_decoded_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "CORES", 3)
+    monkeypatch.setattr(ahead, "CORES", 3)
     waiting: list[int] = []
-    begin = stream.Begun.begin
+    begin = ahead.DecodingAhead._begin
 
-    def counted(self: stream.Begun, row: int, *args: object, **how: object) -> None:
-        begin(self, row, *args, **how)  # type: ignore[arg-type]
-        waiting.append(len(self._coming))
+    def counted(self: ahead.DecodingAhead) -> None:
+        before = len(self._begun)
+        begin(self)
+        waiting.extend(range(before + 1, len(self._begun) + 1))
 
-    monkeypatch.setattr(stream.Begun, "begin", counted)
+    monkeypatch.setattr(ahead.DecodingAhead, "_begin", counted)
     frames, _, _ = shown(write(tmp_path / "log.mcap"))
     assert (sum(map(len, frames)), len(waiting)) == (COUNT, COUNT - 1)
     assert max(waiting) <= 2 * 3
@@ -102,6 +106,98 @@ def test_few_pictures_are_held_and_each_is_decoded_once(
             source.take_all(7)
     assert len(waiting) < COUNT
     assert max(waiting) <= 2 * 3
+
+
+def two(path: Path, *broken: int) -> Path:
+    kind = MessageKind("foxglove.CompressedImage", "protobuf")
+    shown = messages(*broken)
+    write_mcap(path, kind, {"/a": every(40_000_000, shown), "/b": every(40_000_000, shown[::-1])})
+    return path
+
+
+def anyhow(path: Path) -> list[np.ndarray | str]:
+    """What is asked for without a plan: either stream, both at once, other places."""
+    found: list[np.ndarray | str] = []
+    order = np.random.default_rng(0)
+    with contextlib.closing(ForeignSource(path, ["/a", "/b"], loop=True, rate=25)) as source:
+        for what in order.integers(0, 6, 60).tolist():
+            n = int(order.integers(1, 20))
+            try:
+                if what == 0:
+                    source.seek(int(order.integers(0, 3 * COUNT)))
+                elif what < 3:
+                    found += [block.frames for block in source.take_all(n)]
+                else:
+                    found.append(source.take(what % 2, n).frames)
+            except LogDamagedError as error:
+                found.append(str(error))
+                source.seek(source.t + n)
+    return found
+
+
+@pytest.mark.parametrize("broken", [(), (5, 30, 31)])
+def test_whatever_is_asked_for_next_frames_and_errors_are_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: tuple[int, ...]
+) -> None:
+    log, held = two(tmp_path / "log.mcap", *broken), []
+    pop = ahead.DecodingAhead.pop
+    monkeypatch.setattr(
+        ahead.DecodingAhead,
+        "pop",
+        lambda self, place: (held.append(len(self._begun)), pop(self, place))[1],
+    )
+    monkeypatch.setattr(ahead, "CORES", 1)
+    expected = anyhow(log)
+    assert any(isinstance(one, str) for one in expected) == bool(broken)
+    for cores in (2, 3):
+        monkeypatch.setattr(ahead, "CORES", cores)
+        held.clear()
+        for one, other in zip(anyhow(log), expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert max(held) <= 2 * cores
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_between_blocks_the_next_pictures_are_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, together: bool
+) -> None:
+    monkeypatch.setattr(ahead, "CORES", 2)
+    before = threading.active_count()
+    with contextlib.closing(
+        ForeignSource(two(tmp_path / "log.mcap"), ["/a", "/b"], rate=25)
+    ) as source:
+        take = source.take_all if together else functools.partial(source.take, 1)
+        for _ in range(3):
+            take(7)
+            following = [(int(not together), source.t + i) for i in range(4)]
+            assert list(source._ahead._begun) == following
+        begun = list(source._ahead._begun.values())
+        take(7)
+        assert all(one is not None and one.done() for one in begun)
+        assert threading.active_count() > before
+        source.seek(source.end - 2)
+        take(2)
+        assert not source._ahead._begun
+        source.seek(0)
+        take(1)
+        assert source._ahead._begun
+    assert not source._ahead._begun
+    assert threading.active_count() == before
+
+
+def test_an_interrupt_leaves_no_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ahead, "CORES", 2)
+    before, log = threading.active_count(), write(tmp_path / "log.mcap")
+    with contextlib.closing(ForeignSource(log, rate=25)) as source:
+        source.take(0, 7)
+        monkeypatch.setattr(Future, "exception", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            source.take(0, 7)
+    assert threading.active_count() == before
+
+
+def interrupted(self: Future[Any]) -> None:
+    raise KeyboardInterrupt
 
 
 def test_large_pictures_are_left_to_one_thread(

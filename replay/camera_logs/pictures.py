@@ -9,7 +9,7 @@ import contextlib
 import re
 from array import array
 from collections.abc import Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
@@ -26,7 +26,7 @@ from recorder.images.videos import frame_colors, frame_gray, pyav
 from recorder.images.whole import MalformedImage, check_png
 from recorder.mcap.records import MalformedRecord, Problem
 from replay.camera_logs.containers import extent_of
-from replay.camera_logs.stream import Begun, ImageStream, UnreadableError, explained, sorted_times
+from replay.camera_logs.stream import ImageStream, UnreadableError, begun, explained, sorted_times
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
 
@@ -50,7 +50,6 @@ class FolderImages(ImageStream):
 
     def __init__(self, path: Path, topic: str | None, *, color: bool = False) -> None:
         self.path, self._color = path, color
-        self._begun = Begun()
         self.topic = path.resolve().name
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a folder of pictures has no topics, leave {topic} out")
@@ -68,14 +67,14 @@ class FolderImages(ImageStream):
     def count(self) -> int:
         return len(self._files)
 
-    def begin(self, row: int, threads: Executor) -> None:
-        with contextlib.suppress(CdmisfaError):
+    def begin(self, row: int, threads: Executor) -> Future[ByteArray] | None:
+        try:
             data = read_regular(self._files[row], MAX_PICTURE)
-            self._begun.begin(row, threads, data, color=self._color)
+        except CdmisfaError:
+            return None
+        return begun(threads, data, color=self._color)
 
     def image(self, row: int) -> ByteArray:
-        if (shown := self._begun.pop(row)) is not None:
-            return shown
         try:
             data = read_regular(self._files[row], MAX_PICTURE)
         except UsageError as error:

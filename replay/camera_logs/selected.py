@@ -1,18 +1,20 @@
-"""Streams made of others: joined, cut, in another order, and with broken images replaced."""
+"""Streams made of others, joined, cut, in order, broken images replaced; and copies of others."""
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import IntArray
+from cdmisfa.core.arrays import ByteArray, IntArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import stream_name, stream_names
@@ -31,6 +33,12 @@ BROKEN = (MalformedImage, MalformedRecord, UnreadableError)
 
 SALVAGE: Final = "learn and convert pass over what is broken with --salvage"
 """What to do about it."""
+
+_COMPARED: Final = 9
+"""Images of two streams that are compared, from the first to the last."""
+
+_NUMBERS: Final = 256
+"""As many where they are numbers, of which few can be the same by chance."""
 
 
 class Selected(ImageStream):
@@ -73,9 +81,9 @@ class Selected(ImageStream):
         stream, own = self._at(row)
         return stream.image(own)
 
-    def begin(self, row: int, threads: Executor) -> None:
+    def begin(self, row: int, threads: Executor) -> Future[ByteArray] | None:
         stream, own = self._at(row)
-        stream.begin(own, threads)
+        return stream.begin(own, threads)
 
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
         stream, own = self._at(row)
@@ -339,3 +347,42 @@ def _in_folders(stream: ImageStream, folders: int) -> str:
         own = f"{path.stem}/{own}"
     above = Path(str(path) if isinstance(path, Url) else os.path.abspath(path)).parts[:-1]
     return "/".join([*above[max(len(above) - folders, 0) :], own])
+
+
+def copies(streams: Sequence[ImageStream]) -> Iterator[str]:
+    """A line for each stream that shows the same as one before it, of another log.
+
+    Their times are the same, and some of their images.
+    """
+    counts = Counter(stream.count for stream in streams)
+    known: dict[tuple[int, bytes], list[ImageStream]] = {}
+    for stream in streams:
+        if counts[stream.count] < 2 or (first := _shown(stream, 0)) is None:
+            continue
+        alike = known.setdefault((stream.count, first), [])
+        other = next((other for other in alike if _same(other, stream)), None)
+        if other is None:
+            alike.append(stream)
+        else:
+            yield (
+                f"{stream.path}: {stream.topic} shows the same as {other.topic} of {other.path}, "
+                "as a copy does"
+            )
+
+
+def _same(one: ImageStream, two: ImageStream) -> bool:
+    if one.path == two.path or not np.array_equal(one.times, two.times):
+        return False
+    most = _NUMBERS if one.fields else _COMPARED
+    rows = np.unique(np.linspace(0, one.count - 1, most).astype(int)).tolist()
+    pairs = ((_shown(one, row), _shown(two, row)) for row in rows)
+    return all(first is not None and first == second for first, second in pairs)
+
+
+def _shown(stream: ImageStream, row: int) -> bytes | None:
+    """What identifies an image, None of one that cannot be read."""
+    try:
+        image = stream.image(row)
+    except (*BROKEN, LogDamagedError, UsageError):
+        return None
+    return hashlib.sha256(repr(image.shape).encode() + image.tobytes()).digest()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from recorder.images.fields import rounded
 from recorder.images.framing import framings
 from recorder.images.options import COLOR_RECIPE
 from recorder.images.pixels import DISTANCES, Shown, UnknownPixels
+from replay.camera_logs.ahead import AheadSource, DecodingAhead
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
@@ -36,7 +36,6 @@ from replay.camera_logs.alignment import (
     step_of,
     unlike,
 )
-from replay.camera_logs.copies import copies
 from replay.camera_logs.hue import CHOSEN, shows_hue
 from replay.camera_logs.mcap_log import Readers
 from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
@@ -45,12 +44,12 @@ from replay.camera_logs.selected import (
     BROKEN,
     SALVAGE,
     WholeImages,
+    copies,
     excerpts,
     join_parts,
     names_of,
 )
-from replay.camera_logs.stream import CORES, ImageStream, decoding_ahead
-from replay.storage.identity import Identity, LoggedSource
+from replay.storage.identity import Identity
 from replay.storage.location import Location, Url
 from replay.stored import Span, outside
 
@@ -59,7 +58,7 @@ class UnequalError(UsageError):
     """Streams that are on no common clock unless they are aligned."""
 
 
-class ForeignSource(LoggedSource):
+class ForeignSource(AheadSource):
     """Other people's logs on one clock: images of cameras, gray and small, or numbers.
 
     Args:
@@ -113,10 +112,10 @@ class ForeignSource(LoggedSource):
         self.color = bool(options.color)
         self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
-        self._streams: list[ImageStream] = []
-        self._readers, self._threads = Readers(), ThreadPoolExecutor(CORES)
+        self._streams = []
+        self._readers, self._ahead = Readers(), DecodingAhead()
         self.changes: dict[int, str] = {}
-        self._shown: dict[int, tuple[int, Shown]] = {}
+        self._shown = {}
         try:
             self._open()
             try:
@@ -275,14 +274,15 @@ class ForeignSource(LoggedSource):
         for stream in self._streams:
             stream.close()
         self._readers.close()
-        self._threads.shutdown()
+        self._ahead.close()
 
     def _block(self, stream: int, t: int, n: int) -> Block:
         """The frames of a stream; an image smaller than a frame is a UsageError."""
         frames = np.empty((n, *self._spec.frame_shape), self._spec.dtype)
         rows = self._rows[stream][np.arange(t, t + n) % self._count].tolist()
-        images, shown = self._streams[stream], self._shown.get(stream, (-1,))[0]
-        for i, row in enumerate(decoding_ahead(images, rows, shown, self._threads)):
+        if self._spec.images:
+            self._expect(stream, t, rows)
+        for i, row in enumerate(rows):
             frames[i] = self._frame(stream, row)
         return Block(stream, t, freeze(frames), freeze(np.empty((n, 0))))
 
@@ -312,6 +312,8 @@ class ForeignSource(LoggedSource):
 
     def _image(self, stream: int, row: int) -> Shown:
         """A stream's image as it is."""
+        if (begun := self._ahead.pop((stream, row))) is not None:
+            return begun
         images = self._streams[stream]
         try:
             return images.image(row)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Final, TypeVar
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.processes import thread_count
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
 from recorder.images.messages import PACKED, SCHEMAS, Decoder, packed_picture, stated_format
@@ -29,9 +27,6 @@ from replay.storage.location import Location
 class UnreadableError(LogDamagedError):
     """A library cannot read a file."""
 
-
-CORES: Final = thread_count()
-"""Images of a stream that are decoded at once."""
 
 LAST_NS: Final = 2**62
 """Log times from here on are beyond any clock, in nanoseconds."""
@@ -115,8 +110,9 @@ class ImageStream(ABC):
             LogDamagedError: the log is damaged there.
         """
 
-    def begin(self, row: int, threads: Executor) -> None:  # noqa: B027 - some cannot be ahead
-        """Begin to decode an image that is asked for soon; what is wrong with it shows then."""
+    def begin(self, row: int, threads: Executor) -> Future[ByteArray] | None:
+        """Begin to decode a picture that is asked for soon; None of what cannot be."""
+        return None
 
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
         """Apply a function to the bytes of a message; raises as `image`."""
@@ -150,21 +146,9 @@ class ImageStream(ABC):
         """Let go of the files; harmless when called twice."""
 
 
-class Begun:
-    """Pictures that are decoded in threads before they are asked for."""
-
-    def __init__(self) -> None:
-        self._coming: dict[int, Future[ByteArray]] = {}
-
-    def begin(self, row: int, threads: Executor, data: bytes, *, color: bool) -> None:
-        """Begin to decode the picture of a row, a JPEG or PNG."""
-        decode = partial(compressed_image, color=color, most=AT_ONCE)
-        self._coming[row] = threads.submit(decode, data)
-
-    def pop(self, row: int) -> ByteArray | None:
-        """The picture of a row; None where it was not begun, or who asks shall see why not."""
-        coming = self._coming.pop(row, None)
-        return None if coming is None or coming.exception() is not None else coming.result()
+def begun(threads: Executor, data: bytes, *, color: bool) -> Future[ByteArray]:
+    """Begin to decode a JPEG or PNG."""
+    return threads.submit(compressed_image, data, color=color, most=AT_ONCE)
 
 
 class MessageImages(ImageStream):
@@ -183,20 +167,17 @@ class MessageImages(ImageStream):
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found: ...
 
     def image(self, row: int) -> Shown:
-        shown = self._begun.pop(row)
-        return self.taken(row, self.decode) if shown is None else shown
+        return self.taken(row, self.decode)
 
-    def begin(self, row: int, threads: Executor) -> None:
+    def begin(self, row: int, threads: Executor) -> Future[ByteArray] | None:
         kind = self.kind.schema, self.kind.encoding
         if kind not in PACKED or self.fields:
-            return
-        with suppress(CdmisfaError):
-            if (data := self.taken(row, partial(packed_picture, *kind))) is not None:
-                self._begun.begin(row, threads, data, color=self.color)
-
-    @cached_property
-    def _begun(self) -> Begun:
-        return Begun()
+            return None
+        try:
+            data = self.taken(row, partial(packed_picture, *kind))
+        except CdmisfaError:
+            return None
+        return None if data is None else begun(threads, data, color=self.color)
 
     def pixels(self) -> str | None:
         return self.taken(0, partial(stated_format, self.kind.schema, self.kind.encoding))
@@ -211,30 +192,6 @@ class MessageImages(ImageStream):
     @cached_property
     def _stamp(self) -> Stamp | None:
         return stamp_of(self.kind)
-
-
-def decoding_ahead(
-    images: ImageStream, rows: Sequence[int], shown: int, threads: Executor
-) -> Iterator[int]:
-    """Rows in their order, of which the next are decoded in threads meanwhile.
-
-    No more than two images a thread are held; with one thread none is begun.
-
-    Args:
-        images: the stream.
-        rows: of it.
-        shown: the row that is decoded already.
-        threads: `CORES`.
-    """
-    coming = iter([row for row in dict.fromkeys(rows) if row != shown] if CORES > 1 else ())
-    count = 2 * CORES
-    for row in rows:
-        if row != shown:
-            for one in itertools.islice(coming, count):
-                images.begin(one, threads)
-            count = 1
-        yield row
-        shown = row
 
 
 def choose_images(
