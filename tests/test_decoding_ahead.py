@@ -204,6 +204,7 @@ def test_large_pictures_are_left_to_one_thread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They are decoded within a limit of memory, which is of the whole process."""
+    monkeypatch.setattr(ahead, "CORES", 2)
     log, limits = write(tmp_path / "log.mcap"), list[int]()
     budget = pixels.budget
     monkeypatch.setattr(pixels, "budget", lambda: limits.append(1) or budget())
