@@ -73,13 +73,13 @@ class DecodingAhead:
 class AheadSource(LoggedSource):
     """A source of streams of images, of which those that follow a block are decoded meanwhile."""
 
-    _ahead: DecodingAhead
-    _streams: list[ImageStream]
     _rows: Sequence[Rows]
     """Which image of each stream every frame shows."""
-    _shown: dict[int, tuple[int, Shown]]
-    """The last of each stream that was decoded, and its row."""
-    _together: bool = False
+
+    def __init__(self) -> None:
+        self._ahead, self._together = DecodingAhead(), False
+        self._streams: list[ImageStream] = []
+        self._shown: dict[int, tuple[int, Shown]] = {}  # the last of each, and its row
 
     def take_all(self, n: int) -> tuple[Block, ...]:
         """See `StoredSource`."""

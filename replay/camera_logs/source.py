@@ -18,7 +18,7 @@ from recorder.images.fields import rounded
 from recorder.images.framing import framings
 from recorder.images.options import COLOR_RECIPE
 from recorder.images.pixels import DISTANCES, Shown, UnknownPixels
-from replay.camera_logs.ahead import AheadSource, DecodingAhead
+from replay.camera_logs.ahead import AheadSource
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
@@ -112,10 +112,8 @@ class ForeignSource(AheadSource):
         self.color = bool(options.color)
         self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
-        self._streams = []
-        self._readers, self._ahead = Readers(), DecodingAhead()
-        self.changes: dict[int, str] = {}
-        self._shown = {}
+        self._readers, self.changes = Readers(), dict[int, str]()
+        super().__init__()
         try:
             self._open()
             try:
