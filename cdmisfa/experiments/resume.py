@@ -148,7 +148,7 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     except UsageError:
         if not words:
             raise
-    as_begun = not words or words[0] in SCENES
+    as_begun = not words or words[0] in SCENES or bool(begun.get("episodes"))
     words = tuple(words) or named
     if is_live(words[0]):
         raise UsageError(f"{words[0]} was live: name what learn --record wrote of it")

@@ -211,8 +211,14 @@ class Application:
         """What gives as `to`, of blocks of the clock that are handed to it one after the other.
 
         Raises:
-            UsageError: the modules do not take these frames, nor larger ones.
+            UsageError: the modules do not take these frames, nor larger ones, or learned from
+                whole episodes.
         """
+        if self.recipe.centre == "episode":
+            raise UsageError(
+                "the modules learned from frames without the mean of their episode, which is known "
+                "when it is over: name a run of learn without --centre episode"
+            )
         self.recipe.of_frames(np.zeros((1, *spec.frame_shape), spec.dtype))
         judged, made = self._judged(spec), self.recipe.of_frames
         return lambda blocks: judged(
