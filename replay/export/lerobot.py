@@ -48,7 +48,7 @@ ACTIONS, STATE, WORLD = "action", "observation.state", "observation.environment_
 
 ABOUT = """# {name}
 
-Made by cdmisfa, as a LeRobot dataset ({version}): {episodes} in all {frames} at {fps} frames per
+Made by cdmisfa, as a LeRobot dataset ({version}): {episodes}, {frames} in all, at {fps} frames per
 second. `meta/info.json` names its features.
 
 ```python
