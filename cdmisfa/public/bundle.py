@@ -21,6 +21,7 @@ from cdmisfa.experiments.resume import read_command
 from cdmisfa.public.crate import LEARNED, METADATA, RUN, SOURCE, About, description
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from recorder.world.scenes import SCENES
+from replay.arrays import ENDINGS
 from replay.camera_logs.opening import image_logs
 from replay.corpus.finding import may_be_corpus
 from replay.inputs import locations
@@ -117,8 +118,14 @@ def write_bundle(
 
 
 def is_bundle(path: Path) -> bool:
-    """Whether a path is that of a bundle, or of a file that can only be meant as one."""
-    return path.is_file() and (path.suffix.lower() == ".zip" or begun(path).startswith(_ZIP))
+    """Whether a path is that of a bundle, or of a file that can only be meant as one.
+
+    Arrays of NumPy are zip files, too.
+    """
+    ending = path.suffix.lower()
+    return path.is_file() and (
+        ending == ".zip" or (ending not in ENDINGS and begun(path).startswith(_ZIP))
+    )
 
 
 @contextlib.contextmanager
