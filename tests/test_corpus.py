@@ -447,10 +447,11 @@ class TestQuery:
         assert cdmisfa("index", tmp_path / "missing").code == 2
 
 
-def test_the_commands_of_the_page_work(
+def test_the_commands_of_the_pages_work(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page = (ROOT / "docs" / "how-to" / "corpus.md").read_text("utf-8")
+    pages = (ROOT / "docs" / "how-to" / f"{name}.md" for name in ("corpus", "curate", "episodes"))
+    page = "".join(file.read_text("utf-8") for file in pages)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
     lines = "".join(re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)).splitlines()

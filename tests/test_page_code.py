@@ -6,7 +6,6 @@ import contextlib
 import io
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 
 import cdmisfa
-from replay.runs.modules import save_modules
 
 ROOT = Path(__file__).parents[1]
 OF_A_PLUGIN = "plugins.md"  # parts of the toy's files: tests/test_plugins.py compares them
@@ -85,12 +83,6 @@ def of_a_box(out: str) -> cdmisfa.Run:
     """A run on a shade that comes and goes."""
     drift = 128 + 100 * np.sin(np.arange(3000) / 60)[:, None, None] * np.linspace(0, 1, 128)
     return cdmisfa.learn(np.repeat(drift.astype(np.uint8), 48, axis=1), out, max_modules=1)
-
-
-def test_export(ran: Callable[..., Ran]) -> None:
-    (box,) = of_a_box("runs/icub").modules
-    save_modules(Path("runs/icub/modules.npz"), [box, replace(box, index=2)])
-    assert len(ran("export.md")["run"].modules) == 2
 
 
 def test_applying(ran: Callable[..., Ran]) -> None:

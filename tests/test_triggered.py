@@ -337,7 +337,7 @@ def test_a_disk_that_is_full_is_one_line(tmp_path: Path) -> None:
 def test_the_commands_of_the_page_work(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page = (ROOT / "docs" / "how-to" / "cameras.md").read_text("utf-8")
+    page = (ROOT / "docs" / "how-to" / "novel.md").read_text("utf-8")
     monkeypatch.chdir(tmp_path)
     lines = "".join(re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)).splitlines()
     assert lines
