@@ -189,9 +189,11 @@ def test_other_outputs_are_replaced_only_by_force(
     assert (refused.code, refused.err.count("\n")) == (2, 1)
     assert "holds what was made with other options: choose another folder, or" in refused.err
     (logs / "a.mcap").unlink()
+    (out / "notes.csv").write_text("mine")
     forced = cdmisfa(*words, "--frames", 30, "--force", "--to", "csv")
     assert forced.code == 0, forced.err
-    assert sorted(name.rpartition(".")[2] for name in files(out)) == ["csv"] * 3
+    assert files(out).pop("notes.csv") == b"mine"
+    assert sorted(name.rpartition(".")[2] for name in files(out)) == ["csv"] * 4
     shutil.copytree(run, tmp_path / "moved")
     moved = cdmisfa("apply", tmp_path / "moved", logs, "-o", out, "--frames", 30, "--to", "csv")
     assert "3 logs: 0 applied to now, 3 before" in moved.out

@@ -41,7 +41,7 @@ COMMANDLINE = click.core.ParameterSource.COMMANDLINE
 MOST_SAID = 20
 """Logs of which is said what went wrong."""
 
-OF_FILES = ("parquet", "csv", "mcap", "rrd")
+FILE_FORMS = ("parquet", "csv", "mcap", "rrd")
 STDOUT, FOXGLOVE = AS_THEY_COME = ("stdout", "foxglove")
 
 log_options = options_of(
@@ -62,7 +62,7 @@ log_options = options_of(
     "--to",
     multiple=True,
     metavar="FORM|TIME",
-    help=f"What is written, {', '.join(OF_FILES)}; or where blocks go as they come: {STDOUT}, as "
+    help=f"What is written, {', '.join(FILE_FORMS)}; or where blocks go as they come: {STDOUT}, as "
     f"JSON lines, {FOXGLOVE}, of live streams as a robot; or leave out images from this TIME on.",
 )
 @number("--port", "Where --to foxglove is served, on this machine.", 0, 65535)
@@ -115,7 +115,7 @@ def apply_command(
     if out is not None and is_folder(out) and are_logs(source):
         if outlet.way == STDOUT:
             raise UsageError("--to stdout is for what is applied at once: leave out -o FOLDER")
-        where |= {"form": outlet.form or OF_FILES[0], "cameras": cameras, "force": force}
+        where |= {"form": outlet.form or FILE_FORMS[0], "cameras": cameras, "force": force}
         where |= {"frames": frames, "loop": loop, "salvage": salvage}
         _apply_to_many(ctx, run, source, out, as_json=as_json, **where)
         return
@@ -283,14 +283,14 @@ def outlet_of(ctx: click.Context, words: Sequence[str], port: int | None) -> Out
     """Read what --to says, each kind of it once."""
     found = Outlet(port=port)
     for word in words:
-        if word in OF_FILES:
+        if word in FILE_FORMS:
             found = replace(found, form=word)
         elif word in AS_THEY_COME:
             found = replace(found, way=word)
         elif word[:1].isdigit():
             found = replace(found, until=WRITTEN[TIME].convert(word, None, ctx))
         else:
-            names = ", ".join((*OF_FILES, *AS_THEY_COME))
+            names = ", ".join((*FILE_FORMS, *AS_THEY_COME))
             raise UsageError(f"--to {word}: name {names}, or a time, as 1:30")
     if port is not None and found.way != FOXGLOVE:
         raise UsageError("--port goes with --to foxglove")
@@ -334,8 +334,8 @@ def is_folder(out: Path) -> bool:
     ending = out.suffix.lower().removeprefix(".")
     if out.is_dir() or not ending:
         return True
-    if ending not in OF_FILES:
-        endings = ", ".join(f".{one}" for one in OF_FILES)
+    if ending not in FILE_FORMS:
+        endings = ", ".join(f".{one}" for one in FILE_FORMS)
         raise UsageError(f"{out}: name a file with {endings}, or a folder without an ending")
     return False
 

@@ -29,7 +29,6 @@ from cdmisfa.experiments.store import (
     trial_id,
 )
 from recorder.log.files import (
-    OF_FILES,
     found_path,
     held,
     make_folder,
@@ -280,10 +279,11 @@ def _agreed(folder: Path, asked: Mapping[str, Any], *, force: bool) -> str:
 
 
 def _clear(folder: Path) -> None:
-    """Remove all outputs, and what is known of them, where there are some."""
+    """Remove the outputs, and what is known of them; other files stay."""
     if (folder / REQUEST).exists():
-        there = [path for path in folder.parent.iterdir() if path.suffix in OF_FILES]
-        for path in (*there, folder / ROWS, folder / REQUEST):
+        names = [Path(row["run"]).name for row in read_rows(folder) if row.get("run")]
+        outputs = [folder.parent / name for name in names]
+        for path in (*outputs, folder / ROWS, folder / REQUEST):
             path.unlink(missing_ok=True)
 
 
