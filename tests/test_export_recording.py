@@ -259,6 +259,11 @@ def test_segments_of_recordings_become_episodes_of_a_dataset(cdmisfa, tmp_path):
     how = {"lossless": True, "segments": tmp_path / "look.csv"}
     assert export([], out, "lerobot", force=True, **how) == 23
     assert contents(out) == before
+    lines[0] += ",topic"
+    lines[1] += ",/view/left"  # all topics are wanted of its other segments
+    (tmp_path / "look.csv").write_text("\n".join(lines))
+    assert export([], out, "lerobot", force=True, **how) == 23
+    assert contents(out) == before
     record_images(tmp_path / "three", (24, 42))
     for text, why in {
         f"path,start,stop\none,0,{10**18}": "one: no frame of it lies in its segments",

@@ -66,9 +66,15 @@ def logs_of_segments(listed: Path) -> list[Wanted]:
             raise UsageError(f"{listed}: a segment names no log: give each row a path")
         name = segment.log or str(place)
         own = found.setdefault(name, Wanted(name, []))
-        own.files.extend({place}.difference(own.files))
-        own.times.extend({(segment.start, segment.stop)}.difference(own.times))
-        own.topics.extend({segment.topic}.difference({"*", *own.topics}))
+        if place not in own.files:
+            own.files.append(place)
+        if (times := (segment.start, segment.stop)) not in own.times:
+            own.times.append(times)
+        if segment.topic not in own.topics:
+            own.topics.append(segment.topic)
+    for own in found.values():
+        if "*" in own.topics:
+            own.topics.clear()
     return list(found.values())
 
 
