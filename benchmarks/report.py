@@ -16,6 +16,7 @@ import numpy as np
 
 from cdmisfa import kernels
 from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.names import counted
 from cdmisfa.experiments.documents import markdown
 
 RESULTS = Path(__file__).parent / "results"
@@ -104,10 +105,8 @@ def section(document: Mapping[str, Any], data: str = "") -> str:
     of = f" {document['code']}" if "code" in document else ""
     end = f"Measured{of} on: {facts}."
     if data:
-        others = f" {len(tables) - 1} more {'tables' if tables[2:] else 'table'} and" * bool(
-            tables[1:]
-        )
-        tables, end = tables[:1], f"Measured{of};{others} the machine: [{Path(data).name}]({data})."
+        more = f"{counted(len(tables) - 1, 'more table')} and " if tables[1:] else ""
+        tables, end = tables[:1], f"Measured{of}; {more}the machine: [{Path(data).name}]({data})."
     return "\n\n".join([f"## {document['title']}", document["note"], *tables, end])
 
 

@@ -63,6 +63,10 @@ def test_a_page_shows_when_what_was_recorded_and_what_is_wrong(
         done = cdmisfa("view", corpus, *words)
         assert done.code == 2
         assert "is many logs, of which a page is made" in done.err
+    (corpus / "table.csv").write_text("x\n1\n2\n")
+    assert [cdmisfa(what, corpus).code for what in ("index", "view")] == [0, 0]
+    page = (corpus / "corpus.html").read_text("utf-8")
+    assert '<li class=""><div class="name">table.csv</div>' in page  # no pictures, and not broken
 
 
 def test_a_recording_and_a_table_stay_what_they_are(

@@ -1,4 +1,4 @@
-"""What streams and columns are called, whatever a log calls them; how many there are."""
+"""What streams and columns are called, whatever a log calls them; how many, and how long."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import itertools
 import re
 import unicodedata
 from collections.abc import Iterable
+from datetime import timedelta
 
 _OF_VIEWS = re.compile(r"(/view/|observation\.images\.)+(?=.)")
 _LONGEST = 64
@@ -18,6 +19,11 @@ task begins, or that is a joint of the robot."""
 def counted(number: int, what: str, form: str = "") -> str:
     """How many there are, as 1 block or 2 blocks; the number in such a format, as ','."""
     return f"{number:{form}} {what}{'' if number == 1 else 's'}"
+
+
+def lasting(seconds: float | None) -> str:
+    """A length of time, as 1:02:03; a line where it is not known."""
+    return "-" if seconds is None else str(timedelta(seconds=round(seconds)))
 
 
 def stream_name(said: str) -> str:

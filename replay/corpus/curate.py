@@ -23,7 +23,7 @@ from cdmisfa.core.processes import WorkerDied, run_all
 from recorder.log.files import atomic_write, refuse_existing
 from replay.corpus.choosing import rarity, scale, spread_out
 from replay.corpus.index import indexed_logs
-from replay.corpus.judging import NOISE, NONE, VERDICTS, Applies, Judged, Watched, judge, open_log
+from replay.corpus.judging import NOISE, NONE, VERDICTS, Applies, Judged, Watched, judge, open_for
 from replay.report.curated import Curated, report_of_segments
 
 SHOWN: Final = 60
@@ -287,7 +287,7 @@ def _pictures(
 ) -> list[tuple[str, list[Any]]]:
     """Some pictures of each stream of a segment, evenly from its first to its last."""
     found: list[tuple[str, list[Any]]] = []
-    with contextlib.closing(open_log(log.files, known)) as source:
+    with contextlib.closing(open_for(log.files, known)) as source:
         start, stop = segment["t"]
         stop = min(stop, source.first_frame + source.frames)
         at = np.unique(np.linspace(max(start, source.first_frame), stop - 1, PICTURES).astype(int))

@@ -181,7 +181,7 @@ class Watched:
         return float(away.max()) / self.size
 
 
-def open_log(files: Sequence[str], known: Applies | None) -> Any:
+def open_for(files: Sequence[str], known: Applies | None) -> Any:
     """Open a log as modules take it or, without, as it is; what is damaged is passed over."""
     if known is not None:
         return known.open(files, salvage=True)
@@ -191,7 +191,7 @@ def open_log(files: Sequence[str], known: Applies | None) -> Any:
 def judge(files: Sequence[str], known: Applies | None, watched: Watched | None) -> Judged | str:
     """Judge the blocks of a log; in words, why it cannot be."""
     try:
-        with contextlib.closing(open_log(files, known)) as source:
+        with contextlib.closing(open_for(files, known)) as source:
             return _judged(source, known, watched)
     except CdmisfaError as error:
         return str(error)

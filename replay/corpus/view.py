@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,15 +13,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.core.names import counted
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.names import counted, lasting
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.corpus.curate import STREAMS
 from replay.corpus.finding import INDEX
 from replay.corpus.index import IndexedLog, indexed_logs, is_index, read_index
-from replay.corpus.judging import open_log
 from replay.corpus.query import ask, summary
+from replay.inputs import open_to_look
 from replay.report.indexed import Recorded, report_of_index
+from replay.storage.location import location
 
 CARDS: Final = 24
 """Logs of which the first frames are shown."""
@@ -77,13 +78,13 @@ def view_index(
         cards.append(_card(log))
         told(number + 1, len(shown))
     kinds = [
-        (k["kind"], f"{k['logs']:,}", f"{k['files']:,}", f"{k['streams']:,}", _long(k["seconds"]),
+        (k["kind"], f"{k['logs']:,}", f"{k['files']:,}", f"{k['streams']:,}", lasting(k["seconds"]),
          f"{(k['bytes'] or 0) / 1e6:,.1f} MB")
         for k in found.kinds
     ]  # fmt: skip
     many = {name: sum(k[name] or 0 for k in found.kinds) for name in ("logs", "streams", "seconds")}
     lead = f"{counted(many['logs'], 'log', ',')} of {counted(many['streams'], 'stream', ',')}, "
-    lead += f"{_long(many['seconds'])} long: {found.counts['broken']:,} broken, "
+    lead += f"{lasting(many['seconds'])} long: {found.counts['broken']:,} broken, "
     lead += f"{found.counts['double']:,} there more than once."
     broken = [(row["path"], row["problem"]) for row in found.broken]
     double = [(row["paths"][0], " = ".join(row["paths"][1:])) for row in found.double]
@@ -122,7 +123,7 @@ def _evenly(logs: Sequence[IndexedLog], rows: pa.Table) -> list[IndexedLog]:
     known: set[str | None] = {None}
     order = []
     for log in sorted(logs, key=lambda log: (begins.get(log.files[0]) or 0, log.name)):
-        if not all(identity in known for identity in log.identities if identity is not None):
+        if not known.issuperset(log.identities):
             order.append(log)
         known.update(log.identities)
     return [order[i] for i in np.unique(np.linspace(0, len(order) - 1, CARDS).astype(int)) if order]
@@ -132,14 +133,16 @@ def _card(log: IndexedLog) -> dict[str, Any]:
     """A log with its first frames, or why it has none."""
     card: dict[str, Any] = {"name": log.name, "pictures": [], "state": ""}
     try:
-        with contextlib.closing(open_log(log.files, None)) as source:
+        places = [location(file) for file in log.files]
+        with contextlib.closing(open_to_look(places, salvage=True)) as source:
             begins = datetime.fromtimestamp(
                 source.spec.time_ns(source.first_frame) // NANOSECONDS, UTC
             )
-            card["text"] = f"{begins:%Y-%m-%d %H:%M}, {_long(source.frames / source.spec.fps)}"
+            card["text"] = f"{begins:%Y-%m-%d %H:%M}, {lasting(source.frames / source.spec.fps)}"
             card["pictures"] = list(_firsts(source))
     except CdmisfaError as error:
-        card |= {"text": str(error), "state": "broken"}
+        broken = isinstance(error, LogDamagedError)
+        card |= {"text": str(error), "state": "broken" if broken else ""}
     return card
 
 
@@ -148,7 +151,3 @@ def _firsts(source: Any) -> Iterator[Any]:
     for stream in range(len(source.spec.streams[:STREAMS]) if source.spec.images else 0):
         source.seek(source.first_frame)
         yield source.take(stream, 1).frames[0]
-
-
-def _long(seconds: float | None) -> str:
-    return "-" if seconds is None else str(timedelta(seconds=round(seconds)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +22,7 @@ from cdmisfa.cli.printing import (
     warn,
 )
 from cdmisfa.cli.progress import bar
-from cdmisfa.core.names import counted
+from cdmisfa.core.names import counted, lasting
 from cdmisfa.core.options import DURATION
 
 if TYPE_CHECKING:
@@ -156,14 +155,14 @@ def _print_summary(found: Summary) -> None:
     print_columns(
         {name: [row[name] for row in found.kinds] for name in columns}
         | {
-            "length": [_long(row["seconds"]) for row in found.kinds],
+            "length": [lasting(row["seconds"]) for row in found.kinds],
             "size": [in_bytes(row["bytes"]) for row in found.kinds],
         }
     )
     print_line()
     cells = [
         (row["topic"], row["schema"], row["shape"] or "-", row["streams"], row["messages"],
-         "-" if row["rate"] is None else f"{row['rate']:.4g}", _long(row["seconds"]),
+         "-" if row["rate"] is None else f"{row['rate']:.4g}", lasting(row["seconds"]),
          "-" if row["gaps"] is None else row["gaps"])
         for row in found.streams
     ]  # fmt: skip
@@ -185,10 +184,6 @@ def _say_more(found: Summary, name: str, what: str) -> None:
     more = found.counts[name] - len(getattr(found, name))
     if more > 0:
         print_line(f"  and {more} more {what}: ask for them in SQL")
-
-
-def _long(seconds: float | None) -> str:
-    return "-" if seconds is None else str(timedelta(seconds=round(seconds)))
 
 
 @click.command("curate")
