@@ -152,10 +152,12 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     words = tuple(words) or named
     if is_live(words[0]):
         raise UsageError(f"{words[0]} was live: name what learn --record wrote of it")
-    from replay.corpus.finding import may_be_corpus  # not needed to begin a run
-    from replay.inputs import is_recording
+    recorded = False
+    if not as_begun:
+        from replay.corpus.finding import may_be_corpus  # not needed to begin a run
+        from replay.inputs import is_recording
 
-    recorded = not as_begun and not may_be_corpus(words) and is_recording(words)
+        recorded = not may_be_corpus(words) and is_recording(words)
     kept = () if recorded else CAMERAS
     cameras = CameraOptions(**{name: begun[name] for name in kept if name in begun})
     if words[0] not in SCENES:

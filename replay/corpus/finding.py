@@ -68,7 +68,12 @@ def may_be_corpus(words: Sequence[str | Location]) -> bool:
     place = location(words[0]) if len(words) == 1 else None
     if not isinstance(place, Path):
         return False
-    return (place / INDEX).is_file() or (place.suffix == ".parquet" and place.is_file())
+    return has_index(place) or (place.suffix == ".parquet" and place.is_file())
+
+
+def has_index(folder: Path) -> bool:
+    """Whether a folder has an index of the logs in it; what is too long for a name has none."""
+    return os.path.isfile(folder / INDEX)
 
 
 def state_of_log(place: Location) -> tuple[int, str]:

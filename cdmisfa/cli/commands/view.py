@@ -128,9 +128,9 @@ def view_command(
 
 def _index_of(path: Path) -> Path | None:
     """The index of many logs that a path names; None of what is looked at by itself."""
-    from replay.corpus.finding import INDEX
+    from replay.corpus.finding import has_index
 
-    if path.suffix != ".parquet" and not (path / INDEX).is_file():
+    if path.suffix != ".parquet" and not has_index(path):
         return None
     from replay.corpus.view import index_to_view
 
