@@ -419,3 +419,27 @@ def test_recordings_of_scenes_are_episodes(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     assert again.code == 0, again.err
     assert cdmisfa("index", folder / "rec0").code == 0  # it stays one recording
     assert cdmisfa("learn", folder / "rec0", "--json").json["source"]["kind"] == "recording"
+
+
+@pytest.mark.parametrize("below", [".", "day"])
+def test_recordings_in_one_folder_are_episodes_of_their_own(
+    below: str, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    folder = tmp_path / "logs" / below
+    folder.mkdir(parents=True)
+    for seed in (1, 0):
+        words = ("--view", "x1", "--seed", seed, "--frames", 200, "-o", tmp_path / f"rec{seed}")
+        assert cdmisfa("record", "oscillatory", *words).code == 0
+        (tmp_path / f"rec{seed}" / "x1.mcap").rename(folder / f"{seed}.mcap")
+    (folder / "2.mcap").write_bytes((folder / "1.mcap").read_bytes())
+    corpus = tmp_path / "logs"
+    assert cdmisfa("index", corpus).code == 0
+    plan = cdmisfa("learn", corpus, "--dry-run", "--json", "-o", tmp_path / "run").json
+    assert [one["log"] for one in plan["episodes"]] == ["0.mcap", "1.mcap", "2.mcap"]
+    curated = cdmisfa("curate", corpus, "-o", tmp_path / "look", "--json").json
+    assert sorted(Path(row["log"]).name for row in curated["logs"]) == [
+        "0.mcap",
+        "1.mcap",
+        "2.mcap",
+    ]
+    assert f"look at {corpus / 'corpus.html'}" in cdmisfa("view", corpus).err

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_line
 from cdmisfa.core.processes import WorkerDied, run_all
-from cdmisfa.core.untrusted import check_regular
+from cdmisfa.core.untrusted import check_regular, parse_json
 from recorder.log.files import atomic_write, held, make_folder, refuse_unless
 from replay.corpus.finding import INDEX, found_logs
 from replay.corpus.rows import MARK, SCHEMA, VERSION, Answer, Task, look
@@ -31,6 +31,18 @@ SAVED_EVERY: Final = 5000
 """Logs after which what is known is written, so that a kill costs no more than these."""
 
 _SHA256: Final = Task._fields.index("sha256")
+
+_SAME: Final = (
+    "scene",
+    "seed",
+    "config_sha256",
+    "start_ns",
+    "fps",
+    "frame_shape",
+    "dtype",
+    "truth",
+)
+"""What the views of a recording state alike."""
 
 
 @dataclass(slots=True)
@@ -82,23 +94,43 @@ class IndexedLog(NamedTuple):
 def indexed_logs(index: Path) -> list[IndexedLog]:
     """The logs of an index but runs, in the order of their first files.
 
+    Files of recordings that lie in one folder and are not all views of one are a log each.
+
     Raises:
         UsageError: it is no index, or one of another version.
         LogDamagedError: it is damaged.
     """
-    columns = ["log", "path", "kind", "bytes", "changed", "identity", "contents"]
+    columns = ["log", "path", "kind", "bytes", "changed", "identity", "contents", "configuration"]
     table = read_index(index)
     table = table.filter(pc.equal(table["number"], 0)).select(columns)
+    rows = [row for row in table.to_pylist() if row["kind"] != "run"]
+    stated: dict[str, list[str | None]] = {}
+    for row in rows:
+        if row["kind"] == "recording":
+            stated.setdefault(row["log"], []).append(row["configuration"])
+    try:
+        recordings = {name for name, each in stated.items() if _of_one(each)}
+    except (ValueError, AttributeError) as error:
+        raise _damaged(index, error) from error
     found: dict[str, IndexedLog] = {}
-    for row in table.to_pylist():
-        if row["kind"] != "run":
-            path = row["path"]
-            name = row["log"] if row["kind"] == "recording" and row["log"] != "." else path
-            log = found.setdefault(name, IndexedLog(name, row["kind"], [], [], []))
-            log.files.append(path if "://" in path else str(index.parent / path))
-            log.states.append((row["bytes"], row["changed"]))
-            log.identities.append(row["contents"] or row["identity"])
+    for row in rows:
+        path = row["path"]
+        name = row["log"] if row["log"] in recordings else path
+        log = found.setdefault(name, IndexedLog(name, row["kind"], [], [], []))
+        log.files.append(path if "://" in path else str(index.parent / path))
+        log.states.append((row["bytes"], row["changed"]))
+        log.identities.append(row["contents"] or row["identity"])
     return list(found.values())
+
+
+def _of_one(stated: Sequence[str | None]) -> bool:
+    """Whether files are views of one recording, by what each states as JSON."""
+    if len(stated) == 1 or None in stated:
+        return True
+    facts = [parse_json(text or "") for text in stated]
+    views = {str((one.get("view"), one.get("first_frame"))) for one in facts}
+    same = {str([one.get(name) for name in _SAME]) for one in facts}
+    return len(views) == len(facts) and len(same) == 1
 
 
 def is_index(path: Path) -> bool:

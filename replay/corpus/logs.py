@@ -53,16 +53,12 @@ def logs_of_corpus(words: Sequence[str | Location]) -> list[Log] | None:
     index = place / INDEX if place.is_dir() else place
     if not place.is_dir() and not is_index(index):
         return None  # it is a table
-    found: dict[str, list[Location]] = {}
-    for log in indexed_logs(index):
-        files = [location(file) for file in log.files]
-        here = log.kind == "recording" and files[0].parent == index.parent
-        found.setdefault(os.curdir if here else log.name, []).extend(files)
-    if place.is_dir() and [*found] == [os.curdir]:
+    logs = indexed_logs(index)
+    if place.is_dir() and [log.name for log in logs] == [os.curdir]:
         return None  # the folder is one recording, which was indexed
-    if not found:
+    if not logs:
         raise UsageError(f"{index} holds no log to learn from: index a folder of logs")
-    return list(found.values())
+    return [[location(file) for file in log.files] for log in logs]
 
 
 @dataclass(slots=True)

@@ -38,9 +38,10 @@ def index_to_view(path: Path) -> Path | None:
     if not path.is_dir():
         return path if is_index(path) else None
     index = path / INDEX
-    if not index.is_file() or pc.all(pc.equal(read_index(index)["log"], ".")).as_py():
+    if not index.is_file():
         return None
-    return index
+    here = pc.all(pc.equal(read_index(index)["log"], ".")).as_py()
+    return None if here and len(indexed_logs(index)) < 2 else index
 
 
 def view_index(
