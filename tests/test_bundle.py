@@ -390,7 +390,7 @@ def test_the_commands_of_the_page_work(
     monkeypatch: pytest.MonkeyPatch,
     oscillatory_recording: Path,
 ) -> None:
-    page = (ROOT / "docs" / "how-to" / "moments.md").read_text("utf-8")
+    page = (ROOT / "docs" / "how-to" / "bundles.md").read_text("utf-8")
     (block,) = re.findall(r"^```sh\n(cdmisfa bundle.*?)^```$", page, re.MULTILINE | re.DOTALL)
     monkeypatch.chdir(tmp_path)
     shutil.copytree(oscillatory_recording, "recordings/streams")
