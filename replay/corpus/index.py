@@ -100,26 +100,26 @@ def indexed_logs(index: Path) -> list[IndexedLog]:
         UsageError: it is no index, or one of another version.
         LogDamagedError: it is damaged.
     """
-    columns = ["log", "path", "kind", "bytes", "changed", "identity", "contents", "configuration"]
+    columns = ["log", "path", "kind", "bytes", "changed", "identity", "contents"]
     table = read_index(index)
-    table = table.filter(pc.equal(table["number"], 0)).select(columns)
-    rows = [row for row in table.to_pylist() if row["kind"] != "run"]
+    table = table.filter(pc.equal(table["number"], 0))
+    views = table.filter(pc.equal(table["kind"], "recording")).select(["log", "configuration"])
     stated: dict[str, list[str | None]] = {}
-    for row in rows:
-        if row["kind"] == "recording":
-            stated.setdefault(row["log"], []).append(row["configuration"])
+    for row in views.to_pylist():
+        stated.setdefault(row["log"], []).append(row["configuration"])
     try:
         recordings = {name for name, each in stated.items() if _of_one(each)}
     except (ValueError, AttributeError) as error:
         raise _damaged(index, error) from error
     found: dict[str, IndexedLog] = {}
-    for row in rows:
-        path = row["path"]
-        name = row["log"] if row["log"] in recordings else path
-        log = found.setdefault(name, IndexedLog(name, row["kind"], [], [], []))
-        log.files.append(path if "://" in path else str(index.parent / path))
-        log.states.append((row["bytes"], row["changed"]))
-        log.identities.append(row["contents"] or row["identity"])
+    for row in table.select(columns).to_pylist():
+        if row["kind"] != "run":
+            path = row["path"]
+            name = row["log"] if row["log"] in recordings else path
+            log = found.setdefault(name, IndexedLog(name, row["kind"], [], [], []))
+            log.files.append(path if "://" in path else str(index.parent / path))
+            log.states.append((row["bytes"], row["changed"]))
+            log.identities.append(row["contents"] or row["identity"])
     return list(found.values())
 
 
