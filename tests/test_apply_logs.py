@@ -97,7 +97,7 @@ def test_a_folder_of_logs_becomes_one_table(
     ]
     told = cdmisfa("apply", run, logs, "-o", out)
     assert told.code == 3
-    assert "7 logs: 0 applied to now, 7 before, 2 not, or not to the end" in told.out
+    assert "7 logs: 0 applied to now, 7 before; of these 2 not, or not to the end" in told.out
     assert "failed: broken.mcap: " in told.out
 
 
