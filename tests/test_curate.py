@@ -265,6 +265,28 @@ def test_a_double_by_its_messages_is_left_out_where_the_index_knows_them(
         }
 
 
+def test_the_double_of_a_damaged_log_is_judged(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    for name in "abc":
+        cdmisfa("record", "oscillatory", "--frames", 300, "-o", logs / name)
+    shutil.copytree(logs / "c", logs / "d")
+    cdmisfa("index", logs)
+    for file in (logs / "a").iterdir():
+        file.write_text("no log")
+    done = cdmisfa("curate", logs, "-o", tmp_path / "out", "--json")
+    problems = {row["log"]: row["problem"] or "" for row in done.json["logs"]}
+    assert "not an MCAP file" in problems.pop("a")
+    assert problems == {"b": "", **dict.fromkeys("cd", "holds the same as b")}
+
+
+def test_force_replaces_no_folder_with_other_files(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    cdmisfa("record", "oscillatory", "--frames", 300, "-o", tmp_path / "logs" / "a")
+    cdmisfa("index", tmp_path / "logs")
+    done = cdmisfa("curate", tmp_path / "logs", "-o", tmp_path / "logs", "--force")
+    assert (done.code, "holds other files, such as a: choose" in done.err) == (2, True)
+    assert (tmp_path / "logs" / "a" / "x1.mcap").exists()
+
+
 def test_it_says_what_is_left_of_the_budget_and_what_can_be_cut(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:

@@ -35,6 +35,9 @@ PICTURES: Final = 8
 STREAMS: Final = 4
 """Streams of a segment that are shown."""
 
+WRITTEN: Final = frozenset({"blocks.parquet", "curated.json", "index.html", "segments.csv"})
+"""What a folder of segments holds; with other things in it, it is never replaced."""
+
 COLUMNS: Final = {
     "log": pa.string(),
     "stream": pa.string(),
@@ -54,6 +57,7 @@ class _Log:
 
     name: str
     files: list[str] = field(default_factory=list)
+    identities: list[str] = field(default_factory=list)
     doubles: list[str] = field(default_factory=list)
     judged: Judged | None = None
     problem: str = ""
@@ -112,25 +116,28 @@ def curate(
         known_as: the run; what looks as what it watched comes last.
         budget: seconds of all segments together.
         jobs: processes; what is chosen does not depend on them.
-        force: replace the folder.
+        force: replace what was written here before.
         told: how many of the logs that are judged were.
 
     Raises:
-        UsageError: there is no such index or run, no log shows frames, or something is at `out`.
+        UsageError: there is no such index or run, no log shows frames, or something is at `out`,
+            with `force` what was not written here.
         LogWriteError: the folder cannot be written.
     """
     refuse_existing(out, force=force, goes_on=False)
+    if others := sorted(_there(out) - WRITTEN):
+        raise UsageError(f"{out} holds other files, such as {others[0]}: choose another folder")
     logs = _logs(index)
-    judged = [log for log in logs if not log.left_out]
     watched = None if known_as is None else Watched.by(known_as)
     work = functools.partial(judge, known=known, watched=watched)
-    found = run_all(work, [log.files for log in judged], jobs=min(jobs, len(judged)))
-    for done, (number, one) in enumerate(found, 1):
-        if isinstance(one, Judged):
-            judged[number].judged = one
-        else:
-            judged[number].problem = one.what if isinstance(one, WorkerDied) else one
-        told(done, len(judged))
+    while judged := _to_judge(logs):  # again where one could not be that others are doubles of
+        found = run_all(work, [log.files for log in judged], jobs=min(jobs, len(judged)))
+        for done, (number, one) in enumerate(found, 1):
+            if isinstance(one, Judged):
+                judged[number].judged = one
+            else:
+                judged[number].problem = one.what if isinstance(one, WorkerDied) else one
+            told(done, len(judged))
     if not any(log.judged and len(log.judged.t) for log in logs):
         why = next((f": {log.problem}" for log in logs if log.problem), "")
         raise UsageError(f"{index}: no log in it shows frames{why}")
@@ -160,16 +167,26 @@ def curate(
     return shown
 
 
+def _there(out: Path) -> set[str]:
+    return {path.name for path in out.iterdir()} if out.is_dir() else set()
+
+
 def _logs(index: Path) -> list[_Log]:
     """What is opened as one, of each log of an index but runs."""
-    found: list[_Log] = []
+    return [
+        _Log(name, files, [i or file for i, file in zip(identities, files, strict=True)])
+        for name, kind, files, _, identities in indexed_logs(index)
+        if kind is not None
+    ]
+
+
+def _to_judge(logs: Sequence[_Log]) -> list[_Log]:
+    """Logs that were not judged yet, but for doubles of those that were, or are to be."""
     first: dict[str, str] = {}
-    for name, kind, files, _, identities in indexed_logs(index):
-        if kind is not None:
-            pairs = zip(identities, files, strict=True)
-            doubles = [first.setdefault(identity or file, name) for identity, file in pairs]
-            found.append(_Log(name, files, doubles))
-    return found
+    for log in logs:
+        if not log.problem:
+            log.doubles = [first.setdefault(identity, log.name) for identity in log.identities]
+    return [log for log in logs if not (log.judged or log.problem or log.left_out)]
 
 
 def _choose(logs: Sequence[_Log], budget: float) -> tuple[list[_Window], bool]:
