@@ -441,13 +441,29 @@ class TestSegments:
         assert str(rows) in done.err
 
 
+def test_logs_of_one_name_keep_the_folders_that_they_differ_by(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    for name in ("one", "two"):
+        cdmisfa("record", "oscillatory", "--frames", 60, "-o", tmp_path / name)
+    listed = tmp_path / "wanted.csv"
+    rows = (
+        f"{name}/{view}.mcap,0,1600000000000000000"
+        for name in ("one", "two")
+        for view in ("x1", "x2", "x3")
+    )
+    listed.write_text("\n".join(["path,start,stop", *rows]) + "\n")
+    assert cdmisfa("cut", "--segments", listed, "-o", tmp_path / "out").code == 0
+    for name in ("one", "two"):
+        assert check_logs(tmp_path / "out" / name).state == "whole"
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["a.mcap", "-o", "a.mcap", "--force"], "cannot be cut into itself"),
         (["a.mcap", "-o", "b.mcap"], "b.mcap exists: choose another name"),
         (["a.mcap", "-o", "full"], "full exists: choose another folder or overwrite"),
-        (["a.mcap", "full/a.mcap", "-o", "new"], "another log is called a.mcap, too"),
         (["a.mcap", "-o", "c.mcap", "--from", "5", "--to", "4"], "--from 5 is no earlier"),
         (["a.mcap", "-o", "c.mcap", "--topic", "/none"], "no message there is of these"),
         (["a.mcap", "-o", "new", "--topic", "/none"], "no message there is of these"),

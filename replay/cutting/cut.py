@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -156,8 +157,8 @@ def _targets(wanted: Wanted, out: Path, force: bool) -> dict[Path, Wanted]:
     else:
         refuse_existing(out, force=force, goes_on=False)
         targets = {}
-        for file, own in wanted.items():
-            target = out / file.name.removesuffix(PARTIAL)
+        for file, name in _names(wanted).items():
+            own, target = wanted[file], out / name
             if target in targets:
                 raise UsageError(
                     f"{file}: another log is called {file.name}, too: cut each by itself, or join "
@@ -170,6 +171,16 @@ def _targets(wanted: Wanted, out: Path, force: bool) -> dict[Path, Wanted]:
             if isinstance(file, Path) and target.exists() and target.samefile(file):
                 raise UsageError(f"{file}: it cannot be cut into itself, name another file")
     return targets
+
+
+def _names(files: Collection[Location]) -> dict[Location, str]:
+    """A name for each log; with the folders that they differ by, where two have the same."""
+    names = {file: file.name.removesuffix(PARTIAL) for file in files}
+    here = {file: os.path.abspath(file) for file in files if isinstance(file, Path)}
+    if len(set(names.values())) < len(names) == len(here):
+        above = os.path.commonpath([os.path.dirname(file) for file in here.values()])
+        names = {f: os.path.relpath(p, above).removesuffix(PARTIAL) for f, p in here.items()}
+    return names
 
 
 def _written(
