@@ -316,6 +316,8 @@ class TestBadInput:
         other.write_bytes(before[:-9])
         with pytest.raises(LogDamagedError, match="remove it, and index again"):
             index_logs([corpus], other)
+        with pytest.raises(UsageError, match=r"robot.mcap is no index of logs"):
+            read_index(corpus / "robot.mcap")
 
     def test_a_full_disk_leaves_the_index_before(
         self, corpus: Path, monkeypatch: pytest.MonkeyPatch

@@ -244,10 +244,16 @@ def _version(path: Path) -> int:
     try:
         stated = (pq.read_schema(path).metadata or {}).get(MARK, b"")
     except (pa.ArrowException, OSError) as error:
+        if path.suffix != ".parquet":  # a log, say, which nobody should remove
+            raise _no_index(path) from error
         raise _damaged(path, error) from error
     if not stated.isdigit():
-        raise UsageError(f"{path} is no index of logs: name another file with -o")
+        raise _no_index(path)
     return int(stated)
+
+
+def _no_index(path: Path) -> UsageError:
+    return UsageError(f"{path} is no index of logs: name another file, or the folder of an index")
 
 
 def _damaged(path: Path, error: Exception) -> LogDamagedError:
