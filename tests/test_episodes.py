@@ -92,6 +92,9 @@ def test_episodes_are_learned_as_one_log_with_pauses_is(cdmisfa: Cdmisfa, tmp_pa
     assert "ep3.mcap" in cdmisfa("learn", folder, "--dry-run").out
     found = package.learn(str(folder), tau=10)
     assert found.result["signals_sha256"] == learned.json["signals_sha256"]
+    (folder / "ep2.mcap").unlink()
+    without = cdmisfa("check", run, "--json")
+    assert (without.code, without.json["other_files"]) == (4, ["ep2.mcap"])
 
 
 def test_logs_of_the_same_time_are_ordered_by_their_paths_as_numbers(tmp_path: Path) -> None:

@@ -323,8 +323,11 @@ def known_to_both(one: Any, other: Any) -> tuple[Any, Any]:
 
 
 def other_files(one: Any, another: Any) -> list[str]:
-    """Names of the files of a source that are not those of another, by what both know of them."""
-    found = []
+    """Names of the files of a source that are not those of another, by what both know of them.
+
+    Where another has more or fewer, of those that it lacks.
+    """
+    found: list[str] = []
     for key in _FILES:
         own, others = _tables(one, key), _tables(another, key)
         if len(own) == len(others):
@@ -333,6 +336,9 @@ def other_files(one: Any, another: Any) -> list[str]:
                 for file, like in zip(own, others, strict=True)
                 if any(file[known] != like[known] for known in _HASHES & file.keys() & like.keys())
             ]
+        elif others:
+            there = {file.get("file") for file in others}
+            found += [str(file.get("file")) for file in own if file.get("file") not in there]
     return found
 
 
