@@ -185,8 +185,8 @@ def _apply_to_many(
     else:
         again = f" ({found.anew} again: the log or the code has changed)" if found.anew else ""
         print_line(
-            f"{counted(len(found.logs), 'log')}: {found.computed} applied to now{again}, "
-            f"{found.skipped} before; of these {len(found.failed)} not, or not to the end"
+            f"{counted(len(found.logs), 'log')}: {found.computed} tried now{again}, "
+            f"{found.skipped} before; of these {len(found.failed)} failed, or ended early"
         )
         for row in found.failed[:MOST_SAID]:
             print_line(f"failed: {row['log']}: {row['error']}")

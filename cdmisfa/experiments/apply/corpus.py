@@ -90,7 +90,7 @@ class AppliedLogs:
     Attributes:
         out: the folder of the files.
         logs: a row each, by name: `log`, `out`, `frames`, `error`, `warnings`, and `exit_code`.
-        computed: how many were applied to now.
+        computed: how many were tried now.
         skipped: how many were done, or had failed, before.
         anew: how many were applied to again: they, or the code, had changed.
     """
