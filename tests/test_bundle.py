@@ -222,6 +222,7 @@ def test_what_cannot_be_checked_is_not_bundled(
     shutil.copytree(oscillatory_recording, log)
     assert cdmisfa("learn", log, *SHORT, "-o", run).code == 0
     assert cdmisfa("bundle", run, "-o", tmp_path / "f.tar").code == 2
+    assert "x1.mcap is no run" in cdmisfa("bundle", log / "x1.mcap", "-o", out).err
     other = tmp_path / "other"
     assert cdmisfa("record", "oscillatory", "-o", other, "--frames", 2000, "--seed", 9).code == 0
     shutil.rmtree(log)

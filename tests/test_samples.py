@@ -81,7 +81,7 @@ def test_without_a_network_the_rest_is_there(
     (out / "icub").mkdir()
     (out / "icub" / "left.mcap").write_text("mine")
     done = cdmisfa("samples", "-o", out, "--url", unknown)
-    assert_one_line(done, 2, "icub/left.mcap is not that sample: choose another folder")
+    assert_one_line(done, 2, "icub/left.mcap is not that sample: remove it or name another folder")
     assert (out / "icub" / "left.mcap").read_text() == "mine"
 
 

@@ -87,6 +87,8 @@ def write_bundle(
     folder, out, about = run_log(Path(run)).parent, Path(out), about or About()
     refuse_unless(out, "a bundle is a zip file", ".zip")
     refuse_taken(out, force=force)
+    if not (folder / RUN_FILE).is_file():
+        raise UsageError(f"{run} is no run: name the folder that learn wrote")
     if missing := [name for name in _FILES if not (folder / name).is_file()]:
         raise UsageError(f"{folder} has no {missing[0]}: finish it with learn --resume")
     if (state := check_logs(folder).state) != "whole":

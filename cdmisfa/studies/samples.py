@@ -85,7 +85,7 @@ def gather(
         if target.exists():
             same = target.is_file() and target.stat().st_size == log.size
             if not (same and _sha256(target.read_bytes()) == log.sha256):
-                raise UsageError(f"{target} is not that sample: choose another folder")
+                raise UsageError(f"{target} is not that sample: remove it or name another folder")
             continue
         own = here / name
         data = own.read_bytes() if own.is_file() else _fetched(address, name, log.size, target)
