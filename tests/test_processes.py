@@ -67,6 +67,7 @@ def test_they_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 
 def test_ctrl_c_of_a_terminal_is_for_their_parent_only(tmp_path: Path) -> None:
     process, workers = begun(tmp_path)
+    time.sleep(0.5)  # Python overlooks a signal that comes just as it begins to wait for a lock
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode != 0
