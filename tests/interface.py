@@ -38,7 +38,6 @@ SHOWN: Mapping[str, tuple[object, ...]] = {
     "compare": ("run", "run"),
     "at": ("run", 2),
     "check": ("run",),
-    "bundle": ("run", "-o", "run.zip"),
     "fork": ("run", "--at", 2, *SHORT, "-o", "fork"),
     "apply": ("run", "rec", "-o", "applied.csv"),
     "report": ("run",),

@@ -69,10 +69,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "moments",
             "Learn a run again from its source, and compare every signal bit for bit.",
         ),
-        "bundle": (
-            "moments",
-            "Write a run and what it learned from as one file that others can check.",
-        ),
         "at": ("moments", "Say what a learner was after K iterations of a run, exactly."),
     },
     "Keep": {

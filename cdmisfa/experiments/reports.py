@@ -157,20 +157,12 @@ PLAIN = (("seed", 0), ("centre", "run"))
 """Options of a command that say what is so without them."""
 
 
-def command_again(run: Path, source: Sequence[str] = ()) -> str:
-    """The command that begins a run anew, for a shell; "" where the run does not say.
-
-    Args:
-        run: its folder.
-        source: what stands for its source; paths of this machine are then left out of all of it.
-    """
+def command_again(run: Path) -> str:
+    """Return the shell command that starts a run again; "" where run.json does not hold it."""
     try:
         words, options = read_command(Path(run))
     except CdmisfaError:
         return ""
-    if source:
-        words = tuple(source)
-        options |= {"preset": Path(options["preset"]).name} if options.get("preset") else {}
     fields = {field.name for field in dataclasses.fields(CameraOptions)}
     said = option_words(CameraOptions(**{k: v for k, v in options.items() if k in fields}))
     for name, value in options.items():

@@ -1,8 +1,7 @@
-"""`cdmisfa at`, `fork`, `check` and `bundle`: any moment of a run, forks of it, and the proof."""
+"""`cdmisfa at`, `fork` and `check`: restore, continue and recompute a run."""
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
-from cdmisfa.cli.making import WholeRange, flag, number, option, word
+from cdmisfa.cli.making import WholeRange, number, option, word
 from cdmisfa.cli.printing import (
     outcome_line,
     print_document,
@@ -19,7 +18,7 @@ from cdmisfa.cli.printing import (
     quoted,
     tell,
 )
-from cdmisfa.cli.progress import BYTES, bar, learning
+from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import NotReproducedError, UsageError
 from cdmisfa.core.names import counted
 
@@ -133,87 +132,17 @@ def check_command(
 
     So are the keyframes in its log. It says the first signal or memory that differs, and which
     files are no longer those it learned from, and exits with 4 if there are any. A part begins at
-    the newest keyframe before it. RUN may be a bundle, whose files are compared with the hashes in
-    it first; one that was changed is named, with exit code 3.
+    the newest keyframe before it.
     """
     from cdmisfa.experiments.session import Session
-    from cdmisfa.public.bundle import is_bundle, opened_bundle
 
-    with contextlib.ExitStack() as opened:
-        folder = run
-        if is_bundle(run):
-            folder, source = opened.enter_context(opened_bundle(run, source))
-        checked = Session.check(folder, source, start, stop)
+    checked = Session.check(run, source, start, stop)
     if as_json:
         print_document(run=str(run), **checked.as_json())
     else:
         print_line(str(checked))
     if not checked.holds:
         ctx.exit(NotReproducedError.exit_code)
-
-
-@click.command("bundle")
-@options.path_argument("run")
-@options.out("The bundle, *.zip.", required=True)
-@source
-@flag("--no-source", "State what it learned from by its hashes alone, as where that is large.")
-@word(
-    "--license",
-    "LICENSE",
-    "Under which others may use it: a name of SPDX, as CC-BY-4.0, a URL, or words; by default none "
-    "is granted.",
-    default="",
-)
-@word("--author", "NAME", "Who made it; repeatable.", multiple=True)
-@word(
-    "--date",
-    "YYYY-MM-DD",
-    "When it is published; by default when run.json was written.",
-    default="",
-)
-@options.server_limits
-@options.force
-@options.as_json
-def bundle_command(
-    run: Path,
-    out: Path,
-    source: tuple[str, ...],
-    no_source: bool,
-    license: str,
-    author: tuple[str, ...],
-    date: str,
-    force: bool,
-    as_json: bool,
-) -> None:
-    """Write a run and what it learned from as one file that others can check.
-
-    The file is an RO-Crate in a zip: log, modules, configuration, versions and command of the run,
-    and the files that it learned from, each with its hash. `cdmisfa check F.zip` learns the run
-    again from it, on any machine. The same run gives the same bytes.
-    """
-    from cdmisfa.public.bundle import write_bundle
-    from cdmisfa.public.crate import About
-
-    about = About(license, author, date)
-    with bar("bundling", BYTES) as shown:
-        written = write_bundle(
-            run,
-            out,
-            source=source,
-            with_source=not no_source,
-            about=about,
-            force=force,
-            told=shown.update,
-        )
-    if as_json:
-        print_document(**written.as_json())
-        return
-    print_line(f"{out}: {counted(len(written.files), 'file')}, {out.stat().st_size} bytes")
-    if written.source == "hashes":
-        tell(f"what {run} learned from is not in it: who checks it names that with --source")
-    if not license:
-        tell("it grants no licence: --license says under which others may use it")
-    print_line(f"check it anywhere: cdmisfa check {quoted(out)}")
 
 
 @click.command("fork")
