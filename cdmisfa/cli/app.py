@@ -13,16 +13,16 @@ import importlib
 import io
 import os
 import sys
-import time
 import traceback
 from collections.abc import Mapping, Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import click
 
 from cdmisfa.cli.interrupts import end_at_once, ignore_at_the_end, interruptible
 from cdmisfa.cli.on_demand import names_on_demand
-from cdmisfa.cli.printing import Loudness, detail
+from cdmisfa.cli.options import quiet
+from cdmisfa.cli.printing import Stderr
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.untrusted import printable
@@ -133,8 +133,6 @@ class LazyGroup(click.Group):
             return None
         module = importlib.import_module(f"cdmisfa.cli.commands.{COMMANDS[cmd_name][0]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
-        if QUIET not in command.params:
-            command.params += (QUIET, VERBOSE)
         return command
 
     def resolve_command(
@@ -154,32 +152,11 @@ class LazyGroup(click.Group):
                 formatter.write_dl(rows)
 
 
-def _set_loudness(ctx: click.Context, param: click.Parameter, given: bool) -> None:
-    """Take -q or -v, of the program or of a command."""
-    if given and not ctx.resilient_parsing:
-        level = -1 if param is QUIET else 1
-        if Loudness.level == -level:
-            raise click.UsageError("-q says less and -v more: use one of them")
-        Loudness.level = level
-
-
-def _loudness(names: Sequence[str], about: str) -> click.Option:
-    how: dict[str, Any] = {"is_flag": True, "expose_value": False, "callback": _set_loudness}
-    return click.Option(names, help=about, **how)
-
-
-QUIET = _loudness(["-q", "--quiet"], "Say nothing on stderr but errors.")
-VERBOSE = _loudness(
-    ["-v", "--verbose"],
-    "Say more on stderr: the configuration, how long it took, where an unexpected error is.",
-)
-
-
 @click.group(
     cls=LazyGroup,
     context_settings={"help_option_names": ["-h", "--help"]},
-    params=[QUIET, VERBOSE],
 )
+@quiet
 @click.version_option(package_name="cdmisfa", message="cdmisfa %(version)s")
 def cli() -> None:
     """Record what a curious robot sees, learn from it live or from the log, and look.
@@ -223,7 +200,7 @@ def _open_standard_streams() -> None:
 
 def run(args: Sequence[str]) -> int:
     """Run one command and return its exit code; no exception but SystemExit's comes out."""
-    Loudness.level, began = 0, time.monotonic()
+    Stderr.quiet = False
     with interruptible() as stop:
         try:
             try:
@@ -247,15 +224,7 @@ def run(args: Sequence[str]) -> int:
             if _was_interrupt(error):
                 return _fail("interrupted", stop.exit_code)
             return _explain(error)
-    detail(f"took {time.monotonic() - began:.1f} s, {_most_memory()} of memory at most")
     return code if isinstance(code, int) else 0
-
-
-def _most_memory() -> str:
-    """The most memory that this process had at once."""
-    import resource
-
-    return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB"
 
 
 def _was_interrupt(error: BaseException | None) -> bool:
@@ -302,10 +271,11 @@ def _explain(error: Exception) -> int:
         case MemoryError():
             return _fail("out of memory", 1)
         case _:
-            if Loudness.level > 0:
-                traceback.print_exception(error)
-            said = f"unexpected {type(error).__name__}: {error} (please report it; -v shows where)"
-            return _fail(said, 1)
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{os.path.basename(frame.filename)}:{frame.lineno}"
+            return _fail(
+                f"unexpected {type(error).__name__} at {place}: {error} (please report it)", 1
+            )
 
 
 def _fail(message: str, code: int) -> int:

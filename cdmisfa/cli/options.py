@@ -22,7 +22,7 @@ from cdmisfa.cli.making import (
     together,
     word,
 )
-from cdmisfa.cli.printing import warn_deprecated
+from cdmisfa.cli.printing import Stderr, warn_deprecated
 from cdmisfa.core.config import FORMER
 from cdmisfa.core.errors import CdmisfaError, TooSmallError, UsageError, are_for
 from recorder.cameras.options import LiveOptions, TriggerOptions
@@ -136,6 +136,21 @@ engine = together(
     ),
     word("--scheduler", "ADDRESS", "Address of a dask scheduler that runs."),
 )
+
+
+def _be_quiet(ctx: click.Context, param: click.Parameter, given: bool) -> None:
+    Stderr.quiet = Stderr.quiet or given
+
+
+quiet = click.option(
+    "-q",
+    "--quiet",
+    is_flag=True,
+    expose_value=False,
+    callback=_be_quiet,
+    help="Print nothing on stderr but errors.",
+)
+"""`-q`, of the program and of commands that show how far they are."""
 
 
 def seed(

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import counted
 from cdmisfa.core.untrusted import printable
@@ -21,7 +20,6 @@ from cdmisfa.core.untrusted import printable
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.run_folder import RunResult
-    from cdmisfa.experiments.sources import Configuration
     from replay.corpus.episodes import EpisodeSource
     from replay.integrity.learned import ModuleInfo
     from replay.viewer.broadcast import Broadcast
@@ -129,31 +127,20 @@ def say_failed(rows: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
         print_line(f"failed: {at} seed {row['seed']}: {row['error']}", err=err)
 
 
-class Loudness:
-    """How much is said on stderr: as -q and -v of the command say.
+class Stderr:
+    """Standard error.
 
     Attributes:
-        level: -1 for errors alone, 0 for what the user should know, 1 for all.
+        quiet: whether the command prints nothing there but errors (-q).
     """
 
-    level = 0
-
-
-def is_quiet() -> bool:
-    """Whether nothing but errors is said on stderr."""
-    return Loudness.level < 0
+    quiet = False
 
 
 def tell(line: str) -> None:
-    """A line on stderr, unless that is to be quiet."""
-    if not is_quiet():
+    """Print a line on stderr, unless that is to be quiet."""
+    if not Stderr.quiet:
         print_line(line, err=True)
-
-
-def detail(line: str) -> None:
-    """A line on stderr for those who want to know all."""
-    if Loudness.level > 0:
-        tell(line)
 
 
 def warn(line: str) -> None:
@@ -194,13 +181,6 @@ def say_about(source: FrameSource) -> None:
             f"{name}: {counts['messages']} {what}, "
             f"{counted(counts['repeated'], 'frame')} repeated, {counts['dropped']} {what} dropped"
         )
-
-
-def say_configuration(configuration: Configuration) -> None:
-    """Say on stderr every key of a configuration, to those who want to know all."""
-    tables = {"learner": section_table(configuration.learner), **configuration.tables()}
-    for name, table in tables.items():
-        detail(f"{name}: {', '.join(f'{key} {value}' for key, value in table.items())}")
 
 
 def refuse_copies(source: FrameSource, *, strict: bool) -> None:

@@ -10,7 +10,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.printing import is_quiet, tell
+from cdmisfa.cli.printing import Stderr, tell
 from cdmisfa.core.learning import Sink
 from cdmisfa.core.untrusted import printable
 
@@ -51,7 +51,7 @@ class Bar:
 @contextlib.contextmanager
 def bar(title: str, unit: str) -> Iterator[Bar]:
     """Show progress while the body runs, if anyone is looking; the unit is what is counted."""
-    if is_quiet() or not sys.stderr.isatty():
+    if Stderr.quiet or not sys.stderr.isatty():
         yield Bar()
         return
     from rich.console import Console

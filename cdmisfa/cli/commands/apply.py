@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from recorder.cameras.options import LiveOptions
     from replay.storage.location import Location
 
-COMMANDLINE = click.core.ParameterSource.COMMANDLINE
-
 MOST_SAID = 20
 """Logs of which is said what went wrong."""
 
@@ -77,6 +75,7 @@ log_options = options_of(
 @options.server_limits
 @options.force
 @options.as_json
+@options.quiet
 @click.pass_context
 def apply_command(
     ctx: click.Context,
@@ -119,7 +118,8 @@ def apply_command(
         where |= {"frames": frames, "loop": loop, "salvage": salvage}
         _apply_to_many(ctx, run, source, out, as_json=as_json, **where)
         return
-    if given := [name for name in where if ctx.get_parameter_source(name) == COMMANDLINE]:
+    typed = click.core.ParameterSource.COMMANDLINE
+    if given := [name for name in where if ctx.get_parameter_source(name) == typed]:
         raise UsageError(f"--{given[0].replace('_', '-')} goes with logs, and a folder as -o")
     logs = logs_of(source)
     place = place_of(out, outlet.form, logs, force=force)

@@ -45,6 +45,7 @@ JOBS = number("--jobs", "Parallel processes; by default as many as there are pro
 @JOBS
 @options.server_limits
 @options.as_json
+@options.quiet
 @click.pass_context
 def index_command(
     ctx: click.Context,

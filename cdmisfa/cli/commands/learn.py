@@ -22,7 +22,6 @@ from cdmisfa.cli.printing import (
     refuse_copies,
     say_about,
     say_changes,
-    say_configuration,
     say_counts,
     tell,
 )
@@ -109,6 +108,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 @options.server_limits
 @options.force
 @options.as_json
+@options.quiet
 @click.pass_context
 def learn_command(
     ctx: click.Context,
@@ -158,7 +158,6 @@ def learn_command(
         if dry_run:
             print_plan(frames, as_json=as_json)
             return
-        say_configuration(configuration)
         color = getattr(frames, "color", cameras.color)  # what auto chose stays
         with learning(frames.spec, told["max_iterations"]) as (stop, reporter):
             if hasattr(frames, "stop"):

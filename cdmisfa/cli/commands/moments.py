@@ -161,6 +161,7 @@ def check_command(
 @options.server_limits
 @options.force
 @options.as_json
+@options.quiet
 @click.pass_context
 def fork_command(
     ctx: click.Context,

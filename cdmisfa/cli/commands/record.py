@@ -78,6 +78,7 @@ LIVE = ("cameras", "gym")
 @options.trigger_options
 @options.force
 @options.as_json
+@options.quiet
 @click.pass_context
 def record_command(
     ctx: click.Context,
@@ -221,6 +222,7 @@ def _record_scene(
 @options.fsync_every
 @options.force
 @options.as_json
+@options.quiet
 @click.pass_context
 def convert_command(
     ctx: click.Context,

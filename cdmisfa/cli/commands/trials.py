@@ -62,6 +62,7 @@ MOST_SEEDS = 1_000_000
 @options.retry_failed
 @options.server_limits
 @options.as_json
+@options.quiet
 @click.pass_context
 def sweep_command(
     ctx: click.Context,
@@ -188,6 +189,7 @@ def _experiments() -> list[str]:
 @options.path("--page", "Write this Markdown page of all results.")
 @flag("--force", "Replace results of more or other trials.")
 @options.as_json
+@options.quiet
 def reproduce_command(
     name: str | None,
     out: Path | None,
@@ -355,6 +357,7 @@ def _run_arena(
 @number("--frames", "Frames a view.", 400, default=8000)
 @options.jobs
 @options.as_json
+@options.quiet
 def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
     """Record, learn, check and show: the whole story in minutes.
 
