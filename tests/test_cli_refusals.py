@@ -15,7 +15,7 @@ LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
 
 A_RUN = "is a run, not a recording: look at it with cdmisfa view"
 NO_MCAP = "numbers.h5 is no log that is read: logs are .mcap, .bag and .db3 files"
-URLS = ("gs://bucket/there", "https://there.org/x")
+URLS = ("gs://bucket/there", "https://there.org/x", "s3://lab/x")
 ONE = "is a scene, of which only one can be named"
 VAIN = "is for live scenes, and {} is none: leave it out"
 SIZED = "oscillatory is a scene: --size and --rate are for cameras; its rate is --set rec"
@@ -114,10 +114,10 @@ CASES: dict[str, tuple[str, ...]] = {
         )
         for name in ("numbers.csv", "pictures")
     },
-    # what is written goes to no URL but those of s3
+    # what is written goes to no URL
     **{
-        f"{words} {URLS[number % 2]}": (
-            f"{URLS[number % 2]} is a URL: name a path on this machine",
+        f"{words} {URLS[number % 3]}": (
+            f"{URLS[number % 3]} is a URL: name a path on this machine",
         )
         for number, words in enumerate(
             (
@@ -138,11 +138,6 @@ CASES: dict[str, tuple[str, ...]] = {
             )
         )
     },
-    **{
-        f"{words} s3://lab/x": ("s3://lab/x is a URL: name a path on this machine",)
-        for words in ("plot RUN -o", "record icub --scene-picture", "reproduce stability -o")
-    },
-    "record oscillatory -o x --local y": ("--local goes with -o s3://",),
     # a run is no recording
     **{f"learn {run}": (A_RUN,) for run in ("RUN", "RUN/run.mcap")},
     "play RUN": (A_RUN,),

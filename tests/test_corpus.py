@@ -19,7 +19,6 @@ from camera_files import pictures, write_images, write_pictures
 from conftest import Cdmisfa
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from s3_server import buckets, serving_s3
 
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
 from cdmisfa.core.processes import WorkerDied
@@ -230,23 +229,6 @@ class TestUpToDate:
         assert all(Path(path).exists() for path in paths)
         with pytest.raises(UsageError, match="say where, with -o"):
             index_logs([f"{corpus}/*.mcap"])
-
-    def test_an_s3_prefix(
-        self, corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        with serving_s3() as endpoint, buckets(endpoint, monkeypatch) as files:
-            files.mkdir("bucket")
-            files.put(str(corpus / "night"), "bucket/logs/night", recursive=True)
-            files.put(str(corpus / "torn.mcap"), "bucket/logs/torn.mcap")
-            out = tmp_path / "remote.parquet"
-            made = index_logs(["s3://bucket/logs"], out)
-            assert (made.logs, made.read, made.broken) == (4, 4, 1)
-            found = [r for r in read_index(out).to_pylist() if r["topic"] == "/view/x1"]
-            assert found[0]["path"] == "s3://bucket/logs/night/one/x1.mcap"
-            assert found[0]["messages"] == 2000
-            assert index_logs(["s3://bucket/logs"], out).read == 0
-            files.put(str(corpus / "night/one/x2.mcap"), "bucket/logs/night/one/x1.mcap")
-            assert index_logs(["s3://bucket/logs"], out).read == 1
 
 
 class TestBadInput:

@@ -83,7 +83,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "logs",
             "Write a part of MCAP logs, or several joined, messages as they are.",
         ),
-        "upload": ("logs", "Upload a result to an S3 bucket, as `-o s3://...` does."),
     },
     "Many logs": {
         "index": ("corpus", "Index what is in many logs: streams, times, damage, doubles."),

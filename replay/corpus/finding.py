@@ -1,4 +1,4 @@
-"""The logs that words name, with all below folders and prefixes: names, sizes, when they changed.
+"""Find the logs that words name and all logs below folders: names, sizes, when they changed.
 
 No log is opened for this, and no more is asked of the file system than what a folder lists.
 """
@@ -18,7 +18,6 @@ from replay.camera_logs.pictures import PICTURES
 from replay.inputs import locations
 from replay.runs.folders import RUN_FILE
 from replay.storage.location import Location, Url, location
-from replay.storage.uploads import objects_below
 
 INDEX: Final = "corpus.parquet"
 """Name of the index of a folder, in it."""
@@ -34,7 +33,7 @@ class Found(NamedTuple):
         file: its name, as it is opened; of a name that is not UTF-8 as it can be written.
         bytes: of it.
         changed: what differs when it was written again: the time of its last change in
-            nanoseconds, of an object in a store its entity tag; "" where nobody says.
+            nanoseconds; "" of a URL, and where it cannot be opened.
         problem: why it cannot be opened.
     """
 
@@ -51,12 +50,11 @@ def found_logs(words: Sequence[str | Location]) -> Iterator[Found]:
 
     Raises:
         UsageError: a word names nothing.
-        CdmisfaError: a server does not list them.
     """
     seen: set[tuple[int, int]] = set()
     for place in locations(words):
         if isinstance(place, Url):
-            yield from _objects(place)
+            yield Found(place.address)
         elif place.is_dir():
             yield from _below(str(place), seen)
         else:
@@ -150,18 +148,6 @@ def _files_of(entries: Sequence[os.DirEntry[str]], names: set[str]) -> Iterator[
                 yield _named(entry.path, problem=_why(error))
         except OSError as error:
             yield _named(entry.path, problem=_why(error))
-
-
-def _objects(url: Url) -> Iterator[Found]:
-    """The logs below an S3 prefix; another URL is itself one, of which nothing is asked here."""
-    if not url.folder:
-        yield Found(url.address)
-        return
-    stored = objects_below(url)
-    for rest, each in sorted(stored.items()):
-        whole = rest.removesuffix(f".mcap{PARTIAL}")
-        if rest.endswith(".mcap") or (whole != rest and f"{whole}.mcap" not in stored):
-            yield Found(url.address.rstrip("/") + rest, each.size, each.tag)
 
 
 def _state_of_folder(folder: Path) -> tuple[int, str]:

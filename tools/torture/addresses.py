@@ -144,8 +144,8 @@ def _lying(host: str, lie: Callable[[socket.socket], object]) -> None:
     threading.Thread(target=accept, daemon=True).start()
 
 
-def _reading(host: str, place: Path) -> list[tuple[str, tuple[object, ...], dict[str, str]]]:
-    """Commands that read of a host, or write to it."""
+def _reading(host: str) -> list[tuple[str, tuple[object, ...], dict[str, str]]]:
+    """List commands that read from a host."""
     limits = ("--timeout", TIMEOUT, "--read-timeout", TIMEOUT / 2)
     live = [
         (kind, ("record", address, "--frames", 2, "--size", "16x12", "-o", "out"), {})
@@ -157,9 +157,9 @@ def _reading(host: str, place: Path) -> list[tuple[str, tuple[object, ...], dict
         }.items()
     ]
     logs = [(kind, ("info", f"{kind}://{host}/a.mcap", *limits), {}) for kind in ("http", "https")]
-    upload = ("upload", place / "recording", "s3://bucket/x", *limits)
     keys = {"AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": PASSWORD}
-    return [*live, *logs, ("s3", upload, {"AWS_ENDPOINT_URL": f"http://{host}", **keys})]
+    stored = ("info", "s3://bucket/a.mcap", *limits)
+    return [*live, *logs, ("s3", stored, {"AWS_ENDPOINT_URL": f"http://{host}", **keys})]
 
 
 def prepare(folder: Path) -> list[Case]:
@@ -188,7 +188,7 @@ def prepare(folder: Path) -> list[Case]:
     addresses = [
         Case(words, f"address: {kind}", environment=more)
         for host in HOSTS
-        for kind, words, more in _reading(host, folder)
+        for kind, words, more in _reading(host)
     ]
     liars = [
         Case(
@@ -196,9 +196,7 @@ def prepare(folder: Path) -> list[Case]:
         )
         for host in ("127.0.0.1", "::1")
         for said, lie in LIARS.items()
-        for kind, words, more in _reading(
-            f"[{host}]:{PORT}" if ":" in host else f"{host}:{PORT}", folder
-        )
+        for kind, words, more in _reading(f"[{host}]:{PORT}" if ":" in host else f"{host}:{PORT}")
     ]
     cameras._TIMEOUT = TIMEOUT  # type: ignore[misc]
     found = [*ports, *addresses, *liars]

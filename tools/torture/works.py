@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import ctypes
-import hashlib
 import json
-import os
-import signal
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
-from urllib.request import Request, urlopen
 
 from camera_files import write_pictures
-from s3_server import serving_s3, settings
 
 from replay.storage.identity import file_sha256
 
-from .commands import here, must, until
+from .commands import here, must
 from .materials import EASY
 from .outcomes import WRONG, Defect
 
 Words = tuple[object, ...]
 FRAMES = 4000
 ITERATIONS = 300
-PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,18 +67,6 @@ def run(place: Path) -> dict[str, Any]:
 def sweep(place: Path) -> Any:
     """Of a sweep: the mean of each point."""
     return here("results", place, "--json").json
-
-
-def uploaded(place: Path) -> dict[str, Any]:
-    """Of an upload: the bytes of each object, of files that are here or were given."""
-    there = files(place) if place.exists() else {}
-    names = there or [f"x{i}.mcap" for i in (1, 2, 3)]
-    stored = {}
-    for name in names:
-        url = f"{os.environ['AWS_ENDPOINT_URL']}/torture{quote(str(place))}/{name}"
-        with urlopen(Request(url, headers={"Authorization": "AWS nobody:nothing"})) as answer:
-            stored[name] = hashlib.sha256(answer.read()).hexdigest()
-    return {"there": there, "stored": stored}
 
 
 def reproduction(place: Path) -> Any:
@@ -137,17 +117,6 @@ WORKS: Mapping[str, Work] = {
         *((), run, 10, ITERATIONS // 2),
         on=lambda place: ("learn", "-o", place, "--resume", "--no-rerun"),
     ),
-    "record to s3": Work(
-        lambda place, shared: (
-            *("record", *STREAMS, *PARTS, "--seed", 3),
-            *("-o", f"s3://torture{place}", "--local", place),
-        ),
-        *(RESUME, uploaded, 8),
-    ),
-    "upload": Work(
-        lambda place, shared: ("upload", shared / "recording", f"s3://torture{place}"),
-        *((), uploaded, 8),
-    ),
     "convert": Work(
         lambda place, shared: (
             *("convert", shared / "png" / "left", shared / "png" / "right"),
@@ -164,26 +133,8 @@ WORKS: Mapping[str, Work] = {
 }
 
 
-def serve(folder: Path) -> None:
-    """Have an S3 server that ends with this process, and have what is begun here use it."""
-    told = folder / "address"
-    if os.fork() == 0:
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # it tells of every request
-        with serving_s3() as address:
-            urlopen(Request(f"{address}/torture", method="PUT")).close()
-            told.with_suffix(".partial").write_text(address)
-            told.with_suffix(".partial").rename(told)
-            signal.pause()
-    if not until(told.exists, 60):
-        raise Defect(WRONG, "setup", "no S3 server")
-    os.environ |= settings(told.read_text())
-    import s3fs  # noqa: F401 - once for all commands
-
-
 def prepared(folder: Path, names: Collection[str]) -> dict[str, Any]:
     """Results of works that nobody stops, and how many seconds each takes."""
-    serve(folder)
     must(folder, "record", "oscillatory", "-o", folder / "recording", "--frames", FRAMES)
     must(folder, *WORKS["learn, 2.0"].words(folder / "run", folder))
     (folder / "png").mkdir()

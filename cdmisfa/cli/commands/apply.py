@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import completing, options, uploads
+from cdmisfa.cli import completing, options
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import WRITTEN, grouped, number, option, options_of
 from cdmisfa.cli.printing import (
@@ -52,9 +52,8 @@ log_options = options_of(
 @grouped("apply", common=("out", "to", "frames", "loop", "jobs"))
 @options.path_argument("run")
 @click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
-@uploads.out_option(
-    "The file of one log, .parquet, .csv, .mcap or .rrd (a view); or a folder, of a file a log. Or "
-    "s3://..."
+@options.out(
+    "The file of one log, .parquet, .csv, .mcap or .rrd (a view); or a folder, of a file a log."
 )
 @option(
     "--to",

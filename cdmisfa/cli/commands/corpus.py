@@ -58,8 +58,8 @@ def index_command(
 ) -> None:
     """Index what is in many logs: streams, times, damage, doubles.
 
-    CORPUS is a folder, with all that is in it, a pattern such as 'logs/**/*.mcap', an s3:// prefix,
-    or several: recordings, runs, logs of others. The index is one Parquet file, a row a stream; a
+    CORPUS is a folder, with all that is in it, a pattern such as 'logs/**/*.mcap', or
+    several: recordings, runs, logs of others. The index is one Parquet file, a row a stream; a
     log that cannot be read is a row with its problem. Run again, it reads what is new or changed.
     """
     from replay.corpus.index import index_logs

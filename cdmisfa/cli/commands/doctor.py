@@ -29,7 +29,7 @@ EXTRAS = {
     "gym": (("gymnasium",), "gym: streams of simulated tasks; WatchEnv"),
     "rl": (("gymnasium", "stable_baselines3"), "examples/ppo.py"),
     "foxglove": (("foxglove", "websockets"), "foxglove:// streams of robots; play as a robot"),
-    "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs; -o s3://"),
+    "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
     "corpus": (("duckdb",), "query"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "arena": (("ale_py", "av", "gymnasium", "skvideo", "sklearn"), "streams of the arena"),

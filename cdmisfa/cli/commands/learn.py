@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.agents.learners import LEARNERS
-from cdmisfa.cli import completing, options, uploads
+from cdmisfa.cli import completing, options
 from cdmisfa.cli.commands.report import report_beside
 from cdmisfa.cli.making import choice, flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
@@ -43,7 +43,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 
 @grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
 @click.argument("source", nargs=-1, shell_complete=completing.sources)
-@uploads.out_option("Folder of the run, or s3://...; without it nothing is written.")
+@options.out("Folder of the run; without it nothing is written.")
 @options.seed()
 @options.preset
 @options.settings()

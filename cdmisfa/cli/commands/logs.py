@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import completing, options, uploads
+from cdmisfa.cli import completing, options
 from cdmisfa.cli.making import WRITTEN, flag, option, word
 from cdmisfa.cli.printing import (
     print_document,
@@ -22,7 +22,7 @@ from cdmisfa.cli.printing import (
     tell,
 )
 from cdmisfa.cli.progress import bar
-from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, NotReproducedError
 from cdmisfa.core.names import counted
 from cdmisfa.core.options import TIME
 
@@ -146,27 +146,6 @@ def cut_command(log: tuple[str, ...], split: str | None, as_json: bool, **chosen
         click.get_current_context().exit(LogDamagedError.exit_code)
 
 
-@click.command("upload")
-@options.path_argument("result")
-@click.argument("url")
-@options.server_limits
-@options.as_json
-def upload_command(result: Path, url: str, as_json: bool) -> None:
-    """Upload a result to an S3 bucket, as `-o s3://...` does.
-
-    RESULT is the file or folder of a recording, a run, a sweep or an export, URL is
-    s3://BUCKET/NAME. What is there already with the same size and checksum is not sent again.
-    """
-    from replay.storage.location import Url, location
-
-    to = location(url)
-    if not isinstance(to, Url) or to.scheme != "s3":
-        raise UsageError(f"{url} is no s3:// address: write s3://BUCKET/NAME")
-    files, size = uploads.upload_now(result, to, "the same command")
-    if as_json:
-        print_document(url=str(to), files=files, bytes=size)
-
-
 @click.command("compare")
 @options.fetched_argument("runs", nargs=-1)
 @options.path("--save", "Also write their curves, one over the other, as a view.", "F.rrd")
@@ -281,7 +260,7 @@ def _forms() -> list[str]:
     help="Form: parquet, npz, csv, arrow, images, mp4, lerobot, or a plugin's; by default what the "
     "file's name ends in.",
 )
-@uploads.out_option("The file to write, for a recording the folder, or s3://...", required=True)
+@options.out("The file to write, for a recording the folder.", required=True)
 @flag("--lossless", "Keep every value of images in a video.")
 @options.path("--segments", "Export these of many logs: a list, as cdmisfa curate writes.", "FILE")
 @word("--task", "TEXT", "What is done in a LeRobot dataset; by default what a log says.")

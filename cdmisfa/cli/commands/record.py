@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from cdmisfa.cli import completing, options, uploads
+from cdmisfa.cli import completing, options
 from cdmisfa.cli.commands.streams import print_recording, record_streams, refuse_logs
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, word
@@ -45,7 +45,7 @@ LIVE = ("cameras", "gym")
 
 @grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
 @click.argument("source", nargs=-1, shell_complete=completing.sources)
-@uploads.out_option("Folder of the recording, or s3://...")
+@options.out("Folder of the recording.")
 @number(
     "--frames",
     "Frames of each view; by default 1000, with --resume as many as first asked for, of cameras "
@@ -211,7 +211,7 @@ def _record_scene(
 
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
 @click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
-@uploads.out_option("Folder of the recording, or s3://...; --dry-run needs none.")
+@options.out("Folder of the recording; --dry-run needs none.")
 @options.log_options
 @options.dry_run
 @options.live_options

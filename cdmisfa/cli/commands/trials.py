@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import completing, options, uploads
+from cdmisfa.cli import completing, options
 from cdmisfa.cli.making import flag, grouped, number, word
 from cdmisfa.cli.printing import (
     print_document,
@@ -37,11 +37,7 @@ MOST_SEEDS = 1_000_000
 
 @grouped("sweep", common=("out", "grid", "seeds", "settings", "max_iterations", "jobs"))
 @click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
-@uploads.out_option(
-    "Folder of the sweep, or s3://...; what is finished in it is not computed again.",
-    required=True,
-    goes_on=True,
-)
+@options.out("Folder of the sweep; what is finished in it is not computed again.", required=True)
 @word(
     "--grid",
     "KEY=V1,V2,...",
