@@ -89,7 +89,6 @@ def test_the_refusal_prints_a_command_that_works(cdmisfa: Cdmisfa, logs: Path) -
     for words in (
         (*command, *QUICK),
         ("export", uneven, "--to", "images", "-o", logs / "out"),
-        ("play", uneven, "--rate", 100),
     ):
         done = cdmisfa(*words)
         assert done.code == 0, done.err

@@ -137,7 +137,6 @@ def test_settings_of_a_log_or_a_caller_are_checked_like_typed_ones(
     [
         ("convert", "a.mcap", "--rate", "nan"),
         ("record", "oscillatory", "--fsync-every", "nan"),
-        ("play", "a.mcap", "--rate", "nan"),
         ("learn", "oscillatory", "--timeout", "nan"),
     ],
 )

@@ -95,7 +95,7 @@ CASES: dict[str, tuple[str, ...]] = {
     ),
     "sweep REC --grid scene.seed=9,10 -o sweep": ("scene.seed " + VAIN.format("REC"),),
     # a file of another kind is a wrong word and no damage
-    **{f"{command} numbers.h5": (NO_MCAP,) for command in ("info", "verify", "play")},
+    **{f"{command} numbers.h5": (NO_MCAP,) for command in ("info", "verify")},
     **{f"{command} numbers.h5": (NO_MCAP,) for command in ("check", "plot")},
     "recover -o out.mcap numbers.h5": (NO_MCAP,),
     "convert -o out numbers.h5": (NO_MCAP,),
@@ -140,9 +140,6 @@ CASES: dict[str, tuple[str, ...]] = {
     },
     # a run is no recording
     **{f"learn {run}": (A_RUN,) for run in ("RUN", "RUN/run.mcap")},
-    "play RUN": (A_RUN,),
-    "play REC --wait 1": ("--wait is for --to foxglove",),
-    "play no/such": ("no such file or folder",),
     # options that are written otherwise
     "learn nothing.mcap --size 0x48": ("--size",),
     "learn nothing.mcap --from 1:2:3:4": ("--from",),
@@ -192,7 +189,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "record oscillatory --frames 20 -o EMPTY": ("is empty: name a",),
     "view RUN --save EMPTY": ("is empty: name a",),
     "fork EMPTY --at 3 -o fork": ("is empty: name a",),
-    **{f"{command} EMPTY": ("is empty: name a",) for command in ("learn", "view", "info", "play")},
+    **{f"{command} EMPTY": ("is empty: name a",) for command in ("learn", "view", "info")},
     # a conversion needs a folder
     "convert LOGS/left.mcap": ("say -o FOLDER, where the recording goes",),
     "convert LOGS/left.mcap LOGS/right.mcap --rate 9 --dry-run": ("-o REC\n",),

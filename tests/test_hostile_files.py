@@ -262,7 +262,7 @@ def test_what_cannot_be_unpacked_ends_what_is_resumed(tmp_path: Path, compressio
     assert max(held) <= 300
 
 
-WAYS = ("info", "verify", "learn", "convert -o out", "play", "export -o out --to images")
+WAYS = ("info", "verify", "learn", "convert -o out", "export -o out --to images")
 """Commands that take any log."""
 
 

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 import pytest
@@ -22,7 +22,6 @@ from waiting import python
 from cdmisfa.cli import app
 from cdmisfa.cli.app import run
 from cdmisfa.cli.interrupts import SIGNALS, interruptible, stoppable
-from replay.playing.feed import Feed, Playback, Played, paced
 
 
 def wait() -> None:
@@ -125,12 +124,6 @@ def test_a_line_that_is_told_at_the_end_is_told_whole(monkeypatch: Any, capsys: 
     monkeypatch.setattr(click, "echo", interrupted)
     assert run(["info", "not/there"]) == 2
     assert capsys.readouterr().err.startswith("cdmisfa: not/there")
-
-
-class Message(NamedTuple):
-    """What is played."""
-
-    time_ns: int
 
 
 LEARN = ("learn", "oscillatory", "--set", "learner.tau=10", "--max-iterations", 3)
@@ -243,16 +236,6 @@ def _signalled(
 
     monkeypatch.setattr(last, signalled)
     return cdmisfa(*words)
-
-
-def test_what_was_played_to_its_end_was_not_stopped() -> None:
-    for last, stopped in ((2, False), (1, True)):
-        played, signals = Played(), list[int]()
-        feed = Feed(0, 2, lambda: map(Message, range(3)))
-        how = Playback(stop=lambda signals=signals: bool(signals))
-        for i, _ in paced(feed, how, played):
-            signals += [i] if i == last else []
-        assert played.stopped is stopped
 
 
 CLOSED = ("<&-", ">&-", "2>&-", "<&- >&- 2>&-")

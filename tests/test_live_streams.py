@@ -449,28 +449,6 @@ def test_a_topic_that_the_server_does_not_know_yet_is_subscribed_to_again() -> N
     assert [message["op"] for message in told[:3]] == ["subscribe"] * 3
 
 
-def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(
-    cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    script = (
-        "import sys, threading\n"
-        "from pathlib import Path\n"
-        "from websockets.sync.client import connect\n"
-        "from replay.playing.as_robot import play_as_robot\n"
-        "from replay.playing.feed import Playback\n"
-        "left = []\n"
-        "def leave(line):\n"
-        "    client = connect(line.split()[2].strip(','), subprotocols=['foxglove.sdk.v1'])\n"
-        "    client.recv(), client.recv(), client.socket.close(), left.append(1)\n"
-        "def watch(line): threading.Thread(target=leave, args=[line]).start()\n"
-        "how = Playback(stop=lambda: bool(left))\n"
-        "play_as_robot([Path(sys.argv[1])], how, port=0, say=watch)\n"
-    )
-    assert cdmisfa("record", "oscillatory", "-o", tmp_path / "rec", "--frames", "20").code == 0
-    done = python("-W", "ignore", "-c", script, tmp_path / "rec")
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 def test_a_server_whose_headers_never_end_is_told_of_once() -> None:
     script = (
         "import sys\n"

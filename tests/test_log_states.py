@@ -41,7 +41,6 @@ USES = {
     "convert": "convert LOG -o OUT",
     "view": "view LOG --save OUT.rrd",
     "export": "export LOG --to images -o OUT",
-    "play": "play LOG --to foxglove --wait 0 --port 0 --rate 1000",
 }
 
 

@@ -43,12 +43,11 @@ FORMATS = (
     *("recording", "run", *(f"{kind} mcap" for kind in MESSAGES_OF), *BAGS, "video", "video mcap"),
     *(*PICTURES, "lerobot", "table", "url", "several", "glob"),
 )
-COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "play", "index")
+COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "index")
 REFUSED = {
     ("export", "run"): "name the recording",
     ("export", "table"): "holds no images",
     ("learn", "run"): "is a run, not a recording",
-    ("play", "run"): "is a run, not a recording",
     ("convert", "run"): "is a run, not a recording",
     **{("record", kind): "cdmisfa convert" for kind in FORMATS},
 }
@@ -165,10 +164,6 @@ def command_line(command: str, kind: str, words: list[object], out: Path) -> lis
         "export": ["export", *words, "--to", "images", "-o", out / "images", *rate],
         "learn": ["learn", *words, "--max-iterations", "1", "--json", *needed(kind)],
         "convert": ["convert", *words, "-o", out / "rec", "--json", *needed(kind)],
-        "play": [
-            *("play", *words, "--to", "foxglove", "--port", 0, "--wait", 0),
-            *("--rate", 100, "--json", *(["--fps", 50] if rate else [])),
-        ],
         "index": ["index", *words, "-o", out / "all.parquet", "--deep", "--jobs", 1, "--json"],
         "record": ["record", *words, "-o", out / "rec", "--frames", "5"],
     }[command]
@@ -202,8 +197,6 @@ def test_a_command_takes_a_log_or_says_why_not(
             assert len(list((tmp_path / "images").rglob("*.png"))) == streams * COUNT
         case "learn":
             assert done.json["iterations"] == 1
-        case "play":
-            assert done.json["messages"] >= streams * COUNT
         case "index":
             rows = read_index(tmp_path / "all.parquet").to_pylist()
             assert [row["problem"] for row in rows if row["problem"]] == []

@@ -165,8 +165,6 @@ def test_files_of_arrays_are_looked_at_and_converted(
     assert cdmisfa("view", tmp_path / "x.npz", "--save", tmp_path / "v.rrd").code == 0
     first = View(tmp_path / "v.rrd").rows["/views/1_a"]
     assert first["frame"][:2] == ([0, 10] if shown.ndim > 2 else [0, 1])
-    served = ("--to", "foxglove", "--port", 0, "--wait", 0, "--rate", 99)
-    assert cdmisfa("play", tmp_path / "y.npy", *served).code == 0
 
 
 def test_files_of_arrays_are_logs_that_runs_find_again(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_what_is_learned_from_has_one_name(cdmisfa: Cdmisfa, tmp_path: Path, way
     ("words", "names"),
     [
         ([f"foxglove://robot:8765{topic}" for topic in TOPICS], NAMES),
-        ([f"foxglove://127.0.0.1:8765/view/{name}" for name in NAMES], NAMES),  # that is played
+        ([f"foxglove://127.0.0.1:8765/view/{name}" for name in NAMES], NAMES),
         (["foxglove://robot/camera/right%20e/image_raw"], NAMES[1:]),
         ([f"av:films/{name}.mp4" for name in NAMES], NAMES),
         ([f"rtsp://10.0.0.1/{name}" for name in NAMES], NAMES),

@@ -62,11 +62,6 @@ FORBIDDEN = {
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
     "replay.cutting": ("replay.export.frames", "replay.viewer.program", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer.program", "rerun"),
-    "replay.playing": (
-        "cdmisfa.experiments.session",
-        "cdmisfa.agents.learner",
-        "recorder.recording",
-    ),
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),
     "replay.report": ("replay.view.columns", "replay.export.frames", "rerun"),
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),

@@ -13,10 +13,10 @@ from typing import Any
 
 
 class Clock:
-    """A clock that only sleeping moves, by a little more than was asked for, where that is said."""
+    """A clock that only sleeping moves."""
 
-    def __init__(self, over: float = 0.0) -> None:
-        self.now, self.over = 100.0, over
+    def __init__(self) -> None:
+        self.now = 100.0
 
     def monotonic(self) -> float:
         """Its seconds."""
@@ -24,7 +24,7 @@ class Clock:
 
     def sleep(self, seconds: float) -> None:
         """Let seconds pass."""
-        self.now += seconds + self.over
+        self.now += seconds
 
 
 def python(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:

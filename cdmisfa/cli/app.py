@@ -31,7 +31,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Record": {
         "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
         "convert": ("record", "Write camera logs of others as a recording."),
-        "play": ("view", "Show a recording as it was seen, in real time."),
         "samples": ("samples", "Say where the sample logs are, or write them to a folder."),
     },
     "Learn": {

@@ -24,17 +24,14 @@ class Stop:
     Attributes:
         number: of the last signal, 0 for none.
         ended: the work is over, and a signal changes nothing any more.
-        asked: somebody looks whether to stop.
     """
 
     def __init__(self) -> None:
         self.number: int = 0
         self.ended = False
-        self.asked = False
 
     def __call__(self) -> bool:
         """Whether to stop."""
-        self.asked = True
         return self.number != 0
 
     @property
@@ -77,17 +74,16 @@ def end_at_once(code: int | None = None) -> None:
 @contextmanager
 def stoppable(
     notice: str = "finishing what is begun; again to stop at once\n",
-    *,
-    opens: bool = False,
 ) -> Iterator[Stop]:
-    """Let the body end its step at the first signal, and say so; the second one interrupts it.
+    """Let the body finish its step at the first signal, and print `notice`; the second interrupts.
 
-    Where it `opens` something before its steps, the first one does, until it is asked for.
+    Yields:
+        Becomes true with the first signal.
     """
     stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}
 
     def ask(number: int, frame: FrameType | None) -> None:
-        if stop.number or (opens and not stop.asked):
+        if stop.number:
             if callable(handle := outer[number]):  # it notes the signal, for the exit code
                 handle(number, frame)
             raise KeyboardInterrupt

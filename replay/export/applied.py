@@ -160,59 +160,6 @@ class TableSink:
         self._waiting, self._count = [], 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OutputTopic:
-    """A topic on which messages are told: of the frames of a stream, or of a module on it."""
-
-    name: str
-    schema: str
-    definition: bytes
-
-
-class Messages:
-    """What modules give as messages: the frames of each stream, and a topic a module and stream.
-
-    Args:
-        spec: of the frames.
-        modules: in their order.
-
-    Attributes:
-        topics: all that there are.
-    """
-
-    def __init__(self, spec: SourceSpec, modules: Sequence[Module]) -> None:
-        self._spec, self._modules = spec, list(columns_of(modules))
-        self._frames: list[Any] = [VectorEncoder() for _ in spec.streams]
-        if spec.images:
-            height, width = spec.frame_shape
-            self._frames = [ImageEncoder(height, width, name) for name in spec.streams]
-        self._views = [
-            OutputTopic(view_topic(name), encoder.schema, encoder.schema_data())
-            for name, encoder in zip(spec.streams, self._frames, strict=True)
-        ]
-        self._outputs = [
-            [
-                OutputTopic(f"/module{module.index}/{name}", OUTPUT_SCHEMA, OUTPUT_DEFINITION)
-                for module, _ in self._modules
-            ]
-            for name in spec.streams
-        ]
-        self.topics = [*self._views, *(topic for own in self._outputs for topic in own)]
-
-    def of(self, applied: Applied) -> Iterator[tuple[OutputTopic, int, bytes]]:
-        """The messages of a block: topic, log time in nanoseconds, and data."""
-        block = applied.block
-        times = self._spec.times(block.t, block.t + len(block)).tolist()
-        encode, view = self._frames[block.stream], self._views[block.stream]
-        for at, frame in zip(times, block.frames, strict=True):
-            yield view, at, encode(at, frame)
-        for i, (_, own) in enumerate(self._modules):
-            topic = self._outputs[block.stream][i]
-            rows = _encoded(applied, i, own)
-            for at, row in zip(times, rows, strict=True):
-                yield topic, at, row
-
-
 def _encoded(applied: Applied, module: int, own: slice) -> list[bytes]:
     """The messages `cdmisfa.ModuleOutput` of a module on a block, all laid out alike."""
     rows = np.repeat(_row(own.stop - own.start), len(applied.block))
@@ -240,24 +187,50 @@ def _row(count: int) -> NDArray[np.void]:
 
 
 class LogSink:
-    """An MCAP file: a topic a module and stream, beside the frames; readable while written."""
+    """An MCAP file with the frames of each stream and a topic per module and stream.
+
+    The file is readable while it is written.
+    """
 
     def __init__(
         self, path: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool = False
     ) -> None:
-        self._messages = Messages(spec, modules)
+        self._spec, self._modules = spec, list(columns_of(modules))
+        self._encoders: list[Any] = [VectorEncoder() for _ in spec.streams]
+        if spec.images:
+            height, width = spec.frame_shape
+            self._encoders = [ImageEncoder(height, width, name) for name in spec.streams]
         self._log = LogFile(path, force=force, compression="lz4", aside=True)
-        self._channels = {
-            topic: self._log.add_channel(
-                topic.name, self._log.add_schema(topic.schema, ENCODING, topic.definition)
-            )
-            for topic in self._messages.topics
-        }
+
+        def channel(topic: str, schema: str, definition: bytes) -> int:
+            return self._log.add_channel(topic, self._log.add_schema(schema, ENCODING, definition))
+
+        self._views = [
+            channel(view_topic(name), encoder.schema, encoder.schema_data())
+            for name, encoder in zip(spec.streams, self._encoders, strict=True)
+        ]
+        self._outputs = [
+            [
+                channel(f"/module{module.index}/{name}", OUTPUT_SCHEMA, OUTPUT_DEFINITION)
+                for module, _ in self._modules
+            ]
+            for name in spec.streams
+        ]
 
     def add(self, applied: Applied) -> None:
         """See `AppliedSink`."""
-        found = self._messages.of(applied)
-        self._log.write_all([(self._channels[c], at, data, at, 0) for c, at, data in found])
+        block = applied.block
+        times = self._spec.times(block.t, block.t + len(block)).tolist()
+        encode, view = self._encoders[block.stream], self._views[block.stream]
+        found = [
+            (view, at, encode(at, frame), at, 0)
+            for at, frame in zip(times, block.frames, strict=True)
+        ]
+        for i, (_, own) in enumerate(self._modules):
+            topic = self._outputs[block.stream][i]
+            rows = _encoded(applied, i, own)
+            found += [(topic, at, row, at, 0) for at, row in zip(times, rows, strict=True)]
+        self._log.write_all(found)
 
     def close(self) -> None:
         """See `AppliedSink`."""

@@ -169,8 +169,6 @@ def prepare(folder: Path) -> list[Case]:
     rows = ("sweep", "oscillatory", "--seeds", "0:2", "--max-iterations", 3, "--keep-logs")
     must(folder, *rows, "-o", folder / "sweep")
     serving = {
-        "play": ("play", folder / "recording"),
-        "play --to foxglove": ("play", folder / "recording", "--to", "foxglove"),
         "view --web": ("view", folder / "run", "--web"),
         "view a sweep": ("view", folder / "sweep"),
     }

@@ -48,13 +48,6 @@ UNLIKE: dict[str, Work] = {
         lambda place, shared: ("record", LIVE, "--frames", RATE, "--size", "16x12", "-o", place),
         *((), times, 1),
     ),
-    "play": Work(
-        lambda place, shared: (
-            *("play", shared / "recording", "--rate", 1000),
-            *("--to", "foxglove", "--wait", 0, "--port", 0),
-        ),
-        *((), shown, 1),
-    ),
     "view": Work(
         lambda place, shared: ("view", shared / "run", "--save", place.with_suffix(".rrd")),
         *((), shown, 1),

@@ -40,7 +40,7 @@ MOST_SAID = 20
 """Logs of which is said what went wrong."""
 
 FILE_FORMS = ("parquet", "csv", "mcap", "rrd")
-STDOUT, FOXGLOVE = AS_THEY_COME = ("stdout", "foxglove")
+STDOUT = "stdout"
 
 log_options = options_of(
     CameraOptions,
@@ -59,10 +59,9 @@ log_options = options_of(
     "--to",
     multiple=True,
     metavar="FORM|TIME",
-    help=f"What is written, {', '.join(FILE_FORMS)}; or where blocks go as they come: {STDOUT}, as "
-    f"JSON lines, {FOXGLOVE}, of live streams as a robot; or leave out images from this TIME on.",
+    help=f"Format of the files, {', '.join(FILE_FORMS)}; or {STDOUT}: print each block as a JSON "
+    "line as soon as it is complete; or leave out images from this TIME on.",
 )
-@number("--port", "Where --to foxglove is served, on this machine.", 0, 65535)
 @number("--frames", "End after so many frames of each stream.", 1)
 @options.loop
 @options.salvage
@@ -83,7 +82,6 @@ def apply_command(
     source: tuple[str, ...],
     out: Path | None,
     to: tuple[str, ...],
-    port: int | None,
     frames: int | None,
     loop: bool,
     salvage: bool,
@@ -107,11 +105,11 @@ def apply_command(
     """
     from cdmisfa.experiments.apply import Application
 
-    outlet = outlet_of(ctx, to, port)
+    outlet = outlet_of(ctx, to)
     refuse_unfit(source, outlet, live, again=loop or salvage, as_json=as_json)
     cameras = replace(cameras, stop=outlet.until)
     if out is not None and is_folder(out) and are_logs(source):
-        if outlet.way == STDOUT:
+        if outlet.lines:
             raise UsageError("--to stdout is for what is applied at once: leave out -o FOLDER")
         where |= {"form": outlet.form or FILE_FORMS[0], "cameras": cameras, "force": force}
         where |= {"frames": frames, "loop": loop, "salvage": salvage}
@@ -146,7 +144,7 @@ def apply_command(
                 rows[-1]["error"] = str(damaged)
             if stop.number:
                 break
-    if outlet.way != STDOUT:
+    if not outlet.lines:
         print_applied(str(run), rows, as_json=as_json)
     if stop.number:
         ctx.exit(stop.exit_code)
@@ -206,17 +204,13 @@ def refuse_unfit(
     """
     from recorder.cameras.words import is_live
 
-    if outlet.way == STDOUT and as_json:
+    if outlet.lines and as_json:
         raise UsageError("--to stdout prints JSON lines, --json one document: use one of them")
     if any(map(is_live, source)):
         if again:
             raise UsageError("live streams cannot go back: leave out --loop and --salvage")
         return
     options.refuse_live_options(live, source)
-    if outlet.way == FOXGLOVE:
-        raise UsageError(
-            "--to foxglove is for live streams: write -o OUT.mcap, and cdmisfa play it so"
-        )
 
 
 def applied(
@@ -243,14 +237,8 @@ def applied(
     with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
         if place is not None:
             sinks.append(stack.enter_context(written_to(place, spec, modules, force=force)))
-        if outlet.way == STDOUT:
+        if outlet.lines:
             sinks.append(LinesSink(print_line, spec, modules))
-        if outlet.way == FOXGLOVE:
-            from replay.playing.as_robot import HOST, PORT, RobotSink
-
-            robot = RobotSink(PORT if outlet.port is None else outlet.port, spec, modules)
-            sinks.append(stack.enter_context(contextlib.closing(robot)))
-            tell(f"applying at ws://{HOST}:{robot.port}")
         blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))
         total = None if spec.length is None else spec.length * len(spec.streams)
         follow(blocks, sinks, totals, lambda: shown.update(totals.frames, total))
@@ -263,36 +251,32 @@ def applied(
 
 @dataclass(frozen=True, slots=True)
 class Outlet:
-    """What --to and --port say.
+    """Values of --to.
 
     Attributes:
-        form: of files; None where none is named.
-        way: where blocks go as they come, one of `AS_THEY_COME` or "".
+        form: format of the files; None where --to names none.
+        lines: whether each block is printed as a JSON line.
         until: time of a log from which on images are left out.
-        port: of the server.
     """
 
     form: str | None = None
-    way: str = ""
+    lines: bool = False
     until: float | None = None
-    port: int | None = None
 
 
-def outlet_of(ctx: click.Context, words: Sequence[str], port: int | None) -> Outlet:
-    """Read what --to says, each kind of it once."""
-    found = Outlet(port=port)
+def outlet_of(ctx: click.Context, words: Sequence[str]) -> Outlet:
+    """Parse the values of --to."""
+    found = Outlet()
     for word in words:
         if word in FILE_FORMS:
             found = replace(found, form=word)
-        elif word in AS_THEY_COME:
-            found = replace(found, way=word)
+        elif word == STDOUT:
+            found = replace(found, lines=True)
         elif word[:1].isdigit():
             found = replace(found, until=WRITTEN[TIME].convert(word, None, ctx))
         else:
-            names = ", ".join((*FILE_FORMS, *AS_THEY_COME))
+            names = ", ".join((*FILE_FORMS, STDOUT))
             raise UsageError(f"--to {word}: name {names}, or a time, as 1:30")
-    if port is not None and found.way != FOXGLOVE:
-        raise UsageError("--port goes with --to foxglove")
     return found
 
 

@@ -28,7 +28,7 @@ EXTRAS = {
     "video": (("av",), "videos and cameras: learn, record, convert; export --to mp4"),
     "gym": (("gymnasium",), "gym: streams of simulated tasks; WatchEnv"),
     "rl": (("gymnasium", "stable_baselines3"), "examples/ppo.py"),
-    "foxglove": (("foxglove", "websockets"), "foxglove:// streams of robots; play as a robot"),
+    "foxglove": (("websockets",), "foxglove:// streams of robots"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
     "corpus": (("duckdb",), "query"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),

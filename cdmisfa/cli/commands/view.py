@@ -1,4 +1,4 @@
-"""`cdmisfa view` and `play`: look at a run or a recording."""
+"""`cdmisfa view`: look at a run or a recording."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.making import flag, grouped, number, option, options_of, word
-from cdmisfa.cli.printing import announce, print_document, print_line, say_about, tell, warn
+from cdmisfa.cli.making import flag, grouped, number, word
+from cdmisfa.cli.printing import say_about, tell
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.options import CameraOptions
@@ -168,75 +167,3 @@ def _view_sweep(
 
     with bar("preparing views", "runs") as done:
         serve_catalogue(folder, port=port, tab=tab, web=web, progress=done.update)
-
-
-@click.command("play")
-@options.fetched_argument("recording", nargs=-1)
-@option(
-    "--to",
-    "target",
-    type=click.Choice(["rerun", "foxglove"]),
-    default="rerun",
-    show_default=True,
-    help="To the Rerun viewer, or to all that speak the Foxglove WebSocket protocol, as a robot.",
-)
-@number("--rate", "How many times as fast as it was seen.", *(1e-3, 1e3, "TIMES"), default=1.0)
-@number("--fps", "Frames a second of what tells none, as folders of pictures.", *(1e-3, 1e6, "HZ"))
-@options_of(CameraOptions, "cameras", "topics", "fields", "time", "depth")
-@flag("--loop", "Start again at its end, until Ctrl-C.")
-@number(
-    "--wait",
-    "As a robot, begin once so many topics are watched; by default 1, with 0 at once.",
-    *(0, None, "TOPICS"),
-)
-@number(
-    "--port",
-    "Where to serve, on this machine; by default 8765 as a robot, else a free one.",
-    *(0, 65535),
-)
-@options.server_limits
-@options.as_json
-@click.pass_context
-def play_command(
-    ctx: click.Context,
-    /,
-    recording: tuple[Path, ...],
-    target: str,
-    rate: float,
-    fps: float | None,
-    loop: bool,
-    wait: int | None,
-    port: int | None,
-    as_json: bool,
-    cameras: CameraOptions,
-) -> None:
-    """Show a recording as it was seen, in real time.
-
-    RECORDING is the folder of a recording, files of its views, or camera logs of others; of one
-    behind a URL a copy is made. With --to foxglove other tools see it at ws://127.0.0.1:8765, as
-    if it were a running robot, cdmisfa, too: cdmisfa record foxglove://127.0.0.1:8765/view/left
-    """
-    if wait is not None and target != "foxglove":
-        raise UsageError("--wait is for --to foxglove: a viewer that comes late is shown all")
-    with bar("playing", "s") as shown, stoppable(notice="", opens=True) as stop:
-        from replay.playing.feed import Playback
-
-        how = Playback(rate, loop, fps, cameras, say_about, warn, stop, shown.update)
-        if target == "foxglove":
-            from replay.playing.as_robot import PORT, play_as_robot
-
-            at, begin = PORT if port is None else port, 1 if wait is None else wait
-            played = play_as_robot(recording, how, port=at, wait=begin, say=tell)
-        else:
-            from replay.playing.in_rerun import play_in_rerun
-
-            played = play_in_rerun(recording, how, port=port, announce=announce)
-    if played.behind > 1:
-        tell(f"it came to lag {played.behind:.1f} s behind: play it with a smaller --rate")
-    what = "messages" if target == "foxglove" else "frames"
-    if as_json:
-        print_document(**{what: played.count, "seconds": played.seconds})
-    else:
-        print_line(f"played {played.count} {what}, {played.seconds:.2f} s of the recording")
-    if played.stopped and not loop:
-        ctx.exit(stop.exit_code)
