@@ -192,7 +192,6 @@ CASES: dict[str, tuple[str, ...]] = {
     **{f"{command} EMPTY": ("is empty: name a",) for command in ("learn", "view", "info")},
     # a conversion needs a folder
     "convert LOGS/left.mcap": ("say -o FOLDER, where the recording goes",),
-    "convert LOGS/left.mcap LOGS/right.mcap --rate 9 --dry-run": ("-o REC\n",),
     # resuming is advised only where it can be
     "learn oscillatory -o taken": (TAKEN, "go on with --resume"),
     "record oscillatory -o taken": (TAKEN, "go on with --resume"),

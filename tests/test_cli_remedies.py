@@ -26,19 +26,6 @@ LOGS = ROOT / "sample_logs" / "icub"
 SHORT = ("--set", "learner.tau=10", "--no-rerun")
 
 
-@pytest.mark.parametrize("command", ["convert", "learn"])
-def test_a_plan_needs_no_folder_and_none_is_written(
-    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    words = (command, LOGS / "left.mcap", "--size", "16x12", "--dry-run")
-    planned = cdmisfa(*words)
-    assert planned.code == 0, planned.err
-    done = cdmisfa(*words, "-o", "rec")
-    assert (done.code, done.out, done.err) == (0, planned.out, planned.err)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("name", ["y.csv", "y.parquet"])
 def test_export_makes_its_folders(
     cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, name: str

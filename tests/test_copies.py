@@ -1,4 +1,4 @@
-"""Logs of which one is a copy of another are told, or refused with --strict."""
+"""Commands warn about a log that is a copy of another, with both names."""
 
 from __future__ import annotations
 
@@ -53,20 +53,16 @@ MAKE = (byte_copy, written_otherwise, renamed_pictures, table_and_its_copy)
 
 @pytest.mark.parametrize("make", MAKE)
 @pytest.mark.parametrize("command", ["learn", "convert"])
-def test_a_copy_is_told_with_both_names_and_refused_where_asked(
+def test_a_copy_is_told_with_both_names(
     cdmisfa: Cdmisfa, tmp_path: Path, command: str, make: type
 ) -> None:
     one, two, *how = make(tmp_path)
     out = ("-o", tmp_path / "out", *(LEARN if command == "learn" else ()))
-    refused = cdmisfa(command, one, two, *how, *out, "--strict")
-    assert (refused.code, refused.err.count("\n")) == (2, 1)
-    assert not (tmp_path / "out").exists()
     done = cdmisfa(command, one, two, *how, *out)
     assert done.code == 0, done.err
     (line,) = [line for line in done.err.splitlines() if "as a copy does" in line]
     assert line.startswith(f"warning: {two}: ")
     assert f" of {one}, " in line
-    assert line.removeprefix("warning: ") in refused.err
 
 
 def test_cameras_that_differ_are_no_copies(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
@@ -77,7 +73,7 @@ def test_cameras_that_differ_are_no_copies(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     for i in range(20, 40):
         images[i] = (images[i][0], 255 - images[i][1])
     write_images(two, {"/cam": images})
-    done = cdmisfa("learn", one, two, *LEARN, "--strict")
+    done = cdmisfa("learn", one, two, *LEARN)
     assert (done.code, "copy" in done.err) == (0, False)
 
 

@@ -101,22 +101,8 @@ def test_the_choice_is_said_and_the_run_goes_on_with_it(
     one, other = (json.loads((run / "run.json").read_text()) for run in runs)
     assert one["source"]["size"] == [H, width]
     assert one["result"]["signals_sha256"] == other["result"]["signals_sha256"]
-    assert said in cdmisfa("learn", log, "--rate", "20", "--color", "auto", "--dry-run").err
     rec = tmp_path / "rec"
     assert said in cdmisfa("convert", log, "--rate", "20", "--color=auto", "-o", rec).err
-
-
-def test_color_alone_is_on_wherever_it_stands(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    log = pictures(tmp_path / "log", GREY["grey"][:2])
-    plan = ("--rate", "20", "--dry-run", "--json")
-    for words, width in (
-        (("--color", log, *plan), 3 * W),
-        ((log, *plan, "--color"), 3 * W),
-        (("--color", "on", log, *plan), 3 * W),
-        (("--color", "off", log, *plan), W),
-        ((log, *plan), W),
-    ):
-        assert cdmisfa("learn", *words).json["size"] == [H, width]
 
 
 def test_what_has_no_first_frames_or_colours_to_look_at_is_refused(

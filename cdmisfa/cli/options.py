@@ -93,14 +93,8 @@ def refuse_live_options(live: LiveOptions, source: Sequence[str]) -> None:
         raise UsageError(f"{source[0]} is no live stream: {are_for(given, 'live streams')}")
 
 
-dry_run = flag(
-    "--dry-run", "Say what would be read from camera logs, and write nothing.", group="Source"
-)
 loop = flag("--loop", "Start a recording or log again at its end.", group="Source")
 salvage = flag("--salvage", "Pass over damaged parts and images of a log.", group="Source")
-strict = flag(
-    "--strict", "Refuse a log that shows the same as another, as a copy does.", group="Source"
-)
 force = flag("--force", "Overwrite what is already there.")
 no_rerun = flag("--no-rerun", "Do not build the Rerun view run.rrd.")
 no_report = flag("--no-report", "Do not write the report report.html.")

@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import counted
 from cdmisfa.core.untrusted import printable
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.run_folder import RunResult
-    from replay.corpus.episodes import EpisodeSource
     from replay.integrity.learned import ModuleInfo
     from replay.viewer.broadcast import Broadcast
 
@@ -183,81 +181,11 @@ def say_about(source: FrameSource) -> None:
         )
 
 
-def refuse_copies(source: FrameSource, *, strict: bool) -> None:
-    """Refuse logs of which one shows the same as another, where that is asked for.
-
-    Raises:
-        UsageError: one does.
-    """
-    if strict and (said := getattr(source, "copies", ())):
-        raise UsageError(f"{said[0]}: leave one out, or leave out --strict")
-
-
 def say_changes(source: FrameSource) -> None:
     """Say on stderr what showed while a source was read: changes of size, broken images."""
     changes = getattr(source, "changes", {}).values()  # only logs of others have these
     for line in (*changes, *getattr(source, "salvaged", list)()):
         warn(line)
-
-
-def _print_episodes(source: EpisodeSource, *, as_json: bool) -> None:
-    """Print the episodes of a source in their order."""
-    rows, fps = source.plan(), source.spec.fps
-    if as_json:
-        size = list(source.spec.frame_shape)
-        plan = {"frames": source.frames, "rate": fps, "size": size, "episodes": rows}
-        print_document(**plan, warnings=list(source.warnings))
-        return
-    cells = [
-        (number, row["frames"][0], row["frames"][1] - row["frames"][0], row["log"])
-        for number, row in enumerate(rows)
-    ]
-    print_table(("episode", "from", "frames", "log"), cells)
-    for line in (*source.notes, *source.warnings):
-        print_line(line)
-
-
-def print_plan(source: FrameSource, *, as_json: bool) -> None:
-    """Print what would be read: streams, sizes, rates, gaps and drops; of episodes their order.
-
-    Raises:
-        UsageError: it is no camera log.
-    """
-    from replay.camera_logs.source import ForeignSource
-    from replay.corpus.episodes import EpisodeSource
-
-    if isinstance(source, EpisodeSource):
-        _print_episodes(source, as_json=as_json)
-        return
-    if not isinstance(source, ForeignSource):
-        raise UsageError("--dry-run is for camera logs: cdmisfa info says what is in a recording")
-    rows = source.plan()
-    warnings = [*source.warnings, *source.changes.values()]
-    if as_json:
-        size = list(source.spec.frame_shape)
-        plan = {"frames": source.frames, "rate": source.spec.fps, "size": size, "streams": rows}
-        print_document(**plan, warnings=warnings)
-        return
-    what = "images" if source.spec.images else "messages"
-    head = ("stream", what, "rate", "size", "missing", "gaps", "repeated", "dropped")
-    cells = [
-        (row["stream"], row["images"], "-" if row["rate"] is None else f"{row['rate']:.6g}",
-         row["shape"], row["missing"], len(row["gaps"]), row["repeated"], row["dropped"])
-        for row in rows
-    ]  # fmt: skip
-    print_table(head, cells)
-    seconds = source.frames / source.spec.fps
-    print_line(
-        f"{counted(source.frames, 'frame')} at {source.spec.fps:g} a second, {seconds:.6g} s"
-    )
-    unknown = [row["stream"] for row in rows if row["size_changes"] is None]
-    if unknown:
-        said = "whether images change their size shows when they are read"
-        print_line(f"{said}: {' '.join(unknown)}")
-    for note in source.notes:
-        tell(note)
-    for warning in warnings:
-        warn(warning)
 
 
 def announce(broadcast: Broadcast) -> None:

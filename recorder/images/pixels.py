@@ -6,7 +6,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -299,16 +299,6 @@ def _opened(data: bytes, most: int = MAX_PIXELS) -> Iterator[Image.Image]:
         raise MalformedImage(f"its JPEG or PNG takes {limit}") from None
     except Exception as error:  # Pillow raises whatever its codecs raise
         raise MalformedImage(f"its JPEG or PNG is broken ({type(error).__name__})") from None
-
-
-def picture_size(file: BinaryIO) -> tuple[int, int] | None:
-    """The (height, width), upright, that the head of a JPEG or PNG states; None if it is broken."""
-    try:
-        with budget(), Image.open(file, formats=["JPEG", "PNG"]) as image:
-            turned = 5 <= _orientation(image) <= 8
-            return (image.width, image.height) if turned else (image.height, image.width)
-    except Exception:  # Pillow raises whatever its codecs raise
-        return None
 
 
 def _orientation(image: Image.Image) -> int:

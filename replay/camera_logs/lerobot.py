@@ -17,7 +17,7 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, read_json
 from recorder.images.fields import bounded
-from recorder.images.options import NUMBERS_RECIPE, Reading, Size
+from recorder.images.options import NUMBERS_RECIPE, Reading
 from recorder.images.pixels import Shown, compressed_image
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.camera_logs.pictures import VideoImages
@@ -98,12 +98,6 @@ class LeRobotImages(ImageStream):
             raise MalformedRecord(f"{name} has no frame at {place / self._fps:g} s")
         found: ByteArray = images.image(place)
         return found
-
-    def stated_size(self, row: int) -> Size | None:
-        shape = self._info["features"][self.topic].get("shape", ())
-        if len(shape) != 3 or not all(isinstance(n, int) and n > 0 for n in shape):
-            return None
-        return (shape[1], shape[2]) if shape[0] in (1, 3) else (shape[0], shape[1])
 
     def close(self) -> None:
         if self._video and self._images is not None:

@@ -19,9 +19,9 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.untrusted import check_regular, data_bytes, opened_regular, read_regular
-from recorder.images.options import VIDEO_RECIPE, Size
-from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
+from cdmisfa.core.untrusted import check_regular, data_bytes, read_regular
+from recorder.images.options import VIDEO_RECIPE
+from recorder.images.pixels import MAX_PIXELS, compressed_image
 from recorder.images.videos import frame_colors, frame_gray, pyav
 from recorder.images.whole import MalformedImage, check_png
 from recorder.mcap.records import MalformedRecord, Problem
@@ -80,10 +80,6 @@ class FolderImages(ImageStream):
         except UsageError as error:
             raise LogDamagedError(f"it was a picture when it was found: {error}") from None
         return compressed_image(data, color=self._color)
-
-    def stated_size(self, row: int) -> Size | None:
-        with opened_regular(self._files[row], MAX_PICTURE) as file:
-            return picture_size(file)
 
     def where(self, row: int) -> str:
         return str(self._files[row])

@@ -18,7 +18,7 @@ from cdmisfa.core.arrays import ByteArray, IntArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import stream_name, stream_names
-from recorder.images.options import VIDEO_RECIPE, Size
+from recorder.images.options import VIDEO_RECIPE
 from recorder.images.pixels import DISTANCES, Shown
 from recorder.images.videos import VideoPackets
 from recorder.images.whole import MalformedImage
@@ -92,10 +92,6 @@ class Selected(ImageStream):
     def stamp(self, row: int) -> int:
         stream, own = self._at(row)
         return stream.stamp(own)
-
-    def stated_size(self, row: int) -> Size | None:
-        stream, own = self._at(row)
-        return stream.stated_size(own)
 
     def where(self, row: int) -> str:
         stream, own = self._at(row)

@@ -27,7 +27,6 @@ from replay.camera_logs.alignment import (
     gaps_by_time,
     gaps_in_words,
     known_times,
-    missing,
     of_other_rate,
     overlap,
     pauses,
@@ -215,37 +214,10 @@ class ForeignSource(AheadSource):
         """See `LoggedSource`."""
         return self._streams[stream].pixels() or ""
 
-    def plan(self) -> list[dict[str, Any]]:
-        """The plan of --dry-run: what would be read of each stream, as JSON values."""
-        rows: list[dict[str, Any]] = []
-        for name, images, times in zip(self._spec.streams, self._streams, self._times, strict=True):
-            step = step_of(times)
-            row: dict[str, Any] = {"stream": name, "log": str(images.path), "topic": images.topic}
-            row |= {"images": images.count, "rate": 1 / step if step > 0 else None}
-            row |= {"shape": str(self.framings[len(rows)]), "missing": missing(times)}
-            row |= {"size_changes": self._changes_size(len(rows))}
-            row |= {"gaps": [list(gap) for gap in self.pauses[name]], **self.alignment[name]}
-            rows.append(row)
-        return rows
-
     def salvaged(self) -> list[str]:
         """A line for each stream of which broken images were replaced so far."""
         whole = [s.said() for s in self._streams if isinstance(s, WholeImages)]
         return [line for line in whole if line is not None]
-
-    def _changes_size(self, stream: int) -> bool | None:
-        """Whether a stream's images change their size; None where only decoding would tell."""
-        if not self._spec.images:
-            return False
-        images, framing = self._streams[stream], self.framings[stream]
-        for row in np.unique(self._rows[stream]).tolist():
-            size = images.stated_size(row)
-            if size is None:
-                return None
-            if change := framing.change(size):
-                self.changes.setdefault(stream, f"{images.where(row)}: {change}")
-                return True
-        return False
 
     def _chosen(self) -> dict[str, Any]:
         """The options that changed the frames, as JSON values."""

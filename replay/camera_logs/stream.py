@@ -18,7 +18,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
 from recorder.images.messages import PACKED, SCHEMAS, Decoder, packed_picture, stated_format
-from recorder.images.options import RECIPE, Reading, Size
+from recorder.images.options import RECIPE, Reading
 from recorder.images.pixels import AT_ONCE, Shown, compressed_image
 from recorder.log.messages import VECTOR_SCHEMA
 from replay.storage.location import Location
@@ -133,10 +133,6 @@ class ImageStream(ABC):
         None where that message is broken; raises as `image`.
         """
         return ""
-
-    def stated_size(self, row: int) -> Size | None:
-        """The size of an image where that is known without decoding it; of numbers, None."""
-        return None
 
     def where(self, row: int) -> str:
         """How an error names an image."""

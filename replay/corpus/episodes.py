@@ -152,17 +152,6 @@ class EpisodeSource(LoggedSource):
         ends = f"{alike[0].name} to {alike[-1].name}" if len(alike) > 1 else alike[0].name
         self.notes = (f"{counted(len(alike), 'episode')}, {order}: {ends}",)
 
-    def plan(self) -> list[dict[str, Any]]:
-        """The episodes in their order, as JSON values."""
-        return [
-            {
-                "log": episode.name,
-                "frames": [episode.start, episode.start + episode.count],
-                "streams": list(episode.spec.streams),
-            }
-            for episode in self._episodes
-        ]
-
     def pixels(self, stream: int) -> str:
         """See `LoggedSource`."""
         return self._pixels[stream]
@@ -288,14 +277,21 @@ class EpisodeSource(LoggedSource):
 
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """The logs in their order with the frames [start, stop) of each."""
-        files = zip(self.plan(), logs, strict=True)
+        files = [
+            {
+                "file": episode.name,
+                "frames": [episode.start, episode.start + episode.count],
+                **log,
+            }
+            for episode, log in zip(self._episodes, logs, strict=True)
+        ]
         return {
             "kind": "episodes",
             **self.scene(),
             **{key: self._kind.stated[key] for key in _STATED if key in self._kind.stated},
             **({"fields": self._fields} if any(self._fields) else {}),
             "rate": self._spec.fps,
-            "files": [{"file": one["log"], "frames": one["frames"], **log} for one, log in files],
+            "files": files,
             **({"held_out": self.held_out} if self.held_out else {}),
             "loop": self._loop,
         }

@@ -16,10 +16,8 @@ from cdmisfa.cli.commands.report import report_beside
 from cdmisfa.cli.making import choice, flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     announce,
-    print_plan,
     print_result,
     quoted,
-    refuse_copies,
     say_about,
     say_changes,
     say_counts,
@@ -65,7 +63,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 @options.loop
 @flag("--resume", "Resume the run in -o where it was stopped.")
 @options.salvage
-@options.strict
 @flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
 @options.no_report
@@ -103,7 +100,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 @options.keyframes
 @options.fsync_every
 @options.log_options
-@options.dry_run
 @options.live_options
 @options.server_limits
 @options.force
@@ -118,7 +114,6 @@ def learn_command(
     resume: bool,
     force: bool,
     as_json: bool,
-    dry_run: bool,
     live: LiveOptions,
     cameras: CameraOptions,
     **told: Any,
@@ -155,9 +150,6 @@ def learn_command(
     of_cameras = any(map(is_live, source))
     opened = opened_live if of_cameras else opened_logs
     with opened(ctx.params, source, cameras, live) as (frames, configuration):
-        if dry_run:
-            print_plan(frames, as_json=as_json)
-            return
         color = getattr(frames, "color", cameras.color)  # what auto chose stays
         with learning(frames.spec, told["max_iterations"]) as (stop, reporter):
             if hasattr(frames, "stop"):
@@ -225,10 +217,6 @@ def opened_logs(
     with contextlib.closing(frames):
         progress = configuration.learner.algorithm == OF_CAMERAS
         hold_out(frames, told["holdout"], judged=progress)
-        refuse_copies(frames, strict=told["strict"])
-        if told["dry_run"]:
-            yield frames, configuration
-            return
         say_about(frames)
         try:
             yield frames, configuration
@@ -245,11 +233,11 @@ def opened_live(
     from recorder.live import RecordedWhileWatched
     from recorder.log.files import refuse_existing
 
-    refused = ("resume", "loop", "salvage", "episodes", "follow", "dry_run", "holdout")
+    refused = ("resume", "loop", "salvage", "episodes", "follow", "holdout")
     if any(told[name] for name in refused) or told["centre"] == "episode":
         raise UsageError(
             "live streams cannot go back: leave out --resume, --loop, --salvage, --episodes, "
-            "--centre, --follow, --dry-run and --holdout, or learn from a recording of them"
+            "--centre, --follow and --holdout, or learn from a recording of them"
         )
     out, record_to, force = told["out"], told["record_to"], told["force"]
     for folder in (out, record_to):

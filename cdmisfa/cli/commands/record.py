@@ -18,8 +18,6 @@ from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     print_document,
-    print_plan,
-    refuse_copies,
     say_about,
     say_changes,
     tell,
@@ -211,12 +209,10 @@ def _record_scene(
 
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
 @click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
-@options.out("Folder of the recording; --dry-run needs none.")
+@options.out("Folder of the recording.")
 @options.log_options
-@options.dry_run
 @options.live_options
 @options.salvage
-@options.strict
 @flag("--resume", "Resume an attempt that was stopped.")
 @options.server_limits
 @options.fsync_every
@@ -230,12 +226,10 @@ def convert_command(
     source: tuple[str, ...],
     out: Path | None,
     salvage: bool,
-    strict: bool,
     resume: bool,
     fsync_every: float | None,
     force: bool,
     as_json: bool,
-    dry_run: bool,
     live: LiveOptions,
     cameras: CameraOptions,
 ) -> None:
@@ -251,13 +245,11 @@ def convert_command(
     from recorder.log.files import refuse_existing
     from replay.inputs import locations, open_cameras, refuse_what_is_no_log
 
-    out = Path("REC") if out is None and dry_run else _folder(out)
+    out = _folder(out)
     writing: dict[str, Any] = {"fsync_every": fsync_every, "force": force}
     if any(map(is_live, source)):
-        if resume or salvage or dry_run:
-            raise UsageError(
-                "live streams cannot go back: leave out --resume, --salvage and --dry-run"
-            )
+        if resume or salvage:
+            raise UsageError("live streams cannot go back: leave out --resume and --salvage")
         trigger = TriggerOptions()
         record_streams(ctx, source, out, live, cameras, trigger, as_json=as_json, **writing)
         return
@@ -265,14 +257,10 @@ def convert_command(
     named = locations(source)
     for place in named:
         refuse_what_is_no_log(place)
-    if not resume and not dry_run:
+    if not resume:
         refuse_existing(out, force=force)
     opened = open_cameras(named, cameras, salvage=salvage, goal=("convert", str(out)))
     with contextlib.closing(opened) as frames:
-        refuse_copies(frames, strict=strict)
-        if dry_run:
-            print_plan(frames, as_json=as_json)
-            return
         say_about(frames)
         with recording(ctx, out, resume=resume) as (report, stop):
             files = convert(
