@@ -66,7 +66,6 @@ release: $(INSTALLED)
 	    python -m build --outdir $(RELEASE) $(RELEASE)/source && \
 	    auditwheel repair --wheel-dir dist $(RELEASE)/*.whl
 	mv $(RELEASE)/*.tar.gz dist
-	for log in $(RELEASE)/source/sample_logs/icub/*; do cp $$log dist/icub-$${log##*/}; done
 	$(PYTHON) -m venv --without-pip $(RELEASE)/environment
 	$(BIN)/python -m pip --python $(RELEASE)/environment install --quiet dist/*.whl
 	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible \

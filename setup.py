@@ -1,28 +1,12 @@
-"""The kernels in C, the sample, and README for an index; everything else is in pyproject.toml."""
+"""Build the kernels in C and README for an index; everything else is in pyproject.toml."""
 
 import re
-import shutil
 import tomllib
 from pathlib import Path
 
 from setuptools import setup
-from setuptools.command.build_py import build_py
 
 PROJECT = tomllib.loads(Path("pyproject.toml").read_text("utf-8"))["project"]
-
-
-class BuildWithSample(build_py):
-    """What an installation holds, with the sample whose licence is that of the package."""
-
-    def run(self) -> None:
-        """See `build_py`."""
-        super().run()
-        samples = Path("sample_logs")
-        for file in samples / "README.md", *sorted(samples.glob("oscillatory/*.mcap")):
-            if not self.editable_mode:
-                target = Path(self.build_lib, "cdmisfa", file)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(file, target)
 
 
 def described(source: str | None) -> str:
@@ -45,7 +29,6 @@ def described(source: str | None) -> str:
 
 setup(
     cffi_modules=["cdmisfa/kernels/build.py:wide", "cdmisfa/kernels/build.py:plain"],
-    cmdclass={"build_py": BuildWithSample},
     long_description=described(PROJECT["urls"].get("Source")),
     long_description_content_type="text/markdown",
     options={"bdist_wheel": {"py_limited_api": "cp311"}},

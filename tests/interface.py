@@ -49,7 +49,6 @@ SHOWN: Mapping[str, tuple[object, ...]] = {
     "query": ("corpus",),
     "curate": ("corpus", "--budget", "1min", "-o", "chosen"),
     "doctor": (),
-    "samples": (),
 }
 """Commands whose documents are looked at, with what they are given."""
 

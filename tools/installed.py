@@ -5,7 +5,6 @@ It needs nothing but Python, and gives the commands nothing but a folder.
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -15,11 +14,11 @@ from pathlib import Path
 COMMANDS = (
     "--version",
     "doctor",
-    "samples",
-    "learn SAMPLE --loop --max-modules 1 -o run",
+    "record oscillatory --frames 2000 -o recording",
+    "learn recording --loop --max-modules 1 -o run",
     "check run",
     "view run --save run.rrd",
-    "apply run SAMPLE -o applied.parquet",
+    "apply run recording -o applied.parquet",
     "demo --frames 800",
 )
 
@@ -28,17 +27,11 @@ def use(environment: Path, commands: Sequence[str] = COMMANDS) -> None:
     """Run commands of an environment in a folder of their own; the first that fails is raised."""
     program = environment.resolve() / "bin" / "cdmisfa"
     with tempfile.TemporaryDirectory() as folder:
-
-        def ran(line: str) -> str:
-            words = [program, *line.split()]
-            asked = {"cwd": folder, "env": {"HOME": folder}, "stdin": subprocess.DEVNULL}
-            return subprocess.check_output(words, text=True, **asked)  # type: ignore[call-overload]
-
-        samples = json.loads(ran("samples --json"))["samples"]
-        (sample,) = (row["path"] for row in samples if row["name"] == "oscillatory")
         for line in commands:
             print(f"{environment}: cdmisfa {line}", flush=True)
-            ran(line.replace("SAMPLE", sample))
+            words = [program, *line.split()]
+            asked = {"cwd": folder, "env": {"HOME": folder}, "stdin": subprocess.DEVNULL}
+            subprocess.check_output(words, text=True, **asked)  # type: ignore[call-overload]
 
 
 if __name__ == "__main__":

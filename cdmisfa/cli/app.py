@@ -31,7 +31,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Record": {
         "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
         "convert": ("record", "Write camera logs of others as a recording."),
-        "samples": ("samples", "Say where the sample logs are, or write them to a folder."),
     },
     "Learn": {
         "learn": (
@@ -102,7 +101,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "completion",
             "Print what a shell needs to complete commands, scenes, presets, keys and runs.",
         ),
-        "cite": ("cite", "Print what a paper that uses it cites, as BibTeX."),
     },
 }
 """Each command by its heading of --help, with its module in this package and its line of help."""

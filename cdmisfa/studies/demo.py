@@ -1,6 +1,6 @@
 """The demonstration: record the furnished iCub scene, learn from the log, check, and show.
 
-Where there is no simulator, the sample of the oscillatory streams stands for what is recorded.
+Without PyBullet it records the scene of oscillatory streams instead.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure, open_source
 from cdmisfa.modules import Module
-from cdmisfa.studies.samples import samples_here
 from replay.following import OutputHistory
 
 SCENE, PRESET = "icub", "icub-real"
 
 STAND_IN = "oscillatory"
-"""Scene that needs no simulator, and the sample of it."""
+"""Scene that needs no simulator."""
 
 CHECKED_ITERATIONS = 200
 """Length of the stretch on which live and recorded signals are compared."""
@@ -49,7 +48,7 @@ def demo(
         out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
         preset: of scene and learner; by default `PRESET`, or that of the scene that stands in.
         seed: of world and learner.
-        frames: of the recording, where one is made; the learner starts it again at its end.
+        frames: of the recording; the learner starts it again at its end.
         jobs: processes that render.
         stage: opens each stage's report of progress.
 
@@ -62,7 +61,6 @@ def demo(
     """
     from recorder.recording import record_scene
     from replay.export.figures import draw_figures
-    from replay.recordings.source import RecordedSource
 
     missing = [name for name in ("pybullet", "icub_models") if find_spec(name) is None]
     scene = STAND_IN if missing else SCENE
@@ -83,24 +81,18 @@ def demo(
                 max_iterations=most,
             )
 
-    if missing:
-        why = f"as {missing[0]} is not installed: the sample of the {scene} streams stands in"
-        with stage(f"1/4 no recording, {why}", "frames"):
-            recording = samples_here() / scene
-            with contextlib.closing(RecordedSource(recording)) as sample:
-                frames = sample.frames
-    else:
-        with stage(f"1/4 recording three views, {frames} frames each", "frames") as bar:
-            record_scene(
-                scene,
-                recording,
-                configuration.scene,
-                configuration.record,
-                frames=frames,
-                jobs=jobs,
-                force=True,
-                progress=lambda done: bar.update(done, frames),
-            )
+    why = f" of {scene}, since {missing[0]} is not installed" if missing else ""
+    with stage(f"1/4 recording three views{why}, {frames} frames each", "frames") as bar:
+        record_scene(
+            scene,
+            recording,
+            configuration.scene,
+            configuration.record,
+            frames=frames,
+            jobs=jobs,
+            force=True,
+            progress=lambda done: bar.update(done, frames),
+        )
     with stage("2/4 learning from the recording", "blocks") as bar:
         result = learn(bar, recording, folder, None)
     with stage("3/4 checking live against recorded", "blocks") as bar:

@@ -85,8 +85,8 @@ def test_what_is_installed_computes_the_same_bits(
     (wheel,) = built.glob("*.whl")
     assert wheel.name.split("-")[2:4] == ["cp311", "abi3"]
     held = zipfile.ZipFile(wheel).namelist()
-    assert {"lanes.h", "frames.c", "x1.mcap"} <= {Path(name).name for name in held}
-    assert not any("icub/left" in name for name in held)
+    assert {"lanes.h", "frames.c"} <= {Path(name).name for name in held}
+    assert not any(name.endswith(".mcap") for name in held)
     if compiler == "of the machine":
         again = pack(listed, tmp_path / "elsewhere")
         assert again.read_bytes() == packed.read_bytes()

@@ -357,8 +357,8 @@ def _run_arena(
 def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
     """Record, learn, check and show: the whole story in minutes.
 
-    What an earlier demo left in the same folder is replaced. Without PyBullet, which has wheels
-    for Python 3.11 and older, a sample stands in for the recording.
+    It replaces the results of an earlier demo in the same folder. Without PyBullet, which has
+    wheels for Python 3.11 and older, it records the scene oscillatory instead of icub.
     """
     from cdmisfa.studies.demo import demo
 
