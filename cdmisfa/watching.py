@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.learners import LEARNERS, open_learner
+from cdmisfa.agents.learners import learner_entry, open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, turn_to
 from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import LogExhaustedError, UsageError
@@ -90,7 +90,7 @@ class WatchEnv(Env):
             raise UsageError(
                 f"max_iterations={max_iterations!r} given: it is a number from 1, or None"
             )
-        entry = LEARNERS[algorithm]
+        entry = learner_entry(algorithm)
         base = load_preset(entry.preset)["learner"] if entry.preset else {}
         told = ({"algorithm": algorithm}, settings)
         self._config = build(entry.configuration, "learner", base, *told)

@@ -62,9 +62,9 @@ SET = ArenaSet(("sway", "hiss", "swing"), "two fading patterns, and noise", fram
 def tiny() -> Iterator[None]:
     """The small streams among those of the arena, and the set `tiny` of some."""
     for name, kind in KINDS.items():
-        STREAMS.add(name, kind)
-    SETS.add("tiny", SET)
+        STREAMS[name] = kind
+    SETS["tiny"] = SET
     yield
-    SETS.remove("tiny")
+    del SETS["tiny"]
     for name in KINDS:
-        STREAMS.remove(name)
+        del STREAMS[name]

@@ -50,8 +50,6 @@ class Outcome:
         return json.loads(self.out)
 
 
-collect_ignore = ["toy_plugin"]  # a package's own tests, run where it is installed
-
 Cdmisfa = Callable[..., Outcome]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arena_streams import tiny as tiny
+from contracts.sources import SourceContract
 
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import UsageError
@@ -26,7 +27,6 @@ from cdmisfa.studies.arena.streams import (
     make_footage,
     parse,
 )
-from cdmisfa.testing.sources import SourceContract
 
 pytestmark = pytest.mark.usefixtures("tiny")
 

@@ -149,13 +149,6 @@ def test_demo_without_the_simulator_records_oscillatory_streams(
     assert Path(done.json["report"]).parent == tmp_path / "runs" / "demo-oscillatory"
 
 
-def test_the_contract_tests_without_their_extra_name_it(tmp_path: Path) -> None:
-    (tmp_path / "pytest.py").write_text("raise ImportError\n")
-    done = python("-c", "import cdmisfa.testing", env={"PYTHONPATH": f"{tmp_path}:{ROOT}"})
-    said = "cdmisfa.testing needs pytest, which is missing: pip install 'cdmisfa[testing]'"
-    assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
-
-
 def test_a_scheduler_without_an_address_is_one_line_to_the_end_of_the_process(
     tmp_path: Path,
 ) -> None:

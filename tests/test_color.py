@@ -127,7 +127,7 @@ def test_what_has_no_colours_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "t.csv").write_text("a\n1\n2\n")
     with pytest.raises(UsageError, match=r"as they are: --color is for images"):
         ForeignSource(tmp_path / "t.csv", rate=5, color=True)
-    monkeypatch.setitem(CAMERAS._entries, "plain", CameraKind(lambda word, name: None))
+    monkeypatch.setitem(CAMERAS, "plain", CameraKind(lambda word, name: None))
     with pytest.raises(UsageError, match="plain:1 shows gray images: leave out --color"):
         open_live(["plain:1"], LiveOptions(color=True))
 

@@ -46,10 +46,10 @@ def test_what_is_completed(
     assert of("lea") == ["learn"]
     files, *sources = of("learn ")
     assert files is None
-    assert {*SCENES.names(), "camera:"} <= {*sources}
+    assert {*SCENES, "camera:"} <= {*sources}
     assert of("learn osc") == [None, "oscillatory"]
     assert of("learn x --preset ") == [None, *presets()]
-    assert of("learn x --algorithm ") == LEARNERS.names()
+    assert of("learn x --algorithm ") == list(LEARNERS)
     assert of("learn x --set learner.nu") == ["learner.nu="]
     assert {"learner.attention=", "scene.seed=", "record.fps="} <= {*of("learn x --set ")}
     assert "scene.object1.toggle_every=" in of("sweep icub --grid scene.")

@@ -1,4 +1,4 @@
-"""The contracts that plugins are held to hold for what is built in.
+"""The contracts of learners, features, cameras and exports hold for those of this package.
 
 Those of sources and sinks are derived from where these are tested.
 """
@@ -11,6 +11,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from contracts.exports import FormContract
+from contracts.learners import FeatureContract, LearnerContract
+from contracts.sources import CameraContract
 
 from cdmisfa.agents.blank import signals_of_block
 from cdmisfa.agents.learners import open_learner
@@ -20,7 +23,6 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import SIGNALS, values
 from cdmisfa.features.incsfa import Feature, IncrementalFeature
-from cdmisfa.testing import CameraContract, FeatureContract, FormContract, LearnerContract
 from recorder.cameras.readers import Camera
 from recorder.cameras.words import CAMERAS
 from recorder.images.pixels import Shown

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from contracts.learners import SinkContract
 from tensorboardX.proto.event_pb2 import Event
 
 import cdmisfa
 from cdmisfa.core.learning import Learner
-from cdmisfa.testing import SinkContract
 from recorder.world.oscillatory import OscillatorySource
 
 TENSORBOARD = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "tensorboard_sink.py"))

@@ -1,9 +1,8 @@
-"""An expansion, a feature and a learner of somebody else, added without editing a file."""
+"""An expansion and a feature of somebody else, added without editing a file."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,11 +13,9 @@ from numpy.typing import NDArray
 from test_trial import QUICK, assert_equal, step_by_step
 
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.agents.learners import LEARNERS, LearnerEntry
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion
-from cdmisfa.experiments.trial import has_whole_trials, run_trial
+from cdmisfa.experiments.trial import run_trial
 from cdmisfa.features.incsfa import Feature
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import load_modules
@@ -64,29 +61,11 @@ class PlainFeature:
         return np.full(len(frames), 0.01)
 
 
-@dataclasses.dataclass(frozen=True)
-class PlainConfig(LearnerConfig):
-    """Keys `learner.*` of the plain learner: those of 2.0, and one of its own."""
-
-    algorithm: str = "plain"
-    first_mean: float = 0.0
-
-
-def open_plain(config: PlainConfig, spec: Any, seed: int) -> CuriousLearner:
-    learner = CuriousLearner(config, spec, seed, feature=PlainFeature)
-    learner.abstraction.mean[...] = config.first_mean
-    return learner
-
-
 @pytest.fixture(autouse=True)
-def _added() -> Iterator[None]:
-    EXPANSIONS.add("cubic", Expansion(lambda n: 2 * n + n * (n + 1) // 2, cubic))
-    EXPANSIONS.add("many", Expansion(lambda n: n * (MANY_INPUTS // 2 + 1), many))
-    LEARNERS.add("plain", LearnerEntry(PlainConfig, open_plain, preset="oscillatory"))
-    yield
-    EXPANSIONS.remove("cubic")
-    EXPANSIONS.remove("many")
-    LEARNERS.remove("plain")
+def _added(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = (lambda n: 2 * n + n * (n + 1) // 2), (lambda n: n * (MANY_INPUTS // 2 + 1))
+    monkeypatch.setitem(EXPANSIONS, "cubic", Expansion(sizes[0], cubic))
+    monkeypatch.setitem(EXPANSIONS, "many", Expansion(sizes[1], many))
 
 
 @pytest.mark.parametrize(("expansion", "least"), [("cubic", 1), ("many", 0)])
@@ -133,22 +112,3 @@ def test_a_feature_of_ones_own_is_learned_with_and_restored() -> None:
     np.testing.assert_array_equal(one.y, two.y)
     expected = (block.frames - learner.abstraction.mean) @ learner.phi.T
     np.testing.assert_allclose(one.y, expected, rtol=1e-9, atol=1e-12)
-
-
-def test_a_learner_in_python_has_no_whole_trials() -> None:
-    assert has_whole_trials(QUICK)
-    assert not has_whole_trials(PlainConfig())
-    with pytest.raises(UsageError, match=r"learner\.algorithm plain has no whole trials"):
-        run_trial(PlainConfig(), seed=0)
-
-
-def test_a_learner_of_ones_own_is_learned_with_by_its_name(
-    cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    args = ("--algorithm", "plain", "--set", "learner.first_mean=0.5", "--json")
-    learn = ("learn", "oscillatory", *args, "--max-iterations", "5", "--no-rerun")
-    done = cdmisfa(*learn, "-o", str(tmp_path / "run"))
-    assert (done.code, done.json["iterations"]) == (0, 5), done.err
-    assert done.json["epsilon"] == pytest.approx(1.2 * 0.999**5)
-    other = cdmisfa("learn", "oscillatory", "--set", "learner.first_mean=0.5")
-    assert "learner.first_mean is of the learner plain, and this is 2.0" in other.err

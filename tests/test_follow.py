@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from contracts.sources import SourceContract, same
 from waiting import running, started, wait_for
 
 from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, SourceSpec, freeze
@@ -22,7 +23,6 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
-from cdmisfa.testing.sources import SourceContract, same
 from recorder.config import Split
 from recorder.mcap.store import FileStore
 from recorder.recording import record, record_scene

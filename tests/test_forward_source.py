@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from contracts.sources import ForwardContract, same
 from folders import contents
 from live_cameras import SHAPE, bar
 
@@ -16,7 +17,6 @@ from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.session import run
-from cdmisfa.testing.sources import ForwardContract, same
 from recorder.config import Split
 from recorder.recording import RecordingStoppedError, record
 from replay.recordings.source import RecordedSource

@@ -13,12 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 from camera_files import write_images
 from conftest import Cdmisfa
+from contracts.sources import SourceContract
 from folders import contents, coverage
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.experiments.sources import convert
-from cdmisfa.testing.sources import SourceContract
 from recorder.config import Split
 from recorder.images.framing import FRAME_PIXELS, default_size, fitted
 from recorder.images.options import Fit

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from contracts.sources import same
 from folders import coverage
 from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedReaders, bar
 from waiting import wait_for
@@ -21,7 +22,6 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
-from cdmisfa.testing.sources import same
 from recorder.cameras.live import LiveSource
 from recorder.cameras.readers import CameraFrames, Readers
 from recorder.cameras.video import Steady

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, encoded, write_video
 from conftest import Cdmisfa
+from contracts.sources import ForwardContract
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage as FoxgloveRaw
@@ -32,7 +33,6 @@ from websockets.sync.server import ServerConnection, serve
 from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from cdmisfa.testing.sources import ForwardContract
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.video import VideoCamera
 from recorder.cameras.words import is_live, live_names, open_live

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from contracts.learners import CONFIG, SinkContract
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.cli.progress import Bar
@@ -15,7 +16,6 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn_blocks
-from cdmisfa.testing.learners import CONFIG, SinkContract
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 

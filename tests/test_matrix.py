@@ -21,6 +21,7 @@ from camera_files import (
     write_video,
 )
 from conftest import Cdmisfa
+from contracts.sources import SourceContract
 from message_files import STEP, every, learned_alike, write_mcap, write_table
 from PIL import Image
 from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
@@ -29,7 +30,6 @@ from video_packets import FOXGLOVE, foxglove, video
 from web_server import serving
 
 from cdmisfa.core.blocks import FrameSource
-from cdmisfa.testing.sources import SourceContract
 from recorder.images.decoding import MessageKind
 from replay.camera_logs.source import ForeignSource
 from replay.corpus.index import read_index

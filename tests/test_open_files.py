@@ -56,8 +56,8 @@ def limited(*words: str, **options: Any) -> None:
 
 def test_more_parts_than_files_may_be_open_are_read(parts: Path) -> None:
     script = (
-        "import sys\n"
-        "from cdmisfa.testing.sources import same\n"
+        f"import sys; sys.path.append({str(Path(__file__).parent)!r})\n"
+        "from contracts.sources import same\n"
         "from recorder.world.oscillatory import OscillatorySource\n"
         "from replay.recordings.source import RecordedSource\n"
         "from replay.integrity.verify import check_log\n"

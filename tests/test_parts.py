@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from contracts.sources import SourceContract, same
 from folders import contents
 from waiting import running, wait_for
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
-from cdmisfa.testing.sources import SourceContract, same
 from recorder.config import Split
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource

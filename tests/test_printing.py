@@ -7,6 +7,7 @@ import itertools
 from typing import Any
 
 import pytest
+from contracts.learners import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
@@ -16,7 +17,6 @@ from cdmisfa.cli import printing
 from cdmisfa.cli.printing import fitting, print_table
 from cdmisfa.cli.progress import Bar
 from cdmisfa.experiments.loop import learn_blocks
-from cdmisfa.testing.learners import CONFIG
 from recorder.world.oscillatory import OscillatorySource
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from conftest import Cdmisfa
+from contracts.sources import SourceContract
 from PIL import Image
 from rerun.chunk import RrdReader
 from view_data import View
@@ -21,7 +22,6 @@ import cdmisfa
 from cdmisfa import Recording, Run, learn
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.recompute import check_run
-from cdmisfa.testing.sources import SourceContract
 from replay.arrays import ArrayLog
 from replay.camera_logs.options import CameraOptions
 

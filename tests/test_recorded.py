@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from contracts.sources import SourceContract, same
 from folders import flip
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
-from cdmisfa.testing.sources import SourceContract, same
 from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog

@@ -5,12 +5,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from contracts.sources import SourceContract
 from waiting import python
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import UsageError
-from cdmisfa.testing.sources import SourceContract
 from recorder.config import RecordConfig
 from recorder.recording import save_picture
 from recorder.world.icub.config import EyesConfig, IcubConfig, SphereConfig

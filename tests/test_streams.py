@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from contracts.sources import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError
-from cdmisfa.testing.sources import SourceContract
 from recorder.world.oscillatory import PERIOD, OscillatorySource
 
 

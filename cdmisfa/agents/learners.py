@@ -1,13 +1,16 @@
-"""The learners there are, by the name that `learner.algorithm` takes."""
+"""The learners, by the name that `learner.algorithm` takes."""
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError, one_line
 from cdmisfa.core.registry import Registry
 
 if TYPE_CHECKING:  # the command line names the learners without numpy
@@ -23,7 +26,8 @@ class LearnerEntry:
         configuration: the dataclass of its keys `learner.*`; it has a field `algorithm`, whose
             default is the learner's name or that of a version of it.
         open: makes a learner from a configuration of that class, a source's spec and a seed.
-        preset: the preset it takes where none is chosen; None for that of the scene.
+        preset: the preset it takes where none is chosen; None for that of the scene, whose keys
+            `learner.*` are not for the class of a user.
     """
 
     configuration: type[Any]
@@ -50,9 +54,38 @@ LEARNERS: Registry[LearnerEntry] = Registry(
         "1.0": LearnerEntry(LearnerConfig, _curious),
         "progress": LearnerEntry(ProgressConfig, _progress, preset="cameras"),
     },
-    group="cdmisfa.learners",
 )
-"""Every learner; `LEARNERS.add` and entry points `cdmisfa.learners` add others."""
+"""The learners of this package; `learner_entry` also finds a class of the user."""
+
+
+def learner_entry(algorithm: str) -> LearnerEntry:
+    """Return the learner of a name: one of `LEARNERS`, or a class as `package.module:Class`.
+
+    Such a class has the members of `Learner`, takes a configuration, a spec and a seed, and names
+    the dataclass of its keys in its attribute `configuration`.
+
+    Raises:
+        UsageError: there is no such learner, or its class cannot be used.
+    """
+    module, colon, name = algorithm.partition(":")
+    if not colon:
+        return LEARNERS[algorithm]
+    try:
+        # The name may come from a log: the standard library has modules that act when imported.
+        if module.partition(".")[0] in sys.stdlib_module_names:
+            raise ImportError(f"{module} is of the standard library")
+        learner = getattr(importlib.import_module(module), name)
+    except Exception as error:  # whatever importing code of the user raises
+        raise UsageError(
+            f"the learner {algorithm} cannot be imported ({type(error).__name__}: "
+            f"{one_line(error)}): install its package, or name its folder in PYTHONPATH"
+        ) from error
+    configuration = getattr(learner, "configuration", None)
+    if not (isinstance(configuration, type) and is_dataclass(configuration)):
+        raise UsageError(
+            f"the learner {algorithm} has no attribute configuration, the dataclass of its keys"
+        )
+    return LearnerEntry(configuration, learner)
 
 
 def open_learner(config: Any, spec: SourceSpec, seed: int) -> Learner:
@@ -66,4 +99,4 @@ def open_learner(config: Any, spec: SourceSpec, seed: int) -> Learner:
     Raises:
         UsageError: there is no such learner, or it cannot learn from such a source.
     """
-    return LEARNERS[config.algorithm].open(config, spec, seed)
+    return learner_entry(config.algorithm).open(config, spec, seed)

@@ -78,7 +78,7 @@ def _sources() -> list[str]:
     from recorder.cameras.words import CAMERAS
     from recorder.world.scenes import SCENES
 
-    return [*SCENES.names(), *(f"{kind}:" for kind in CAMERAS.names())]
+    return [*SCENES, *(f"{kind}:" for kind in CAMERAS)]
 
 
 def _presets() -> Iterable[str]:
@@ -92,8 +92,8 @@ def _keys() -> Iterator[str]:
     from recorder.config import RecordConfig
     from recorder.world.scenes import SCENES
 
-    of_learners = [("learner", LEARNERS[name].configuration) for name in LEARNERS.names()]
-    of_scenes = [("scene", SCENES[name].config) for name in SCENES.names()]
+    of_learners = [("learner", entry.configuration) for entry in LEARNERS.values()]
+    of_scenes = [("scene", entry.config) for entry in SCENES.values()]
     sections: list[tuple[str, type[Any]]] = [*of_learners, *of_scenes, ("record", RecordConfig)]
     keys = (key for section, config in sections for key in _keys_of(section, config()))
     yield from dict.fromkeys(f"{key}=" for key in keys)

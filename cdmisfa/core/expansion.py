@@ -47,7 +47,7 @@ EXPANSIONS: Registry[Expansion] = Registry(
         "quadratic": Expansion(lambda n: n + n * (n + 1) // 2, _inputs_and_products),
     },
 )
-"""Every expansion, by the name that `learner.expansion` takes; `EXPANSIONS.add` adds one."""
+"""Every expansion, by the name that `learner.expansion` takes."""
 
 
 def expanded_size(kind: str, n_inputs: int) -> int:

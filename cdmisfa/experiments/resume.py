@@ -5,20 +5,18 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.agents.learners import LEARNERS, open_learner
+from cdmisfa.agents.learners import learner_entry, open_learner
 from cdmisfa.core.blocks import SeekableSource, SourceSpec
 from cdmisfa.core.config import build, section_table
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
 from cdmisfa.core.options import parse_settings
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.names import placed, renamed, same_names
 from cdmisfa.experiments.sources import CLOCK, configure, open_logs
 from recorder.cameras.words import is_live
@@ -73,7 +71,7 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     """The command that began a run: its source and its options.
 
     Raises:
-        UsageError: there is no run, it does not say, or its source is of a plugin that is gone.
+        UsageError: there is no run, or it does not say.
         LogDamagedError: its log cannot be read.
     """
     log = log_to_resume(run)
@@ -81,12 +79,6 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     if not isinstance(kept, Mapping) or not isinstance(kept.get("source"), list):
         raise UsageError(f"{run} does not say what it learns from: name its source")
     source = [str(word) for word in kept["source"]]
-    for word in source:
-        path = word.startswith(os.curdir) or "://" in word
-        if not (path or word in SCENES or is_live(word)):
-            raise UsageError(
-                f"{run} learns from {word}, which {_packages_gone(log)} brought: install it again"
-            )
     options = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in kept.items()
@@ -111,14 +103,6 @@ def command_of_fork(
     kept = () if world is None else (f"scene.seed={world}",)  # the world keeps the parent's seed
     options["settings"] = (*options.get("settings", ()), *kept, *settings)
     return tuple(source) or words, options
-
-
-def _packages_gone(log: Path) -> str:
-    """The packages of plugins that a run used and that are not installed any more."""
-    keyframe = read_keyframe(log)
-    used = {} if keyframe is None else keyframe.versions
-    gone = [f"{name} {used[name]}" for name in sorted(used.keys() - versions().keys())]
-    return f"the plugin {' or '.join(gone)}" if gone else "a plugin"
 
 
 def log_to_resume(run: Path) -> Path:
@@ -314,7 +298,7 @@ def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, 
     """
     try:
         table, seed, fork = manifest["config"]["learner"], manifest["seed"], manifest.get(FORK)
-        config = build(LEARNERS[table["algorithm"]].configuration, "learner", table)
+        config = build(learner_entry(table["algorithm"]).configuration, "learner", table)
         if fork is None:
             return (ConfigSpan(0, config, seed, reseeded=False),)
         before = config_history(log, fork["before"])
@@ -379,7 +363,7 @@ def _config_of_fork(before: Mapping[str, Any], settings: Sequence[str]) -> Any:
     other = next((section for section in words if section != "learner"), None)
     if other is not None:
         raise UsageError(f"{other}.* is the parent's and stays: a fork changes learner.* alone")
-    kind = LEARNERS[before["algorithm"]].configuration
+    kind = learner_entry(before["algorithm"]).configuration
     config = build(kind, "learner", before, words.get("learner", {}))
     for key, old, new in differences(
         section_table(build(kind, "learner", before)), section_table(config)

@@ -9,15 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
-from cdmisfa.experiments.documents import machine, versions, write_json
+from cdmisfa.experiments.documents import machine, write_json
 from cdmisfa.experiments.resume import COMMAND, FORK, SET_ASIDE
 from cdmisfa.modules import Module
-from recorder.cameras.words import PACKAGES
 from recorder.images.recipe import Recipe
 from recorder.log.files import (
     held,
@@ -27,7 +25,6 @@ from recorder.log.files import (
     refuse_existing,
     refuse_special,
 )
-from recorder.world.scenes import SCENES, scene_of
 from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, REPORT_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.modules import save_modules
@@ -151,25 +148,6 @@ class OpenLog(Sink):
         """Write the last weights, and hand over what was written."""
         self._log.weights(self._learner)
         self._log.flush()
-
-
-def versions_used(
-    config: Any, source: FrameSource, described: Mapping[str, Any] | None = None
-) -> dict[str, str]:
-    """Versions of the packages that a run depends on, those of its plugins, too.
-
-    Args:
-        config: of the learner.
-        source: what it learns from.
-        described: what the source says of itself, where it may be of cameras.
-    """
-    scene = scene_of(source)
-    return {
-        **versions(),
-        **LEARNERS.versions(config.algorithm),
-        **(SCENES.versions(scene.name) if scene is not None else {}),
-        **(described or {}).get(PACKAGES, {}),
-    }
 
 
 @contextlib.contextmanager

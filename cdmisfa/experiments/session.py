@@ -17,6 +17,7 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
+from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.holdout import judged
 from cdmisfa.experiments.loop import INTERRUPTED, BestEffort, Digest, Keyframes, learn_blocks
 from cdmisfa.experiments.names import placed
@@ -40,7 +41,6 @@ from cdmisfa.experiments.run_folder import (
     in_words,
     opened_log,
     undecided,
-    versions_used,
     with_recipes,
     write_results,
 )
@@ -90,7 +90,7 @@ class Session:
 
         Args:
             source: live or recorded.
-            config: of the learner, as its entry in `LEARNERS` says.
+            config: of the learner, as its entry says.
             folder: of the run, or None to keep nothing.
             seed: of the policy and of the abstractions' first weights.
             max_iterations: end after so many.
@@ -108,7 +108,7 @@ class Session:
         self._limits = {"max_iterations": max_iterations, "max_modules": max_modules}
         self._force, self._resumed = force, False
         described = described or description(source, at_once=True)
-        self._versions = versions_used(config, source, described)
+        self._versions = versions()
         self.manifest: dict[str, Any] = {
             "config": {**(sections or {}), "learner": section_table(config)},
             "seed": seed,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.agents.learners import LEARNERS
+from cdmisfa.agents.learners import LEARNERS, learner_entry
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import LearnerConfig, build, load_preset, section_table
 from cdmisfa.core.errors import UsageError, are_for
@@ -42,7 +42,7 @@ class Configuration:
     """Everything a run or a recording was told.
 
     Attributes:
-        learner: keys `learner.*`, of the class that the learner's entry in `LEARNERS` names.
+        learner: keys `learner.*`, of the class that the learner's entry names.
         scene: keys `scene.*`.
         record: keys `record.*`.
         streams: of what kind the streams are where they are no scene's: "cameras", "gym",
@@ -159,8 +159,10 @@ def _configure(
 ) -> Configuration:
     """Fill a configuration from the sections of a chosen preset and of settings."""
     algorithm = words.get("learner", {}).get("algorithm", learner if preset is None else None)
-    own = LEARNERS[algorithm].preset if algorithm is not None else None
-    tables = chosen if preset is not None else load_preset(own or SCENES[kind].preset)
+    default = learner_entry(algorithm).preset if algorithm is not None else None
+    tables = chosen if preset is not None else load_preset(default or SCENES[kind].preset)
+    if preset is None and algorithm is not None and algorithm not in LEARNERS:
+        tables = {**tables, "learner": {}}  # a class of the user has keys of its own
     for section in (*tables, *words):
         if section not in SECTIONS:
             raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
@@ -170,9 +172,9 @@ def _configure(
         algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
     _refuse_keys_of_others(algorithm, words.get("learner", {}))
     _refuse_keys_of_others(algorithm, tables.get("learner", {}), preset)
-    named = {"algorithm": algorithm}
+    own, named = learner_entry(algorithm).configuration, {"algorithm": algorithm}
     return Configuration(
-        learner=build(LEARNERS[algorithm].configuration, "learner", *layers["learner"], named),
+        learner=build(own, "learner", *layers["learner"], named),
         scene=build(SCENES[kind].config, "scene", *layers["scene"], {"kind": kind}),
         record=build(RecordConfig, "record", *layers["record"]),
     )
@@ -201,7 +203,7 @@ def _refuse_other_scene(
 
 def _refuse_keys_of_others(algorithm: str, keys: Iterable[str], preset: str | None = None) -> None:
     """Refuse a key that is another learner's; `preset` sets it, or None where the user does."""
-    own = {field.name for field in fields(LEARNERS[algorithm].configuration)}
+    own = {field.name for field in fields(learner_entry(algorithm).configuration)}
     for key in sorted(set(keys) - own):
         for name, entry in LEARNERS.items():
             if key in {field.name for field in fields(entry.configuration)}:
@@ -325,13 +327,11 @@ def open_logs(
             f"{live[0]} is a live stream, which cannot go back: record it first, with cdmisfa "
             f"record {shlex.join(live)} -o REC"
         )
-    paths = locations(words)
-    for path in paths:
+    for path in (paths := locations(words)):
         if not isinstance(path, Url) and not path.exists() and follow is None:
             _, colon, address = str(path).partition(":")
-            kinds = [f"{kind}:{address}" for kind in CAMERAS.names() if colon]
-            scenes = SCENES.names()
-            raise no_such(path, [*scenes, *kinds], f"the scenes are {', '.join(scenes)}")
+            kinds = [f"{kind}:{address}" for kind in CAMERAS if colon]
+            raise no_such(path, [*SCENES, *kinds], f"the scenes are {', '.join(SCENES)}")
     if follow is None:
         how: Any = {"loop": loop, "salvage": salvage}
         source: StoredSource | None = None

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
+import inspect
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from cdmisfa.agents.learners import LEARNERS
+from cdmisfa.agents.learners import LEARNERS, learner_entry
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import MAX_LIST
@@ -41,7 +43,6 @@ from cdmisfa.experiments.store import (
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
 from recorder.log.files import atomic_write
 from recorder.world.oscillatory import OscillatoryConfig
-from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
 from replay.storage.location import Limits, limited, limits
 
@@ -178,15 +179,12 @@ def plan(
         point = dict(zip(grid, map(_kept, values), strict=True))
         words_of = (f"{key}={value}" for key, value in zip(grid, values, strict=True))
         told = configured((*settings, *words_of))
+        learner = [section_table(told.learner), _own_code(told.learner.algorithm)]
         for seed in each:
             configuration = told.seeded(seed)
-            depends: list[Any] = [section_table(configuration.learner)]
-            used = LEARNERS.versions(configuration.learner.algorithm)
+            depends: list[Any] = [*learner]
             if scene:  # the world's part counts only where it is live
                 depends.append(configuration.tables())
-                used |= SCENES.versions(configuration.scene.kind)
-            if used:
-                depends.append(used)
             if cameras != CameraOptions():
                 depends.append(dataclasses.asdict(cameras))
             name = trial_id(depends, seed, recorded, [max_iterations, max_modules], code())
@@ -206,6 +204,14 @@ def plan(
             )
             trials.setdefault(trial.id, trial)
     return list(trials.values())
+
+
+def _own_code(algorithm: str) -> str:
+    """Return a hash of the module of a user's learner, as `code` is of ours; "" for ours."""
+    if algorithm in LEARNERS:
+        return ""
+    module = inspect.getfile(learner_entry(algorithm).open)
+    return hashlib.sha256(Path(module).read_bytes()).hexdigest()
 
 
 def _configured(

@@ -67,7 +67,8 @@ def learn(
             options; the name of a scene ("oscillatory", "icub"); words of live streams
             ("camera:/dev/video0", "gym:CartPole-v1"); or an open source, which is left open.
         out: the run's folder; by default a temporary one, which goes with the run.
-        algorithm: "progress", the default but of scenes, "2.0", "1.0", or a plugin's.
+        algorithm: "progress", the default but of scenes, "2.0", "1.0", or a class of yours as
+            "package.module:Class".
         seed: of the random choices, and of scenes and simulated tasks.
         max_iterations: end after so many.
         max_modules: end after so many; by default the learner ends by itself, and any learner

@@ -25,9 +25,6 @@ from recorder.images.options import (
 if TYPE_CHECKING:
     from recorder.cameras.readers import Camera
 
-PACKAGES: Final = "packages"
-"""Key of what cameras of plugins say of themselves: the versions of their packages."""
-
 _VIDEO: Final = ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp")
 
 _STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
@@ -74,9 +71,8 @@ CAMERAS: Registry[CameraKind] = Registry(
         "foxglove": CameraKind(_foxglove, ("depth", "fields", "color", "say")),
         **{kind: CameraKind(_video, ("color",), VIDEO_RECIPE) for kind in _VIDEO},
     },
-    group="cdmisfa.sources",
 )
-"""What cameras' words begin with; `CAMERAS.add` and entry points `cdmisfa.sources` add others."""
+"""What cameras' words begin with."""
 
 
 def is_live(word: str) -> bool:
@@ -154,8 +150,6 @@ def open_live(
         about |= {"recipe": NUMBERS_RECIPE, "fields": list(options.fields)}
     if options.color:
         about["recipe"] = COLOR_RECIPE
-    if packages := CAMERAS.versions(*schemes):
-        about[PACKAGES] = packages
     if options.depth is not None:
         about["range_metres"] = list(options.depth)
     frames = CameraFrames(names, options.size, options.fit, color=bool(options.color), say=say)

@@ -1,7 +1,4 @@
-"""The scenes there are, opened by name, and the blocks that they show, in order of time.
-
-Others are added by `SCENES.add` and by plugins.
-"""
+"""The scenes, opened by name, and the blocks that they show, in order of time."""
 
 from __future__ import annotations
 
@@ -75,9 +72,8 @@ SCENES: Registry[Scene] = Registry(
         "icub": Scene(IcubConfig, IcubSource, "icub", scene_picture, ("pybullet", "icub-models")),
         "oscillatory": Scene(OscillatoryConfig, _open_oscillatory, "oscillatory"),
     },
-    group="cdmisfa.sources",
 )
-"""The live scenes; `SCENES.add` and entry points `cdmisfa.sources` add others."""
+"""The live scenes."""
 
 
 @dataclass(frozen=True, slots=True)

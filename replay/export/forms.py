@@ -55,9 +55,8 @@ FORMS: Registry[Form] = Registry(
         "mp4": Form("recording", write_films, "frames", lossy=True),
         "lerobot": Form("recording", write_lerobot, "frames", lossy=True, write_many=write_dataset),
     },
-    group="cdmisfa.exports",
 )
-"""Every form; `FORMS.add` and entry points `cdmisfa.exports` add others."""
+"""Every form."""
 
 WRITTEN = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
 """Endings of the files that exports of recordings write; a folder with others is not theirs."""
@@ -100,7 +99,7 @@ def export(
         CdmisfaError: the file cannot be written.
     """
     if form not in FORMS:
-        raise UsageError(f"no form {form!r} for --to: {did_you_mean(form, FORMS.names())}")
+        raise UsageError(f"no form {form!r} for --to: {did_you_mean(form, FORMS)}")
     described = FORMS[form]
     if lossless and not described.lossy:
         lossy = " and ".join(name for name, other in FORMS.items() if other.lossy)

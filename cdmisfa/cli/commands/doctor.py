@@ -6,17 +6,15 @@ import importlib.util
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib import metadata
-from typing import Any
 
 import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.printing import print_document, print_table
-from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.registry import GROUPS, Registry, find, plugins
+from cdmisfa.core.errors import CdmisfaError
 
 NAMES = ("recorder", "replay")
 """Packages of ours beside `cdmisfa`, whose names others may have, too."""
@@ -35,7 +33,6 @@ EXTRAS = {
     "arena": (("ale_py", "av", "gymnasium", "skvideo", "sklearn"), "streams of the arena"),
     "sklearn": (("sklearn",), "RecursiveSFA and IncSFA, estimators of scikit-learn"),
     "river": (("river",), "OnlineSFA, a transformer of river"),
-    "testing": (("pytest",), "the contract tests of cdmisfa.testing"),
     "dask": (("distributed",), "sweep and reproduce --engine dask"),
 }
 """Optional parts of the package: the modules they bring, and what needs them."""
@@ -99,32 +96,6 @@ def _names() -> Iterator[Check]:
             yield Check(f"name {name}", False, detail)
 
 
-def _plugins() -> Iterator[Check]:
-    try:
-        from cdmisfa.agents.learners import LEARNERS
-        from recorder.cameras.words import CAMERAS
-        from recorder.world.scenes import SCENES
-        from replay.export.forms import FORMS
-    except ImportError:  # `_packages` says which package is missing
-        return
-    registries: Mapping[str, tuple[Registry[Any], ...]] = {
-        "cdmisfa.sources": (SCENES, CAMERAS),
-        "cdmisfa.learners": (LEARNERS,),
-        "cdmisfa.exports": (FORMS,),
-    }
-    for group, needed_for in GROUPS.items():
-        for plugin in plugins(group):
-            ok, detail = False, f"{plugin}, which is never used: cdmisfa has its own"
-            if not any(plugin.name in registry.first for registry in registries[group]):
-                try:
-                    find(group, plugin.name)
-                    plugin.load(*(registry.entry_class for registry in registries[group]))
-                    ok, detail = True, str(plugin)
-                except UsageError as error:
-                    detail = str(error)
-            yield Check(f"plugin {plugin.name}", ok, detail, needed_for)
-
-
 def _simulator() -> Iterator[Check]:
     for name, module in (("pybullet", "pybullet"), ("icub-models", "icub_models")):
         if importlib.util.find_spec(module) is not None:
@@ -168,7 +139,6 @@ LOOKS: tuple[Callable[[], Iterator[Check]], ...] = (
     _packages,
     _names,
     _extras,
-    _plugins,
     _simulator,
     _kernels,
     _vulkan,

@@ -48,10 +48,11 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 @word(
     "--algorithm",
     "NAME",
-    f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
+    f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a "
+    "class of your own, package.module:Class. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
     group="Learner",
-    shell_complete=completing.among(LEARNERS.names),
+    shell_complete=completing.among(lambda: LEARNERS),
 )
 @options.deprecated("--portable")
 @options.end_after("iterations", "End after so many iterations.")

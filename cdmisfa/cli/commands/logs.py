@@ -247,7 +247,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 def _forms() -> list[str]:
     from replay.export.forms import FORMS
 
-    return FORMS.names()
+    return list(FORMS)
 
 
 @click.command("export")
@@ -257,7 +257,7 @@ def _forms() -> list[str]:
     "form",
     metavar="FORM",
     shell_complete=completing.among(_forms),
-    help="Form: parquet, npz, csv, arrow, images, mp4, lerobot, or a plugin's; by default what the "
+    help="Form: parquet, npz, csv, arrow, images, mp4, lerobot; by default what the "
     "file's name ends in.",
 )
 @options.out("The file to write, for a recording the folder.", required=True)

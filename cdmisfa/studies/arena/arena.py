@@ -55,7 +55,7 @@ CONTESTANTS: Registry[tuple[str, ...]] = Registry(
         },
     },
 )
-"""Settings of every learner that is compared, over its preset; `CONTESTANTS.add` adds one."""
+"""Settings of every learner that is compared, over its preset."""
 
 COMPUTED: Final = tuple(
     f"cdmisfa/studies/arena/{name}"

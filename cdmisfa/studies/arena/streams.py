@@ -115,7 +115,7 @@ STREAMS: Registry[Kind] = Registry(
         **{f"uniform-{sd:g}": Kind(pictures.uniform_noise(sd), False) for sd in NOISE_SD},
     },
 )
-"""Every stream; `STREAMS.add` adds one."""
+"""Every stream."""
 
 CAMERAS: Registry[Camera] = Registry(
     "camera",
@@ -241,7 +241,7 @@ SETS: Registry[ArenaSet] = Registry(
         for name, entry in tomllib.loads(Path(__file__).with_name("sets.toml").read_text()).items()
     },
 )
-"""Every set; `SETS.add` adds one."""
+"""Every set."""
 
 REPORTED: Final = "reported-"
 """What sets begin with on which nothing may be tuned; all others are for that."""

@@ -1,17 +1,18 @@
-"""A learner: it watches one stream after the other, and keeps the mean of what it saw."""
+"""A learner of your own: it watches one stream after the other, and keeps the mean of its frames.
+
+PYTHONPATH=examples cdmisfa learn oscillatory --algorithm watcher:Watcher -o runs/watcher
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.agents.blank import signals_of_block
-from cdmisfa.agents.learners import LearnerEntry
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.signals import BlockSignals
@@ -20,16 +21,17 @@ from cdmisfa.modules import Module
 
 @dataclass(frozen=True)
 class WatcherConfig:
-    """Keys `learner.*`."""
+    """Keys `learner.*`: `algorithm` is needed, the others are the learner's own."""
 
-    algorithm: str = "watcher"
+    algorithm: str = "watcher:Watcher"
     tau: int = 30
     patience: int = 50
 
 
 class Watcher:
-    """See `Learner`."""
+    """See `cdmisfa.core.learning.Learner`."""
 
+    configuration = WatcherConfig
     events: tuple[str, ...] = ()
     modules: tuple[Module, ...] = ()
     max_modules = None
@@ -42,42 +44,47 @@ class Watcher:
 
     @property
     def iteration(self) -> int:
+        """Return the number of blocks that were watched."""
         return int(self._count[0])
 
     @property
     def stream(self) -> int:
+        """Return the stream to watch next."""
         return self.iteration % len(self.spec.streams)
 
     @property
     def phi(self) -> NDArray[np.float64]:
+        """Return what is learned, (outputs, inputs), for the log."""
         return self._mean.copy()
 
     @property
     def over(self) -> str:
+        """Return why learning ends, or ""."""
         return "nothing_left" if self.iteration >= self.config.patience else ""
 
     def step(self, block: Block) -> BlockSignals:
+        """Learn from a block and return its signals; the signals not given here are NaN."""
         if (block.stream, len(block)) != (self.stream, self.tau):
             raise ValueError(f"{self.tau} frames of stream {self.stream} are needed")
-        seen = block.frames.reshape(len(block), -1).mean(axis=0)
-        change = float(np.abs(seen - self._mean[0]).mean())
+        mean = block.frames.reshape(len(block), -1).mean(axis=0)
+        change = float(np.abs(mean - self._mean[0]).mean())
         iteration = self.iteration
-        self._mean[0] += (seen - self._mean[0]) / (iteration + 1)
+        self._mean[0] += (mean - self._mean[0]) / (iteration + 1)
         self._count += 1
-        said = {"reward": change, "next_stream": self.stream}
-        return signals_of_block(block, self.spec, iteration, outputs=1, modules=0, **said)
+        given = {"reward": change, "next_stream": self.stream}
+        return signals_of_block(block, self.spec, iteration, outputs=1, modules=0, **given)
 
     @property
     def state(self) -> LearnerState:
+        """Return a copy of everything that a resumed run continues from."""
         arrays = {"mean": self._mean.copy(), "count": self._count.copy()}
         return LearnerState(arrays, (), self._rng.bit_generator.state)
 
     def restore(self, state: LearnerState) -> None:
+        """Continue from such a copy."""
         overwrite({"mean": self._mean, "count": self._count}, state.arrays)
         self._rng.bit_generator.state = dict(state.policy_rng)
 
     def summary(self) -> Mapping[str, Any]:
+        """Return what `learn --json` says beside."""
         return {"mean": self._mean[0].tolist()}
-
-
-WATCHER = LearnerEntry(WatcherConfig, Watcher, str(Path(__file__).with_name("watcher.toml")))

@@ -1,0 +1,117 @@
+"""A learner of the user, named as package.module:Class: learned with, checked, resumed, refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from contracts.learners import LearnerContract
+from waiting import python
+
+from cdmisfa.agents.learners import learner_entry
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.learning import Learner
+from cdmisfa.experiments.sources import configure
+from cdmisfa.experiments.store import read_rows
+from cdmisfa.experiments.sweep import plan, sweep
+from cdmisfa.experiments.trial import has_whole_trials, run_trial
+
+ROOT = Path(__file__).parents[1]
+OWN = "watcher:Watcher"
+
+
+@pytest.fixture(autouse=True)
+def _found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "examples")
+
+
+class TestWatcher(LearnerContract):
+    def open(self, spec: SourceSpec, seed: int) -> Learner:
+        entry = learner_entry(OWN)
+        return entry.open(entry.configuration(), spec, seed)
+
+
+def test_it_learns_is_checked_and_resumed(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = ("learn", "oscillatory", "--algorithm", OWN, "--set", "learner.patience=9")
+    words = (*words, "--no-rerun", "--json")
+    whole = cdmisfa(*words, "-o", tmp_path / "whole").json
+    assert (whole["iterations"], whole["frames"], whole["ended"]) == (9, 270, "nothing_left")
+    assert cdmisfa("check", tmp_path / "whole", "--json").json["identical"]
+    cdmisfa(*words, "-o", tmp_path / "parts", "--max-iterations", 4, "--keyframes", 2)
+    resumed = cdmisfa("learn", "--resume", "-o", tmp_path / "parts", "--max-iterations", 9).code
+    assert resumed == 0
+    result = json.loads((tmp_path / "parts" / "run.json").read_text())["result"]
+    assert result["signals_sha256"] == whole["signals_sha256"]
+    assert result["mean"] == whole["mean"]
+
+
+def test_another_process_finds_it_on_pythonpath(tmp_path: Path) -> None:
+    words = ("learn", "oscillatory", "--algorithm", OWN, "--max-iterations", "3", "--no-rerun")
+    env = {"PYTHONPATH": f"{ROOT / 'examples'}:{ROOT}"}
+    done = python("-m", "cdmisfa", *words, "-o", tmp_path / "run", cwd=tmp_path, env=env)
+    assert done.returncode == 0, done.stderr
+    done = python("-m", "cdmisfa", "check", tmp_path / "run", cwd=tmp_path, env=env)
+    assert done.returncode == 0, done.stderr
+    done = python("-m", "cdmisfa", "check", "run", cwd=tmp_path, env={"PYTHONPATH": str(ROOT)})
+    assert done.returncode == 2
+    assert done.stderr.startswith("cdmisfa: the learner watcher:Watcher cannot be imported")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_sweep_uses_it_and_knows_its_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = (f"learner.algorithm={OWN}", "learner.patience=4")
+    grid = {"learner.tau": [10, 20]}
+    sweep("oscillatory", tmp_path / "swept", seeds=[0], settings=settings, grid=grid, jobs=2)
+    rows = read_rows(tmp_path / "swept")
+    assert sorted(row["result"]["frames"] for row in rows) == [40, 80]
+    planned = [plan(["oscillatory"], grid={}, seeds=[0], settings=settings)[0].id for _ in range(2)]
+    monkeypatch.setattr("inspect.getfile", lambda found: __file__)
+    other = plan(["oscillatory"], grid={}, seeds=[0], settings=settings)[0].id
+    assert planned[0] == planned[1] != other
+
+
+def test_it_has_no_whole_trials() -> None:
+    config = learner_entry(OWN).configuration()
+    assert has_whole_trials(LearnerConfig())
+    assert not has_whole_trials(config)
+    with pytest.raises(UsageError, match=r"learner\.algorithm watcher:Watcher has no whole trials"):
+        run_trial(config, seed=0)
+
+
+def test_its_keys_are_those_of_its_configuration() -> None:
+    own = configure("oscillatory", settings=(f"learner.algorithm={OWN}",)).learner
+    assert (own.algorithm, own.tau, own.patience) == (OWN, 30, 50)
+    with pytest.raises(UsageError, match=r"learner\.tua: did you mean learner\.tau\?"):
+        configure("oscillatory", settings=(f"learner.algorithm={OWN}", "learner.tua=3"))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("nowhere:Watcher", "No module named 'nowhere'): install its package, or name its folder"),
+        ("watcher:Wacher", "module 'watcher' has no attribute 'Wacher')"),
+        ("watcher:WatcherConfig", "has no attribute configuration, the dataclass of its keys"),
+        ("antigravity:Watcher", "antigravity is of the standard library)"),
+        (":Watcher", "cannot be imported (ValueError"),
+        ("progess", "did you mean progress?"),
+    ],
+)
+def test_what_is_no_learner_is_one_line(cdmisfa: Cdmisfa, name: str, words: str) -> None:
+    refused = cdmisfa("learn", "oscillatory", "--algorithm", name)
+    assert (refused.code, refused.err.count("\n")) == (2, 1)
+    assert words in refused.err
+
+
+def test_it_learns_from_python(tmp_path: Path) -> None:
+    import cdmisfa
+
+    frames = np.random.default_rng(0).random((300, 2))
+    run = cdmisfa.learn(frames, tmp_path / "run", algorithm=OWN, max_iterations=3)
+    assert run.result["iterations"] == 3

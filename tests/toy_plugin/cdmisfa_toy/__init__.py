@@ -1,1 +1,0 @@
-"""A plugin of each kind, as small as they can be."""
