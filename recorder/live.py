@@ -39,7 +39,6 @@ class RecordedWhileWatched(ForwardSource):
         folder: of the recording; made if it does not exist.
         settings: how the files are written; the clock is the source's.
         split: write every view as parts of limited size or duration.
-        fsync_every: see `record`.
         force: overwrite an earlier recording in the folder.
 
     Attributes:
@@ -58,7 +57,6 @@ class RecordedWhileWatched(ForwardSource):
         *,
         settings: RecordConfig | None = None,
         split: Split | None = None,
-        fsync_every: float | None = None,
         force: bool = False,
     ) -> None:
         self.files: list[ViewRecording] = []
@@ -75,9 +73,7 @@ class RecordedWhileWatched(ForwardSource):
         with ExitStack() as stack:
             stale = other_recordings(self.folder, recording) if force else []
             stack.enter_context(prepared_folder(self.folder, views if force else (), stale))
-            self._logs = ViewLogs(
-                self.folder, recording, settings, places, 1, split, fsync_every=fsync_every
-            )
+            self._logs = ViewLogs(self.folder, recording, settings, places, 1, split)
             stack.callback(self._logs.abandon)
             self._open = stack.pop_all()
 

@@ -97,7 +97,6 @@ def record(
     jobs: int = 1,
     force: bool = False,
     resume: bool = False,
-    fsync_every: float | None = None,
     stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
 ) -> list[ViewRecording]:
@@ -120,8 +119,6 @@ def record(
         jobs: processes that render; only a scene can be opened in more than one.
         force: overwrite an earlier recording in the folder.
         resume: continue where an earlier attempt with the same arguments ended.
-        fsync_every: seconds after which the disk has what was written, so that a power cut takes
-            no more; None leaves it to the operating system until a file is finished.
         stop: asked after every block; true ends the recording with an error.
         progress: called after every block; never where there was nothing left to record.
 
@@ -153,7 +150,7 @@ def record(
             places = {view: begin_view(folder, view, split) for view in chosen}
         frames = frames or default
         poses = getattr(source, "head_poses", ())
-        logs = ViewLogs(folder, recording, settings, places, frames, split, poses, fsync_every)
+        logs = ViewLogs(folder, recording, settings, places, frames, split, poses)
         open_logs.callback(logs.abandon)
         starts = logs.starts()
         blocks = (
@@ -185,7 +182,6 @@ class ViewLogs:
         frames: how many each view shall have.
         split: where parts end.
         poses: of the head in each of the recording's views, where there is a head.
-        fsync_every: see `record`.
     """
 
     def __init__(
@@ -197,7 +193,6 @@ class ViewLogs:
         frames: int,
         split: Split | None,
         poses: Sequence[HeadPose] = (),
-        fsync_every: float | None = None,
     ) -> None:
         self._folder, self._recording = folder, recording
         self._parts = {view: list(place.parts) for view, place in places.items()}
@@ -223,7 +218,6 @@ class ViewLogs:
                     split=split,
                     parts=self._parts[view],
                     first=place.first,
-                    fsync_every=fsync_every,
                 )
                 if earlier is not None:
                     log.copy(earlier, place.stop)

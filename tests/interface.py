@@ -19,7 +19,7 @@ import click
 
 SNAPSHOT = Path(__file__).parent / "data" / "interface.json"
 
-SHORT = ("--max-iterations", 3, "--no-rerun", "--no-report")
+SHORT = ("--max-iterations", 3, "--no-rerun")
 
 EASY = ("tau=40", "eta_dot_window=8", "warm_up=3", "delta=1", "min_variance=1e-6", "novel_share=0")
 SOON = ("--no-rerun", *(word for key in EASY for word in ("--set", f"learner.{key}")))

@@ -136,7 +136,6 @@ def test_settings_of_a_log_or_a_caller_are_checked_like_typed_ones(
     "words",
     [
         ("convert", "a.mcap", "--rate", "nan"),
-        ("record", "oscillatory", "--fsync-every", "nan"),
         ("learn", "oscillatory", "--timeout", "nan"),
     ],
 )

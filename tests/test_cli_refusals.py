@@ -77,7 +77,6 @@ CASES: dict[str, tuple[str, ...]] = {
     "export REC --to mp4 -o z.parquet": ("z.parquet: a folder is written",),
     "export REC --to lerobot -o z.parquet": ("z.parquet: a folder is written",),
     "recover REC/x1.mcap -o x.csv": ("x.csv: the log is an MCAP file, name it x.mcap",),
-    "at RUN 3 --save-module x.csv": ("x.csv: the module is an NPZ file, name it x.npz",),
     **{
         f"{words} -o x.mcap": ("x.mcap: a folder is written, name it without .mcap",)
         for words in ("record oscillatory", "learn oscillatory", "convert LOGS", "sweep REC")

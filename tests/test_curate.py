@@ -131,7 +131,7 @@ def test_what_a_run_knows_is_not_chosen(cdmisfa: Cdmisfa, tmp_path: Path) -> Non
     logs = tmp_path / "logs"
     cdmisfa("record", "oscillatory", "--frames", 6000, "-o", logs / "waves")
     cdmisfa("index", logs)
-    learned = ("--algorithm", "progress", "--no-rerun", "--no-report", "-o", tmp_path / "run")
+    learned = ("--algorithm", "progress", "--no-rerun", "-o", tmp_path / "run")
     assert cdmisfa("learn", logs / "waves", *learned).code == 0
     words = ("curate", logs, "--known", tmp_path / "run", "--budget", "1min", "--json")
     assert cdmisfa(*words, "-o", tmp_path / "out").code == 0
@@ -213,7 +213,7 @@ def test_what_looks_as_what_a_run_watched_comes_last(cdmisfa: Cdmisfa, tmp_path:
     for name, event in (("usual", None), ("again", None), ("event", 200)):
         ms = ((t * 1000 // FPS, frame) for t, frame in enumerate(scene(rng, event)))
         write_images(logs / f"{name}.mcap", {"/camera": ms})
-    words = ("--loop", "--max-iterations", 200, "--no-rerun", "--no-report", "-o", tmp_path / "run")
+    words = ("--loop", "--max-iterations", 200, "--no-rerun", "-o", tmp_path / "run")
     assert cdmisfa("learn", logs / "usual.mcap", "--topic", "/camera", *words).code == 0
     cdmisfa("index", logs)
     words = ("--known", tmp_path / "run", "--budget", "4s", "-o", tmp_path / "out", "--json")
@@ -239,7 +239,7 @@ def test_how_many_processes_judge_changes_nothing(cdmisfa: Cdmisfa, tmp_path: Pa
         assert cdmisfa("record", "oscillatory", *words).code == 0
     (logs / "3" / "x1.mcap").write_bytes((logs / "3" / "x1.mcap").read_bytes()[:5000])
     cdmisfa("index", logs)
-    learned = ("--algorithm", "progress", "--no-rerun", "--no-report", "--max-iterations", 60)
+    learned = ("--algorithm", "progress", "--no-rerun", "--max-iterations", 60)
     assert cdmisfa("learn", logs / "0", *learned, "--loop", "-o", tmp_path / "run").code == 0
     for jobs in (1, 2):
         out = tmp_path / f"out-{jobs}"

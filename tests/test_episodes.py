@@ -28,7 +28,7 @@ from replay.runs.keyframes import read_keyframe
 
 STEP_MS = 50
 SIZE = 16, 24
-QUICK = ("--set", "learner.tau=10", "--no-rerun", "--no-report")
+QUICK = ("--set", "learner.tau=10", "--no-rerun")
 
 
 def scenes(count: int, frames: int, seed: int = 0) -> list[np.ndarray]:
@@ -284,7 +284,7 @@ def test_killed_in_the_middle_of_many_episodes_it_is_resumed_with_the_same_signa
     kept = read_keyframe(log)
     assert kept is not None
     assert 100 <= kept.iteration < 300
-    done = cdmisfa("learn", "--resume", "-o", run, "--json", "--no-rerun", "--no-report")
+    done = cdmisfa("learn", "--resume", "-o", run, "--json", "--no-rerun")
     assert done.code == 0, done.err
     assert done.json["signals_sha256"] == whole["signals_sha256"]
     np.save(folder / "ep149.npy", np.zeros((25, 4)))
@@ -321,7 +321,7 @@ def backgrounds(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_log(folder / "logs" / f"ep{i}.mcap", images, i * 1000)
     assert run(["index", str(folder / "logs")]) == 0
     words = ["learn", str(folder / "logs"), "--centre", "episode", "-o", str(folder / "run")]
-    assert run([*words, "--no-rerun", "--no-report"]) == 0
+    assert run([*words, "--no-rerun"]) == 0
     return folder
 
 
@@ -411,7 +411,7 @@ def test_recordings_of_scenes_are_episodes(cdmisfa: Cdmisfa, tmp_path: Path) -> 
         assert cdmisfa("record", "oscillatory", *words).code == 0
     assert cdmisfa("index", folder).code == 0
     run = tmp_path / "run"
-    learned = cdmisfa("learn", folder, "-o", run, "--json", "--no-rerun", "--no-report").json
+    learned = cdmisfa("learn", folder, "-o", run, "--json", "--no-rerun").json
     assert [file["file"] for file in learned["source"]["files"]] == ["rec0", "rec1"]
     assert learned["source"]["scene"] == "oscillatory"
     assert json.loads((run / "run.json").read_text())["config"]["learner"]["algorithm"] == "2.0"

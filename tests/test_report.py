@@ -265,7 +265,7 @@ def test_the_progress_learner_is_shown_with_its_own_rules(tmp_path: Path) -> Non
 def test_the_progress_learner_saves_where_all_its_rules_hold_and_nowhere_else(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
-    words = ("--algorithm", "progress", "--no-rerun", "--no-report", "-o", tmp_path)
+    words = ("--algorithm", "progress", "--no-rerun", "-o", tmp_path)
     assert cdmisfa("learn", "oscillatory", *words).code == 0
     told = read_told(tmp_path, frames=1)
     rules = conditions_of(told.outline, told.signals)
@@ -353,8 +353,6 @@ def test_learning_does_not_fail_with_its_report(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("learn", "oscillatory", "--max-iterations", 5, "--no-rerun", "-o")
-    assert cdmisfa(*words, tmp_path / "without", "--no-report").code == 0
-    assert not (tmp_path / "without" / "report.html").exists()
     done = cdmisfa(*words, tmp_path / "with", "--json")
     assert (done.code, done.json["ended"], done.err) == (0, "max_iterations", "")
     assert (tmp_path / "with" / "report.html").is_file()

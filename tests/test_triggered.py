@@ -245,7 +245,7 @@ def test_what_cannot_be_is_refused_in_one_line(
 
 
 def test_what_a_run_knows_is_not_recorded(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    run_of = ("--algorithm", "progress", "--no-rerun", "--no-report", "-o", tmp_path / "run")
+    run_of = ("--algorithm", "progress", "--no-rerun", "-o", tmp_path / "run")
     cdmisfa("record", "oscillatory", "--frames", 6000, "-o", tmp_path / "all")
     assert cdmisfa("learn", tmp_path / "all", *run_of).code == 0
     known = {module.stream for module in Run(tmp_path / "run").modules}
@@ -271,7 +271,7 @@ def test_larger_pictures_are_judged_as_the_run_saw_them(cdmisfa: Cdmisfa, tmp_pa
     small = np.stack([pendulum(k, 0) for k in range(6000)])
     np.save(tmp_path / "small.npy", small)
     words = ("learn", tmp_path / "small.npy", "--algorithm", "progress", "--max-modules", 1)
-    done = cdmisfa(*words, "--no-rerun", "--no-report", "-o", tmp_path / "run")
+    done = cdmisfa(*words, "--no-rerun", "-o", tmp_path / "run")
     assert done.code == 0, done.err
     application = Application(tmp_path / "run")
     n = application.tau

@@ -327,31 +327,28 @@ class CuriousLearner:
             **out,
         )
 
-    @property
-    def unfinished(self) -> Module:
-        """The adaptive abstraction as the last iteration left it, as a module."""
-        agent, memory = self.agent, self.agent.memory[0]
-        return Module(
-            index=len(self.modules) + 1,
-            stream=self.spec.streams[int(memory["last_stream"])],
-            stream_index=int(memory["last_stream"]),
-            iteration=int(memory["iteration"]) - 1,
-            phi=self.abstraction.phi.copy(),
-            mean=self.abstraction.mean.copy(),
-            band_mean=agent.gate_mean.copy(),
-            band_sd=np.sqrt(agent.gate_variance),
-            eta=agent.eta.copy(),
-            policy=agent.policy.copy(),
-            expansion=self.config.expansion,
-            scale=self.scale,
-            frame_shape=self.spec.frame_shape,
-            centres=agent.centres.copy(),
-            counts=agent.counts.copy(),
-        )
-
     def save_abstraction(self) -> None:
         """Freeze the abstraction that the last iteration found ready, and begin a new one."""
-        self.modules.append(self.unfinished)
+        agent, memory = self.agent, self.agent.memory[0]
+        self.modules.append(
+            Module(
+                index=len(self.modules) + 1,
+                stream=self.spec.streams[int(memory["last_stream"])],
+                stream_index=int(memory["last_stream"]),
+                iteration=int(memory["iteration"]) - 1,
+                phi=self.abstraction.phi.copy(),
+                mean=self.abstraction.mean.copy(),
+                band_mean=agent.gate_mean.copy(),
+                band_sd=np.sqrt(agent.gate_variance),
+                eta=agent.eta.copy(),
+                policy=agent.policy.copy(),
+                expansion=self.config.expansion,
+                scale=self.scale,
+                frame_shape=self.spec.frame_shape,
+                centres=agent.centres.copy(),
+                counts=agent.counts.copy(),
+            )
+        )
         self._freeze()
         begin_abstraction(self.agent, self.rules.epsilon_start)
         self.abstraction = self._new_abstraction()

@@ -97,7 +97,6 @@ loop = flag("--loop", "Start a recording or log again at its end.", group="Sourc
 salvage = flag("--salvage", "Pass over damaged parts and images of a log.", group="Source")
 force = flag("--force", "Overwrite what is already there.")
 no_rerun = flag("--no-rerun", "Do not build the Rerun view run.rrd.")
-no_report = flag("--no-report", "Do not write the report report.html.")
 retry_failed = flag("--retry-failed", "Compute trials again that failed before.")
 as_json = option(
     "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
@@ -115,12 +114,6 @@ keyframes = number(
     "Keep the learner's state every N iterations; by default every 100, or less often so that they "
     "stay a small part of the log.",
     *(1, None, "N"),
-)
-fsync_every = number(
-    "--fsync-every",
-    "Let the disk have what is written after so long, so that a power cut takes no more; by "
-    "default the operating system decides until a file is finished.",
-    *(0.0, 1e6, "SECONDS"),
 )
 engine = together(
     choice(

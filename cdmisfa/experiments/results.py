@@ -334,28 +334,7 @@ def as_table(points: Sequence[PointResult]) -> tuple[list[str], list[list[str]]]
     return head, rows
 
 
-def as_latex(points: Sequence[PointResult]) -> str:
-    """A booktabs table with the columns of `as_table`."""
-    head, rows = as_table(points)
-    lines = [
-        r"\begin{tabular}{" + "l" * len(head) + "}",
-        r"\toprule",
-        _latex_line(head),
-        r"\midrule",
-        *map(_latex_line, rows),
-        r"\bottomrule",
-        r"\end{tabular}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
 def _cell(found: MeanSd) -> str:
     if not found.n:
         return ""
     return f"{found.mean:.4g}" if math.isnan(found.sd) else f"{found.mean:.4g} ± {found.sd:.2g}"
-
-
-def _latex_line(cells: Sequence[str]) -> str:
-    special = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "±": r"$\pm$"}
-    escaped = ["".join(special.get(c, c) for c in cell) for cell in cells]
-    return " & ".join(escaped) + r" \\"

@@ -159,7 +159,6 @@ def opened_log(
     force: bool,
     resumed: bool,
     aside: Path | None,
-    fsync_every: float | None,
     view: bool,
 ) -> Iterator[RunWriter]:
     """The log of a run, to be finished inside, while its folder is held.
@@ -173,7 +172,6 @@ def opened_log(
         force: replace what is in the folder.
         resumed: whether the run is resumed.
         aside: its log of before, where it holds anything; set aside under `SET_ASIDE`.
-        fsync_every: see `RunWriter`.
         view: whether the run will have a view.
 
     Raises:
@@ -204,7 +202,7 @@ def opened_log(
             for path in stale:
                 path.unlink(missing_ok=True)
         force = force or resumed
-        log = RunWriter(finished, source.spec, manifest, force=force, fsync_every=fsync_every)
+        log = RunWriter(finished, source.spec, manifest, force=force)
         try:
             yield log
         except BaseException as error:

@@ -248,7 +248,6 @@ class Session:
         sinks: Sequence[Sink] = (),
         stop: Callable[[], bool] = lambda: False,
         keyframes: int | None = None,
-        fsync_every: float | None = None,
         rerun: bool = True,
         live: bool = False,
         announce: Callable[[Broadcast], None] = lambda broadcast: None,
@@ -262,8 +261,6 @@ class Session:
             stop: asked before every iteration; true ends the run cleanly, without a view, and a
                 long source is known by a sample.
             keyframes: iterations between keyframes, see `Keyframes`.
-            fsync_every: seconds after which the disk has the log, so that a power cut takes no
-                more; None leaves it to the operating system until the run is finished.
             rerun: also build the Rerun view.
             live: also show the run in Rerun while it learns, to viewers on this machine.
             announce: called with what viewers of the live view are served.
@@ -286,7 +283,6 @@ class Session:
                         force=self._force,
                         resumed=self._resumed,
                         aside=self.before if self._resumed else None,
-                        fsync_every=fsync_every,
                         view=rerun,
                     )
                 )

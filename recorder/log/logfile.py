@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import math
 import os
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final, Self
@@ -187,7 +185,6 @@ class LogFile:
         compression: Compression = "zstd",
         chunk_size: int = 1024 * 1024,
         flush_ns: int = FLUSH_NS,
-        fsync_every: float | None = None,
         aside: bool = False,
     ) -> None:
         """Open NAME.partial for writing.
@@ -200,8 +197,6 @@ class LogFile:
             compression: of the chunks.
             chunk_size: bytes of messages at which a chunk is closed.
             flush_ns: log time after which it is flushed.
-            fsync_every: seconds of wall time after which a flush lets the disk have everything,
-                too; None leaves that to the operating system until the end. The bytes are the same.
             aside: compress in a thread of its own; the bytes are the same.
 
         Raises:
@@ -214,8 +209,6 @@ class LogFile:
         self._force = force
         self._flush_ns = flush_ns
         self._chunk_start: int | None = None
-        self._fsync_every = math.inf if fsync_every is None else fsync_every
-        self._next_sync = time.monotonic() + self._fsync_every
         self._named_on_disk = False
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         refuse_taken(self.path, force=force)
@@ -337,21 +330,15 @@ class LogFile:
         self._writer.end_chunk()
         self._writer.settle()
         self._stream.flush()
-        if time.monotonic() >= self._next_sync:
-            self._sync()
 
     def sync(self) -> None:
         """Flush, and let the disk have everything: a power cut takes nothing of it."""
         self.flush()
-        self._sync()
-
-    def _sync(self) -> None:
         self._stream.sync()
         if not self._named_on_disk:
             with self._telling():
                 to_disk(self.partial.parent)
             self._named_on_disk = True
-        self._next_sync = time.monotonic() + self._fsync_every
 
     def finish(self) -> None:
         """Write the index, make the file durable and give it its name.

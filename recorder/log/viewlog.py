@@ -55,7 +55,6 @@ class ViewLog:
         split: where parts end; None for a single file.
         parts: file and number of frames of each part that is finished.
         first: first frame of the part that is next.
-        fsync_every: see `LogFile`.
 
     Attributes:
         parts: as given; those that are finished since are added.
@@ -73,12 +72,11 @@ class ViewLog:
         split: Split | None = None,
         parts: list[tuple[Path, int]] | None = None,
         first: int = 0,
-        fsync_every: float | None = None,
     ) -> None:
         self.parts = [] if parts is None else parts
         self.t = first
         self._folder, self._view, self._recording = folder, view, recording
-        self._settings, self._fsync_every = settings, fsync_every
+        self._settings = settings
         self._split = split
         self._spec = spec = recording.spec
         self._length = split.frames(spec.fps) if split else None
@@ -159,7 +157,6 @@ class ViewLog:
             library=f"cdmisfa {version('cdmisfa')}",
             compression=settings.compression,
             chunk_size=settings.chunk_size,
-            fsync_every=self._fsync_every,
         )
         stated = self._recording.metadata(self._view, self.t)
         log.add_metadata(RECORDING_METADATA, stated.record())

@@ -66,7 +66,6 @@ class RunWriter(Sink):
         watched_every: keep every this many frames of images; vectors are all kept.
         phi_every: keep the weights every this many iterations, on each save, where a learner that
             has weights of each stream goes on to another one, and at the end.
-        fsync_every: see `LogFile`.
 
     Raises:
         UsageError: the file exists and `force` is not set.
@@ -82,7 +81,6 @@ class RunWriter(Sink):
         force: bool = False,
         watched_every: int = 10,
         phi_every: int = PHI_EVERY,
-        fsync_every: float | None = None,
     ) -> None:
         self.spec, self.path = spec, Path(path)
         self._watched_every = max(watched_every, 1)
@@ -97,7 +95,6 @@ class RunWriter(Sink):
             compression="lz4",
             chunk_size=CHUNK_BYTES,
             flush_ns=NEVER_NS,
-            fsync_every=fsync_every,
             aside=True,
         )
         self._next_flush = time.monotonic() + FLUSH_SECONDS

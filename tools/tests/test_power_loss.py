@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import random
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,9 +21,8 @@ from tools.torture.power import (
     cuts,
     go_on,
     record,
-    write_tree,
 )
-from tools.torture.stories import FRAMES, OUT, STORIES, frames, iterations
+from tools.torture.stories import STORIES
 
 OLDER = ("run.before.mcap.partial", "x1.mcap.partial.kept")
 """Logs that are gone on with, until the new ones hold what they do."""
@@ -70,36 +67,6 @@ def test_what_was_there_before_is_not_given_up_for_what_the_disk_has_not(
     ]
     left = itertools.product(gone, (SYNCED, ZEROS), (NAMES, OLD_NAMES))
     goes_on([Cut(recorded, *how) for how in left], tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "before", "progress", "least"),
-    [
-        ("record", ("x1.mcap.partial", -2), frames, 3 * (FRAMES - 100)),
-        # the last four, with the end of the log, follow when all before is synced
-        ("learn", ("run.mcap.partial", -5), iterations, 400),
-    ],
-)
-def test_fsync_every_bounds_what_a_power_cut_takes(
-    tmp_path: Path, name: str, before: tuple[str, int], progress: Callable[[Path], int], least: int
-) -> None:
-    """Before a file's last data is written, all but what was written since is on the disk."""
-    file, write = before
-    found = []
-    for number, option in enumerate(("", " --fsync-every 0")):
-        (tmp_path / f"recorded{number}").mkdir()
-        story = replace(STORIES[name], words=f"{STORIES[name].words}{option}")
-        recorded = record(story, tmp_path / f"recorded{number}")
-        about = enumerate(recorded.calls)
-        writes = [n for n, c in about if c.kind == "write" and c.path.name == file]
-        cut = Cut(recorded, writes[write], SYNCED, OLD_NAMES)
-        (tmp_path / f"left{number}").mkdir()
-        write_tree(cut.tree, tmp_path / f"left{number}")
-        found.append((recorded.result, progress(tmp_path / f"left{number}" / OUT)))
-    (result, kept), (same, more) = found
-    assert result == same
-    assert kept == 0
-    assert more >= least
 
 
 def test_a_disk_has_what_was_synced() -> None:

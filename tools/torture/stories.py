@@ -246,7 +246,7 @@ def cut_short(folder: Path, words: str, name: str, writes: int) -> None:
 
 RECORD = f"record oscillatory -o {OUT} --frames {FRAMES}"
 LEARN = f"learn {GIVEN} -o {OUT} --loop --set learner.tau=10"
-LONG = f"{LEARN} --max-iterations {ITERATIONS} --no-rerun --no-report"
+LONG = f"{LEARN} --max-iterations {ITERATIONS} --no-rerun"
 TORN = f"{GIVEN}/x1.mcap.partial"
 
 
@@ -324,7 +324,7 @@ STORIES = {
             "learn",
             LONG,
             (
-                f"learn -o {OUT} --resume --no-rerun --no-report",
+                f"learn -o {OUT} --resume --no-rerun",
                 f"{LONG} --resume",
                 f"{LONG} --force",
             ),
@@ -333,18 +333,18 @@ STORIES = {
         ),
         Story(
             "learn with a view",
-            f"{LEARN} --max-iterations 30 --no-report",
+            f"{LEARN} --max-iterations 30",
             (
-                f"learn -o {OUT} --resume --no-report",
-                f"{LEARN} --max-iterations 30 --no-report --force",
+                f"learn -o {OUT} --resume",
+                f"{LEARN} --max-iterations 30 --force",
             ),
             learned,
             _recording,
         ),
         Story(
             "learn --resume",
-            f"learn -o {OUT} --resume --no-rerun --no-report",
-            (f"learn -o {OUT} --resume --no-rerun --no-report",),
+            f"learn -o {OUT} --resume --no-rerun",
+            (f"learn -o {OUT} --resume --no-rerun",),
             learned,
             _learning,
             iterations,
@@ -354,7 +354,7 @@ STORIES = {
             f"{LONG} --resume",
             (f"{LONG} --resume",),
             learned,
-            lambda folder: _learned(folder, f"{LEARN} --max-iterations 250 --no-rerun --no-report"),
+            lambda folder: _learned(folder, f"{LEARN} --max-iterations 250 --no-rerun"),
             iterations,
         ),
         Story(

@@ -130,12 +130,6 @@ class ProgressLearner:
         return np.zeros((self._n_outputs, self._n_inputs)) if held is None else held.sfa.phi
 
     @property
-    def unfinished(self) -> Module | None:
-        """The candidate of the stream to watch next, as a module; None where there is none."""
-        held = self._candidates.get(self.stream)
-        return None if held is None else self._module(self.stream, held)
-
-    @property
     def over(self) -> str:
         """Whether no stream is being learned, nor was for `learner.watch` blocks; see `Learner`."""
         return (

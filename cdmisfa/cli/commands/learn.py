@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 OPENED = ("preset", "seed", "loop", "salvage", "episodes", "centre")
 """Options that say how a source is opened."""
 
-KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
+KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
 """Options that are handed on to the run as they are."""
 
 
@@ -66,7 +66,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 @options.salvage
 @flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
-@options.no_report
 @flag("--episodes", "Take each log as an episode, one after the other.", group="Source")
 @choice(
     "--centre",
@@ -99,7 +98,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
     group="Live streams",
 )
 @options.keyframes
-@options.fsync_every
 @options.log_options
 @options.live_options
 @options.server_limits
@@ -174,7 +172,7 @@ def learn_command(
     if resume and not reporter.told and not stop():
         tell("nothing was left to do: the run had come as far before")
     print_result(result, as_json=as_json)
-    if result.run is not None and result.ended != INTERRUPTED and not told["no_report"]:
+    if result.run is not None and result.ended != INTERRUPTED:
         report_beside(result.run, quiet=as_json)
     if result.ended == INTERRUPTED:
         if result.run is not None and not of_cameras:
@@ -261,7 +259,6 @@ def opened_live(
                 frames,
                 record_to,
                 settings=configuration.record,
-                fsync_every=told["fsync_every"],
                 force=force,
             ) as recorded:
                 yield recorded, configuration

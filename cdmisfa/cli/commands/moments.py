@@ -19,7 +19,7 @@ from cdmisfa.cli.printing import (
     tell,
 )
 from cdmisfa.cli.progress import learning
-from cdmisfa.core.errors import NotReproducedError, UsageError
+from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.names import counted
 
 source = word(
@@ -34,19 +34,10 @@ source = word(
 @click.command("at")
 @options.path_argument("run")
 @click.argument("iterations", metavar="K", type=click.IntRange(0))
-@options.path("--save-module", "Write what it was just learning as a file of modules.", "F.npz")
 @source
 @options.server_limits
-@options.force
 @options.as_json
-def at_command(
-    run: Path,
-    iterations: int,
-    save_module: Path | None,
-    source: tuple[str, ...],
-    force: bool,
-    as_json: bool,
-) -> None:
+def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: bool) -> None:
     """Say what a learner was after K iterations of a run, exactly.
 
     K is the number of iterations that were done, from 0 on. The learner is put where a keyframe in
@@ -60,8 +51,6 @@ def at_command(
     with Session.at(run, iterations, source) as again:
         log, learner, t = again.log, again.learner, again.t
     state, streams = learner.state, learner.spec.streams  # type: ignore[attr-defined]
-    if save_module is not None:
-        _save_unfinished(learner, save_module, force=force)
     if as_json:
         print_document(
             run=str(log.parent),
@@ -87,23 +76,6 @@ def at_command(
         print_line(f"policy: {', '.join(f'{name} {ACTIONS[action]}' for name, action in policy)}")
     size = sum(array.nbytes for array in state.arrays.values()) / 1000
     print_line(f"memory: {len(state.arrays)} arrays, {size:.1f} kB; --json prints all of it")
-    if save_module is not None:
-        print_line(f"module written to {save_module}")
-
-
-def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
-    """Write what a learner is learning as a file of one module."""
-    import dataclasses
-
-    from recorder.log.files import refuse_taken, refuse_unless
-    from replay.runs.modules import save_modules
-
-    module = getattr(learner, "unfinished", None)
-    if module is None:
-        raise UsageError("nothing is being learned then: choose another iteration")
-    refuse_unless(path, "the module is an NPZ file", ".npz", "")
-    refuse_taken(path, force=force)
-    save_modules(path, [dataclasses.replace(module, index=1)])
 
 
 @click.command("check")
@@ -155,9 +127,7 @@ def check_command(
 @options.end_after("modules", "End after so many modules in all; by default as the run.")
 @source
 @options.no_rerun
-@options.no_report
 @options.keyframes
-@options.fsync_every
 @options.server_limits
 @options.force
 @options.as_json
@@ -171,9 +141,7 @@ def fork_command(
     max_iterations: int | None,
     max_modules: int | None,
     no_rerun: bool,
-    no_report: bool,
     keyframes: int | None,
-    fsync_every: float | None,
     as_json: bool,
     **told: Any,
 ) -> None:
@@ -194,12 +162,11 @@ def fork_command(
             sinks=(reporter,),
             stop=stop,
             keyframes=keyframes,
-            fsync_every=fsync_every,
             rerun=not no_rerun,
             hashing=reporter.hashing,
         )
     print_result(result, as_json=as_json)
-    if result.run is not None and result.ended != INTERRUPTED and not no_report:
+    if result.run is not None and result.ended != INTERRUPTED:
         report_beside(result.run, quiet=as_json)
     both = f"cdmisfa compare {quoted(run)} {quoted(out)} --save both.rrd"
     tell(f"both in one view: {both}")

@@ -70,7 +70,6 @@ LIVE = ("cameras", "gym")
     "Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
     "--resume as first asked for.",
 )
-@options.fsync_every
 @options.image_options
 @options.live_options
 @options.trigger_options
@@ -215,7 +214,6 @@ def _record_scene(
 @options.salvage
 @flag("--resume", "Resume an attempt that was stopped.")
 @options.server_limits
-@options.fsync_every
 @options.force
 @options.as_json
 @options.quiet
@@ -227,7 +225,6 @@ def convert_command(
     out: Path | None,
     salvage: bool,
     resume: bool,
-    fsync_every: float | None,
     force: bool,
     as_json: bool,
     live: LiveOptions,
@@ -246,7 +243,7 @@ def convert_command(
     from replay.inputs import locations, open_cameras, refuse_what_is_no_log
 
     out = _folder(out)
-    writing: dict[str, Any] = {"fsync_every": fsync_every, "force": force}
+    writing: dict[str, Any] = {"force": force}
     if any(map(is_live, source)):
         if resume or salvage:
             raise UsageError("live streams cannot go back: leave out --resume and --salvage")

@@ -36,7 +36,6 @@ def record_streams(
     *,
     as_json: bool,
     force: bool,
-    fsync_every: float | None,
     frames: int | None = None,
     split: str | None = None,
     **how: Any,
@@ -71,7 +70,6 @@ def record_streams(
             out,
             settings=configuration.record,
             split=None if split is None else Split.parse(split),
-            fsync_every=fsync_every,
             force=force,
         )
         with bar("recording", "frames") as shown:

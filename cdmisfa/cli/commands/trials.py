@@ -144,17 +144,16 @@ def parse_seeds(text: str) -> list[int]:
 @click.command("results")
 @options.path_argument("folder")
 @flag("--csv", "Print comma-separated values.")
-@flag("--latex", "Print a LaTeX table (booktabs).")
 @options.as_json
-def results_command(folder: Path, csv: bool, latex: bool, as_json: bool) -> None:
+def results_command(folder: Path, csv: bool, as_json: bool) -> None:
     """Print mean and standard deviation over seeds at each point of a sweep.
 
     FOLDER is that of the sweep, the trials are those that it was asked for last.
     """
     from cdmisfa.experiments import results
 
-    if csv + latex + as_json > 1:
-        raise click.UsageError("choose one of --csv, --latex and --json")
+    if csv and as_json:
+        raise click.UsageError("choose one of --csv and --json")
     points = results.results(folder)
     for key, values in results.varied(points).items():
         tell(f"{key} differs: {', '.join(map(str, values))}")
@@ -162,8 +161,6 @@ def results_command(folder: Path, csv: bool, latex: bool, as_json: bool) -> None
         print_json(results.as_json(points))
     elif csv:
         print_text(results.as_csv(points))
-    elif latex:
-        print_text(results.as_latex(points))
     else:
         print_table(*results.as_table(points))
 
