@@ -163,6 +163,16 @@ def test_help_imports_nothing_heavy() -> None:
     assert python("-c", code).stderr.strip() == "[]"
 
 
+def test_learning_from_a_scene_without_a_view_imports_no_viewer(tmp_path: Path) -> None:
+    words = ["learn", "oscillatory", "-o", str(tmp_path / "run"), "--max-iterations", "1"]
+    code = (
+        f"import sys; from cdmisfa.cli import run; assert run({[*words, '--no-rerun']}) == 0\n"
+        "heavy = {'rerun', 'matplotlib', 'pybullet', 'replay.camera_logs.source'}\n"
+        "print(heavy & sys.modules.keys(), file=sys.stderr)"
+    )
+    assert python("-c", code, check=True).stderr.splitlines()[-1] == "set()"
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_that_the_group_repeats(name: str) -> None:
     command = cli.get_command(click.Context(cli), name)

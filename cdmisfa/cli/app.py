@@ -20,7 +20,6 @@ from typing import NoReturn
 import click
 
 from cdmisfa.cli.interrupts import end_at_once, ignore_at_the_end, interruptible
-from cdmisfa.cli.on_demand import names_on_demand
 from cdmisfa.cli.options import quiet
 from cdmisfa.cli.printing import Stderr
 from cdmisfa.core.errors import CdmisfaError, UsageError
@@ -173,7 +172,6 @@ def main() -> NoReturn:
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
         sys.stdout.reconfigure(errors="replace")
     ignore_at_the_end()
-    names_on_demand("rerun")  # of 550 modules a view needs 200
     code = run(sys.argv[1:])
     end_at_once(code)
     # An interrupt inside of an exec, as imports have them, is remembered until the next one:
