@@ -39,10 +39,7 @@ fuzz: $(INSTALLED)
 	$(BIN)/python -m tools.fuzz.guided --seconds $(or $(SECONDS),60)
 	$(BIN)/python -m tools.fuzz.logs --cases 1000000 --jobs 2
 
-# The streams of the arena take minutes to make: they are kept.
 torture: $(INSTALLED) sanitized
-	test -e build/torture/streams || $(BIN)/cdmisfa arena small --learners progress \
-	    --seeds 0:2 --budget 2000 --jobs 2 -o build/torture/arena --streams build/torture/streams
 	$(BIN)/python -m tools.torture --seed $(or $(SEED),0) --page docs/results/reliability.md
 
 # Tests of what attacks the product, with some cases of each kind.

@@ -7,7 +7,6 @@ import importlib
 import pkgutil
 
 import benchmarks
-from benchmarks.curation import page as curation
 from benchmarks.history import draw, keep
 from benchmarks.report import PAGE, PICTURE, write_page
 
@@ -18,7 +17,7 @@ def main() -> None:
     The ratios of a run that is not quick are kept under the commit, too.
     """
     modules = pkgutil.iter_modules(benchmarks.__path__)
-    names = sorted({m.name for m in modules} - {"__main__", "history", "report"})
+    names = sorted({m.name for m in modules} - {"__main__", "arena", "history", "report"})
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument(
         "name", nargs="*", metavar="NAME", help=f"one of {', '.join(names)}, or page"
@@ -30,7 +29,6 @@ def main() -> None:
         if name == "page":
             draw(PAGE.parent / PICTURE)
             print(write_page())
-            print(curation.write_page())
             continue
         if name not in names:
             parser.error(f"no benchmark {name}: there are {', '.join(names)}")

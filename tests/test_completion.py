@@ -54,7 +54,6 @@ def test_what_is_completed(
     assert {"learner.attention=", "scene.seed=", "record.fps="} <= {*of("learn x --set ")}
     assert "scene.object1.toggle_every=" in of("sweep icub --grid scene.")
     assert of("reproduce ic") == ["icub"]
-    assert "small" in of("arena ")
     assert of("export x --to par") == ["parquet"]
     monkeypatch.chdir(oscillatory_run.parents[1])
     run = str(oscillatory_run.relative_to(Path.cwd()))

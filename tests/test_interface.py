@@ -49,5 +49,5 @@ def test_documents_on_stdout_are_versioned_and_alone(cdmisfa: Cdmisfa) -> None:
     assert [name for name, keys in kept["keys of --json"].items() if "schema" not in keys] == []
     with_json = {name for name, words in kept["commands"].items() if "--json" in words}
     looked_at = {name.partition(" ")[0] for name in kept["keys of --json"]}
-    assert with_json - looked_at == {"arena", "demo", "reproduce"}
+    assert with_json - looked_at == {"demo", "reproduce"}
     assert cdmisfa("signals", "--json").json["schema"] == kept["formats"]["JSON documents"]

@@ -325,14 +325,13 @@ def test_every_rule_chooses_a_stream(name: str, learning: list[bool], seed: int)
         learning=np.array(learning),
         changed=np.array(learning) & rng.integers(0, 2, n).astype(bool),
         errors={s: rng.random(int(rng.integers(RECENT + 1))) for s in range(0, n, 2)},
-        surprise=rng.choice([np.nan, 0.5, 1.0, 2.0], (n, RECENT)),
         visits=rng.integers(1, 100, n),
         draws=rng.random(2),
         explore=0.1,
     )
     stream, drawn = RULES[name](situation)
     assert 0 <= stream < n
-    if name not in ("random", "sticky") and any(learning) and not drawn:
+    if name != "random" and any(learning) and not drawn:
         assert learning[stream]
 
 
@@ -340,28 +339,13 @@ def test_rules_and_settings_agree() -> None:
     assert tuple(RULES) == ATTENTIONS
 
 
-FALLS = np.r_[np.full(8, 2.0), np.full(8, 1.0)]
-EVEN = np.full(RECENT, 1.5)
-NOT_YET = np.full(RECENT, np.nan)
-
-
 @pytest.mark.parametrize(
     ("name", "told", "draw", "chosen"),
     [
-        ("robin", {"stream": 1, "learning": [1, 1, 0, 1]}, 0.5, 3),
-        ("robin", {"stream": 3, "learning": [0, 0, 1, 0]}, 0.5, 2),
-        ("robin", {"stream": 3, "learning": [0, 0, 0, 0]}, 0.5, 0),
         ("novel", {"stream": 1, "learning": [1, 1, 0, 1], "visits": [3, 9, 99, 5]}, 0.5, 1),
         ("novel", {"learning": [1, 1, 0, 1], "changed": [0, 0, 0, 1]}, 0.5, 3),
         ("novel", {"learning": [1, 1, 0, 1]}, 0.05, 2),  # explores what was decided
         ("novel", {"learning": [1, 1, 1, 1], "visits": [1, 1, 2, 1]}, 0.05, 2),
-        ("alp", {"errors": [EVEN, FALLS, EVEN, FALLS[::-1]]}, 0.3, 1),
-        ("alp", {"errors": [EVEN, FALLS, EVEN, FALLS[::-1]]}, 0.7, 3),
-        ("alp", {"errors": [EVEN, FALLS, EVEN[:3], EVEN]}, 0.3, 2),
-        ("lpm", {"surprise": [EVEN, FALLS[::-1], FALLS, EVEN]}, 0.5, 2),
-        ("lpm", {"surprise": [EVEN, FALLS, NOT_YET, EVEN]}, 0.5, 2),
-        ("prediction", {"surprise": [EVEN, FALLS, 2 * EVEN, EVEN]}, 0.5, 2),
-        ("rnd", {"surprise": [2 * EVEN, FALLS, EVEN, EVEN], "learning": [0, 1, 1, 1]}, 0.5, 2),
     ],
 )
 def test_rules_choose_what_they_are_for(
@@ -371,30 +355,12 @@ def test_rules_choose_what_they_are_for(
         stream=told.get("stream", 0),
         learning=np.array(told.get("learning", [1] * 4), bool),
         changed=np.array(told.get("changed", [0] * 4), bool),
-        errors=dict(enumerate(told.get("errors", ()))),
-        surprise=np.array(told.get("surprise", np.empty((4, 0)))),
+        errors={},
         visits=np.array(told.get("visits", [9] * 4)),
         draws=np.array([draw, draw]),
         explore=0.1,
     )
     assert RULES[name](situation)[0] == chosen
-
-
-def test_noise_surprises_for_ever_and_what_was_often_seen_is_no_longer_new() -> None:
-    source = MovingPictures("swing", "noise")
-    learners = {
-        name: ProgressLearner(ProgressConfig(components=8, attention=name), source.spec, 0)
-        for name in ("prediction", "rnd")
-    }
-    for learner in learners.values():
-        source.seek(0)
-        for _ in range(25):
-            learner.step(source.take(learner.stream, learner.tau))
-    errors = {name: it.state.arrays["surprise.errors"] for name, it in learners.items()}
-    swing, noise = np.nanmean(errors["prediction"][:, -5:], axis=1)
-    assert noise > 3 * swing
-    watched = errors["rnd"][np.isfinite(errors["rnd"][:, -6:]).all(axis=1)]
-    assert (watched[:, -1] < 0.5 * np.nanmax(watched, axis=1)).all()
 
 
 def test_peoples_own_logs_are_learned_from_with_it(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

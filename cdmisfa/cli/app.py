@@ -91,7 +91,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "trials",
             "Reproduce an experiment of the paper: numbers, tables and figures.",
         ),
-        "arena": ("trials", "Compare learners on sets of streams: what they learn, and how soon."),
         "demo": ("trials", "Record, learn, check and show: the whole story in minutes."),
     },
     "This machine": {

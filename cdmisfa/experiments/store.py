@@ -29,17 +29,12 @@ DONE, FAILED = "done", "failed"
 
 
 @cache
-def code(*more: str) -> str:
-    """Version of what a trial computes: the package's, and a hash of learner and recorder.
-
-    Args:
-        more: further modules that decide it: "cdmisfa/studies/arena/trial".
-    """
+def code() -> str:
+    """Return the version of what a trial computes: the package's, and a hash of its sources."""
     root = Path(__file__).parents[2]
     rooms = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")
     files = [file for room in rooms for file in (root / room).rglob("*.py")]
-    modules = ("cdmisfa/experiments/loop", "cdmisfa/experiments/trial", *more)
-    files += [root / f"{module}.py" for module in modules]
+    files += [root / "cdmisfa" / "experiments" / name for name in ("loop.py", "trial.py")]
     digest = hashlib.sha256()
     for file in sorted(files):
         digest.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())

@@ -1,1 +1,1 @@
-"""Studies of many runs: the paper's experiments, the arena, and the demonstration."""
+"""Studies of many runs: the paper's experiments and the demonstration."""

@@ -294,7 +294,7 @@ def make_environment(task: str, **options: Any) -> Any:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs no screen
     gymnasium = _package("gymnasium", "gym")
     if task.startswith("ALE/"):
-        ale = _package("ale_py", "arena")
+        ale = _package("ale_py", "bench")
         ale.ALEInterface.setLoggerMode(ale.LoggerMode.Error)
         gymnasium.register_envs(ale)
     try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import json
 import os
 import signal
 import time
@@ -18,7 +17,7 @@ from typing import Any
 
 import psutil
 
-from .commands import LIMIT, ROOT, Fork, Process, here, judge, until
+from .commands import LIMIT, Fork, Process, here, judge, until
 from .kills import check_disk, finish
 from .outcomes import HANG, MIXED, RIGHT, SKIPPED, WRONG, Defect, Job, Limits, Outcome
 from .processes import descendants, wait_gone
@@ -37,16 +36,7 @@ BEGINNING = 3.0
 GOING_ON = 90.0
 """Seconds in which what goes on without a worker must have ended."""
 
-STREAMS = ROOT / "build" / "torture" / "streams"
-"""Those of the arena take minutes to make: `make torture` makes them, once."""
-
 PR_SET_CHILD_SUBREAPER = 36
-
-
-def arena(place: Path) -> Any:
-    """Of an arena: every trial's row."""
-    rows = [json.loads(line) for line in (place / "rows.jsonl").read_text().splitlines()]
-    return {row["id"]: row["result"] for row in rows}
 
 
 CHILDREN: Mapping[str, Work] = {
@@ -62,13 +52,6 @@ CHILDREN: Mapping[str, Work] = {
         *(("--resume",), files, 3),
     ),
     "sweep --jobs 2": WORKS["sweep --jobs 2"],
-    "arena --jobs 2": Work(
-        lambda place, shared: (
-            *("arena", "small", "--learners", "progress,2.0", "--seeds", "0:2", "--jobs", 2),
-            *("--budget", 2000, "--streams", STREAMS, "-o", place),
-        ),
-        *((), arena, 2),
-    ),
 }
 
 
@@ -76,8 +59,6 @@ def prepare(folder: Path) -> dict[str, Any]:
     """Results of commands without workers, and how long each takes."""
     results, seconds = {}, {}
     for name, work in CHILDREN.items():
-        if name.startswith("arena") and not STREAMS.exists():
-            continue
         place, began = folder / "done" / name, time.monotonic()
         ran = here(*work.words(place, folder), *ALONE)
         if ran.code != 0:

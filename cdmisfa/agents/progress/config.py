@@ -14,11 +14,8 @@ from cdmisfa.core.config import (
     positive,
 )
 
-ATTENTIONS = (
-    "progress", "random", "robin", "novel", "sticky", "gamma", "ucb", "prediction", "rnd", "alp",
-    "lpm",
-)  # fmt: skip
-"""How the stream to watch is chosen, see `attention`."""
+ATTENTIONS = ("novel", "progress", "random")
+"""Rules that choose the stream to watch, see `attention`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +32,7 @@ class ProgressConfig:
         expansion: `none`, `quadratic`, or `auto`: quadratic where `components` hold all of it
             (frames of 4 values), else none.
         window: exponential window of the statistics of a stream (frames).
-        attention: how the stream to watch is chosen: `progress`, `random`, `robin`, `novel`,
-            `sticky`, `gamma`, `ucb`, `prediction`, `rnd`, `alp`, `lpm`.
+        attention: rule that chooses the stream to watch: `novel`, `progress` or `random`.
         visit: blocks that a stream being learned is watched at least.
         explore: probability of any stream at a choice, of the rules that explore.
         test_frames: window of the tests on frames not yet learned from; at least 20 blocks

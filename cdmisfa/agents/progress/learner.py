@@ -41,7 +41,6 @@ from cdmisfa.agents.progress.judging import (
     stale,
     take_output,
 )
-from cdmisfa.agents.progress.surprise import MEASURES
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand, expanded_size
@@ -72,6 +71,7 @@ class ProgressLearner:
     Attributes:
         modules: what it learned so far.
         events: what the last iteration brought, one line each.
+        rule: chooses the next stream; that of the configuration unless another is assigned.
     """
 
     def __init__(self, config: ProgressConfig, spec: SourceSpec, seed: int) -> None:
@@ -92,9 +92,7 @@ class ProgressLearner:
         self._streams = new_streams(len(spec.streams))
         size = 8 * self._n_inputs * (2 * config.components + self._n_outputs + 4)
         self._candidates = Candidates(self._new_candidate, size)
-        measure = MEASURES.get(config.attention)
-        n = len(spec.streams)
-        self._surprise = None if measure is None else measure(n, RECENT, self._n_inputs)
+        self.rule = RULES[config.attention]
         self._freeze()
 
     @property
@@ -181,8 +179,6 @@ class ProgressLearner:
         y_frozen = kernels.outputs(self._phi, self._offset, frames)
         error = candidate.error
         candidate.learn(frames, gap=int(own["next"]) != block.t)
-        if self._surprise is not None:
-            self._surprise.take(stream, frames, candidate)
         own["next"], own["last"] = block.t + len(block), counts["iteration"]
         own["visits"] += 1
         counts["iteration"] += 1
@@ -240,8 +236,7 @@ class ProgressLearner:
     @property
     def _own(self) -> dict[str, NDArray[Any]]:
         """Everything that changes in it but for its candidates, by name; no copies."""
-        own = {"streams": self._streams, "counts": self._counts}
-        return own if self._surprise is None else own | self._surprise.arrays
+        return {"streams": self._streams, "counts": self._counts}
 
     @property
     def _learning(self) -> NDArray[np.bool_]:
@@ -369,13 +364,11 @@ class ProgressLearner:
         if (learning & held).sum() >= self._candidates.most:
             learning &= held
         errors = {s: c.recent_errors(RECENT) for s, c in self._candidates.items()}
-        measured = np.empty((len(learning), 0)) if self._surprise is None else self._surprise.errors
         situation = Situation(
             stream=self.stream,
             learning=learning,
             changed=learning & (self._streams["module"] >= 0),
             errors=errors,
-            surprise=measured,
             visits=self._streams["visits"],
             draws=draws,
             explore=self.config.explore,
@@ -384,7 +377,7 @@ class ProgressLearner:
         explored = False
         if counts["stay"] >= self.config.visit or not learning[self.stream]:
             counts["stay"] = 0
-            counts["stream"], explored = RULES[self.config.attention](situation)
+            counts["stream"], explored = self.rule(situation)
         return interest(situation), explored
 
 

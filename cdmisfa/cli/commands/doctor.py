@@ -30,7 +30,6 @@ EXTRAS = {
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
     "corpus": (("duckdb",), "query"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
-    "arena": (("ale_py", "av", "gymnasium", "skvideo", "sklearn"), "streams of the arena"),
     "sklearn": (("sklearn",), "RecursiveSFA and IncSFA, estimators of scikit-learn"),
     "river": (("river",), "OnlineSFA, a transformer of river"),
     "dask": (("distributed",), "sweep and reproduce --engine dask"),

@@ -1,4 +1,4 @@
-"""`cdmisfa sweep`, `results`, `reproduce`, `arena` and `demo`: many trials, and the whole story."""
+"""`cdmisfa sweep`, `results`, `reproduce` and `demo`: many trials, and the whole story."""
 
 from __future__ import annotations
 
@@ -259,88 +259,6 @@ def _reproduce(name: str, request: Request, **where: Any) -> dict[str, Any]:
         f"{'reproduced' if document['reproduced'] else 'NOT reproduced'}"
     )
     return document
-
-
-def _sets() -> list[str]:
-    from cdmisfa.studies.arena.streams import SETS
-
-    return [ALL, "tuning", "reported", *SETS]
-
-
-@click.command("arena")
-@click.argument("sets", nargs=-1, metavar="[SET]...", shell_complete=completing.among(_sets))
-@word("--learners", "NAME,...", "Which learners [default: all].")
-@options.seeds("Seeds of learners and streams", "0:10")
-@options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
-@options.path("--streams", "Folder of the streams [default: OUT/streams].")
-@number("--budget", "Stop a run after so many frames, instead of the set's number.", 1)
-@number("--switch-cost", "Frames lost at each change of view.", 0, default=0)
-@options.settings()
-@options.jobs
-@options.engine
-@options.retry_failed
-@options.path("--page", "Write this Markdown page of all results in OUT.")
-@options.as_json
-@click.pass_context
-def arena_command(
-    ctx: click.Context,
-    /,
-    sets: tuple[str, ...],
-    out: Path | None,
-    page: Path | None,
-    as_json: bool,
-    **each: Any,
-) -> None:
-    """Compare learners on sets of streams: what they learn, and how soon.
-
-    SET is one of those that docs/results/arena.md lists, all, tuning, or reported: those on which
-    nothing was tuned, which are run where none is named, or, with --page, the page is made from
-    the results that are there. Most sets need the extra [arena]; the set small needs nothing.
-    """
-    from cdmisfa.studies.arena.arena import arena_results
-    from cdmisfa.studies.arena.figure import draw_figure
-    from cdmisfa.studies.arena.page import arena_table, write_arena_page
-
-    folder = out or Path("arena")
-    failed = () if page is not None and not sets else _run_arena(folder, sets, **each)
-    document = arena_results(folder)
-    figure, _ = draw_figure(document, folder)
-    if page is not None:
-        write_arena_page(document, figure, page)
-    tell(f"figure {figure}" + (f", page {page}" if page is not None else ""))
-    if as_json:
-        print_document(**document, folder=folder)
-    else:
-        print_table(*arena_table(document))
-    say_failed(failed, err=True)
-    if failed:
-        ctx.exit(1)
-
-
-def _run_arena(
-    folder: Path, sets: tuple[str, ...], *, learners: str | None, seeds: str, **each: Any
-) -> Any:
-    """Compute what is missing; the rows of the trials that failed."""
-    from cdmisfa.studies.arena.arena import run_arena
-    from cdmisfa.studies.arena.streams import chosen_sets
-
-    chosen = [name.strip() for name in (learners or "").split(",") if name.strip()]
-    with bar("arena", "trials") as shown:
-        report = run_arena(
-            folder,
-            chosen_sets(sets or ("reported",)),
-            chosen,
-            parse_seeds(seeds),
-            making=lambda done, total, note: shown.update(done, total, "streams, made first"),
-            progress=shown.update,
-            **each,
-        )
-    again = f" ({report.outdated} again: the code has changed since)" if report.outdated else ""
-    tell(
-        f"{report.trials} trials: {report.computed} computed{again}, {report.skipped} finished "
-        f"before, {len(report.failed)} failed"
-    )
-    return report.failed
 
 
 @click.command("demo")

@@ -1,0 +1,1 @@
+"""The arena: compare learners on sets of streams, `python -m benchmarks.arena SET`."""

@@ -1,0 +1,173 @@
+"""One trial: run a learner on a set of streams, and judge its modules.
+
+Modules are judged against batch SFA and against the true state of the world, on frames that the
+learner did not see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.arena.streams import CHANGE, SETS, ArenaSource, parse, slowest_output
+from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.learning import Learner
+from cdmisfa.experiments.loop import ending
+from cdmisfa.experiments.results import correlation
+from cdmisfa.modules import Module
+
+SLOW_ENOUGH = 1.25
+"""A learned output may be so many times as fast as batch SFA's slowest."""
+
+KNOWS = 0.8
+"""Correlation with batch SFA from which on a module knows a stream that it was not learned on."""
+
+RIDGE = 1e-3
+"""Penalty of the linear probe, as a share of the number of frames."""
+
+
+class Saved(NamedTuple):
+    """A module, the stream it was learned on, what that showed, and the blocks seen by then."""
+
+    module: Module
+    stream: int
+    name: str
+    learnable: bool
+    block: int
+
+
+@dataclass
+class Course:
+    """What happened in a run.
+
+    Attributes:
+        saved: the modules, in order.
+        watched: of every block its first frame and its stream.
+        given_up: blocks that each stream was watched until it was first given up.
+        ended: whether the learner ended by itself.
+    """
+
+    saved: list[Saved] = field(default_factory=list)
+    watched: list[tuple[int, int]] = field(default_factory=list)
+    given_up: dict[int, int] = field(default_factory=dict)
+    ended: bool = False
+
+
+def run_learner(learner: Learner, source: ArenaSource, name: str) -> Course:
+    """Let a learner learn until it ends by itself, or the set's frames are over."""
+    course, entry = Course(), SETS[name]
+    while source.t < entry.get("frames", 240_000):
+        if not entry.get("goes_on") and ending(learner, learner.max_modules, None):
+            course.ended = True
+            break
+        block = source.take(learner.stream, learner.tau)
+        learner.step(block)
+        stream, shown = block.stream, source.shown(block.stream, source.t - 1)
+        course.watched.append((block.t, stream))
+        about = stream, shown.name, shown.learnable, len(course.watched)
+        course.saved += [Saved(module, *about) for module in learner.modules[len(course.saved) :]]
+        if any(f"{source.spec.streams[stream]} is given up" in text for text in learner.events):
+            visits = sum(watched == stream for _, watched in course.watched)
+            course.given_up.setdefault(stream, visits)
+    return course
+
+
+def judge(course: Course, source: ArenaSource, components: int, expansion: str) -> dict[str, Any]:
+    """Return what a run came to, as JSON values; None where a measure does not apply.
+
+    Args:
+        course: of the run.
+        source: what it learned from.
+        components: K of the batch SFA that modules are compared with.
+        expansion: of that.
+    """
+    targets = _targets(course, source, (components, expansion))
+    at = list(targets.values())
+    never = [not any(shown.learnable for shown in phases) for phases in source.phases]
+    right = [one.name for one in course.saved if one.learnable]
+    wrong = [one.name for one in course.saved if not one.learnable]
+    vain = [not source.shown(stream, t).learnable for t, stream in course.watched]
+    return {
+        "targets": targets,
+        "noise": wrong,
+        "learned": float(np.mean([block is not None for block in at])),
+        "noise learned": len(wrong),
+        "twice": len(right) - len(set(right)),
+        "noise told": max((n for s, n in course.given_up.items() if never[s]), default=None),
+        "in vain": float(np.mean(vain)),
+        "ends": float(course.ended),
+        "blocks": len(course.watched) if course.ended else None,
+        "all learned": None if None in at else max(at),
+        **_probes(course, source, (components, expansion)),
+    }
+
+
+def _targets(course: Course, source: ArenaSource, terms: tuple[int, str]) -> dict[str, int | None]:
+    """Return the block by which each learnable stream was learned.
+
+    That is by the first module that was learned on it and is slow enough. Where there is none, a
+    module counts that is slow enough where it was learned, and here, and follows batch SFA here.
+    """
+    slow, knows = list[tuple[int, str]](), list[tuple[int, str]]()
+    for name in filter(_is_learnable, source.footage):
+        answer, reference = slowest_output(source.reference(name, *terms)[0], source.footage[name])
+        for k, one in enumerate(course.saved):
+            y, slowness = slowest_output(one.module, source.footage[name])
+            if slowness <= SLOW_ENOUGH * reference:
+                slow.append((k, name))
+                knows += [(k, name)] if correlation(y, answer) > KNOWS else []
+    sound = [k for k, one in enumerate(course.saved) if (k, one.name) in slow]
+    found = {}
+    for stream, phases in enumerate(source.phases):
+        for phase, shown in enumerate(phases):
+            own = [k for k in sound if course.saved[k].name == shown.name]
+            by = own or [k for k in sound if (k, shown.name) in knows]
+            if shown.learnable:
+                begins = sum(t < phase * CHANGE for t, _ in course.watched)
+                name = f"{source.spec.streams[stream]} {phase}"
+                found[name] = max(begins, course.saved[by[0]].block) if by else None
+    return found
+
+
+def _is_learnable(name: str) -> bool:
+    return parse(name)[0].learnable
+
+
+def _probes(course: Course, source: ArenaSource, terms: tuple[int, str]) -> dict[str, float | None]:
+    """Return R^2 of the state by the modules of each stream, and by principal components."""
+    found = []
+    for name, footage in source.footage.items():
+        modules = [one.module for one in course.saved if one.name == name and one.learnable]
+        if modules and footage.state.shape[1]:
+            own = np.concatenate([m.transform(footage.frames) for m in modules], axis=1)
+            leading = source.reference(name, *terms)[1].transform(footage.frames)
+            n = min(own.shape[1], leading.shape[1])
+            found.append([probe(y[:, :n], footage.state) for y in (own, leading)])
+    means = np.mean(found, axis=0).tolist() if found else (None, None)
+    return dict(zip(("R2", "R2 of components"), means, strict=True))
+
+
+def probe(features: FloatArray, state: FloatArray) -> float:
+    """Return how well a linear map tells the state of the world from features, mean R^2.
+
+    Ridge regression is fitted on the first three quarters of the frames and judged on the last.
+    A part of the state that stands still in either is left out, and one that is told worse than
+    by its mean counts 0.
+
+    Args:
+        features: (n, J).
+        state: (n, C).
+    """
+    cut = 3 * len(state) // 4
+    moves = (np.ptp(state[:cut], axis=0) > 0) & (np.ptp(state[cut:], axis=0) > 0)
+    x = features - features[:cut].mean(axis=0)
+    scale = x[:cut].std(axis=0)
+    x = x[:, scale > 0] / scale[scale > 0]
+    s = state[:, moves] - state[:cut, moves].mean(axis=0)
+    gram = x[:cut].T @ x[:cut] + RIDGE * cut * np.eye(x.shape[1])
+    weights = np.linalg.solve(gram, x[:cut].T @ s[:cut])
+    error = ((s[cut:] - x[cut:] @ weights) ** 2).sum(axis=0)
+    total = ((s[cut:] - s[cut:].mean(axis=0)) ** 2).sum(axis=0)
+    return float(np.maximum(1 - error / total, 0).mean())
