@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,12 +18,6 @@ from recorder.world.scenes import BLOCK
 
 COUNTS: Final = "cdmisfa.live"
 """Name of the metadata record that says what became of a live stream's pictures."""
-
-TRIGGERED: Final = "cdmisfa.triggered"
-"""Name of the one that says which segments were kept of what was watched, and why."""
-
-SEGMENT: Final = "cdmisfa.segment."
-"""Name, with its number, of the one that says why a segment was kept, as soon as it begins."""
 
 
 class RecordedWhileWatched(ForwardSource):
@@ -64,7 +57,6 @@ class RecordedWhileWatched(ForwardSource):
         self._source, self._spec, self._t = source, source.spec, source.t
         self.folder = folder_here(folder)
         self.gaps = bool(getattr(source, "gaps", False))
-        self._noted = 0
         refuse_existing(self.folder, force=force, goes_on=False)
         settings = settings or RecordConfig()
         recording = recording_spec(source, None, settings, None)
@@ -92,11 +84,6 @@ class RecordedWhileWatched(ForwardSource):
         if hasattr(self._source, "stop"):
             self._source.stop = stop
 
-    @property
-    def held(self) -> int:
-        """Frames that the source has read and not given yet, see `TriggeredSource`."""
-        return getattr(self._source, "held", 0)
-
     def take(self, stream: int, n: int) -> Block:
         """See `FrameSource`; what the other streams show meanwhile is recorded, too."""
         return take_unbroken(self, stream, n)
@@ -112,7 +99,6 @@ class RecordedWhileWatched(ForwardSource):
         for block in blocks:
             self._logs.write(block)
         self._t = self._source.t
-        self._note_segments()
         return blocks
 
     def describe(self) -> Mapping[str, Any]:
@@ -125,23 +111,7 @@ class RecordedWhileWatched(ForwardSource):
             if counts := self.alignment.get(view):
                 counted = {name: str(count) for name, count in counts.items()}
                 self._logs.add_metadata(stream, COUNTS, counted)
-        if (triggered := getattr(self._source, "triggered", None)) is not None:
-            self._note(TRIGGERED, triggered())
         self.files = self._logs.finish()
-
-    def _note_segments(self) -> None:
-        """Say in every file why the segments were kept that have begun."""
-        for segment in getattr(self._source, "segments", ())[self._noted :]:
-            if segment.start < self._t:
-                first = segment.triggers[0]
-                told = {"start": segment.start, "stream": first.stream, "frame": first.start}
-                self._note(f"{SEGMENT}{self._noted}", {**told, "novelty": first.novelty})
-                self._noted += 1
-
-    def _note(self, name: str, told: Mapping[str, Any]) -> None:
-        values = {k: v if isinstance(v, str) else json.dumps(v) for k, v in told.items()}
-        for stream in range(len(self.spec.streams)):
-            self._logs.add_metadata(stream, name, values)
 
     def close(self) -> None:
         """Let go of the source, and of the files as they are."""
@@ -171,7 +141,7 @@ def record_watched(
     Args:
         recorded: entered, and finished, here.
         frames: how many; by default all that the source shows.
-        stop: asked often; true ends the recording, with what the source holds.
+        stop: asked often; true ends the recording.
         progress: told how many frames there are.
 
     Raises:
@@ -180,6 +150,6 @@ def record_watched(
     recorded.stop = stop
     step = 1 if recorded.gaps else BLOCK
     with recorded, contextlib.suppress(LogExhaustedError):
-        while (recorded.held or not stop()) and (frames is None or recorded.t < frames):
+        while not stop() and (frames is None or recorded.t < frames):
             recorded.take_all(step if frames is None else min(step, frames - recorded.t))
             progress(recorded.t)

@@ -25,7 +25,7 @@ from cdmisfa.cli.making import (
 from cdmisfa.cli.printing import Stderr, warn_deprecated
 from cdmisfa.core.config import FORMER
 from cdmisfa.core.errors import CdmisfaError, TooSmallError, UsageError, are_for
-from recorder.cameras.options import LiveOptions, TriggerOptions
+from recorder.cameras.options import LiveOptions
 from recorder.images.options import ImageOptions
 from replay.camera_logs.options import CameraOptions
 from replay.storage.location import Limits, limited, limits
@@ -77,10 +77,6 @@ look_options = options_of(CameraOptions, "cameras", "topics", "fields", "time", 
 
 live_options = options_of(LiveOptions, "live", "hold", "on_loss", "stall")
 """How live streams are put on one clock."""
-
-
-trigger_options = options_of(TriggerOptions, "trigger")
-"""Which frames of a source are recorded."""
 
 
 def refuse_live_options(live: LiveOptions, source: Sequence[str]) -> None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, Literal
 
-from cdmisfa.core.options import DURATION, setting
+from cdmisfa.core.options import setting
 from recorder.images.options import ImageOptions
 
 OnLoss = Literal["reconnect", "wait", "end"]
@@ -50,31 +49,3 @@ class LiveOptions(ImageOptions):
         group="Live streams",
     )
     seed: int = 0
-
-
-AROUND: Final = 5.0
-"""Seconds that are kept before and after what is novel."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TriggerOptions:
-    """Which frames of a source are recorded; by default all."""
-
-    when: Literal["novel"] | None = setting(
-        None, "Record only what is novel, and what was before and after it.", group="Source"
-    )
-    known: Path | None = setting(
-        None, "A run: what its modules know is not novel, with --when.", unit="RUN", group="Source"
-    )
-    before: float = setting(
-        AROUND,
-        "How much is recorded before what is novel, with --when.",
-        unit=DURATION,
-        group="Source",
-    )
-    after: float = setting(
-        AROUND,
-        "How much is recorded after it, with --when.",
-        unit=DURATION,
-        group="Source",
-    )

@@ -156,24 +156,6 @@ class Recipe:
         made = [make_frame(picture, self) for picture in pictures]
         return np.stack(made) if made else np.empty((0, *self.shape), np.uint8)
 
-    def of_frames(self, frames: NDArray[Any]) -> NDArray[Any]:
-        """Frames as they are, or larger gray ones made as small as these.
-
-        Args:
-            frames: (n, height, width) uint8, or (n, values) of numbers.
-
-        Raises:
-            UsageError: they are smaller, or in colours.
-        """
-        if frames.shape[1:] == self.shape:
-            return frames
-        if self.size is None or self.color or frames.ndim != 3:
-            raise UsageError(
-                f"frames of {frames.shape[1:]} given, and the modules learned from {self.shape}: "
-                "choose what is as large"
-            )
-        return Recipe(self.shape, self.fit).frames(frames)
-
 
 def make_frame(picture: Any, recipe: Recipe) -> Shown:
     """The frame that a raw picture, or numbers, become: what a learner learns from.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
@@ -61,9 +61,6 @@ class Applies(Protocol):
 
     def to(self, source: Any) -> Iterator[Applied]:
         """Apply the modules to them, block by block."""
-
-    def judge(self, spec: SourceSpec) -> Callable[[Sequence[Block]], Iterator[Applied]]:
-        """What applies them to blocks that are handed to it one after the other."""
 
 
 class Verdict(NamedTuple):

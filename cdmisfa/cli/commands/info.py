@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from replay.integrity.learned import RunInfo
 
 MOST_NAMED = 8
-"""Streams of a run, and segments of a recording, that are named."""
+"""Streams of a run that are named."""
 
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
@@ -63,7 +63,7 @@ def _print_info(found: LogInfo) -> None:
         print_line(f"signals of version {version}: {lacks} are not in it, read as NaN")
     if found.run is not None:
         _print_run(found, found.run)
-    for line in (*_times(found), *_kept(found), *_room(found.size, found.library)):
+    for line in (*_times(found), *_room(found.size, found.library)):
         print_line(line)
     _print_channels(found.channels)
 
@@ -113,22 +113,6 @@ def _times(found: LogInfo) -> Iterator[str]:
     shared = f"{kinds.pop()} " if len(kinds) == 1 else ""
     messages = counted(found.messages, f"{shared}message")
     yield f"{messages}, {long}, from {_clock(start)} to {_clock(end)}"
-
-
-def _kept(found: LogInfo) -> Iterator[str]:
-    """What of a stream was recorded, where only what is novel was, and what it began with."""
-    from recorder.live import SEGMENT, TRIGGERED
-
-    records = {name: values for file in found.metadata.values() for name, values in file.items()}
-    segments = [name for name in records if name.startswith(SEGMENT)]
-    told = records.get(TRIGGERED, {})
-    if not told and not segments:
-        return
-    share = f", {told.get('kept')} of {told.get('watched')} frames" if told else " so far"
-    each = [f"{records[s].get('stream')} at frame {records[s].get('frame')}" for s in segments]
-    more = f" and {len(each) - MOST_NAMED} more" if len(each) > MOST_NAMED else ""
-    by = f", triggered by {', '.join(each[:MOST_NAMED])}{more}" if each else ""
-    yield f"only what is novel: {counted(len(each), 'segment')}{share}{by}"
 
 
 def _room(size: SizeInfo, library: str) -> Iterator[str]:

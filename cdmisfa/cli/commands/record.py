@@ -24,8 +24,6 @@ from cdmisfa.cli.printing import (
 )
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.options import given, option_name
-from recorder.cameras.options import TriggerOptions
 
 if TYPE_CHECKING:
     from recorder.cameras.options import LiveOptions
@@ -72,7 +70,6 @@ LIVE = ("cameras", "gym")
 )
 @options.image_options
 @options.live_options
-@options.trigger_options
 @options.force
 @options.as_json
 @options.quiet
@@ -89,7 +86,6 @@ def record_command(
     as_json: bool,
     images: ImageOptions,
     live: LiveOptions,
-    trigger: TriggerOptions,
     **writing: Any,
 ) -> None:
     """Record what a scene or cameras show, one MCAP file per view.
@@ -99,10 +95,6 @@ def record_command(
 
     Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
     av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. Logs of others are written by cdmisfa convert.
-
-    With --when novel a recording holds only what is new, of all streams at once, and what was 5 s
-    before and after it: what no module of --known RUN knows, or else what differs from all that was
-    new before. Noise and what stands still are never new.
     """
     from cdmisfa.experiments.sources import configure, is_scene, of_scene
     from recorder.cameras.words import is_live
@@ -110,19 +102,16 @@ def record_command(
     from recorder.recording import recorded, save_picture
     from recorder.world.scenes import SCENES
 
-    if trigger.when is None and (vain := given(trigger)):
-        raise UsageError(f"{option_name(vain[0])} goes with --when novel")
-    if any(map(is_live, source)) or trigger.when is not None:
+    if any(map(is_live, source)):
         views, jobs, resume = (writing.pop(name) for name in ("views", "jobs", "resume"))
         if resume or views or jobs > 1 or scene_picture is not None:
-            what = "live streams" if trigger.when is None else "what is recorded when it is novel"
             raise UsageError(
-                f"{what} cannot go back, and all of it is recorded: leave out --resume, --view, "
-                "--jobs and --scene-picture"
+                "live streams cannot go back, and all of it is recorded: leave out --resume, "
+                "--view, --jobs and --scene-picture"
             )
         live = dataclasses.replace(live, seed=seed)
         writing |= {"preset": preset, "settings": settings, "as_json": as_json}
-        record_streams(ctx, source, _folder(out), live, images, trigger, **writing)
+        record_streams(ctx, source, _folder(out), live, images, **writing)
         return
     refuse_logs(source)
     resumed = out if writing["resume"] else None
@@ -247,8 +236,7 @@ def convert_command(
     if any(map(is_live, source)):
         if resume or salvage:
             raise UsageError("live streams cannot go back: leave out --resume and --salvage")
-        trigger = TriggerOptions()
-        record_streams(ctx, source, out, live, cameras, trigger, as_json=as_json, **writing)
+        record_streams(ctx, source, out, live, cameras, as_json=as_json, **writing)
         return
     options.refuse_live_options(live, source)
     named = locations(source)

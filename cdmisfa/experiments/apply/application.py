@@ -201,38 +201,12 @@ class Application:
         """
         stored = isinstance(source, StoredSource)
         reads = _reads(source, self._step(source.spec) if stored else self.tau, self.tau, frames)
-        judged = self._judged(source.spec)
-        for found in self._ahead(reads) if stored else map(self._projected, reads):
-            yield from judged(found)
+        judges = [_Judge(self.modules) for _ in source.spec.streams]
+        for parts in self._ahead(reads) if stored else map(self._projected, reads):
+            for part, y in sorted(parts, key=lambda one: (one[0].t, one[0].stream)):
+                yield judges[part.stream].judge(part, y)
             if stop():
                 return
-
-    def judge(self, spec: SourceSpec) -> Callable[[Sequence[Block]], Iterator[Applied]]:
-        """What gives as `to`, of blocks of the clock that are handed to it one after the other.
-
-        Raises:
-            UsageError: the modules do not take these frames, nor larger ones, or learned from
-                whole episodes.
-        """
-        if self.recipe.centre == "episode":
-            raise UsageError(
-                "the modules learned from frames without the mean of their episode, which is known "
-                "when it is over: name a run of learn without --centre episode"
-            )
-        self.recipe.of_frames(np.zeros((1, *spec.frame_shape), spec.dtype))
-        judged, made = self._judged(spec), self.recipe.of_frames
-        return lambda blocks: judged(
-            self._projected([replace(b, frames=made(b.frames)) for b in blocks])
-        )
-
-    def _judged(self, spec: SourceSpec) -> Callable[[Sequence[Part]], Iterator[Applied]]:
-        judges = [_Judge(self.modules) for _ in spec.streams]
-
-        def judged(found: Sequence[Part]) -> Iterator[Applied]:
-            for part, y in sorted(found, key=lambda one: (one[0].t, one[0].stream)):
-                yield judges[part.stream].judge(part, y)
-
-        return judged
 
     def _step(self, spec: SourceSpec) -> int:
         """Frames of a log that are read at once, whole blocks."""
