@@ -1,24 +1,15 @@
-"""What a shell completes, and how much is said on stderr."""
+"""Shell completion, help, -q, and error messages of the command line."""
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa
 
-from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli.app import COMMANDS, GROUPS
 from cdmisfa.cli.commands.learn import learn_command
-from cdmisfa.core.config import presets
-from recorder.world.scenes import SCENES
-
-ROOT = Path(__file__).parents[1]
 
 
 def completed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], line: str):
@@ -34,31 +25,18 @@ def completed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     return [value if kind == "plain" else None for kind, value in pairs]
 
 
-def test_what_is_completed(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    oscillatory_run: Path,
+def test_a_shell_completes_commands_options_choices_and_files(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def of(line: str) -> list[str | None]:
         return completed(monkeypatch, capsys, f"cdmisfa {line}")
 
     assert of("") == list(COMMANDS)
     assert of("lea") == ["learn"]
-    files, *sources = of("learn ")
-    assert files is None
-    assert {*SCENES, "camera:"} <= {*sources}
-    assert of("learn osc") == [None, "oscillatory"]
-    assert of("learn x --preset ") == [None, *presets()]
-    assert of("learn x --algorithm ") == list(LEARNERS)
-    assert of("learn x --set learner.nu") == ["learner.nu="]
-    assert {"learner.attention=", "scene.seed=", "record.fps="} <= {*of("learn x --set ")}
-    assert "scene.object1.toggle_every=" in of("sweep icub --grid scene.")
-    assert of("reproduce ic") == ["icub"]
-    assert of("export x --to par") == ["parquet"]
-    monkeypatch.chdir(oscillatory_run.parents[1])
-    run = str(oscillatory_run.relative_to(Path.cwd()))
-    for command in ("view", "info", "check", "compare", "apply"):
-        assert of(f"{command} {run[:-1]}") == [None, run]
+    assert of("learn x --max-mod") == ["--max-modules"]
+    assert of("sweep x --engine ") == ["local", "dask"]
+    for command in ("learn", "convert", "view", "info", "check", "apply"):
+        assert of(f"{command} x") == [None]
 
 
 def test_a_name_is_fetched_when_its_command_runs_and_not_when_a_shell_completes(
@@ -67,34 +45,6 @@ def test_a_name_is_fetched_when_its_command_runs_and_not_when_a_shell_completes(
     monkeypatch.setattr("replay.storage.opening.fetched", lambda url: pytest.fail("fetched"))
     found = completed(monkeypatch, capsys, "cdmisfa view https://a.b/run.mcap --scr")
     assert found == ["--screenshot"]
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
-def test_bash_completes_files_beside_names(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    program = tmp_path / "cdmisfa"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m cdmisfa "$@"\n')
-    program.chmod(0o755)
-    (tmp_path / "oscillations.mcap").touch()
-    said = cdmisfa("completion", "bash").out
-    ask = "COMP_WORDS=(cdmisfa learn osc); COMP_CWORD=2; compopt() { :; }"
-    said += f"\n{ask}; _cdmisfa_completion cdmisfa"
-    done = subprocess.run(
-        ["bash", "--norc", "-c", f'{said}; printf "%s\\n" "${{COMPREPLY[@]}}"'],
-        env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert sorted(done.stdout.split()) == ["oscillations.mcap", "oscillatory"]
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_each_shell_is_told_how_to_ask(cdmisfa: Cdmisfa, shell: str) -> None:
-    said = cdmisfa("completion", shell)
-    assert (said.code, said.err) == (0, "")
-    assert f"_CDMISFA_COMPLETE={shell}_complete" in said.out
-    assert "_path_files -f" not in said.out  # beside words of ours zsh drops what was typed
 
 
 def test_the_programs_help_has_every_command_below_a_heading(cdmisfa: Cdmisfa) -> None:

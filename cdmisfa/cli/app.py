@@ -95,10 +95,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "This machine": {
         "doctor": ("doctor", "Say what this machine has and what it lacks."),
-        "completion": (
-            "completion",
-            "Print what a shell needs to complete commands, scenes, presets, keys and runs.",
-        ),
     },
 }
 """Each command by its heading of --help, with its module in this package and its line of help."""

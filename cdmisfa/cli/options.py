@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import click
 
-from cdmisfa.cli import completing
 from cdmisfa.cli.making import (
     Command,
     choice,
@@ -47,6 +46,9 @@ class LocalPath(click.Path):
 
 
 OUT = LocalPath(path_type=Path)
+
+WORD = click.Path(readable=False)
+"""A path, URL or other word of a source; a shell completes it as a file."""
 """Type of every option that says where something is written, and of what is read from no URL."""
 
 
@@ -103,7 +105,6 @@ preset = word(
     "NAME",
     "Preset (icub, icub-real, oscillatory, cameras) or a .toml file; by default the source's.",
     group="Learner",
-    shell_complete=completing.presets,
 )
 keyframes = number(
     "--keyframes",
@@ -154,8 +155,7 @@ def settings(
     unit: str = "KEY=VALUE",
 ) -> Callable[[Command], Command]:
     """`--set`."""
-    how: dict[str, Any] = {"group": "Learner", "shell_complete": completing.keys}
-    how["callback"] = _warn_of_former
+    how: dict[str, Any] = {"group": "Learner", "callback": _warn_of_former}
     return option("--set", "settings", multiple=True, metavar=unit, help=about, **how)
 
 
@@ -211,7 +211,7 @@ def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]
 
 def path_argument(name: str) -> Callable[[Command], Command]:
     """A path of this machine; whether it exists is for the library to say, in its own words."""
-    return click.argument(name, type=OUT, shell_complete=completing.runs)
+    return click.argument(name, type=OUT)
 
 
 def fetched_argument(
@@ -234,7 +234,7 @@ def fetched_argument(
                 error.args = (text,)
                 raise
 
-        how: dict[str, Any] = {"callback": _fetched, "shell_complete": completing.runs}
+        how: dict[str, Any] = {"callback": _fetched, "type": WORD}
         argument = click.argument(name, nargs=nargs, required=required, **how)
         return cast(Command, argument(naming_the_url))
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import completing, options
+from cdmisfa.cli import options
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import WRITTEN, grouped, number, option, options_of
 from cdmisfa.cli.printing import (
@@ -51,7 +51,7 @@ log_options = options_of(
 
 @grouped("apply", common=("out", "to", "frames", "loop", "jobs"))
 @options.path_argument("run")
-@click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
+@click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out(
     "The file of one log, .parquet, .csv, .mcap or .rrd (a view); or a folder, of a file a log."
 )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import completing, options
+from cdmisfa.cli import options
 from cdmisfa.cli.commands.info import in_bytes
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.making import WRITTEN, flag, number, word
@@ -38,7 +38,7 @@ JOBS = number("--jobs", "Parallel processes; by default as many as there are pro
 
 
 @click.command("index")
-@click.argument("corpus", nargs=-1, required=True, shell_complete=completing.runs)
+@click.argument("corpus", nargs=-1, required=True, type=options.WORD)
 @options.out("The index, a .parquet file; by default corpus.parquet in the folder.")
 @flag("--deep", "Decode every log: checksums, gaps, shapes, and what is twice in other files.")
 @flag("--full", "Read every byte: what changed shows by SHA-256, not by size and time.")
@@ -103,7 +103,7 @@ def _named(index: Path) -> Path:
 
 
 @click.command("query")
-@click.argument("corpus", shell_complete=completing.runs)
+@click.argument("corpus", type=options.WORD)
 @click.argument("sql", required=False)
 @options.out("Write the answer as a .parquet file.")
 @options.force
@@ -188,7 +188,7 @@ def _say_more(found: Summary, name: str, what: str) -> None:
 
 
 @click.command("curate")
-@click.argument("corpus", shell_complete=completing.runs)
+@click.argument("corpus", type=options.WORD)
 @options.out("The folder of the segments and their page.", required=True)
 @options.path("--known", "A run: what looks as what it watched comes last.", "RUN")
 @word(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cdmisfa.cli import completing, options
+from cdmisfa.cli import options
 from cdmisfa.cli.printing import (
     outcome_line,
     print_columns,
@@ -30,7 +30,7 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
 
 @click.command("info")
-@click.argument("path", nargs=-1, required=True, shell_complete=completing.runs)
+@click.argument("path", nargs=-1, required=True, type=options.WORD)
 @options.server_limits
 @options.as_json
 @click.pass_context

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.agents.learners import LEARNERS
-from cdmisfa.cli import completing, options
+from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
 from cdmisfa.cli.making import choice, flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
@@ -40,7 +40,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
 
 
 @grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
-@click.argument("source", nargs=-1, shell_complete=completing.sources)
+@click.argument("source", nargs=-1, type=options.WORD)
 @options.out("Folder of the run; without it nothing is written.")
 @options.seed()
 @options.preset
@@ -52,7 +52,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
     "class of your own, package.module:Class. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
     group="Learner",
-    shell_complete=completing.among(lambda: LEARNERS),
 )
 @options.deprecated("--portable")
 @options.end_after("iterations", "End after so many iterations.")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import completing, options
+from cdmisfa.cli import options
 from cdmisfa.cli.making import WRITTEN, flag, option, word
 from cdmisfa.cli.printing import (
     print_document,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @click.command("verify")
-@click.argument("path", nargs=-1, required=True, shell_complete=completing.runs)
+@click.argument("path", nargs=-1, required=True, type=options.WORD)
 @options.server_limits
 @options.as_json
 @click.pass_context
@@ -58,7 +58,7 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
 
 
 @click.command("recover")
-@click.argument("path", shell_complete=completing.runs)
+@click.argument("path", type=options.WORD)
 @options.out("The whole log to write.", required=True)
 @options.server_limits
 @options.force
@@ -90,7 +90,7 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
 
 
 @click.command("cut")
-@click.argument("log", nargs=-1, shell_complete=completing.runs)
+@click.argument("log", nargs=-1, type=options.WORD)
 @options.out("An MCAP file, in which all are joined, or a folder for a file each.", required=True)
 @option(
     "--from",
@@ -244,19 +244,12 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
         tell(f"nothing is drawn of {run}: it has no iterations")
 
 
-def _forms() -> list[str]:
-    from replay.export.forms import FORMS
-
-    return list(FORMS)
-
-
 @click.command("export")
 @options.fetched_argument("path", nargs=-1, required=False)
 @option(
     "--to",
     "form",
     metavar="FORM",
-    shell_complete=completing.among(_forms),
     help="Form: parquet, npz, csv, arrow, images, mp4, lerobot; by default what the "
     "file's name ends in.",
 )

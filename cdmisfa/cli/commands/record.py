@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from cdmisfa.cli import completing, options
+from cdmisfa.cli import options
 from cdmisfa.cli.commands.streams import print_recording, record_streams, refuse_logs
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, word
@@ -40,7 +40,7 @@ LIVE = ("cameras", "gym")
 
 
 @grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
-@click.argument("source", nargs=-1, shell_complete=completing.sources)
+@click.argument("source", nargs=-1, type=options.WORD)
 @options.out("Folder of the recording.")
 @number(
     "--frames",
@@ -196,7 +196,7 @@ def _record_scene(
 
 
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
-@click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
+@click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out("Folder of the recording.")
 @options.log_options
 @options.live_options

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import completing, options
+from cdmisfa.cli import options
 from cdmisfa.cli.making import flag, grouped, number, word
 from cdmisfa.cli.printing import (
     print_document,
@@ -36,14 +36,13 @@ MOST_SEEDS = 1_000_000
 
 
 @grouped("sweep", common=("out", "grid", "seeds", "settings", "max_iterations", "jobs"))
-@click.argument("source", nargs=-1, required=True, shell_complete=completing.sources)
+@click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out("Folder of the sweep; what is finished in it is not computed again.", required=True)
 @word(
     "--grid",
     "KEY=V1,V2,...",
     "Values to try for a configuration key; several grids multiply.",
     multiple=True,
-    shell_complete=completing.keys,
 )
 @options.seeds("Seeds of every point", "0:20")
 @options.preset
@@ -165,14 +164,8 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
         print_table(*results.as_table(points))
 
 
-def _experiments() -> list[str]:
-    from cdmisfa.studies.paper.reproduce import EXPERIMENTS
-
-    return [*EXPERIMENTS, ALL]
-
-
 @click.command("reproduce")
-@click.argument("name", required=False, shell_complete=completing.among(_experiments))
+@click.argument("name", required=False)
 @options.out("Folder of the results [default: reproduction].")
 @number("--trials", "Trials per condition, instead of the paper's number.", 1)
 @options.jobs
