@@ -18,13 +18,10 @@ from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig, Split
 from recorder.log.files import (
-    atomic_write,
     folder_here,
     holds_recording,
     prepared_folder,
     refuse_existing,
-    refuse_taken,
-    refuse_unless,
 )
 from recorder.log.manifest import RecordingSpec, RecordingStart, store_start
 from recorder.log.resume import (
@@ -371,23 +368,3 @@ def recording_spec(
         {"scene": scene.table(), "record": section_table(clock)},
         SCENES[scene.name].packages,
     )
-
-
-def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = False) -> None:
-    """Draw a scene from outside into a PNG file.
-
-    Raises:
-        UsageError: the scene has no picture, or the file exists, or is no .png.
-        LogWriteError: the file or its folder cannot be written.
-        CdmisfaError: the simulator is not installed.
-    """
-    draw = SCENES[name].picture
-    if draw is None:
-        able = " or ".join(able for able, entry in SCENES.items() if entry.picture)
-        raise UsageError(f"the scene {name} has no picture: --scene-picture is for {able}")
-    path = Path(path)
-    refuse_unless(path, "the picture is a PNG", ".png")
-    refuse_taken(path, force=force)
-    image = draw(config)
-    with atomic_write(path) as partial:
-        image.save(partial, format="PNG", optimize=True)

@@ -120,36 +120,3 @@ def test_a_conversion_is_resumed_by_convert(cdmisfa: Cdmisfa, tmp_path: Path) ->
         assert (refused.code, refused.err) == (2, line)
     done = cdmisfa("convert", log, "-o", folder, "--resume", "--size", "16x12")
     assert done.code == 0, done.err
-
-
-class TestScenePicture:
-    @pytest.fixture(autouse=True)
-    def _simulator(self) -> None:
-        pytest.importorskip("pybullet")
-
-    def test_alone(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-        picture = tmp_path / "new" / "folder" / "scene.png"
-        drawn = cdmisfa("record", "icub", "--scene-picture", picture, "--json")
-        assert drawn.json == {"schema": 1, "picture": str(picture)}
-        assert drawn.err == f"picture {picture}\n"
-        assert picture.read_bytes().startswith(PNG)
-        before = picture.read_bytes()
-        refused = cdmisfa("record", "icub", "--scene-picture", picture)
-        assert (refused.code, "scene.png exists" in refused.err) == (2, True)
-        assert picture.read_bytes() == before
-
-    def test_beside_a_recording(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-        picture, folder = tmp_path / "scene.png", tmp_path / "rec"
-        words = ("--view", "center", "--frames", 3, "--json")
-        done = cdmisfa("record", "icub", "-o", folder, "--scene-picture", picture, *words)
-        assert [view["name"] for view in done.json["views"]] == ["center"]
-        assert picture.read_bytes().startswith(PNG)
-
-    def test_a_folder_is_no_picture(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-        (tmp_path / "a.png").mkdir()
-        for path, force in [(tmp_path, ()), (tmp_path / "a.png", ("--force",))]:
-            refused = cdmisfa("record", "icub", "--scene-picture", path, *force)
-            assert refused.code != 0
-            assert refused.err.count("\n") == 1
-            assert str(path) in refused.err
-        assert list(tmp_path.iterdir()) == [tmp_path / "a.png"]

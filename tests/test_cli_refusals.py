@@ -28,7 +28,6 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn oscilatory": ("oscilatory", "did you mean oscillatory?"),
     "record icubs -o x": ("icubs", "did you mean icub?"),
     "record icub": ("-o",),
-    "record oscillatory --scene-picture x.png": ("icub",),
     "record oscillatory -o x --view x9": ("x9", "x1, x2, x3"),
     **{f"{command} no/such": ("no/such",) for command in ("info", "verify", "view", "plot")},
     "compare no/such neither": ("no/such",),
@@ -122,7 +121,6 @@ CASES: dict[str, tuple[str, ...]] = {
             (
                 "learn oscillatory --max-iterations 3 -o",
                 "record oscillatory --frames 20 -o",
-                "record icub --scene-picture",
                 "convert no.mcap -o",
                 "sweep oscillatory --seeds 0 --max-iterations 3 -o",
                 "export RUN --to csv -o",
@@ -190,7 +188,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "fork EMPTY --at 3 -o fork": ("is empty: name a",),
     **{f"{command} EMPTY": ("is empty: name a",) for command in ("learn", "view", "info")},
     # a conversion needs a folder
-    "convert LOGS/left.mcap": ("say -o FOLDER, where the recording goes",),
+    "convert LOGS/left.mcap": ("-o",),
     # resuming is advised only where it can be
     "learn oscillatory -o taken": (TAKEN, "go on with --resume"),
     "record oscillatory -o taken": (TAKEN, "go on with --resume"),

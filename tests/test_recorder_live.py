@@ -12,7 +12,6 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig
-from recorder.recording import save_picture
 from recorder.world.icub.config import EyesConfig, IcubConfig, SphereConfig
 from recorder.world.icub.matrices import eye_matrix, grey, perspective
 from recorder.world.icub.world import Motions
@@ -20,7 +19,6 @@ from recorder.world.scenes import SCENES, open_scene
 
 pytest.importorskip("pybullet")
 
-from recorder.world.icub.picture import SIZE
 from recorder.world.icub.source import TRUTH, IcubSource
 from recorder.world.icub.world import World
 
@@ -98,18 +96,15 @@ def test_the_truth_is_where_the_objects_are(seen):
     assert columns[y == 0.6].max() < columns[y == 0.4].min()
 
 
-@pytest.mark.parametrize(("robot_seen", "frames"), [(False, 30), (True, 1)])
-def test_views_are_as_if_all_were_drawn_each_frame_but_for_the_robot(seen, robot_seen, frames):
-    """The table drawn once and the objects over it, against everything drawn, the robot, too."""
+def test_views_are_as_if_all_were_drawn_each_frame(seen):
+    """The table drawn once and the objects over it, against everything drawn."""
     eyes, motions = SCENE.eyes, Motions(SCENE, 1)
     lens = perspective(eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far)
     differing = 0
-    with contextlib.closing(World(SCENE, robot_seen=robot_seen)) as world:
-        for t, places in enumerate(motions.positions(0, frames)):
+    with contextlib.closing(World(SCENE)) as world:
+        for t, places in enumerate(motions.positions(0, 30)):
             world.place(places)
             for view, yaw in enumerate(eyes.yaw):
-                if robot_seen:
-                    world.turn_head(yaw)
                 pair = [
                     grey(world.render(m, lens, eyes.width, eyes.height, eyes.light)[0])
                     for m in (eye_matrix(eyes, world.neck, yaw, side) for side in (1, -1))
@@ -156,22 +151,3 @@ def test_a_scene_of_another_size(seen):
 def test_a_scene_that_cannot_be_is_named(scene, words):
     with pytest.raises(UsageError, match=words):
         open_scene("icub", build(IcubConfig, "scene", scene))
-
-
-def test_the_picture_shows_the_robot_the_table_and_the_objects(tmp_path):
-    from PIL import Image
-
-    path = tmp_path / "scene.png"
-    save_picture("icub", IcubConfig(), path)
-    with Image.open(path) as image:
-        assert image.size == SIZE
-        pixels = np.asarray(image).astype(int)
-    red = (pixels[..., 0] > 100) & (pixels[..., 1] < 60)
-    dark = pixels.max(axis=-1) < 45
-    assert red.sum() > 10_000
-    assert np.ptp(np.nonzero(red)[0]) > 300
-    assert dark.sum() > 3_000
-    with pytest.raises(UsageError, match="exists"):
-        save_picture("icub", IcubConfig(), path)
-    with pytest.raises(UsageError, match=r"\.png"):
-        save_picture("icub", IcubConfig(), tmp_path / "scene.jpg")

@@ -22,7 +22,6 @@ from recorder.world.icub.textures import SIDE, TEXTURES, texture
 pytest.importorskip("pybullet")
 
 from recorder.world.icub.physics import PhysicalMotions
-from recorder.world.icub.picture import scene_picture
 from recorder.world.icub.source import HEIGHTS, TRUTH, IcubSource
 from recorder.world.icub.world import Motions
 
@@ -227,17 +226,3 @@ BYTES = {
     "tiles": "6a00a743",
     "wood": "ee711189",
 }
-
-
-def test_the_picture_shows_the_room_and_below_it_every_view():
-    image = scene_picture(REAL, (360, 270))
-    assert image.size == (360, 270 + 90)
-    red, green, blue = np.moveaxis(np.asarray(image).astype(int), -1, 0)
-    wooden = (red > green + 20) & (green > blue + 20)
-    assert wooden[:270].mean() > 0.1
-    below = wooden[270:].reshape(90, 3, 120).mean(axis=(0, 2))
-    assert below.min() > 0.2
-    assert (blue > red + 50).mean() > 0.0016
-    assert (green > red + 40).mean() > 0.0005
-    robot = (red > 100) & (green < 40)
-    assert robot[:270].mean() > 0.007

@@ -53,7 +53,6 @@ def made(tmp_path_factory: pytest.TempPathFactory, oscillatory_run: Path) -> dic
         "view RUN --save OUT.rrd",
         "view RUN --screenshot OUT.png",
         "recover REC/x1.mcap -o OUT.mcap",
-        "record icub --scene-picture OUT.png",
         "record oscillatory --frames 20 -o OUT",
         "learn oscillatory --no-rerun --max-iterations 2 -o OUT",
         "sweep oscillatory --seeds 1 --max-iterations 2 -o OUT",

@@ -16,14 +16,11 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import Registry
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.picture import scene_picture
 from recorder.world.icub.source import IcubSource
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
-
-    from PIL.Image import Image
 
 
 Opener = Callable[[Any, RecordConfig], SeekableSource]
@@ -51,14 +48,12 @@ class Scene:
         config: what it can be told (keys `scene.*`).
         open: makes its source.
         preset: its configuration where none is chosen: name of a preset, or a .toml file.
-        picture: draws it from outside, where that can be done.
         packages: whose versions its frames depend on.
     """
 
     config: type[SceneConfig]
     open: Opener
     preset: str
-    picture: Callable[[Any], Image] | None = None
     packages: tuple[str, ...] = ()
 
 
@@ -69,7 +64,7 @@ def _open_oscillatory(config: OscillatoryConfig, record: RecordConfig) -> Seekab
 SCENES: Registry[Scene] = Registry(
     "scene",
     {
-        "icub": Scene(IcubConfig, IcubSource, "icub", scene_picture, ("pybullet", "icub-models")),
+        "icub": Scene(IcubConfig, IcubSource, "icub", ("pybullet", "icub-models")),
         "oscillatory": Scene(OscillatoryConfig, _open_oscillatory, "oscillatory"),
     },
 )

@@ -17,7 +17,6 @@ from cdmisfa.cli.commands.streams import print_recording, record_streams, refuse
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
-    print_document,
     say_about,
     say_changes,
     tell,
@@ -41,7 +40,7 @@ LIVE = ("cameras", "gym")
 
 @grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
 @click.argument("source", nargs=-1, type=options.WORD)
-@options.out("Folder of the recording.")
+@options.out("Folder of the recording.", required=True)
 @number(
     "--frames",
     "Frames of each view; by default 1000, with --resume as many as first asked for, of cameras "
@@ -60,7 +59,6 @@ LIVE = ("cameras", "gym")
 @options.jobs
 @options.preset
 @options.settings()
-@options.path("--scene-picture", "Draw the scene from outside instead of recording it.", "F.png")
 @flag("--resume", "Resume an interrupted recording.")
 @word(
     "--split",
@@ -78,11 +76,10 @@ def record_command(
     ctx: click.Context,
     /,
     source: tuple[str, ...],
-    out: Path | None,
+    out: Path,
     seed: int,
     preset: str | None,
     settings: tuple[str, ...],
-    scene_picture: Path | None,
     as_json: bool,
     images: ImageOptions,
     live: LiveOptions,
@@ -99,19 +96,19 @@ def record_command(
     from cdmisfa.experiments.sources import configure, is_scene, of_scene
     from recorder.cameras.words import is_live
     from recorder.log.manifest import RecordingStart
-    from recorder.recording import recorded, save_picture
+    from recorder.recording import recorded
     from recorder.world.scenes import SCENES
 
     if any(map(is_live, source)):
         views, jobs, resume = (writing.pop(name) for name in ("views", "jobs", "resume"))
-        if resume or views or jobs > 1 or scene_picture is not None:
+        if resume or views or jobs > 1:
             raise UsageError(
                 "live streams cannot go back, and all of it is recorded: leave out --resume, "
-                "--view, --jobs and --scene-picture"
+                "--view and --jobs"
             )
         live = dataclasses.replace(live, seed=seed)
         writing |= {"preset": preset, "settings": settings, "as_json": as_json}
-        record_streams(ctx, source, _folder(out), live, images, **writing)
+        record_streams(ctx, source, out, live, images, **writing)
         return
     refuse_logs(source)
     resumed = out if writing["resume"] else None
@@ -130,22 +127,8 @@ def record_command(
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
     seed = seed if given_seed or start.seed is None else start.seed
     configuration = configure(named, preset, of_scene(settings, images), seed)
-    if scene_picture is not None:
-        save_picture(named, configuration.scene, scene_picture, force=writing["force"])
-        tell(f"picture {scene_picture}")
-        if out is None:
-            if as_json:
-                print_document(picture=str(scene_picture))
-            return
-    out = _folder(out)
     files = _record_scene(ctx, configuration, out, **writing)
     print_recording(out, files, as_json=as_json)
-
-
-def _folder(out: Path | None) -> Path:
-    if out is None:
-        raise click.UsageError("say -o FOLDER, where the recording goes")
-    return out
 
 
 def _start(folder: Path) -> RecordingStart:
@@ -197,7 +180,7 @@ def _record_scene(
 
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
-@options.out("Folder of the recording.")
+@options.out("Folder of the recording.", required=True)
 @options.log_options
 @options.live_options
 @options.salvage
@@ -211,7 +194,7 @@ def convert_command(
     ctx: click.Context,
     /,
     source: tuple[str, ...],
-    out: Path | None,
+    out: Path,
     salvage: bool,
     resume: bool,
     force: bool,
@@ -231,7 +214,6 @@ def convert_command(
     from recorder.log.files import refuse_existing
     from replay.inputs import locations, open_cameras, refuse_what_is_no_log
 
-    out = _folder(out)
     writing: dict[str, Any] = {"force": force}
     if any(map(is_live, source)):
         if resume or salvage:

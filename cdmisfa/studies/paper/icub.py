@@ -39,7 +39,6 @@ from cdmisfa.studies.paper.experiment import (
 )
 from cdmisfa.studies.paper.oscillatory import paper_config, stay_rewards
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.picture import scene_picture
 from replay.recordings.source import RecordedSource
 
 OPTIMAL = ((0, "011"), (2, "110"))
@@ -139,15 +138,13 @@ class Icub(Experiment):
         pages.draw_policies(axes[0, 1], policy, "d", "share of trials that stay")
         pages.draw_eta_dot(axes[0, 2], eta_dot, paper_config("icub").delta, "e")
         paths = pages.save_figure(figure, folder, "icub")
-        scene, axes = pages.new_figure(1, 2)
+        scene, axes = pages.new_figure(1, 1)
         shown = next(t.arrays["shown"] for t in trials)
         views = [np.pad(view, ((1, 1), (0, 0)), constant_values=255) for view in shown]
-        images = np.asarray(scene_picture(IcubConfig())), np.concatenate(views)
-        names = "from outside", "what it sees: left, center, right"
-        for panel, image, letter, name in zip(axes[0], images, "ab", names, strict=True):
-            panel.imshow(image, cmap="gray", vmin=0, vmax=255)
-            panel.set(xticks=[], yticks=[])
-            pages.letter_panel(panel, letter, name, "")
+        panel = axes[0, 0]
+        panel.imshow(np.concatenate(views), cmap="gray", vmin=0, vmax=255)
+        panel.set(xticks=[], yticks=[])
+        pages.letter_panel(panel, "a", "what it sees: left, center, right", "")
         paths = [*pages.save_figure(scene, folder, "icub-scene"), *paths]
         outputs, axes = pages.new_figure(2, 2, sharey=True)
         for i, name in enumerate(OBJECTS):
