@@ -29,12 +29,17 @@ DONE, FAILED = "done", "failed"
 
 
 @cache
-def code() -> str:
-    """Return the version of what a trial computes: the package's, and a hash of its sources."""
+def code(*more: str) -> str:
+    """Return the version of what a trial computes: the package's, and a hash of its sources.
+
+    Args:
+        more: further modules that decide the result: "cdmisfa/modules".
+    """
     root = Path(__file__).parents[2]
     rooms = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")
     files = [file for room in rooms for file in (root / room).rglob("*.py")]
-    files += [root / "cdmisfa" / "experiments" / name for name in ("loop.py", "trial.py")]
+    modules = ("cdmisfa/experiments/loop", "cdmisfa/experiments/trial", *more)
+    files += [root / f"{module}.py" for module in modules]
     digest = hashlib.sha256()
     for file in sorted(files):
         digest.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
