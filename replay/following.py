@@ -1,4 +1,4 @@
-"""The quantity of the world that each module's output follows, for figures and views."""
+"""The quantity of the world that each module's output follows, for reports and views."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import (
-    TRUTH_TOPIC,
     WATCHED_TOPIC,
     Frames,
     RunHeader,
@@ -154,12 +153,7 @@ def _angles(truth: FloatArray) -> tuple[int, ...]:
 
 
 def read_outputs(
-    path: Path,
-    outline: Outline,
-    modules: int,
-    most: int = KEPT,
-    *,
-    truth: Frames | None = None,
+    path: Path, outline: Outline, truth: Frames, modules: int, most: int
 ) -> tuple[OutputHistory, ...]:
     """The outputs of the first modules of a run on their own streams; see `read_batches`.
 
@@ -170,9 +164,9 @@ def read_outputs(
     Args:
         path: of the run.
         outline: the run in short.
+        truth: frames and the ground truth of each.
         modules: how many, at most.
         most: last frames of each.
-        truth: ground truth of each frame, where that was read already.
     """
     header = outline.header
     collectors = [
@@ -184,11 +178,10 @@ def read_outputs(
     for columns in read_columns(path, header):
         for collector in collectors:
             collector.add(columns)
-    truth = _read_truth(path, header) if truth is None else truth
     outputs = {c.number: c.last(most) for c in collectors if c.blocks}
     silent = {c.number: outputs[c.number][0] for c in collectors if c.blocks and c.is_silent}
     outputs |= _of_kept_modules(path, header, silent)
-    angles = _angles(truth[1]) if truth is not None else None
+    angles = _angles(truth[1])
     return tuple(
         OutputHistory(c.number, c.stream, t, y, _truth_at(t, truth), angles)
         for c in collectors
@@ -221,23 +214,14 @@ def _in_one(parts: Sequence[Frames]) -> Frames:
     return np.concatenate(frames), np.concatenate(values)
 
 
-def _truth_at(t: IntArray, truth: Frames | None) -> FloatArray:
+def _truth_at(t: IntArray, truth: Frames) -> FloatArray:
     """(n, D) ground truth at n frames; D is 0 where not all of them have it."""
-    if truth is not None and len(t):
-        frames, values = truth
+    frames, values = truth
+    if len(t):
         at = np.searchsorted(frames, t)
         if at.max() < len(frames) and (frames[at] == t).all():
             return values[at]
     return np.empty((len(t), 0))
-
-
-def _read_truth(path: Path, header: RunHeader) -> Frames | None:
-    """Ground truth of each frame that was watched; None where the world has none."""
-    if not header.spec.truth:
-        return None
-    batches = read_batches(path, header, topics=(TRUTH_TOPIC,))
-    pieces = [piece for batch in batches for piece in batch.truth]
-    return _in_one(pieces) if pieces else None
 
 
 class _OutputCollector:

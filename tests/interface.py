@@ -41,7 +41,6 @@ SHOWN: Mapping[str, tuple[object, ...]] = {
     "fork": ("run", "--at", 2, *SHORT, "-o", "fork"),
     "apply": ("run", "rec", "-o", "applied.csv"),
     "report": ("run",),
-    "plot": ("run",),
     "signals": (),
     "sweep": ("oscillatory", "--seeds", "0:1", "--max-iterations", 2, "-o", "sweep"),
     "results": ("sweep",),

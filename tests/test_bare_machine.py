@@ -39,7 +39,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "doctor",
         "verify run",
         "check run",
-        "plot run -o figures",
         "view run --save view.rrd",
         "export run -o signals.parquet",
         "record oscillatory --frames 50 --jobs 2 -o rec",

@@ -15,7 +15,6 @@ import pytest
 from conftest import Cdmisfa, Outcome
 from folders import flip
 from mcap.reader import make_reader
-from run_data import VECTOR, write_run
 from waiting import started, wait_for
 
 from cdmisfa import Run
@@ -194,21 +193,6 @@ class TestRuns:
         assert (document["file"], document["rows"]) == (str(file), 15)
         assert file.stat().st_size > 0
         assert_one_line(cdmisfa("export", oscillatory_run, "-o", file), 2, "--force")
-
-    def test_plot_names_its_files(
-        self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
-    ) -> None:
-        figures = cdmisfa("plot", oscillatory_run, "-o", tmp_path / "f", "--json").json["figures"]
-        assert sorted(figures) == sorted(str(file) for file in (tmp_path / "f").iterdir())
-        assert {Path(file).suffix for file in figures} == {".png", ".svg"}
-
-    def test_plot_says_when_there_is_nothing_to_draw(
-        self, cdmisfa: Cdmisfa, tmp_path: Path
-    ) -> None:
-        write_run(tmp_path / "run.mcap", VECTOR, 0)
-        done = cdmisfa("plot", tmp_path, "-o", tmp_path / "f")
-        assert (done.code, done.out) == (0, "")
-        assert done.err == f"nothing is drawn of {tmp_path}: it has no iterations\n"
 
     @pytest.mark.parametrize(
         ("algorithm", "blocks", "said"),

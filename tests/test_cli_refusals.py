@@ -29,7 +29,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "record icubs -o x": ("icubs", "did you mean icub?"),
     "record icub": ("-o",),
     "record oscillatory -o x --view x9": ("x9", "x1, x2, x3"),
-    **{f"{command} no/such": ("no/such",) for command in ("info", "verify", "view", "plot")},
+    **{f"{command} no/such": ("no/such",) for command in ("info", "verify", "view")},
     "compare no/such neither": ("no/such",),
     "recover no/such -o x": ("no/such",),
     "export no/such -o x.csv": ("no/such: no such file or folder",),
@@ -94,7 +94,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "sweep REC --grid scene.seed=9,10 -o sweep": ("scene.seed " + VAIN.format("REC"),),
     # a file of another kind is a wrong word and no damage
     **{f"{command} numbers.h5": (NO_MCAP,) for command in ("info", "verify")},
-    **{f"{command} numbers.h5": (NO_MCAP,) for command in ("check", "plot")},
+    "check numbers.h5": (NO_MCAP,),
     "recover -o out.mcap numbers.h5": (NO_MCAP,),
     "convert -o out numbers.h5": (NO_MCAP,),
     "view --save out.rrd numbers.h5": (NO_MCAP,),
@@ -103,7 +103,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "export --to images -o out numbers.h5": (NO_MCAP,),
     **{
         f"{command} arrays.npz": ("arrays.npz holds arrays: make a recording", "cdmisfa convert")
-        for command in ("verify", "recover -o out.mcap", "check", "plot")
+        for command in ("verify", "recover -o out.mcap", "check")
     },
     **{
         f"recover {name} -o out.mcap": (
@@ -125,7 +125,6 @@ CASES: dict[str, tuple[str, ...]] = {
                 "sweep oscillatory --seeds 0 --max-iterations 3 -o",
                 "export RUN --to csv -o",
                 "recover RUN/run.mcap -o",
-                "plot RUN -o",
                 "reproduce stability --trials 1 -o",
                 "reproduce --page",
                 "demo --frames 400 -o",
@@ -177,7 +176,6 @@ CASES: dict[str, tuple[str, ...]] = {
     "record oscillatory --resume -o file/below": (FOLDER,),
     "sweep oscillatory --seeds 0 -o file": (FOLDER,),
     "fork RUN --at 3 --force -o file": (FOLDER,),
-    "plot RUN -o file/below": (FOLDER,),
     "sweep oscillatory -o RUN --seeds 0:1": ("run.mcap",),
     "export RUN -o - --to csv": ("name another",),
     "view RUN --screenshot x.jpg": ("the picture is a PNG, name it x.png",),

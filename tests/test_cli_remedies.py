@@ -131,8 +131,7 @@ def test_demo_replaces_an_earlier_one(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     assert (first["view"], first["follows"]) == ("left", "object1_y")
     assert (second["view"], second["follows"]) == ("right", "object3_y")
     assert min(first["correlation"], second["correlation"]) > 0.9
-    for file in (*report["figures"], Path(report["run"]) / "run.rrd"):
-        assert Path(file).stat().st_size > 0
+    assert (Path(report["run"]) / "run.rrd").stat().st_size > 0
 
 
 def test_demo_without_the_simulator_records_oscillatory_streams(

@@ -347,7 +347,6 @@ def test_every_kind_that_is_read_is_named(ending: str) -> None:
         "record oscillatory --frames 20 -o out",
         "learn oscillatory --max-iterations 1 -o out",
         "export RUN --to csv -o out.csv",
-        "plot RUN -o out",
         "reproduce stability --trials 1 -o out",
     ],
 )

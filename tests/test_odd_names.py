@@ -60,7 +60,7 @@ def hostile_log(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "words", ["info", "verify", "learn", "plot", "convert -o rec", "export -o x.parquet"]
+    "words", ["info", "verify", "learn", "convert -o rec", "export -o x.parquet"]
 )
 def test_names_in_logs_do_not_steer_the_terminal(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str

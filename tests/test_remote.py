@@ -256,7 +256,7 @@ def test_a_run_on_a_server_is_looked_at_and_not_learned_from(
     assert (tmp_path / "far.csv").read_bytes() == (tmp_path / "near.csv").read_bytes()
 
 
-def test_runs_on_a_server_are_compared_and_drawn(
+def test_runs_on_a_server_are_compared(
     cdmisfa: Cdmisfa, web: WebServer, oscillatory_run: Path, tmp_path: Path
 ) -> None:
     web.files["/runs/a/run.mcap"] = (oscillatory_run / "run.mcap").read_bytes()
@@ -264,15 +264,9 @@ def test_runs_on_a_server_are_compared_and_drawn(
     same = cdmisfa("compare", oscillatory_run, url, "--json")
     assert (same.code, same.json["identical"]) == (0, True), same
     assert [row["run"] for row in same.json["runs"]] == [oscillatory_run.name, "a"]
-    drawn = cdmisfa("plot", url, "-o", tmp_path / "figures")
-    assert drawn.code == 0, drawn
-    assert len(list((tmp_path / "figures").iterdir())) > 2
-    bare = cdmisfa("plot", url)
-    assert (bare.code, "-o FOLDER" in bare.err) == (2, True), bare
-    for words in (("compare", oscillatory_run), ("plot",)):
-        missing = cdmisfa(*words, web.url("/none/run.mcap"))
-        assert (missing.code, "/none/run.mcap: the server answers 404" in missing.err) == (2, True)
-        assert "http:/1" not in missing.err
+    missing = cdmisfa("compare", oscillatory_run, web.url("/none/run.mcap"))
+    assert (missing.code, "/none/run.mcap: the server answers 404" in missing.err) == (2, True)
+    assert "http:/1" not in missing.err
 
 
 def test_camera_logs_on_a_server_are_converted(

@@ -70,15 +70,13 @@ def test_info_says_so(cdmisfa) -> None:
     assert signals == {"version": 1, "missing": list(LACKS)}
 
 
-def test_it_can_be_shown_exported_and_drawn(cdmisfa, tmp_path) -> None:
+def test_it_can_be_shown_and_exported(cdmisfa, tmp_path) -> None:
     for words in (
         ("view", OLD, "--save", tmp_path / "old.rrd"),
         ("export", OLD, "-o", tmp_path / "old.parquet"),
-        ("plot", OLD, "-o", tmp_path / "figures"),
     ):
         assert cdmisfa(*words).code == 0, words
     assert (tmp_path / "old.rrd").stat().st_size > 10_000
-    assert list((tmp_path / "figures").iterdir())
     table = pq.read_table(tmp_path / "old.parquet")
     assert table.num_rows == 8
     assert table["roc_error"].null_count == len(table)
@@ -131,12 +129,12 @@ def test_two_versions_that_differ_elsewhere_too(tmp_path) -> None:
     assert str(difference).startswith("signals of version 1 against 4; of those in both: iteration")
 
 
-@pytest.mark.parametrize("command", ["view", "plot", "compare"])
+@pytest.mark.parametrize("command", ["view", "compare"])
 def test_a_later_version_is_refused_in_one_line(cdmisfa, tmp_path, monkeypatch, command) -> None:
     with monkeypatch.context() as patch:
         patch.setattr("replay.runs.writer.SCHEMA_VERSION", 9)
         newer = written(tmp_path / "newer", list(read_signals(OLD)))
-    more = {"view": ["--save", tmp_path / "x.rrd"], "plot": [], "compare": [OLD]}[command]
+    more = {"view": ["--save", tmp_path / "x.rrd"], "compare": [OLD]}[command]
     refused = cdmisfa(command, newer, *more)
     error = refused.err
     assert refused.code == 2

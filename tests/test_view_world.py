@@ -23,8 +23,9 @@ from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.head import NECK
 from recorder.world.icub.matrices import eye_matrix
 from recorder.world.icub.source import TRUTH
-from replay.following import read_outputs
+from replay.following import OutputHistory, read_outputs
 from replay.palette import colour, packed
+from replay.runs.log import read_batches
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view.build import build_view
@@ -144,12 +145,17 @@ def test_the_recording_says_what_stood_where(tmp_path):
     assert world_of_run(header, tmp_path, sample) == (scenery_of(CONFIG), None)
 
 
+def outputs_of(run: Path) -> tuple[OutputHistory, ...]:
+    pieces = [piece for batch in read_batches(run) for piece in batch.truth]
+    truth = np.concatenate([t for t, _ in pieces]), np.concatenate([v for _, v in pieces])
+    return read_outputs(run, read_outline(run), truth, 6, 20_000)
+
+
 def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
     records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
-    outline = read_outline(tmp_path)
     build_view(tmp_path, tmp_path / "run.rrd")
     rows, names = View(tmp_path / "run.rrd").rows, View(tmp_path / "run.rrd").titles()
-    outputs = {o.module: o for o in read_outputs(tmp_path, outline, 6)}
+    outputs = {o.module: o for o in outputs_of(tmp_path)}
     assert set(outputs) == {1, 2, 3}
     for number in (1, 2):
         output = outputs[number]
@@ -174,7 +180,7 @@ def test_a_module_that_said_nothing_later_is_asked_itself(tmp_path):
     build_view(tmp_path, tmp_path / "run.rrd")
     watched = View(tmp_path / "run.rrd").rows["/world/watched"]
     shown = dict(zip(watched["frame"], (v[0] for v in watched["Scalars:scalars"]), strict=True))
-    *_, output = read_outputs(tmp_path, read_outline(tmp_path), 6)
+    *_, output = outputs_of(tmp_path)
     assert output.module == last.module
     np.testing.assert_allclose(output.y, [2 * shown[t] for t in output.t.tolist()])
 

@@ -53,7 +53,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "Write what came of a run as one HTML page, to be read, printed or sent.",
         ),
         "info": ("info", "Say what is in a recording, a run, any MCAP file, or a camera log."),
-        "plot": ("logs", "Draw the figures of a run."),
         "results": (
             "trials",
             "Print mean and standard deviation over seeds at each point of a sweep.",

@@ -60,7 +60,6 @@ def demo(
         NotReproducedError: live and recorded signals differ.
     """
     from recorder.recording import record_scene
-    from replay.export.figures import draw_figures
 
     missing = [name for name in ("pybullet", "icub_models") if find_spec(name) is None]
     scene = STAND_IN if missing else SCENE
@@ -110,7 +109,6 @@ def demo(
             "recording": recording,
             "run": folder,
             "report": write_report([folder]),
-            "figures": draw_figures(folder, None, force=True),
             "iterations": result.iterations,
             "live_equals_recorded": True,
             "modules": [followed_by(module, source) for module in result.modules],

@@ -1,4 +1,4 @@
-"""Draw the pictures of these pages again: runs, views of every tab, figures. `make pictures`.
+"""Draw the pictures of these pages again: runs, views of every tab. `make pictures`.
 
 With names of pictures, only those; runs that are in build/pictures already are not learned again.
 """
@@ -61,13 +61,6 @@ VIEWS = {
 }
 """Pictures of views: the run or recording, the tab, and further options."""
 
-FIGURES = {
-    "decision": ("icub", "decision"),
-    "contact_sheet": ("icub", "contact_sheet"),
-    "streams": ("progress", "streams"),
-}
-"""Pictures that `plot` draws: the run, and the name of the figure."""
-
 REPORTS = {"report": ("icub", "1180,1150")}
 """Pictures of reports: the run, and the size of the browser's window."""
 
@@ -111,14 +104,6 @@ def fewer_colours(drawn: Path) -> None:
         few.save(IMAGES / drawn.name, optimize=True)
 
 
-def draw_figure(name: str) -> None:
-    """Draw one figure of one run."""
-    source, figure = FIGURES[name]
-    folder = BUILD / f"{source}-figures"
-    must("plot", str(learned(source)), "-o", str(folder), "--force")
-    shutil.copyfile(folder / f"{figure}.png", IMAGES / f"{name}.png")
-
-
 def draw_report(name: str) -> None:
     """Draw the top of a report, in Chromium."""
     source, size = REPORTS[name]
@@ -136,9 +121,8 @@ def draw_report(name: str) -> None:
 def main() -> None:
     """Draw the pictures that are named, by default all."""
     BUILD.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[1:] or [*VIEWS, *FIGURES, *REPORTS]:
-        draw = draw_figure if name in FIGURES else draw_report if name in REPORTS else draw_view
-        draw(name)
+    for name in sys.argv[1:] or [*VIEWS, *REPORTS]:
+        (draw_report if name in REPORTS else draw_view)(name)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Runs and recordings for other programs: tables, figures, videos, datasets."""
+"""Runs and recordings for other programs: tables, images, videos, datasets."""
 
 from cdmisfa.core.exports import exports
 
@@ -7,7 +7,5 @@ __getattr__, __dir__, __all__ = exports(
     {
         "replay.export.forms": "FORMS Form export",
         "replay.export.tables": "export_signals",
-        "replay.export.figures": "draw_figures",
-        "replay.export.history": "read_history",
     },
 )

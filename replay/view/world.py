@@ -337,7 +337,7 @@ def write_learned(
         return []
     frames, values = (np.concatenate(part)[-MOST_FRAMES:] for part in zip(*truth, strict=True))
     iterations, lessons = outline.blocks.iteration(frames), []
-    for output in read_outputs(log, outline, MOST, MOST_FRAMES, truth=(frames, values)):
+    for output in read_outputs(log, outline, (frames, values), MOST, MOST_FRAMES):
         found = output.best_fit(spec.truth)
         if found is None:
             continue

@@ -36,7 +36,6 @@ COMMANDS: dict[str, Callable[[Path, Path], Words]] = {
     "compare": lambda at, out: ("compare", at / "run", at / "run", "--json"),
     "export": lambda at, out: ("export", at / "run", "-o", out / "run.csv"),
     "view": lambda at, out: ("view", at / "run", "--save", out / "run.rrd"),
-    "plot": lambda at, out: ("plot", at / "run", "-o", out),
     "sweep": lambda at, out: (
         *("sweep", "oscillatory", "--seeds", "0:2", "--max-iterations", 3, "-o", out),
     ),

@@ -219,31 +219,6 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
         print_table(("signal", *both), signals)
 
 
-@click.command("plot")
-@options.fetched_argument("run")
-@options.out("Folder of the figures; by default figures in the run's folder.")
-@options.server_limits
-@options.force
-@options.as_json
-def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> None:
-    """Draw the figures of a run.
-
-    RUN is its folder, or its run.mcap, which may be behind a URL: then a copy is made.
-    """
-    if out is None and options.is_fetched(run):
-        raise click.UsageError("of a run behind a URL say where the figures go: -o FOLDER")
-    from replay.export.figures import draw_figures
-
-    files = draw_figures(run, out, force=force)
-    if as_json:
-        print_document(run=str(run), figures=[str(file) for file in files])
-        return
-    for file in files:
-        print_line(file)
-    if not files:
-        tell(f"nothing is drawn of {run}: it has no iterations")
-
-
 @click.command("export")
 @options.fetched_argument("path", nargs=-1, required=False)
 @option(
