@@ -46,7 +46,6 @@ SHOWN: Mapping[str, tuple[object, ...]] = {
     "results": ("sweep",),
     "index": ("corpus",),
     "query": ("corpus",),
-    "curate": ("corpus", "--budget", "1min", "-o", "chosen"),
     "doctor": (),
 }
 """Commands whose documents are looked at, with what they are given."""

@@ -434,7 +434,7 @@ class TestQuery:
 def test_the_commands_of_the_pages_work(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pages = (ROOT / "docs" / "how-to" / f"{name}.md" for name in ("corpus", "curate", "episodes"))
+    pages = (ROOT / "docs" / "how-to" / f"{name}.md" for name in ("corpus", "episodes"))
     page = "".join(file.read_text("utf-8") for file in pages)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")

@@ -222,60 +222,35 @@ def test_lerobot_itself_loads_the_dataset(dataset):
     np.testing.assert_array_equal(seen, np.stack([255 - pixels[0, FIRST]] * 3))
 
 
-def test_segments_of_recordings_become_episodes_of_a_dataset(cdmisfa, tmp_path):
+def test_several_recordings_become_episodes_of_a_dataset(cdmisfa, tmp_path):
     pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
-    pixels = {name: record_images(tmp_path / name)[0] for name in ("one", "two")}
-    step = 10**9 // 50
-    rows = [  # of a recording the files of both views, of the other its folder
-        *((f"one/{view}.mcap", 30, 40, "one") for view in ("left", "right")),
-        ("two", 50, 99, ""),
-        *((f"one/{view}.mcap", 5, 15, "one") for view in ("left", "right")),
-    ]
-    times = [(path, 10**18 + a * step, 10**18 + b * step, log) for path, a, b, log in rows]
-    lines = [",".join(map(str, row)) for row in (("path", "start", "stop", "log"), *times)]
-    (tmp_path / "look.csv").write_text("\n".join(lines))
+    paths = [tmp_path / "one", tmp_path / "two"]
+    pixels = [record_images(path, inverted=path.name == "two")[0] for path in paths]
     out = tmp_path / "robot"
-    words = ("--segments", tmp_path / "look.csv", "--lossless", "-o", out, "--json")
-    assert cdmisfa("export", "--to", "lerobot", *words).json["rows"] == 23
-    wanted = [("one", 30, 40), ("one", 5, 15), ("two", 50, 53)]
-    episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    words = (*paths, "--to", "lerobot", "--lossless", "-o", out, "--json")
+    assert cdmisfa("export", *words).json["rows"] == 2 * FRAMES
     data = pq.read_table(out / "data/chunk-000/file-000.parquet").to_pydict()
-    assert data["index"] == list(range(23))
-    assert data["episode_index"] == [0] * 10 + [1] * 10 + [2] * 3
-    assert data["frame_index"] == [*range(10), *range(10), *range(3)]
+    assert data["index"] == list(range(2 * FRAMES))
+    assert data["episode_index"] == [0] * FRAMES + [1] * FRAMES
+    assert data["frame_index"] == [*range(FRAMES), *range(FRAMES)]
+    episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     stats = json.loads((out / "meta/stats.json").read_text())
     for stream, view in enumerate(("left", "right")):
         key = f"observation.images.{view}"
-        own = [pixels[name][stream, low:high] for name, low, high in wanted]
-        for episode, expected in zip(episodes, own, strict=True):
+        for episode, shown in zip(episodes, pixels, strict=True):
             chunk, file = (episode[f"videos/{key}/{what}_index"] for what in ("chunk", "file"))
             found, _, _ = decoded(out / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4")
-            ends = [round(50 * episode[f"videos/{key}/{e}_timestamp"]) for e in ("from", "to")]
-            np.testing.assert_array_equal(found[slice(*ends)], expected)
-        every = np.concatenate(own) / 255
+            np.testing.assert_array_equal(found, shown[stream])
+        every = np.concatenate([shown[stream] for shown in pixels]) / 255
         np.testing.assert_allclose(stats[key]["mean"], np.full((3, 1, 1), every.mean()))
         np.testing.assert_allclose(stats[key]["std"], np.full((3, 1, 1), every.std()))
     before = contents(out)
-    how = {"lossless": True, "segments": tmp_path / "look.csv"}
-    assert export([], out, "lerobot", force=True, **how) == 23
-    assert contents(out) == before
-    lines[0] += ",topic"
-    lines[1] += ",/view/left"  # all topics are wanted of its other segments
-    (tmp_path / "look.csv").write_text("\n".join(lines))
-    assert export([], out, "lerobot", force=True, **how) == 23
+    assert export(paths, out, "lerobot", force=True, lossless=True) == 2 * FRAMES
     assert contents(out) == before
     record_images(tmp_path / "three", (24, 42))
-    for text, why in {
-        f"path,start,stop\none,0,{10**18}": "one: no frame of it lies in its segments",
-        f"start,stop\n0,{10**19}": "a segment names no log: give each row a path",
-        f"path,start,stop\none,0,{10**19}\nthree,0,{10**19}": "three: its frame_shape is",
-    }.items():
-        (tmp_path / "wrong.csv").write_text(text)
-        with pytest.raises(UsageError, match=why):
-            export([], tmp_path / "out", "lerobot", segments=tmp_path / "wrong.csv")
-        assert not (tmp_path / "out").exists()
-    with pytest.raises(UsageError, match="mp4 is of one log: segments are for lerobot"):
-        export([], tmp_path / "out", "mp4", segments=tmp_path / "look.csv")
+    with pytest.raises(UsageError, match="three: its frame_shape is"):
+        export([paths[0], tmp_path / "three"], tmp_path / "wrong", "lerobot")
+    assert not (tmp_path / "wrong").exists()
 
 
 def test_tasks_become_states_actions_and_episodes(cdmisfa, tmp_path):

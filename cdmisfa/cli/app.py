@@ -82,7 +82,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "Many logs": {
         "index": ("corpus", "Index what is in many logs: streams, times, damage, doubles."),
-        "curate": ("corpus", "Choose what to look at in many logs, within a budget of time."),
         "query": ("corpus", "Ask an index in SQL, or say what it has: how much, broken, double."),
     },
     "Studies": {

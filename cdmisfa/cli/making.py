@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar, cast
 
 import click
 
-from cdmisfa.core.options import DURATION, RANGE, SIZE, TIME, option_name
+from cdmisfa.core.options import RANGE, SIZE, TIME, option_name
 from recorder.images.options import Color
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -188,11 +188,6 @@ def _seconds(parts: Sequence[str | None]) -> float:
     return hours * 3600 + minutes * 60 + seconds
 
 
-def _duration(parts: Sequence[str | None]) -> float:
-    number, unit = parts
-    return float(number or 0) * {"s": 1, "min": 60, "h": 3600}[unit or "s"]
-
-
 def _range(parts: Sequence[str | None]) -> tuple[float, float] | None:
     low, high = (float(part or 0) for part in parts)
     return (low, high) if low < high else None
@@ -207,9 +202,6 @@ WRITTEN = {
         "seconds, or MINUTES:SECONDS, as 1:30",
         r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d{1,9})?)",
         _seconds,
-    ),
-    DURATION: Written(
-        "duration", "90s, 10min or 2h", r"(\d{1,9}(?:\.\d{1,6})?) ?(s|min|h)", _duration
     ),
     RANGE: Written(
         "range",

@@ -14,7 +14,7 @@ from typing import Any, Final
 from cdmisfa.core.config import shown
 from cdmisfa.core.errors import UsageError
 
-SIZE, TIME, RANGE, DURATION = "WxH", "TIME", "LOW:HIGH", "DURATION"
+SIZE, TIME, RANGE = "WxH", "TIME", "LOW:HIGH"
 """Units that are written in a way of their own: (height, width), seconds, two numbers, seconds."""
 
 _WRITTEN: Final[Mapping[str, Callable[[Any], str]]] = {

@@ -16,7 +16,6 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.names import counted, lasting
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
-from replay.corpus.curate import STREAMS
 from replay.corpus.finding import INDEX
 from replay.corpus.index import IndexedLog, indexed_logs, is_index, read_index
 from replay.corpus.query import ask, summary
@@ -26,6 +25,9 @@ from replay.storage.location import location
 
 CARDS: Final = 24
 """Logs of which the first frames are shown."""
+
+STREAMS: Final = 4
+"""Streams of a log that are shown."""
 
 _DOUBLE: Final = "SELECT unnest(paths) AS path FROM doubles"
 

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry, did_you_mean
 from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
+from replay.camera_logs.opening import only_foreign
 from replay.camera_logs.options import CameraOptions
-from replay.export.episodes import logs_of_segments, opened_in_turn, recordings_apart
 from replay.export.frames import write_film, write_films, write_images
-from replay.export.lerobot import write_dataset, write_lerobot
+from replay.export.lerobot import write_dataset
 from replay.export.tables import TABLES, export_signals
-from replay.inputs import About, holds_run, open_to_look
+from replay.inputs import About, Logged, holds_run, open_to_look
+from replay.recordings.source import RecordedSource
+from replay.recordings.view_file import NoRecordingError
 from replay.storage.opening import no_such
+
+_ALIKE: Final = ("streams", "frame_shape", "dtype", "truth", "fps")
+"""What recordings have in common that become one dataset."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,15 +37,16 @@ class Form:
             `lossless` where `lossy` is set.
         unit: what is counted.
         lossy: whether it may lose a little of what was logged.
-        write_many: writes several logs, each open until the next is asked for and with the frames
-            [start, stop) that are wanted of it; None of a form that is of one.
     """
 
     of: Literal["run", "recording"]
     write: Callable[..., int]
     unit: str
     lossy: bool = False
-    write_many: Callable[..., int] | None = None
+
+
+def _write_lerobot(source: Logged, folder: Path, **how: Any) -> int:
+    return write_dataset([source], folder, **how)
 
 
 def _table(form: str) -> Form:
@@ -53,7 +59,7 @@ FORMS: Registry[Form] = Registry(
         **{form: _table(form) for form in TABLES},
         "images": Form("recording", write_images, "images"),
         "mp4": Form("recording", write_films, "frames", lossy=True),
-        "lerobot": Form("recording", write_lerobot, "frames", lossy=True, write_many=write_dataset),
+        "lerobot": Form("recording", _write_lerobot, "frames", lossy=True),
     },
 )
 """Every form."""
@@ -70,22 +76,19 @@ def export(
     force: bool = False,
     lossless: bool = False,
     cameras: CameraOptions | None = None,
-    segments: Path | None = None,
     task: str | None = None,
     about: About = lambda source: None,
 ) -> int:
     """Write a run's signals, or recordings' frames, in another form.
 
     Args:
-        path: a run; for a form of recordings a recording, or camera logs; for one of several,
+        path: a run; for a form of recordings a recording, or camera logs; for LeRobot several
             folders of recordings, too.
         out: the file; for those forms the folder, or for one view's video a file *.mp4.
         form: one of `FORMS`; see `export_signals`.
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images that become a video.
         cameras: which streams of camera logs; by default all of images.
-        segments: for a form of several logs, a list of what is wanted of which; see
-            `read_segments`.
         task: for LeRobot, what is done, in words.
         about: given a recording or camera logs before they are written, to say what they are.
 
@@ -108,14 +111,6 @@ def export(
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     refuse_special(out)
     paths = [path] if isinstance(path, Path) else list(path)
-    if segments is not None:
-        if paths:
-            raise UsageError(f"{segments}: its segments name their logs: name no others beside it")
-        if described.write_many is None:
-            many = " or ".join(name for name, other in FORMS.items() if other.write_many)
-            raise UsageError(f"{form} is of one log: segments are for {many}")
-    elif not paths:
-        raise UsageError("name what is exported: a run, a recording, or camera logs")
     if task is not None and form != "lerobot":
         raise UsageError(f"{form} has no word for a task: --task is for lerobot")
     for named in paths:
@@ -129,15 +124,14 @@ def export(
         words: dict[str, Any] = {"lossless": lossless} if described.lossy else {}
         if form == "lerobot":
             words |= {"name": out.name, "task": task}
-        logs = logs_of_segments(segments) if segments else recordings_apart(paths)
-        if described.write_many is None or not logs:
+        if form != "lerobot" or not _are_recordings(paths):
             return _export_recording(paths, out, form, words, cameras, about)
         _refuse_others(out)
         with (
-            contextlib.closing(opened_in_turn(logs, cameras, about)) as opened,
+            contextlib.closing(_opened_in_turn(paths, cameras, about)) as opened,
             atomic_write(out) as place,
         ):
-            return described.write_many(opened, place, **words)
+            return write_dataset(opened, place, **words)
     if out.is_dir():
         raise UsageError(f"{out} is a folder: name the file to write")
     if not all(map(holds_run, paths)):
@@ -178,6 +172,42 @@ def _export_recording(
         about(source)
         with atomic_write(out) as place:
             return FORMS[form].write(source, place, **words)
+
+
+def _are_recordings(paths: Sequence[Path]) -> bool:
+    """Whether these are several folders of recordings, each with episodes of its own."""
+    if len(paths) < 2 or not all(path.is_dir() and not only_foreign(path) for path in paths):
+        return False
+    try:
+        for path in paths:
+            RecordedSource(path).close()
+    except NoRecordingError:
+        return False
+    return True
+
+
+def _opened_in_turn(
+    paths: Sequence[Path], cameras: CameraOptions | None, about: About
+) -> Generator[Logged]:
+    """Yield each recording, open until the next is asked for.
+
+    Raises:
+        UsageError: one has other streams, sizes or rates than the first, or as for `open_to_look`.
+        LogDamagedError: one is damaged.
+    """
+    first = None
+    for path in paths:
+        with contextlib.closing(open_to_look([path], cameras)) as source:
+            about(source)
+            first = first or source.spec
+            for what in _ALIKE:
+                one, other = getattr(first, what), getattr(source.spec, what)
+                if one != other:
+                    raise UsageError(
+                        f"{path}: its {what} is {other}, that of {paths[0]} {one}: export "
+                        "them by themselves, or convert them first"
+                    )
+            yield source
 
 
 def _refuse_others(out: Path) -> None:

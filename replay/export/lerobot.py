@@ -62,31 +62,23 @@ Columns = dict[str, NDArray[Any]]
 Feature = dict[str, Any]
 
 
-def write_lerobot(source: Logged, folder: Path, **how: Any) -> int:
-    """Write a recording, each stretch of frames that every view has as an episode.
-
-    See `write_dataset`.
-    """
-    return write_dataset([(source, shared_spans(source))], folder, **how)
-
-
 def write_dataset(
-    logs: Iterable[tuple[Logged, Sequence[Span]]],
+    logs: Iterable[Logged],
     folder: Path,
     *,
     name: str,
     lossless: bool,
     task: str | None = None,
 ) -> int:
-    """Write parts of recordings as a LeRobot dataset, and return how many frames it has.
+    """Write recordings as a LeRobot dataset, and return how many frames it has.
 
-    Images become videos `observation.images.VIEW`, a file a log; values `observation.VIEW`, and
-    truths `action`, `observation.state` and `observation.environment_state`; numbers are float32,
-    as LeRobot's own. Where an episode of a recorded task begins, another one does.
+    An episode is a stretch of frames that every view has; where an episode of a recorded task
+    begins, another one does. Images become videos `observation.images.VIEW`, a file a log; values
+    become `observation.VIEW`; ground truth becomes `action`, `observation.state` and
+    `observation.environment_state`. Numbers are float32, as LeRobot's own.
 
     Args:
-        logs: each open until the next is asked for, with the frames [start, stop) of episodes; of
-            the same streams, shape and rate.
+        logs: each open until the next is asked for; of the same streams, shape and rate.
         folder: where to.
         name: what the dataset's card calls it.
         lossless: keep every pixel.
@@ -98,8 +90,8 @@ def write_dataset(
         CdmisfaError: a file cannot be written.
     """
     with contextlib.closing(_Dataset(folder, lossless=lossless)) as dataset:
-        for source, wanted in logs:
-            dataset.add(source, _episodes(source, wanted), task or _task(source))
+        for source in logs:
+            dataset.add(source, _episodes(source), task or _task(source))
         return dataset.finish(name)
 
 
@@ -223,11 +215,11 @@ def _task(source: Logged) -> str:
     return f"what {source.scene().get('scene', 'a recording')} shows"
 
 
-def _episodes(source: Logged, spans: Sequence[Span]) -> list[Span]:
-    """Spans of frames, parted where an episode of a task begins that was recorded."""
+def _episodes(source: Logged) -> list[Span]:
+    """Return the spans of frames that every view has, cut where a recorded task begins again."""
     begins = [i for i, name in enumerate(source.spec.truth) if name.startswith(BEGINS)]
     found: list[Span] = []
-    for low, high in spans:
+    for low, high in shared_spans(source):
         edges = {low, high}
         for block in pieces(source, 0, [(low, high)]) if begins else ():
             edges |= {block.t + int(i) for i in np.flatnonzero(block.truth[:, begins].any(axis=1))}

@@ -41,7 +41,7 @@ from recorder.log.files import RECORDING
 from recorder.log.manifest import read_start
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
-from replay.export.lerobot import write_lerobot
+from replay.export.lerobot import write_dataset
 from replay.recordings.source import RecordedSource
 from replay.runs.codec import decode_matrix, decode_signals, encode_matrix, encode_signals
 from replay.runs.folders import REQUEST, RUN_JSON, read_run_json
@@ -323,7 +323,7 @@ def _lerobot(path: Path) -> None:
     source = RecordedSource([path])
     try:
         if source.frames <= 1000:
-            write_lerobot(source, path.parent / "dataset", name="it", lossless=True)
+            write_dataset([source], path.parent / "dataset", name="it", lossless=True)
     finally:
         source.close()
 

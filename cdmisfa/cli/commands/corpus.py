@@ -1,4 +1,4 @@
-"""Commands on many logs: their index, questions to it, and what to look at."""
+"""Commands on many logs: their index, and questions to it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.info import in_bytes
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.making import WRITTEN, flag, number, word
+from cdmisfa.cli.making import flag, number
 from cdmisfa.cli.printing import (
     print_columns,
     print_document,
@@ -23,13 +23,9 @@ from cdmisfa.cli.printing import (
 )
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.names import counted, lasting
-from cdmisfa.core.options import DURATION
 
 if TYPE_CHECKING:
     from replay.corpus.query import Summary
-
-MOST_RANKED = 20
-"""Logs that are listed of those with something new."""
 
 MOST_GONE = 5
 """Logs that are gone, of which so many are named."""
@@ -185,75 +181,3 @@ def _say_more(found: Summary, name: str, what: str) -> None:
     more = found.counts[name] - len(getattr(found, name))
     if more > 0:
         print_line(f"  and {more} more {what}: ask for them in SQL")
-
-
-@click.command("curate")
-@click.argument("corpus", type=options.WORD)
-@options.out("The folder of the segments and their page.", required=True)
-@options.path("--known", "A run: what looks as what it watched comes last.", "RUN")
-@word(
-    "--budget",
-    "TIME",
-    "How long all is that is chosen.",
-    type=WRITTEN[DURATION],
-    default="10min",
-    show_default=True,
-)
-@JOBS
-@options.server_limits
-@options.force
-@options.as_json
-def curate_command(
-    corpus: str,
-    out: Path,
-    known: Path | None,
-    budget: float,
-    jobs: int | None,
-    force: bool,
-    as_json: bool,
-) -> None:
-    """Choose what to look at in many logs, within a budget of time.
-
-    CORPUS is what cdmisfa index indexed. Noise and doubles are set apart; of the rest comes first
-    what is rare and differs most from all chosen before and, with --known, from what a run watched.
-    OUT has a page of contact sheets, index.html, the segments for cdmisfa cut, segments.csv, and
-    what became of each block, blocks.parquet.
-    """
-    from cdmisfa.experiments.apply import Application
-    from replay.corpus.curate import curate
-    from replay.corpus.index import index_path
-    from replay.report.curated import told as told_of_log
-
-    with bar("judging", "logs") as shown:
-        found = curate(
-            index_path(corpus),
-            out,
-            known=None if known is None else Application(known),
-            known_as=known,
-            budget=budget,
-            jobs=jobs or os.cpu_count() or 1,
-            force=force,
-            told=shown.update,
-        )
-    for row in found.logs:
-        if row["problem"]:
-            tell(f"{row['log']}: {row['problem']}")
-    if as_json:
-        print_document(out=out, **found.as_json())
-        return
-    head = ("log", "new", "known, s", "novel, s", "noise, s")
-    print_table(head, [told_of_log(row) for row in found.logs[:MOST_RANKED]])
-    if (more := len(found.logs) - MOST_RANKED) > 0:
-        print_line(f"and {counted(more, 'more log')}, in curated.json")
-    print_line(
-        "seconds of all streams of a log together; new is a sum of distances, without a unit"
-    )
-    lasts = f"{found.chosen:.1f} s of the budget of {budget:.1f} s"
-    why = f": {found.left}" if found.left else ""
-    print_line(f"{counted(len(found.segments), 'segment')} written to {out}, {lasts}{why}")
-    tell(f"look at {out / 'index.html'}")
-    if found.to_cut:
-        cut = f"cdmisfa cut --segments {quoted(out / 'segments.csv')} -o {quoted(out / 'cut')}"
-        tell(f"cut out {found.to_cut} of {len(found.segments)}: {cut}")
-    elif found.segments:
-        tell("none can be cut out: only those of MCAP files can")

@@ -220,7 +220,7 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
 
 
 @click.command("export")
-@options.fetched_argument("path", nargs=-1, required=False)
+@options.fetched_argument("path", nargs=-1)
 @option(
     "--to",
     "form",
@@ -230,7 +230,6 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
 )
 @options.out("The file to write, for a recording the folder.", required=True)
 @flag("--lossless", "Keep every value of images in a video.")
-@options.path("--segments", "Export these of many logs: a list, as cdmisfa curate writes.", "FILE")
 @word("--task", "TEXT", "What is done in a LeRobot dataset; by default what a log says.")
 @options.look_options
 @options.server_limits
@@ -250,7 +249,7 @@ def export_command(
     outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
     PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
     camera logs of others, several at once, too, and numbers in them with --field. Folders of
-    several recordings, or --segments of many logs, become episodes of one dataset.
+    several recordings become episodes of one dataset.
     """
     from replay.export.forms import FORMS, export
     from replay.export.tables import CSV_LEAVES_OUT
@@ -265,8 +264,7 @@ def export_command(
     if form in ("mp4", "lerobot") and not chosen["lossless"] and _is_film(out):
         tell("H.264 changes pixels a little: --lossless keeps them all")
     if as_json:
-        named = " ".join(map(str, path or [chosen["segments"]]))
-        print_document(path=named, file=str(out), rows=rows)
+        print_document(path=" ".join(map(str, path)), file=str(out), rows=rows)
         return
     print_line(f"{rows} {FORMS[form].unit} written to {out}")
 
