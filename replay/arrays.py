@@ -24,7 +24,6 @@ from replay.camera_logs.opening import fits_topic
 from replay.camera_logs.options import CameraOptions
 from replay.storage.arrays import load_numbers
 from replay.storage.identity import FilesIdentity, Identity, LoggedSource
-from replay.storage.location import Location
 
 ENDINGS: Final = (".npy", ".npz")
 """Endings of files of NumPy's arrays."""
@@ -151,13 +150,13 @@ class ArrayLog(LoggedSource):
         return str(self._files[0]) if self._files else f"the array {next(iter(self.arrays))}"
 
 
-def are_arrays(paths: Sequence[Location]) -> bool:
+def are_arrays(paths: Sequence[Path]) -> bool:
     """Whether paths are files of NumPy's arrays.
 
     Raises:
         UsageError: some are, and some are others.
     """
-    found = [isinstance(path, Path) and path.suffix.lower() in ENDINGS for path in paths]
+    found = [path.suffix.lower() in ENDINGS for path in paths]
     if any(found) and not all(found):
         other = paths[found.index(False)]
         raise UsageError(f"{other} is no file of arrays as the others are: take each apart")
@@ -165,7 +164,7 @@ def are_arrays(paths: Sequence[Location]) -> bool:
 
 
 def open_arrays(
-    paths: Sequence[Location], options: CameraOptions | None = None, *, loop: bool = False
+    paths: Sequence[Path], options: CameraOptions | None = None, *, loop: bool = False
 ) -> ArrayLog:
     """Open files of NumPy, .npy with a stream each or .npz with one an array.
 

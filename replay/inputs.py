@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fnmatch
 import glob
 import shlex
 from collections.abc import Callable, Sequence
@@ -12,12 +11,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.mcap.reader import LogReader
 from recorder.mcap.records import no_log
 from replay.arrays import ENDINGS, ArrayLog, are_arrays, open_arrays
 from replay.camera_logs.opening import (
     ALL,
-    WHOLE_FILES,
     channels_of,
     image_logs,
     image_topics,
@@ -28,9 +25,9 @@ from replay.camera_logs.pictures import by_number
 from replay.camera_logs.source import ForeignSource, UnequalError
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
-from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
-from replay.storage.location import Location, Url, location
-from replay.storage.opening import log_files, no_such, open_store, starts_as_log
+from replay.runs.folders import RUN_FILE, is_run
+from replay.storage.location import is_url, location
+from replay.storage.opening import no_such, starts_as_log
 
 Logged = RecordedSource | ForeignSource | ArrayLog
 """Frames from logs, or from files of arrays."""
@@ -40,7 +37,7 @@ About = Callable[[Logged], None]
 
 
 def open_log(
-    paths: Sequence[Location],
+    paths: Sequence[Path],
     cameras: CameraOptions | None = None,
     *,
     loop: bool = False,
@@ -71,13 +68,11 @@ def open_log(
     if cameras == CameraOptions() and not any(map(only_foreign, paths)):
         with contextlib.suppress(NoRecordingError):
             return _without(left_out, RecordedSource(paths, loop=loop, salvage=salvage))
-        for path in paths:
-            _refuse_remote_run(path)
     return _without(left_out, _open(paths, cameras, loop=loop, salvage=salvage, goal=goal))
 
 
 def open_to_look(
-    paths: Sequence[Location], cameras: CameraOptions | None = None, *, salvage: bool = False
+    paths: Sequence[Path], cameras: CameraOptions | None = None, *, salvage: bool = False
 ) -> Logged:
     """Open logs to view, export or play: every topic of images, aligned by time if need be.
 
@@ -118,7 +113,7 @@ def _checked(source: Logged) -> Logged:
 
 
 def open_cameras(
-    paths: Sequence[str | Location],
+    paths: Sequence[str | Path],
     cameras: CameraOptions,
     *,
     loop: bool = False,
@@ -139,25 +134,25 @@ def open_cameras(
     return _without(left_out, _open(paths, cameras, loop=loop, salvage=salvage, goal=goal))
 
 
-def _open(paths: Sequence[str | Location], cameras: CameraOptions, **how: Any) -> ForeignSource:
+def _open(paths: Sequence[str | Path], cameras: CameraOptions, **how: Any) -> ForeignSource:
     chosen: dict[str, Any] = {each.name: getattr(cameras, each.name) for each in fields(cameras)}
     return ForeignSource(paths, **chosen, **how)
 
 
 def _readable(
-    paths: Sequence[Location], cameras: CameraOptions
-) -> tuple[list[Location], CameraOptions, list[str]]:
+    paths: Sequence[Path], cameras: CameraOptions
+) -> tuple[list[Path], CameraOptions, list[str]]:
     """The logs of several that can be read, with their topics, and why the others cannot.
 
     Raises:
         LogDamagedError: none can be read.
     """
-    broken: dict[Location, LogDamagedError] = {}
+    broken: dict[Path, LogDamagedError] = {}
     for path in paths if len(paths) > 1 else ():
         try:
-            if isinstance(path, Path) and only_foreign(path):
+            if only_foreign(path):
                 channels_of(path)
-            elif isinstance(path, Url) or path.is_file():
+            elif path.is_file():
                 image_topics(path)
         except LogDamagedError as error:
             broken[path] = error
@@ -207,14 +202,12 @@ def is_recording(words: Sequence[str]) -> bool:
     return True
 
 
-def refuse_what_is_no_log(path: Location) -> None:
+def refuse_what_is_no_log(path: Path) -> None:
     """Refuse a run, or a file that is no log.
 
     Raises:
         UsageError: it is one of them.
     """
-    if isinstance(path, Url):  # opened only once: see `_refuse_remote_run`
-        return
     if path.is_dir():
         run = is_run(path)
     elif not path.exists():
@@ -229,53 +222,33 @@ def refuse_what_is_no_log(path: Location) -> None:
         raise _a_run(path)
 
 
-def _refuse_remote_run(path: Location) -> None:
-    """Refuse a run behind a URL, once it is known to be no recording."""
-    if isinstance(path, Url) and not path.folder:
-        with LogReader(open_store(path)) as reader:
-            if any(record.name == RUN_METADATA for record in reader.metadata):
-                raise _a_run(path)
-
-
-def _a_run(path: Location) -> UsageError:
+def _a_run(path: Path) -> UsageError:
     return UsageError(
         f"{path} is a run, not a recording: look at it with cdmisfa view {shlex.quote(str(path))}, "
         "or learn from what it learned from"
     )
 
 
-def locations(words: Sequence[str | Location]) -> list[Location]:
-    """The paths and URLs that words name, in their order; a pattern names matches, by number.
+def locations(words: Sequence[str | Path]) -> list[Path]:
+    """Return the paths that words name, in their order; a pattern names matches, by number.
 
     Raises:
         UsageError: nothing matches a pattern, or a URL is of a kind that is not read.
+        CdmisfaError: a server does not give what a URL names.
     """
-    found: list[Location] = []
+    found: list[Path] = []
     for word in words:
-        found += _matches(word) if isinstance(word, str) and _is_pattern(word) else [location(word)]
-    for place in found:
-        if isinstance(place, Url) and place.suffix.lower() in WHOLE_FILES:
-            raise UsageError(f"{place}: of URLs MCAP logs are read: copy this file here first")
+        pattern = isinstance(word, str) and not is_url(word) and any(c in word for c in "*?[")
+        if pattern and not Path(word).exists():
+            found += _matches(str(word))
+        else:
+            found.append(location(word))
     return found
 
 
-def _is_pattern(word: str) -> bool:
-    return any(letter in word for letter in "*?[") and not Path(word).exists()
-
-
-def _matches(word: str) -> list[Location]:
-    if "://" not in word:
-        matched = [Path(name) for name in glob.glob(word, recursive=True)]
-        matched = [path for path in matched if path.suffix not in (".rrd", ".json")]
-        if not matched:
-            raise UsageError(f"{word}: no file or folder matches")
-        return [*sorted(matched, key=by_number)]
-    if not word.startswith("s3://"):
-        return [location(word)]  # a question mark of a web address, and servers list nothing
-    folder, _, pattern = word.rpartition("/")
-    if _is_pattern(folder):
-        raise UsageError(f"{word}: a pattern is the last part of an s3:// address only")
-    listed = [log for log in log_files(location(folder)) if fnmatch.fnmatchcase(log.name, pattern)]
-    if not listed:
-        raise UsageError(f"{word}: no log matches")
-    return [log for log in listed if isinstance(log, Url)]
+def _matches(word: str) -> list[Path]:
+    matched = [Path(name) for name in glob.glob(word, recursive=True)]
+    matched = [path for path in matched if path.suffix not in (".rrd", ".json")]
+    if not matched:
+        raise UsageError(f"{word}: no file or folder matches")
+    return sorted(matched, key=by_number)

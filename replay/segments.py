@@ -18,7 +18,7 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import MAX_JSON, parse_json, read_regular
 from replay.camera_logs.opening import fits_topic
-from replay.storage.location import Location, Url, location
+from replay.storage.location import location
 from replay.stored import Span
 
 FOREVER: Final = 2**64
@@ -62,7 +62,7 @@ def within(times: NDArray[np.uint64], spans: Sequence[Span]) -> NDArray[np.bool_
     return inside
 
 
-def read_segments(path: Path) -> list[tuple[Location | None, Segment]]:
+def read_segments(path: Path) -> list[tuple[Path | None, Segment]]:
     """The rows of a list of segments, CSV or JSON: `path`, `start`, `stop`, `topic` and `log`.
 
     Times are nanoseconds or dates (ISO 8601, UTC where they name no zone). A relative path is one
@@ -95,7 +95,7 @@ def _from_json(text: bytes) -> list[tuple[str, Mapping[str, Any]]]:
     return [(f"segment {i}", row) for i, row in enumerate(rows)]
 
 
-def _row(path: Path, where: str, row: Mapping[str, Any]) -> tuple[Location | None, Segment]:
+def _row(path: Path, where: str, row: Mapping[str, Any]) -> tuple[Path | None, Segment]:
     for name in ("start", "stop"):
         if name not in row:
             raise UsageError(f"{path}: {where} misses {name}: a row is {', '.join(_FIELDS)}")
@@ -109,7 +109,7 @@ def _row(path: Path, where: str, row: Mapping[str, Any]) -> tuple[Location | Non
         if not isinstance(row.get(name, ""), str):
             raise UsageError(f"{path}: {where}: its {name} is no text")
     place = location(row["path"]) if row.get("path") else None
-    if place is not None and not isinstance(place, Url):
+    if place is not None:
         place = path.parent / place
     return place, Segment(start, stop, row.get("topic") or "*", row.get("log") or "")
 

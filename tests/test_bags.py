@@ -136,15 +136,6 @@ def test_a_bag_is_described_without_its_messages(
     assert {(c["start_ns"], c["end_ns"]) for c in channels.values()} == {(10**18, last)}
 
 
-@pytest.mark.parametrize("word", ["https://host/film.mp4", "s3://bucket/a.bag", "http://h/t.csv"])
-@pytest.mark.parametrize("command", ["info", "verify", "learn", "convert"])
-def test_urls_are_of_mcap_logs(command: str, word: str, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    out = ["-o", tmp_path / "out"] if command in ("learn", "convert") else []
-    refused = cdmisfa(command, word, *out)
-    assert (refused.code, refused.err.count("\n")) == (2, 1)
-    assert "of URLs MCAP logs are read: copy this file here first" in refused.err
-
-
 @pytest.mark.parametrize("kind", ["FILE", "MESSAGE", "BZ2", "LZ4"])
 def test_a_packed_bag_is_the_same_and_unpacks_to_no_more_than_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str

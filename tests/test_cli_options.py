@@ -16,13 +16,12 @@ from cdmisfa.core.options import given, option_name, option_words
 from recorder.cameras.options import LiveOptions
 from recorder.images.options import ImageOptions
 from replay.camera_logs.options import CameraOptions
-from replay.storage.location import Limits
 
 MADE = {
     "record": (ImageOptions, LiveOptions),
     "convert": (CameraOptions, LiveOptions),
-    "learn": (CameraOptions, LiveOptions, Limits),
-    "sweep": (CameraOptions, Limits),
+    "learn": (CameraOptions, LiveOptions),
+    "sweep": (CameraOptions,),
 }
 """Commands with all options of these dataclasses."""
 
@@ -58,7 +57,7 @@ def test_every_setting_has_its_option_and_no_option_is_without(name: str) -> Non
     assert grouped - made <= {"--record"}
 
 
-@pytest.mark.parametrize("settings", [ImageOptions, CameraOptions, LiveOptions, Limits])
+@pytest.mark.parametrize("settings", [ImageOptions, CameraOptions, LiveOptions])
 def test_every_field_is_an_option_but_the_seed_that_all_share(settings: Any) -> None:
     plain = [field.name for field in dataclasses.fields(settings) if not field.metadata]
     assert plain in ([], ["seed"])
@@ -136,7 +135,6 @@ def test_settings_of_a_log_or_a_caller_are_checked_like_typed_ones(
     "words",
     [
         ("convert", "a.mcap", "--rate", "nan"),
-        ("learn", "oscillatory", "--timeout", "nan"),
     ],
 )
 def test_no_number_is_no_number(cdmisfa: Cdmisfa, words: tuple[str, ...]) -> None:

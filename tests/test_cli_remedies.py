@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
-import shlex
 import shutil
 import tomllib
 from pathlib import Path
@@ -13,7 +12,6 @@ from pathlib import Path
 import pytest
 from conftest import Cdmisfa
 from waiting import python
-from web_server import serving
 
 from cdmisfa.cli.commands.doctor import EXTRAS
 from cdmisfa.core.errors import LogDamagedError
@@ -32,25 +30,6 @@ def test_export_makes_its_folders(
     out = tmp_path / "no" / "such" / name
     assert cdmisfa("export", oscillatory_run, "-o", out).code == 0
     assert out.stat().st_size > 0
-
-
-def test_errors_about_a_fetched_log_name_its_url(
-    cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
-) -> None:
-    with serving() as web:
-        web.files["/x1.mcap"] = (oscillatory_recording / "x1.mcap").read_bytes()
-        url = web.url("/x1.mcap")
-        done = cdmisfa("export", url, "-o", tmp_path / "a.csv")
-    assert done.code != 0
-    assert url in done.err
-    assert "/cdmisfa-" not in done.err
-
-
-def test_advice_can_be_pasted_into_a_shell(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    run = tmp_path / "my run #1"
-    done = cdmisfa("learn", "oscillatory", "-o", run, "--max-iterations", 3, *SHORT)
-    advice = done.out.partition("look at it: ")[2].partition("\n")[0]
-    assert shlex.split(advice, comments=True) == ["cdmisfa", "view", str(run)]
 
 
 @pytest.mark.parametrize("words", [(), ("--web",), ("--save", "a.rrd")])

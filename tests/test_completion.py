@@ -42,7 +42,7 @@ def test_a_shell_completes_commands_options_choices_and_files(
 def test_a_name_is_fetched_when_its_command_runs_and_not_when_a_shell_completes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("replay.storage.opening.fetched", lambda url: pytest.fail("fetched"))
+    monkeypatch.setattr("replay.storage.location._copied", lambda url: pytest.fail("fetched"))
     found = completed(monkeypatch, capsys, "cdmisfa view https://a.b/run.mcap --scr")
     assert found == ["--screenshot"]
 

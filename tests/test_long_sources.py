@@ -33,7 +33,7 @@ from replay.runs.compare import told_otherwise
 from replay.runs.log import read_header
 from replay.runs.run import stated_source
 from replay.storage import identity
-from replay.storage.identity import log_identity
+from replay.storage.identity import LogIdentity
 from replay.view.build import build_view
 
 CONFIG = LearnerConfig(tau=20)
@@ -169,7 +169,7 @@ def test_a_log_without_checksums_is_told_from_one_with_the_same_index(tmp_path: 
         how = {"compression": CompressionType.NONE, "enable_data_crcs": False}
         path, kind = tmp_path / f"{value}.mcap", MessageKind("", "raw")
         with LogReader(write_mcap(path, kind, {"t": [(0, data)]}, **how)) as reader:
-            known.append(log_identity(reader).sample())
+            known.append(LogIdentity(reader).sample())
     assert known[0]["bytes"] == known[1]["bytes"]
     assert known[0]["sample_sha256"] != known[1]["sample_sha256"]
 

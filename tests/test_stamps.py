@@ -14,7 +14,6 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from message_files import START, STEP, every, learned_alike, write_mcap
 from test_foreign import raw_json
 from test_numbers import bag, joint_state
-from web_server import serving
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -66,22 +65,6 @@ def test_images_are_shown_at_the_times_of_their_headers(kind: str, tmp_path: Pat
         shown = source.take(0, COUNT).frames
         assert (shown == [images[i] for i in (0, 2, 1, *range(3, COUNT))]).all()
         assert source.describe()["stamp"] == "header"
-
-
-def test_parts_on_a_server_are_known_by_what_was_read_of_them(tmp_path: Path) -> None:
-    pytest.importorskip("aiohttp")
-    (kind, messages), half = LOGS["protobuf"], COUNT // 2
-    made_then = list(messages())
-    with serving() as web:
-        for name, own in {"a": made_then[:half], "b": made_then[half:]}.items():
-            part = write_mcap(tmp_path / name, kind, {"/cam": every(STEP, own)})
-            web.files[f"/{name}.mcap"] = part.read_bytes()
-        urls = [web.url(f"/{name}.mcap") for name in "ab"]
-        with ForeignSource(urls, stamp="header") as source:
-            assert source.alignment["cam"]["messages"] == COUNT
-            files = source.describe()["files"]
-    assert [file["url"] for file in files] == urls
-    assert all("index_sha256" in file for file in files)
 
 
 @pytest.mark.parametrize("ros1", [True, False])

@@ -25,6 +25,7 @@ from cdmisfa.cli.printing import Stderr
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.untrusted import printable
+from replay.storage.location import with_urls
 
 GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Record": {
@@ -266,5 +267,5 @@ def _explain(error: Exception) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    click.echo(printable(f"cdmisfa: {' '.join(message.split())}"), err=True)
+    click.echo(printable(with_urls(f"cdmisfa: {' '.join(message.split())}")), err=True)
     return code

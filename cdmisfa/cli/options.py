@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,21 +15,17 @@ from cdmisfa.cli.making import (
     flag,
     number,
     option,
-    option_of,
     options_of,
     together,
     word,
 )
 from cdmisfa.cli.printing import Stderr, warn_deprecated
 from cdmisfa.core.config import FORMER
-from cdmisfa.core.errors import CdmisfaError, TooSmallError, UsageError, are_for
+from cdmisfa.core.errors import TooSmallError, UsageError, are_for
 from recorder.cameras.options import LiveOptions
 from recorder.images.options import ImageOptions
 from replay.camera_logs.options import CameraOptions
-from replay.storage.location import Limits, limited, limits
-
-FETCHED = "cdmisfa.fetched"
-"""Where a command's context keeps the paths of copies, and what they are copies of."""
+from replay.storage.location import location
 
 
 class LocalPath(click.Path):
@@ -190,20 +185,6 @@ def path(
     return option(name, type=OUT, metavar=unit, help=about, **how)
 
 
-def _hold(ctx: click.Context, param: click.Parameter, value: float) -> None:
-    """Set a time limit for the command, and for fetching its arguments."""
-    ctx.with_resource(limited(dataclasses.replace(limits(), **{str(param.name): value})))
-
-
-server_limits = together(
-    *(
-        option_of(Limits, field, callback=_hold, is_eager=True, expose_value=False)
-        for field in dataclasses.fields(Limits)
-    )
-)
-"""Time limits of servers, for commands that take URLs."""
-
-
 def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]:
     """`-o`: where the result goes."""
     return option("-o", "--out", type=OUT, required=required, help=meaning)
@@ -214,68 +195,21 @@ def path_argument(name: str) -> Callable[[Command], Command]:
     return click.argument(name, type=OUT)
 
 
-def fetched_argument(
+def log_argument(
     name: str, *, nargs: int = 1, required: bool = True
 ) -> Callable[[Command], Command]:
-    """A path, or several; a log behind a URL is copied into a file while the command runs.
+    """A log's path or URL, or several, of which patterns are replaced by what matches them."""
 
-    What the command complains about then names the URL, not the copy.
-    """
+    def opened(
+        ctx: click.Context, param: click.Parameter, value: str | tuple[str, ...]
+    ) -> Path | tuple[Path, ...]:
+        if ctx.resilient_parsing:  # a shell completes what follows
+            return Path()
+        if isinstance(value, tuple):
+            from replay.inputs import locations
 
-    def wrapped(command: Command) -> Command:
-        @functools.wraps(command)
-        def naming_the_url(*args: Any, **values: Any) -> Any:
-            try:
-                return command(*args, **values)
-            except CdmisfaError as error:
-                text = str(error)
-                for copy, url in click.get_current_context().meta.get(FETCHED, ()):
-                    text = text.replace(copy, url)
-                error.args = (text,)
-                raise
+            return tuple(locations(value))
+        return location(value)
 
-        how: dict[str, Any] = {"callback": _fetched, "type": WORD}
-        argument = click.argument(name, nargs=nargs, required=required, **how)
-        return cast(Command, argument(naming_the_url))
-
-    return wrapped
-
-
-def is_fetched(path: Path) -> bool:
-    """Whether a path is that of a copy, which goes when the command ends."""
-    names = click.get_current_context().meta.get(FETCHED, ())
-    return any(str(path) == copy for copy, _ in names)
-
-
-def _fetched(
-    ctx: click.Context, param: click.Parameter, value: str | tuple[str, ...]
-) -> Path | tuple[Path, ...]:
-    if ctx.resilient_parsing:  # a shell completes what follows
-        return Path()
-    if isinstance(value, tuple):
-        return tuple(_copy_of(ctx, word) for word in _matched(value))
-    return _copy_of(ctx, value)
-
-
-def _matched(words: tuple[str, ...]) -> tuple[str, ...]:
-    """Words with patterns as what matches them."""
-    if not any(letter in word for word in words for letter in "*?["):
-        return words
-    from replay.inputs import locations
-    from replay.storage.location import Url
-
-    return tuple(p.address if isinstance(p, Url) else str(p) for p in locations(words))
-
-
-def _copy_of(ctx: click.Context, word: str) -> Path:
-    from replay.storage.location import Url, location
-
-    place = location(word)
-    if not isinstance(place, Url):
-        return place
-    from replay.storage.opening import fetched
-
-    copy = ctx.with_resource(fetched(place))
-    names = ctx.meta.setdefault(FETCHED, [])
-    names += [(str(copy), str(place)), (str(copy.parent), str(place.parent))]
-    return copy
+    how: dict[str, Any] = {"callback": opened, "type": WORD}
+    return click.argument(name, nargs=nargs, required=required, **how)

@@ -15,6 +15,7 @@ import click
 
 from cdmisfa.core.names import counted
 from cdmisfa.core.untrusted import printable
+from replay.storage.location import with_urls
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
@@ -37,7 +38,7 @@ def quoted(path: str | Path) -> str:
 
 def print_line(line: object = "", *, err: bool = False) -> None:
     """A line on stdout, or stderr; names in it cannot steer the terminal."""
-    click.echo(printable(str(line)), err=err)
+    click.echo(printable(with_urls(str(line))), err=err)
 
 
 def print_text(text: str) -> None:
@@ -66,7 +67,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """
     from rich.cells import cell_len
 
-    cells = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
+    cells = [[printable(with_urls(str(cell))) for cell in row] for row in (head, *rows)]
     columns = list(zip(*cells, strict=True))
     widths = [max(map(cell_len, column)) for column in columns]
     if sys.stdout.isatty():

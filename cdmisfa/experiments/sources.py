@@ -319,7 +319,6 @@ def open_logs(
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
     from replay.corpus.finding import may_be_corpus
     from replay.inputs import locations, open_log
-    from replay.storage.location import Url
     from replay.storage.opening import no_such
 
     if live := [str(word) for word in words if is_live(str(word))]:
@@ -328,7 +327,7 @@ def open_logs(
             f"record {shlex.join(live)} -o REC"
         )
     for path in (paths := locations(words)):
-        if not isinstance(path, Url) and not path.exists() and follow is None:
+        if not path.exists() and follow is None:
             _, colon, address = str(path).partition(":")
             kinds = [f"{kind}:{address}" for kind in CAMERAS if colon]
             raise no_such(path, [*SCENES, *kinds], f"the scenes are {', '.join(SCENES)}")
@@ -344,8 +343,6 @@ def open_logs(
         return source
     from replay.recordings.followed import FollowedSource
 
-    if isinstance(paths[0], Url):
-        raise UsageError(f"{paths[0]}: only the folder of a recording can be followed")
     return FollowedSource(paths[0], timeout=follow)
 
 

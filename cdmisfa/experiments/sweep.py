@@ -44,7 +44,6 @@ from cdmisfa.experiments.trial import has_whole_trials, run_trial
 from recorder.log.files import atomic_write
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.camera_logs.options import CameraOptions
-from replay.storage.location import Limits, limited, limits
 
 REQUEST = "sweep.json"
 """What was asked for last."""
@@ -64,7 +63,6 @@ class SweepTrial(StoredTrial):
         cameras: how images of others become frames.
         max_iterations: end after so many.
         max_modules: end after so many.
-        limits: of the time for servers that the source is on.
     """
 
     source: tuple[str, ...]
@@ -73,7 +71,6 @@ class SweepTrial(StoredTrial):
     cameras: CameraOptions
     max_iterations: int | None
     max_modules: int | None
-    limits: Limits
 
 
 def sweep(
@@ -200,7 +197,6 @@ def plan(
                 max_modules=max_modules,
                 log=logs / name if logs is not None else None,
                 code=code(),
-                limits=limits(),
             )
             trials.setdefault(trial.id, trial)
     return list(trials.values())
@@ -272,8 +268,7 @@ def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     if is_scene(trial.source):
         source = configuration.open_scene()
     else:
-        with limited(trial.limits):
-            source = open_logs(trial.source, loop=trial.loop, cameras=trial.cameras)
+        source = open_logs(trial.source, loop=trial.loop, cameras=trial.cameras)
     with contextlib.closing(source), contextlib.ExitStack() as opened:
         log = None
         if trial.log is not None:

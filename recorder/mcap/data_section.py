@@ -7,15 +7,11 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
-from cdmisfa.core.errors import LogDamagedError
-from recorder.mcap.records import MAGIC, RECORD_HEADER, Segment, crc32
+from recorder.mcap.records import RECORD_HEADER, Segment, crc32
 from recorder.mcap.store import OnePass, Store
-from recorder.mcap.summary import FOOTER_BYTES
-from recorder.mcap.walk import DATA_END_BYTES, LogStructure
+from recorder.mcap.walk import LogStructure
 
 _CHUNK_HEADER: Final = 256
-_BEGINNING: Final = 64 * 1024
-"""Bytes that are read of a log behind a URL before its end is known."""
 
 
 class DataSection:
@@ -32,8 +28,6 @@ class DataSection:
         self._structure = structure
         self._damaged = damaged
         self._checked = 0
-        self._remote = file.remote and structure.complete
-        self._marks_then = self._marks() if self._remote else []
 
     def check(self, crc: int | None = None) -> None:
         """Compare the checksum that the log states with that of its data, once.
@@ -56,63 +50,40 @@ class DataSection:
 
     @property
     def vouched(self) -> bool:
-        """Whether a checksum over all of the data is stated, of a log that can be read in all."""
-        return bool(self._structure.data_crc) and not self.file.remote
+        """Whether a checksum over all of the data is stated."""
+        return bool(self._structure.data_crc)
 
     def check_unproven(self) -> None:
-        """Check it for a chunk that has no checksum of its own; of a URL not all is read for it."""
-        if self._structure.by_index and not self._remote:
+        """Check it for a chunk that has no checksum of its own."""
+        if self._structure.by_index:
             self.check()
 
     def unprotected(self, segments: Sequence[Segment]) -> int:
         """Count the segments that no checksum protects.
 
-        Of a file opened by its index, which states none, the first chunk stands for all; of a URL
-        opened so that is not known, and 0.
+        Of a file opened by its index, which states none, the first chunk stands for all.
         """
-        if self._structure.data_crc or self._remote:
+        if self._structure.data_crc:
             return 0
         if self._structure.by_index:
             places = [s.offset + RECORD_HEADER.size for s in segments[:1]]
             segments = [Segment.of_chunk(p, self.file.peek(p, _CHUNK_HEADER)) for p in places]
         return sum(1 for s in segments if s.crc == 0 and s.size)
 
-    def confirm(self) -> None:
-        """Check that a log behind a URL is still the one that was opened.
-
-        Raises:
-            LogDamagedError: it was replaced while it was read.
-        """
-        if self._remote:
-            self.file.forget()
-            if self._marks() != self._marks_then:
-                raise LogDamagedError(
-                    f"{self.file.path}: it was replaced while it was read; begin again"
-                )
-
-    def _marks(self) -> list[int]:
-        """CRCs of what another log would not have: the beginning, and those that it states."""
-        end, size = self._structure.data_end, self.file.size
-        last = size - FOOTER_BYTES - len(MAGIC)
-        spans = ((0, _BEGINNING), (end, end + DATA_END_BYTES), (last, size))
-        return [self.file.crc(start, stop) for start, stop in spans]
-
-    def sha256(self, start: int, counted: Callable[[int], None] = lambda count: None) -> str:
-        """SHA-256 of the file from a place on, with its checksum checked where that is 0.
+    def sha256(self, counted: Callable[[int], None] = lambda count: None) -> str:
+        """Return the SHA-256 of the file, whose checksum is checked on the way.
 
         Args:
-            start: the place.
-            counted: told of bytes that were hashed.
+            counted: called with the number of each further bytes that were hashed.
         """
-        sha256, crc, at = hashlib.sha256(), 0, start
+        sha256, crc, at = hashlib.sha256(), 0, 0
         end = self._structure.data_end if self._structure.data_crc else 0
-        for block in self.file.blocks(start, self.file.size):
+        for block in self.file.blocks(0, self.file.size):
             sha256.update(block)
             crc = crc32(block[: max(end - at, 0)], crc)
             at += len(block)
             counted(len(block))
-        if start == 0:
-            self.check(crc)
+        self.check(crc)
         return sha256.hexdigest()
 
     def changed(self) -> bool:

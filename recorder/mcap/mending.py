@@ -36,7 +36,7 @@ class MendedStore(Store):
 
     def __init__(self, store: Store) -> None:
         super().__init__(store.path)
-        self.size, self.remote = store.size, store.remote
+        self.size = store.size
         self.mended: list[Problem] = []
         self._store = store
         self._places: list[int] = []

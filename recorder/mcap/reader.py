@@ -33,10 +33,6 @@ Check = Literal["chunks", "data", "pass"]
 
 NO_CHECKSUMS = "it has no checksums, nothing vouches for its bytes"
 
-_SENT_LESS = (
-    "the server sends less than the log, or the log was cut (cdmisfa recover saves what is there)"
-)
-
 
 class LogReader:
     """An MCAP file, read by its content and not by what its index claims.
@@ -77,7 +73,7 @@ class LogReader:
             salvage: leave out what is damaged.
             check: "chunks" believes a summary that accounts for every message; "data" looks at
                 every record of a file and at the checksum over its data, "pass" leaves the latter
-                to `one_pass`. By default "chunks", with `salvage` "data"; of a URL "chunks".
+                to `one_pass`. By default "chunks", with `salvage` "data".
 
         Raises:
             UsageError: it cannot be opened.
@@ -90,9 +86,8 @@ class LogReader:
         self._file = log if isinstance(log, Store) else FileStore(Path(log))
         self.path = self._file.path
         try:
-            remote = self._file.remote
             check = check or ("data" if salvage else "chunks")
-            by_index = remote or check == "chunks"
+            by_index = check == "chunks"
             found = LogStructure(self._file, self._refuse, by_index=by_index, resync=salvage)
             self._structure = found
             self.data = DataSection(self._file, found, self._refuse_data)
@@ -102,8 +97,6 @@ class LogReader:
             self._settle()
             if not self.by_index and check != "pass":
                 self.data.check()
-            if remote and not (self.complete or salvage):
-                raise LogDamagedError(f"{self.path}: {self.missing}: {_SENT_LESS}")
         except BaseException as error:
             self._file.close()
             if isinstance(error, MalformedRecord):
@@ -175,13 +168,8 @@ class LogReader:
         return self._file.read(attachment.offset, attachment.size)
 
     def digest(self) -> str:
-        """SHA-256 of the file, checked as it is read; of a URL opened by index of its end."""
-        remote = self.by_index and self._file.remote
-        return self.data.sha256(self._structure.data_end if remote else 0)
-
-    def confirm(self) -> None:
-        """See that a log behind a URL was not replaced; see `DataSection.confirm`."""
-        self.data.confirm()
+        """SHA-256 of the file, checked as it is read."""
+        return self.data.sha256()
 
     def crc_absent(self) -> int:
         """Count the segments that no CRC protects; see `DataSection.unprotected`."""

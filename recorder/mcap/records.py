@@ -9,7 +9,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from pathlib import Path
+from typing import Any, Final
 
 from mcap.opcode import Opcode
 
@@ -36,18 +37,6 @@ CHUNK_HEADER: Final = struct.Struct("<BQQQQI")
 """Opcode, length, first and last log time, size and CRC; compression and records follow."""
 
 
-class Place(Protocol):
-    """Where a log is: a path, or a URL."""
-
-    @property
-    def name(self) -> str:
-        """Its last part."""
-
-    @property
-    def suffix(self) -> str:
-        """See `Path.suffix`."""
-
-
 class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with a record, not where
     """Bytes that are not what MCAP says they are; the reader adds file and place."""
 
@@ -60,7 +49,7 @@ KINDS: Final = (
 """What is read, for errors; docs/how-to/logs.md says more."""
 
 
-def no_log(path: Place) -> CdmisfaError:
+def no_log(path: Path) -> CdmisfaError:
     """What is wrong with a file that begins otherwise: damage, where its name is that of a log."""
     if ".mcap" in path.name:
         return LogDamagedError(f"{path}: not an MCAP file (its first bytes are not MCAP's)")

@@ -14,7 +14,7 @@ from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import open_regular
-from recorder.mcap.records import Place, crc32
+from recorder.mcap.records import crc32
 
 PARTIAL: Final = ".partial"
 """Ending of what is being written, or whose writing was cut short."""
@@ -32,13 +32,11 @@ _AHEAD: Final = 16 * 1024 * 1024
 
 
 class Store(ABC):
-    """`size` bytes at a path or URL, read at any place, short pieces through one small window."""
+    """`size` bytes of a file, read at any place, short pieces through one small window."""
 
     size: int
-    remote: bool = False
-    """Whether it is behind a URL, so that it costs time, and all of it much."""
 
-    def __init__(self, path: Place) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self._window = b""
         self._window_at = 0
@@ -288,7 +286,7 @@ class OnePass(Store):
 
     def __init__(self, store: Store) -> None:
         super().__init__(store.path)
-        self.size, self.remote = store.size, store.remote
+        self.size = store.size
         self._store = store
         self._at = 0
         self._crc = 0

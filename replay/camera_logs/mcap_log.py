@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -22,8 +23,6 @@ from replay.camera_logs.stream import (
     explained,
     sorted_times,
 )
-from replay.storage.location import Location, Url
-from replay.storage.opening import open_store
 
 Found = TypeVar("Found")
 
@@ -33,13 +32,13 @@ class Readers(contextlib.ExitStack):
 
     def __init__(self) -> None:
         super().__init__()
-        self._open: dict[Location, LogReader] = {}
+        self._open: dict[Path, LogReader] = {}
         self._expected: dict[LogReader, list[Segment]] = {}
 
-    def reader(self, path: Location, *, salvage: bool) -> LogReader:
+    def reader(self, path: Path, *, salvage: bool) -> LogReader:
         """The reader of a log; raises as `LogReader` does."""
         if path not in self._open:
-            self._open[path] = self.enter_context(LogReader(open_store(path), salvage=salvage))
+            self._open[path] = self.enter_context(LogReader(path, salvage=salvage))
         return self._open[path]
 
     def expect(self, reader: LogReader, segments: list[Segment]) -> None:
@@ -57,8 +56,7 @@ class McapImages(MessageImages):
         topic: may be left out where there is one of images.
         salvage: leave out what is damaged.
         reading: what is taken.
-        readers: of logs of which other topics are taken, too; of what is behind a URL each topic
-            has a reader of its own, which reads ahead.
+        readers: of logs of which other topics are taken, too.
 
     Raises:
         UsageError: no such topic, or not what is wanted on it.
@@ -67,7 +65,7 @@ class McapImages(MessageImages):
 
     def __init__(
         self,
-        path: Location,
+        path: Path,
         topic: str | None,
         *,
         salvage: bool = False,
@@ -79,8 +77,7 @@ class McapImages(MessageImages):
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
         self._alone = Readers()
-        shared = readers is not None and not isinstance(path, Url)
-        self._readers = readers if readers is not None and shared else self._alone
+        self._readers = self._alone if readers is None else readers
         self.reader = self._readers.reader(path, salvage=salvage)
         try:
             _refuse_nothing(self.reader)
@@ -148,13 +145,13 @@ class McapImages(MessageImages):
             yield segment, pairs[pairs[:, 1].argsort(kind="stable"), 0]
 
 
-def mcap_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
+def mcap_topics(path: Path, reading: Reading = IMAGES) -> list[str]:
     """The topics of an MCAP log with what is wanted.
 
     Raises:
         LogDamagedError: it is no MCAP file, or has nothing in it.
     """
-    with LogReader(open_store(path), salvage=True) as reader:
+    with LogReader(path, salvage=True) as reader:
         _refuse_nothing(reader)
         channels = reader.channels.values()
         found = (c.topic for c in channels if decoder_of(_kind(reader, c), reading) is not None)

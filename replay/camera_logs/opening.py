@@ -24,8 +24,8 @@ from replay.camera_logs.pictures import PICTURES, VIDEOS, FolderImages, VideoIma
 from replay.camera_logs.selected import VideoMessages, by_stamps, join_by_time
 from replay.camera_logs.stream import ChannelFacts, ImageStream, NothingLoggedError, holds_none
 from replay.camera_logs.table import TABLES, TableNumbers, table_channels
-from replay.storage.identity import FilesIdentity, Identity, log_identity
-from replay.storage.location import Location, Url, location
+from replay.storage.identity import FilesIdentity, Identity, LogIdentity
+from replay.storage.location import location
 from replay.storage.opening import log_files
 
 Format = Literal["mcap", "split", "bag", "dataset", "pictures", "video", "table"]
@@ -37,10 +37,8 @@ ALL: Final = ("*",)
 """Topics that mean every one with images."""
 
 
-def log_format(path: Location) -> Format:
+def log_format(path: Path) -> Format:
     """The format of a log; a folder of MCAP files that are parts of one log is "split"."""
-    if isinstance(path, Url):
-        return "mcap"
     if path.is_dir():
         if is_dataset(path):
             return "dataset"
@@ -58,21 +56,21 @@ def log_format(path: Location) -> Format:
     return "table" if path.suffix.lower() in TABLES and path.is_file() else "mcap"
 
 
-def only_foreign(path: Location) -> bool:
+def only_foreign(path: Path) -> bool:
     """Whether a path cannot be one of our recordings, by its format."""
     return log_format(path) not in ("mcap", "split")
 
 
-def image_logs(paths: Sequence[str | Location]) -> list[Location]:
+def image_logs(paths: Sequence[str | Path]) -> list[Path]:
     """The logs that paths mean, one at least: a folder of MCAP files is each, a rosbag2 one log."""
-    found: list[Location] = []
+    found: list[Path] = []
     for path in map(location, paths):
         found += log_files(path) if log_format(path) == "mcap" else [path]
     return found
 
 
 def open_images(
-    path: Location,
+    path: Path,
     topic: str | None,
     *,
     salvage: bool = False,
@@ -104,7 +102,7 @@ def open_images(
 
 
 def _open(
-    path: Location,
+    path: Path,
     topic: str | None,
     *,
     salvage: bool,
@@ -113,7 +111,7 @@ def _open(
 ) -> ImageStream:
     """Open a log with the reader of its format, which raises as `open_images` does."""
     kind = log_format(path)
-    if isinstance(path, Url) or kind == "mcap":
+    if kind == "mcap":
         return McapImages(path, topic, salvage=salvage, reading=reading, readers=readers)
     if kind == "split":
         return _open_parts(path, topic, salvage=salvage, reading=reading, readers=readers)
@@ -159,26 +157,21 @@ def _open_parts(path: Path, topic: str | None, **how: Any) -> ImageStream:
     return join_by_time(path, parts, [f"{error}: left out" for error in empty])
 
 
-def identity_of(path: Location, streams: Sequence[ImageStream]) -> Identity:
+def identity_of(path: Path, streams: Sequence[ImageStream]) -> Identity:
     """The identity of a log: its bytes; of a folder, names and contents count.
 
     The streams hold the log open, where it is an MCAP file.
-
-    Raises:
-        ValueError: it is at a URL, and none of the streams holds it open.
     """
-    readers = [s.reader for s in streams if isinstance(s, McapImages) and s.path == path]
-    if readers:
-        return log_identity(*dict.fromkeys(readers))
-    if isinstance(path, Url):
-        raise ValueError(f"{path} is not open")
+    for stream in streams:
+        if isinstance(stream, McapImages) and stream.path == path:
+            return LogIdentity(stream.reader)
     if not path.is_dir():
         return FilesIdentity(path)
     found = path.rglob("*") if is_dataset(path) else path.iterdir()
     return FilesIdentity(path, (file for file in found if file.is_file()))
 
 
-def image_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
+def image_topics(path: Path, reading: Reading = IMAGES) -> list[str]:
     """The topics of a camera log with images, or with the messages that are wanted.
 
     Raises:
@@ -186,7 +179,7 @@ def image_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
         CdmisfaError: a package that reads it is missing.
     """
     kind = log_format(path)
-    if isinstance(path, Url) or kind == "mcap":
+    if kind == "mcap":
         return mcap_topics(path, reading)
     if kind == "dataset":
         return dataset_cameras(path)
@@ -227,8 +220,8 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
 
 
 def named_streams(
-    files: Sequence[Location], topics: Sequence[str], reading: Reading = IMAGES
-) -> list[tuple[Location, str | None]]:
+    files: Sequence[Path], topics: Sequence[str], reading: Reading = IMAGES
+) -> list[tuple[Path, str | None]]:
     """The log and the topic of each stream that is meant.
 
     Without topics each log has one stream. As many topics as logs are one of each log in turn;
@@ -245,7 +238,7 @@ def named_streams(
         if len(topics) == len(files):
             return list(zip(files, topics, strict=True))
     known = [(file, name) for file in files for name in image_topics(file, reading)]
-    found: dict[tuple[Location, str | None], None] = {}
+    found: dict[tuple[Path, str | None], None] = {}
     for topic in topics:
         fits = [(file, name) for file, name in known if fits_topic(name, topic)]
         if not known:

@@ -24,7 +24,6 @@ from recorder.images.videos import VideoPackets
 from recorder.images.whole import MalformedImage
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, UnreadableError, sorted_times
-from replay.storage.location import Location, Url
 
 Found = TypeVar("Found")
 
@@ -112,7 +111,7 @@ def selected(stream: ImageStream, rows: IntArray, times: NDArray[np.uint64]) -> 
 
 
 def join_by_time(
-    path: Location, streams: Sequence[ImageStream], warnings: Sequence[str] = ()
+    path: Path, streams: Sequence[ImageStream], warnings: Sequence[str] = ()
 ) -> ImageStream:
     """The images on one topic of several logs, by their times, ties in the order of the logs."""
     times = np.concatenate([stream.times for stream in streams])
@@ -323,7 +322,7 @@ def names_of(streams: Sequence[ImageStream]) -> tuple[str, ...]:
     topics = [s.topic for s in streams]
     if len(set(topics)) == len(topics):
         return stream_names(topics)
-    paths = [s.path.address if isinstance(s.path, Url) else str(s.path.resolve()) for s in streams]
+    paths = [str(s.path.resolve()) for s in streams]
     places = list(zip(paths, topics, strict=True))
     for i, place in enumerate(places):
         if place in places[:i]:
@@ -338,10 +337,10 @@ def names_of(streams: Sequence[ImageStream]) -> tuple[str, ...]:
 def _in_folders(stream: ImageStream, folders: int) -> str:
     """A stream's name with those of its file, and of some of the folders this is in."""
     path, own = stream.path, stream_name(stream.topic)
-    stems = [path.stem, *([path.resolve().name] if isinstance(path, Path) else [])]
+    stems = [path.stem, path.resolve().name]
     if own not in map(stream_name, stems):
         own = f"{path.stem}/{own}"
-    above = Path(str(path) if isinstance(path, Url) else os.path.abspath(path)).parts[:-1]
+    above = Path(os.path.abspath(path)).parts[:-1]
     return "/".join([*above[max(len(above) - folders, 0) :], own])
 
 

@@ -49,7 +49,6 @@ from replay.camera_logs.selected import (
     names_of,
 )
 from replay.storage.identity import Identity
-from replay.storage.location import Location, Url
 from replay.stored import Span, outside
 
 
@@ -86,7 +85,7 @@ class ForeignSource(AheadSource):
 
     def __init__(
         self,
-        paths: str | Location | Sequence[str | Location],
+        paths: str | Path | Sequence[str | Path],
         topics: Sequence[str] = (),
         *,
         loop: bool = False,
@@ -109,7 +108,7 @@ class ForeignSource(AheadSource):
             self._options = options = replace(options, color=color)
             self.notes = (CHOSEN[color],)
         self.color = bool(options.color)
-        self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
+        self._files = image_logs([paths] if isinstance(paths, str | Path) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
         self._readers, self.changes = Readers(), dict[int, str]()
         super().__init__()

@@ -8,6 +8,7 @@ from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -21,7 +22,6 @@ from recorder.images.messages import PACKED, SCHEMAS, Decoder, packed_picture, s
 from recorder.images.options import RECIPE, Reading
 from recorder.images.pixels import AT_ONCE, Shown, compressed_image
 from recorder.log.messages import VECTOR_SCHEMA
-from replay.storage.location import Location
 
 
 class UnreadableError(LogDamagedError):
@@ -79,7 +79,7 @@ class ImageStream(ABC):
         decode: what makes an image of a message; None where they are no messages of a log.
     """
 
-    path: Location
+    path: Path
     topic: str
     times: NDArray[np.uint64]
     encoding: str = ""
@@ -191,7 +191,7 @@ class MessageImages(ImageStream):
 
 
 def choose_images(
-    path: Location,
+    path: Path,
     topic: str | None,
     channels: Iterable[tuple[str, MessageKind, Found]],
     reading: Reading,
@@ -251,7 +251,7 @@ class NothingLoggedError(LogDamagedError):
     """A log that was cut before its first message."""
 
 
-def holds_none(path: Location, reading: Reading) -> str:
+def holds_none(path: Path, reading: Reading) -> str:
     """The error text for a log without images, or without fields."""
     if reading.fields:
         return f"{path}: it holds no messages whose fields are known"
@@ -274,7 +274,7 @@ def sorted_times(where: str, times: Sequence[int] | NDArray[np.integer[Any]]) ->
 
 
 @contextmanager
-def explained(path: Location, program: str, *, held: int = 0, remedy: str = "") -> Iterator[None]:
+def explained(path: Path, program: str, *, held: int = 0, remedy: str = "") -> Iterator[None]:
     """Turn any error of a library that reads a file into one line, within a memory budget.
 
     Args:
@@ -291,7 +291,7 @@ def explained(path: Location, program: str, *, held: int = 0, remedy: str = "") 
 
 
 @contextmanager
-def arrow_explained(path: Location, *, held: int = 0, remedy: str = "") -> Iterator[None]:
+def arrow_explained(path: Path, *, held: int = 0, remedy: str = "") -> Iterator[None]:
     """As `explained`, for PyArrow, whose memory is then the system's, which the budget counts.
 
     What its own pool has in reserve has no budget.
@@ -304,7 +304,7 @@ def arrow_explained(path: Location, *, held: int = 0, remedy: str = "") -> Itera
 
 
 @contextmanager
-def in_one_line(path: Location, program: str, remedy: str = "") -> Iterator[None]:
+def in_one_line(path: Path, program: str, remedy: str = "") -> Iterator[None]:
     """Turn any error of a library that reads a file into one line.
 
     Raises:

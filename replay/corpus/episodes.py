@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final, Literal
 
 from cdmisfa.core.blocks import Block, SourceSpec
@@ -25,7 +26,6 @@ from replay.corpus.logs import (
 )
 from replay.inputs import Logged, open_log
 from replay.storage.identity import Identity, LoggedSource
-from replay.storage.location import Location
 from replay.stored import Span
 
 SAID: Final = 5
@@ -39,8 +39,8 @@ _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "ti
 
 
 def open_episodes(
-    words: Sequence[str | Location],
-    paths: Sequence[Location] | Literal[False],
+    words: Sequence[str | Path],
+    paths: Sequence[Path] | Literal[False],
     cameras: CameraOptions | None = None,
     **how: Any,
 ) -> EpisodeSource | None:

@@ -17,7 +17,7 @@ from replay.camera_logs.opening import WHOLE_FILES, log_format
 from replay.camera_logs.pictures import PICTURES
 from replay.inputs import locations
 from replay.runs.folders import RUN_FILE
-from replay.storage.location import Location, Url, location
+from replay.storage.location import is_url
 
 INDEX: Final = "corpus.parquet"
 """Name of the index of a folder, in it."""
@@ -43,7 +43,7 @@ class Found(NamedTuple):
     problem: str = ""
 
 
-def found_logs(words: Sequence[str | Location]) -> Iterator[Found]:
+def found_logs(words: Sequence[str | Path]) -> Iterator[Found]:
     """The logs that words name, in the order of names within each folder.
 
     A folder is listed once, by whichever links lead there.
@@ -52,20 +52,22 @@ def found_logs(words: Sequence[str | Location]) -> Iterator[Found]:
         UsageError: a word names nothing.
     """
     seen: set[tuple[int, int]] = set()
-    for place in locations(words):
-        if isinstance(place, Url):
-            yield Found(place.address)
-        elif place.is_dir():
-            yield from _below(str(place), seen)
-        else:
-            yield _file(place)
+    for word in words:
+        if is_url(word):
+            yield Found(str(word))
+            continue
+        for place in locations([word]):
+            if place.is_dir():
+                yield from _below(str(place), seen)
+            else:
+                yield _file(place)
 
 
-def may_be_corpus(words: Sequence[str | Location]) -> bool:
+def may_be_corpus(words: Sequence[str | Path]) -> bool:
     """Whether words are a folder that has an index, or a file that may be one."""
-    place = location(words[0]) if len(words) == 1 else None
-    if not isinstance(place, Path):
+    if len(words) != 1:
         return False
+    place = Path(words[0])
     return has_index(place) or (place.suffix == ".parquet" and place.is_file())
 
 
@@ -74,14 +76,12 @@ def has_index(folder: Path) -> bool:
     return os.path.isfile(folder / INDEX)
 
 
-def state_of_log(place: Location) -> tuple[int, str]:
+def state_of_log(place: Path) -> tuple[int, str]:
     """Bytes of a log on this machine and when it changed, as `Found` has them.
 
     Raises:
         OSError: it is not there.
     """
-    if isinstance(place, Url):
-        return 0, ""
     if place.is_dir():
         return _state_of_folder(place)
     state = os.stat(place)

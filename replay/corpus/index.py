@@ -21,7 +21,7 @@ from cdmisfa.core.untrusted import check_regular, parse_json
 from recorder.log.files import atomic_write, held, make_folder, refuse_unless
 from replay.corpus.finding import INDEX, found_logs
 from replay.corpus.rows import MARK, SCHEMA, VERSION, Answer, Task, look
-from replay.storage.location import Location, location
+from replay.storage.location import is_url, location
 from replay.storage.opening import no_such
 
 BATCH: Final = 32
@@ -157,7 +157,7 @@ def index_path(place: str | Path) -> Path:
 
 
 def index_logs(
-    words: Sequence[str | Location],
+    words: Sequence[str | Path],
     out: Path | None = None,
     *,
     deep: bool = False,
@@ -261,12 +261,13 @@ def _damaged(path: Path, error: Exception) -> LogDamagedError:
     return LogDamagedError(f"{path} is damaged ({said}): remove it, and index again")
 
 
-def _place_of(words: Sequence[str | Location], out: Path | None) -> Path:
+def _place_of(words: Sequence[str | Path], out: Path | None) -> Path:
     """Where the index of some logs is."""
     if out is not None:
         refuse_unless(out, "an index is a Parquet file", ".parquet")
         return out
-    if len(words) == 1 and isinstance(place := location(words[0]), Path):
+    if len(words) == 1 and not is_url(words[0]):
+        place = location(words[0])
         if place.is_dir():
             return place / INDEX
         if not (place.exists() or any(letter in str(place) for letter in "*?[")):
@@ -275,7 +276,7 @@ def _place_of(words: Sequence[str | Location], out: Path | None) -> Path:
     raise UsageError(f"{named}: no folder, which would hold its index: say where, with -o")
 
 
-def _there(words: Sequence[str | Location], folder: Path) -> pa.Table:
+def _there(words: Sequence[str | Path], folder: Path) -> pa.Table:
     """The logs that are there, with their paths relative to the folder of the index."""
     below = os.path.join(folder, "")
     found: dict[str, Task] = {}

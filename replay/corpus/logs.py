@@ -21,7 +21,7 @@ from replay.corpus.index import indexed_logs, is_index
 from replay.inputs import Logged
 from replay.recordings.source import RecordedSource
 from replay.storage.identity import Identity, LoggedSource
-from replay.storage.location import Location, Url, location
+from replay.storage.location import location
 from replay.stored import Span
 
 STREAM: Final = "stream"
@@ -30,14 +30,14 @@ STREAM: Final = "stream"
 SMALL: Final = 1 << 20
 """Bytes of a log of which all are hashed when it is first opened."""
 
-Log = Sequence[Location]
+Log = Sequence[Path]
 """What is opened as one: a log, or the files of a recording's views."""
 
 Told = Callable[[float, float | None], None]
 """Told how many logs were opened, and of how many."""
 
 
-def logs_of_corpus(words: Sequence[str | Location]) -> list[Log] | None:
+def logs_of_corpus(words: Sequence[str | Path]) -> list[Log] | None:
     """The recordings and logs of others in an index; None where words name none.
 
     Args:
@@ -247,9 +247,7 @@ def kind_of(spec: SourceSpec) -> tuple[Any, ...]:
 
 
 def _way(log: Log) -> str:
-    """The path of a log, or its address; of several files that of their folder."""
-    if isinstance(log[0], Url):
-        return str(log[0])
+    """The path of a log; of several files that of their folder."""
     path = os.path.abspath(log[0])
     return os.path.dirname(path) if len(log) > 1 else path
 

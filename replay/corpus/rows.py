@@ -25,9 +25,8 @@ from replay.camera_logs.opening import identity_of, image_topics, only_foreign, 
 from replay.corpus.finding import state_of_log
 from replay.integrity.info import ChannelInfo, LogInfo, describe_log, describe_reader
 from replay.integrity.state import failed_state
-from replay.storage.identity import FilesIdentity, Identity, log_identity
-from replay.storage.location import Location, Url, location
-from replay.storage.opening import open_store
+from replay.storage.identity import FilesIdentity, Identity, LogIdentity
+from replay.storage.location import is_url, location
 
 VERSION: Final = 1
 """Rises whenever a column changes its meaning."""
@@ -128,7 +127,7 @@ def look(tasks: Sequence[Task], deep: bool, full: bool) -> Answer:
         except _SameError:
             continue
         except Exception as raised:  # whatever a broken file makes a library of others raise
-            if not (_is_url(task.file) or os.path.lexists(task.file)):
+            if not (is_url(task.file) or os.path.lexists(task.file)):
                 looked.append(task.path)
                 gone.append(task.path)
                 continue
@@ -167,7 +166,7 @@ def _contents(rows: Sequence[Mapping[str, Any]]) -> str | None:
     return hashlib.sha256(json.dumps(known).encode()).hexdigest() if known else None
 
 
-def _rows_of(place: Location, task: Task, deep: bool, full: bool) -> Iterator[dict[str, Any]]:
+def _rows_of(place: Path, task: Task, deep: bool, full: bool) -> Iterator[dict[str, Any]]:
     sha256 = None
     if full:
         sha256 = _all_bytes(place)
@@ -175,7 +174,7 @@ def _rows_of(place: Location, task: Task, deep: bool, full: bool) -> Iterator[di
             raise _SameError
     info, identity, contents = _described(place, deep)
     problems = [f"{p.where}: {p.what}" for p in info.problems]
-    if not isinstance(place, Url) and state_of_log(place) != (task.bytes, task.changed):
+    if not is_url(task.file) and state_of_log(place) != (task.bytes, task.changed):
         problems.append("it changed while it was indexed: index again")
     records = [record for found in info.metadata.values() for record in found.values()]
     stated = {name: value for record in records for name, value in record.items()}
@@ -222,20 +221,18 @@ def _stream(channel: ChannelInfo, view: Mapping[str, str]) -> dict[str, Any]:
     return found
 
 
-def _described(
-    place: Location, deep: bool
-) -> tuple[LogInfo, str | None, Sequence[Mapping[str, Any]]]:
+def _described(place: Path, deep: bool) -> tuple[LogInfo, str | None, Sequence[Mapping[str, Any]]]:
     """A log, its identity, and what its messages were found to be, of each channel."""
-    if isinstance(place, Path) and (only_foreign(place) or are_arrays([place])):
+    if only_foreign(place) or are_arrays([place]):
         info = describe_log(place, decode=deep)
         contents = [_shown(place, c.topic) if deep else {} for c in info.channels]
         return info, _hash_of(identity_of(place, ())), contents
-    with LogReader(open_store(place), salvage=True, check="chunks") as reader:
-        identity = _hash_of(log_identity(reader))
+    with LogReader(place, salvage=True, check="chunks") as reader:
+        identity = _hash_of(LogIdentity(reader))
         if not deep:
             info = describe_reader(reader, decode=False)
             return info, identity, [{} for _ in info.channels]
-    with LogReader(open_store(place), salvage=True, check="pass") as reader:
+    with LogReader(place, salvage=True, check="pass") as reader:
         content = _Content(reader)
         info = describe_reader(reader, decode=True, told=content.add)
         found = content.found()
@@ -279,7 +276,7 @@ class _Content:
         return known
 
 
-def _shown(place: Location, topic: str) -> dict[str, Any]:
+def _shown(place: Path, topic: str) -> dict[str, Any]:
     """Shape of the first image of a topic, and how many are missing; nothing where it has none."""
     try:
         with contextlib.closing(open_images(place, topic)) as images:
@@ -297,11 +294,8 @@ def _hash_of(identity: Identity) -> str:
     return str(next(v for k, v in identity.sample().items() if k.endswith("sha256")))
 
 
-def _all_bytes(place: Location) -> str:
-    """SHA-256 of all of a log; of one behind a URL, of its index."""
-    if isinstance(place, Url):
-        with LogReader(open_store(place), salvage=True) as reader:
-            return reader.digest()
+def _all_bytes(place: Path) -> str:
+    """SHA-256 of all of a log."""
     if place.is_dir():
         return FilesIdentity(place, (f for f in place.rglob("*") if f.is_file())).sha256(_ignore)
     return FilesIdentity(place).sha256(_ignore)
@@ -333,7 +327,3 @@ def _log_of(path: str, info: LogInfo) -> str:
 def _said(text: str) -> str:
     line = " ".join(text.encode("utf-8", "backslashreplace").decode().split())
     return line if len(line) <= MOST_SAID else f"{line[: MOST_SAID - 3]}..."
-
-
-def _is_url(word: str) -> bool:
-    return "://" in word

@@ -25,8 +25,7 @@ from replay.cutting.origin import Origin
 from replay.cutting.output import Output, Part
 from replay.inputs import locations
 from replay.segments import FOREVER, Segment, read_segments
-from replay.storage.location import Location
-from replay.storage.opening import log_files, open_store
+from replay.storage.opening import log_files
 
 if TYPE_CHECKING:
     from recorder.config import Split
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 SCHEMA: Final = 1
 """Version of `Cut.as_json`."""
 
-Wanted = dict[Location, list[Segment]]
+Wanted = dict[Path, list[Segment]]
 """What is wanted of each log."""
 
 
@@ -55,7 +54,7 @@ class Cut:
 
 
 def cut_logs(
-    logs: Sequence[str | Location],
+    logs: Sequence[str | Path],
     out: str | Path,
     *,
     start: float = 0.0,
@@ -117,8 +116,8 @@ def cut_logs(
     return Cut(tuple(parts), tuple(problems))
 
 
-def _files(place: Location) -> list[Location]:
-    if isinstance(place, Path) and place.exists() and only_foreign(place):
+def _files(place: Path) -> list[Path]:
+    if place.exists() and only_foreign(place):
         raise UsageError(
             f"{place} is no MCAP file, and others are not cut: learn and convert take a part with "
             "--from and --to"
@@ -126,7 +125,7 @@ def _files(place: Location) -> list[Location]:
     return log_files(place)
 
 
-def _wanted(files: Sequence[Location], topics: Sequence[str], listed: Path | None) -> Wanted:
+def _wanted(files: Sequence[Path], topics: Sequence[str], listed: Path | None) -> Wanted:
     """What is wanted of each log, by topics and a list of segments."""
     if not files and listed is None:
         raise UsageError("no log was named: name one, or a list of them with --segments")
@@ -145,8 +144,8 @@ def _wanted(files: Sequence[Location], topics: Sequence[str], listed: Path | Non
     return found
 
 
-def _first_time(file: Location) -> int:
-    with LogReader(open_store(file), salvage=True, check="chunks") as reader:
+def _first_time(file: Path) -> int:
+    with LogReader(file, salvage=True, check="chunks") as reader:
         return min((s.start for s in reader.segments if s.size), default=FOREVER)
 
 
@@ -168,15 +167,15 @@ def _targets(wanted: Wanted, out: Path, force: bool) -> dict[Path, Wanted]:
     for target, those in targets.items():
         refuse_taken(target, force=force)
         for file in those:
-            if isinstance(file, Path) and target.exists() and target.samefile(file):
+            if target.exists() and target.samefile(file):
                 raise UsageError(f"{file}: it cannot be cut into itself, name another file")
     return targets
 
 
-def _names(files: Collection[Location]) -> dict[Location, str]:
+def _names(files: Collection[Path]) -> dict[Path, str]:
     """A name for each log; with the folders that they differ by, where two have the same."""
     names = {file: file.name.removesuffix(PARTIAL) for file in files}
-    here = {file: os.path.abspath(file) for file in files if isinstance(file, Path)}
+    here = {file: os.path.abspath(file) for file in files}
     if len(set(names.values())) < len(names) == len(here):
         above = os.path.commonpath([os.path.dirname(file) for file in here.values()])
         names = {f: os.path.relpath(p, above).removesuffix(PARTIAL) for f, p in here.items()}
@@ -260,5 +259,5 @@ def _rows(
         yield group[0], found
 
 
-def _problem(file: Location, error: LogDamagedError) -> Problem:
+def _problem(file: Path, error: LogDamagedError) -> Problem:
     return Problem(str(file), str(error).removeprefix(f"{file}: "))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -29,8 +30,6 @@ from recorder.mcap.tables import MessageTable
 from replay.runs.folders import RUN_METADATA
 from replay.segments import FOREVER, spans_of, within
 from replay.segments import Segment as Wanted
-from replay.storage.location import Location
-from replay.storage.opening import open_store
 from replay.stored import Span
 
 _MOST: Final = 2**16
@@ -129,9 +128,9 @@ class Origin:
         LogDamagedError: it is damaged.
     """
 
-    def __init__(self, path: Location, wanted: Sequence[Wanted], *, salvage: bool = False) -> None:
+    def __init__(self, path: Path, wanted: Sequence[Wanted], *, salvage: bool = False) -> None:
         self.path, self.wanted = path, wanted
-        self.reader = reader = LogReader(open_store(path), salvage=salvage)
+        self.reader = reader = LogReader(path, salvage=salvage)
         self._buffer = bytearray()
         self._last: tuple[Segment | None, MessageTable | None] = None, None
         try:
@@ -165,7 +164,6 @@ class Origin:
         most = 2 * sum(s.stop - s.offset for s in self.chunks if self._covers(s)) > reader.size
         if not (most and self._same and data.vouched and reader.by_index):
             yield
-            reader.confirm()
             return
         with data.passing() as self._file:
             self._vouched = True

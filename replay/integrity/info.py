@@ -15,6 +15,7 @@ from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.reader import Check, LogReader
 from recorder.mcap.records import Channel, Problem, Segment
+from recorder.mcap.store import FileStore
 from replay.arrays import are_arrays
 from replay.camera_logs.opening import channels_of, log_format, only_foreign
 from replay.camera_logs.pictures import FolderImages
@@ -40,8 +41,7 @@ from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_METADATA
 from replay.runs.log import SIGNALS_TOPIC, record_version
 from replay.storage.arrays import load_numbers
-from replay.storage.location import Location
-from replay.storage.opening import log_files, open_store
+from replay.storage.opening import log_files
 
 SCHEMA: Final = 1
 """Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
@@ -168,12 +168,11 @@ class LogInfo:
         return {"schema": SCHEMA, **asdict(self)}
 
 
-def describe(*words: str | Location) -> LogInfo:
+def describe(*words: str | Path) -> LogInfo:
     """Describe a recording's or run's folder, any MCAP file, or camera logs; several as one.
 
-    Torn and damaged files are described as far as they can be read. Of a URL whose summary
-    accounts for every message no more than that is read, and `crc` is "unchecked". Of several, one
-    that cannot be read is described as such.
+    Torn and damaged files are described as far as they can be read. Of several, one that
+    cannot be read is described as such.
 
     Raises:
         UsageError: no such log.
@@ -224,9 +223,9 @@ def _iterations(channels: Sequence[ChannelInfo]) -> int:
     return sum(c.messages for c in channels if c.topic == SIGNALS_TOPIC)
 
 
-def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
+def _describe_place(place: Path, *, alone: bool) -> Iterator[LogInfo]:
     """Describe the logs at a place; of several one that cannot be read is described as such."""
-    logs: list[Location] = [place]
+    logs: list[Path] = [place]
     try:
         if not only_foreign(place) and not are_arrays([place]):
             logs = log_files(place)
@@ -244,23 +243,23 @@ def _describe_place(place: Location, *, alone: bool) -> Iterator[LogInfo]:
             yield _unread(log, error)
 
 
-def describe_log(log: Location, *, decode: bool | None = None) -> LogInfo:
-    """Describe a file, its URL, or a folder that is one log; raises as `describe`.
+def describe_log(log: Path, *, decode: bool | None = None) -> LogInfo:
+    """Describe a file or a folder that is one log; raises as `describe`.
 
     What is in it is decoded, only its summary is read, or as much as `CHECK_BYTES` says.
     """
-    if isinstance(log, Path) and only_foreign(log):
+    if only_foreign(log):
         return _describe_foreign(log, 0 if decode is False else CHECK_BYTES)
-    if isinstance(log, Path) and are_arrays([log]):
+    if are_arrays([log]):
         return _describe_arrays(log)
-    store = open_store(log)
-    small = isinstance(log, Path) and store.size <= CHECK_BYTES
+    store = FileStore(log)
+    small = store.size <= CHECK_BYTES
     check: Check = "pass" if (small if decode is None else decode) else "chunks"
     with LogReader(store, salvage=True, check=check) as reader:
         return describe_reader(reader, decode=decode)
 
 
-def _unread(place: str | Location, error: CdmisfaError) -> LogInfo:
+def _unread(place: str | Path, error: CdmisfaError) -> LogInfo:
     crc, state = failed_state(error)
     wrong = (as_problem(place, error),)
     return LogInfo(str(place), "foreign", (), 0, False, crc, wrong, {}, state=state)
@@ -370,12 +369,7 @@ def kind_of(reader: LogReader) -> Kind:
     return "run" if RUN_METADATA in names else "foreign"
 
 
-def moved(problem: Problem, copy: Path, place: Location) -> Problem:
-    """A problem with what was copied called by its own name."""
-    return Problem(problem.where.replace(str(copy), str(place)), problem.what)
-
-
-def as_problem(path: str | Location, error: CdmisfaError) -> Problem:
+def as_problem(path: str | Path, error: CdmisfaError) -> Problem:
     """An error as a problem of the file that it names."""
     return Problem(str(path), str(error).removeprefix(f"{path}: "))
 

@@ -18,7 +18,6 @@ from cdmisfa.modules import Module
 from replay.runs.folders import RUN_FILE, read_run_json, run_log
 from replay.runs.log import read_header
 from replay.runs.modules import load_modules
-from replay.storage.location import Location
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +81,8 @@ class RunInfo:
         return None
 
 
-def run_folder(place: Location) -> Path | None:
+def run_folder(place: Path) -> Path | None:
     """The folder of the run that a place is, if it is one."""
-    if not isinstance(place, Path):
-        return None
     with contextlib.suppress(CdmisfaError):
         log = run_log(place)
         return log.parent if log.name.startswith(RUN_FILE) else None

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import struct
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,12 +19,12 @@ from recorder.mcap.chunks import UNUSED
 from recorder.mcap.mending import mended
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem
-from recorder.mcap.store import PARTIAL
+from recorder.mcap.store import PARTIAL, FileStore
 from replay.camera_logs.opening import only_foreign
 from replay.integrity.counting import ChannelCount
-from replay.integrity.info import SCHEMA, moved, problems_of
-from replay.storage.location import Location, location
-from replay.storage.opening import fetched, log_files, open_store
+from replay.integrity.info import SCHEMA, problems_of
+from replay.storage.location import location
+from replay.storage.opening import log_files
 
 _HASHED: Final = struct.Struct("<HIQQ")
 """Of a message, before its payload: channel, sequence, log time, publish time."""
@@ -70,12 +70,11 @@ class Recovery:
         return {"schema": SCHEMA, "out": found.pop("out"), "complete": self.complete, **found}
 
 
-def recover_log(src: str | Location, dst: str | Path, *, force: bool = False) -> Recovery:
+def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Recovery:
     """Write a complete, indexed log of everything in `src` that is readable.
 
     The new file is read again, with its checksums, and compared before this returns.
-    Of a folder each log is recovered into the folder `dst`. What lies behind a URL is copied
-    first.
+    Of a folder each log is recovered into the folder `dst`.
 
     Raises:
         UsageError: no such log, one of another kind than MCAP, or the output exists and `force` is
@@ -83,20 +82,13 @@ def recover_log(src: str | Location, dst: str | Path, *, force: bool = False) ->
         LogDamagedError: not an MCAP file, or nothing in it can be saved.
         LogWriteError: the disk does not take it.
     """
-    place, dst = location(src), Path(dst)
-    with fetched(place) as copy:
-        found = _recover(copy, dst, force)
-    lost, right = ([moved(p, copy, place) for p in those] for those in (found.lost, found.mended))
-    return replace(found, lost=tuple(lost), mended=tuple(right))
-
-
-def _recover(src: Path, dst: Path, force: bool) -> Recovery:
+    src, dst = location(src), Path(dst)
     if src.exists() and only_foreign(src):
         raise UsageError(
             f"{src} is no MCAP file, and others are not recovered: learn and convert pass over "
             "broken images of them with --salvage"
         )
-    files = [file for file in log_files(src) if isinstance(file, Path)]
+    files = log_files(src)
     targets = [dst]
     if src.is_dir():
         if dst.exists() and not dst.is_dir():
@@ -146,7 +138,7 @@ def _opened(src: Path) -> Iterator[tuple[LogReader, tuple[Problem, ...]]]:
         if not reader.problems:
             yield reader, ()
             return
-    store = mended(open_store(src))
+    store = mended(FileStore(src))
     with LogReader(store, salvage=True) as reader:
         yield reader, tuple(Problem(f"{src}: {p.where}", p.what) for p in store.mended)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Final, Literal
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.mcap.reader import LogReader
 from replay.inputs import locations
-from replay.storage.location import Location
 
 State = Literal["whole", "unchecked", "not read", "cut short", "damaged"]
 """Unchecked: nothing is wrong as far as was looked. Not read: no log, or not one that is read."""
@@ -38,14 +38,14 @@ def failed_state(error: CdmisfaError) -> tuple[Crc, State]:
 
 
 def located(
-    words: Sequence[str | Location],
-) -> tuple[list[Location], list[tuple[str, CdmisfaError]]]:
+    words: Sequence[str | Path],
+) -> tuple[list[Path], list[tuple[str, CdmisfaError]]]:
     """The places that words name, and each word of several that names none, with why.
 
     Raises:
         UsageError: there is one word, and it names none.
     """
-    places: list[Location] = []
+    places: list[Path] = []
     refused: list[tuple[str, CdmisfaError]] = []
     for word in words:
         try:

@@ -27,7 +27,7 @@ from replay.camera_logs.opening import (
 from replay.camera_logs.stream import ImageStream
 from replay.camera_logs.table import table_notes
 from replay.integrity.counting import count_messages
-from replay.integrity.info import SCHEMA, as_problem, kind_of, moved, problems_of
+from replay.integrity.info import SCHEMA, as_problem, kind_of, problems_of
 from replay.integrity.state import Crc, State, crc_of, failed_state, located, state_of, worst
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
@@ -36,8 +36,8 @@ from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, read_header
 from replay.runs.modules import load_modules
 from replay.runs.run import facts_sha256
 from replay.storage.arrays import MAX_BYTES
-from replay.storage.location import Location, location
-from replay.storage.opening import fetched, log_files, open_store
+from replay.storage.location import location
+from replay.storage.opening import log_files
 
 
 class RunPass:
@@ -180,7 +180,7 @@ class LogCheck:
         return {"schema": SCHEMA, "ok": self.ok, "state": self.state, **asdict(self)}
 
 
-def check_logs(*words: str | Location) -> LogCheck:
+def check_logs(*words: str | Path) -> LogCheck:
     """Check several logs, each by itself; see `check_log`, which raises where there is one."""
     named, refused = located(words)
     checks = []
@@ -199,14 +199,12 @@ def check_logs(*words: str | Location) -> LogCheck:
     )
 
 
-def _unread(place: str | Location, error: CdmisfaError) -> LogCheck:
+def _unread(place: str | Path, error: CdmisfaError) -> LogCheck:
     return LogCheck((as_problem(place, error),), (FileCheck(str(place), *failed_state(error)),))
 
 
-def check_log(path: str | Location) -> LogCheck:
+def check_log(path: str | Path) -> LogCheck:
     """Check a log, or all logs of a folder, by decoding everything in them, in one pass of each.
-
-    What lies behind a URL is copied first, for all of it is needed more than once.
 
     Of a run also: its signals and, in its folder, the files beside its log are those that its
     final record states. Of a recording also: each view has every frame once; of a folder, that
@@ -219,33 +217,30 @@ def check_log(path: str | Location) -> LogCheck:
         CdmisfaError: a package that reads it is missing.
     """
     place = location(path)
-    if isinstance(place, Path) and only_foreign(place):
+    if only_foreign(place):
         return _check_images(place)
     problems: list[Problem] = []
     files: list[FileCheck] = []
     views: list[_ViewPass] = []
     notes: list[str] = []
-    beside = isinstance(place, Path) and place.is_dir()
-    with fetched(place) as copy:
-        for file in log_files(copy):
-            checked, found, passed = _check_file(file, beside=beside)
-            problems += found
-            files.append(replace(checked, file=checked.file.replace(str(copy), str(place))))
-            if checked.crc == "absent":
-                notes.append(f"{files[-1].file}: {NO_CHECKSUMS}")
-            if isinstance(passed, _ViewPass):
-                views.append(passed)
-            elif passed is not None and not found:
-                problems += passed.problems()
-                notes += passed.notes()
-            elif not found:
-                told = _check_topics(file, image_topics(file))
-                problems += told.problems
-                notes += told.notes
-        if views:
-            problems += _check_views(views, alone=copy.is_file())
-    unique = dict.fromkeys(moved(problem, copy, place) for problem in problems)
-    return LogCheck(tuple(unique), tuple(files), tuple(dict.fromkeys(notes)))
+    for file in log_files(place):
+        checked, found, passed = _check_file(file, beside=place.is_dir())
+        problems += found
+        files.append(checked)
+        if checked.crc == "absent":
+            notes.append(f"{file}: {NO_CHECKSUMS}")
+        if isinstance(passed, _ViewPass):
+            views.append(passed)
+        elif passed is not None and not found:
+            problems += passed.problems()
+            notes += passed.notes()
+        elif not found:
+            told = _check_topics(file, image_topics(file))
+            problems += told.problems
+            notes += told.notes
+    if views:
+        problems += _check_views(views, alone=place.is_file())
+    return LogCheck(tuple(dict.fromkeys(problems)), tuple(files), tuple(dict.fromkeys(notes)))
 
 
 def _check_images(path: Path) -> LogCheck:
@@ -265,7 +260,7 @@ def _check_images(path: Path) -> LogCheck:
     return replace(found, files=files, notes=(*notes, *found.notes))
 
 
-def _check_topics(path: Location, topics: Iterable[str]) -> LogCheck:
+def _check_topics(path: Path, topics: Iterable[str]) -> LogCheck:
     """Decode every image on some topics of a camera log."""
     problems: list[Problem] = []
     missing: dict[str, None] = {}
@@ -298,7 +293,7 @@ def _broken(images: ImageStream) -> Iterator[Problem]:
 class _ViewPass:
     """Checks the frames of one file of a recording while its chunks are decoded."""
 
-    def __init__(self, path: Location, reader: LogReader) -> None:
+    def __init__(self, path: Path, reader: LogReader) -> None:
         self.path = path
         self.view: ViewFile | None = None
         self.error: LogDamagedError | None = None
@@ -324,10 +319,10 @@ class _ViewPass:
 
 
 def _check_file(
-    path: Location, *, beside: bool
+    path: Path, *, beside: bool
 ) -> tuple[FileCheck, list[Problem], _ViewPass | RunPass | None]:
     try:
-        with LogReader(open_store(path), salvage=True, check="pass") as reader:
+        with LogReader(path, salvage=True, check="pass") as reader:
             passed = _pass_of(path, reader, beside)
             told = passed.add if passed else lambda _: None
             counts = count_messages(reader, decode=True, told=told)
@@ -348,10 +343,10 @@ def _check_file(
         return FileCheck(str(path), "bad", "damaged"), [as_problem(path, error)], None
 
 
-def _pass_of(path: Location, reader: LogReader, beside: bool) -> _ViewPass | RunPass | None:
+def _pass_of(path: Path, reader: LogReader, beside: bool) -> _ViewPass | RunPass | None:
     """The check of a log's content while it is decoded, if it is a recording or a run."""
     kind = kind_of(reader)
-    if kind == "run" and isinstance(path, Path) and reader.complete:
+    if kind == "run" and reader.complete:
         return RunPass(path, reader, beside=beside)
     return _ViewPass(path, reader) if kind == "recording" else None
 

@@ -26,9 +26,8 @@ from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import PARTIAL
 from replay.recordings.view_file import ViewFile, intersection
-from replay.storage.identity import Identity, LoggedSource, log_identity
-from replay.storage.location import Location, Url
-from replay.storage.opening import log_files, open_store
+from replay.storage.identity import Identity, LoggedSource, LogIdentity
+from replay.storage.opening import log_files
 from replay.stored import merged
 
 
@@ -44,7 +43,7 @@ def head_poses(path: Path) -> dict[str, HeadPose]:
     """
     found: dict[str, HeadPose] = {}
     for file in log_files(path):
-        with LogReader(open_store(file)) as reader:
+        with LogReader(file) as reader:
             facts = next((r.values for r in reader.metadata if r.name == RECORDING_METADATA), {})
             pose = first_pose(reader)
         if pose is not None and "view" in facts:
@@ -91,7 +90,7 @@ class RecordedSource(LoggedSource):
 
     Args:
         paths: a recording's folder, or the files of its views, finished or `.partial`; or an
-            S3 prefix, or URLs.
+            URLs.
         loop: begin again at the end instead of stopping there.
         salvage: leave out, in every view, what is damaged in one of them.
         opened: views that were opened already.
@@ -105,7 +104,7 @@ class RecordedSource(LoggedSource):
 
     def __init__(
         self,
-        paths: str | Location | Iterable[str | Location],
+        paths: str | Path | Iterable[str | Path],
         *,
         loop: bool = False,
         salvage: bool = False,
@@ -148,7 +147,7 @@ class RecordedSource(LoggedSource):
         """
         before = {view.path.name.removesuffix(PARTIAL): view for view in self._all()}
         files = log_files(self._paths)
-        there = {path.name.removesuffix(PARTIAL): path for path in files if isinstance(path, Path)}
+        there = {path.name.removesuffix(PARTIAL): path for path in files}
         if not all(n in there and v.reader.is_at(there[n]) for n, v in before.items()):
             return False
         opened: list[ViewFile] = []
@@ -156,7 +155,7 @@ class RecordedSource(LoggedSource):
         try:
             for path in files:
                 view = before.get(path.name.removesuffix(PARTIAL))
-                if view is not None and isinstance(path, Path):
+                if view is not None:
                     view.refresh(path)
                     opened.append(view)
                 elif not _only_begun(path):
@@ -176,7 +175,7 @@ class RecordedSource(LoggedSource):
         return {p[0].facts.view: [r for view in p for r in view.ranges] for p in self._views}
 
     def _logs(self) -> list[Identity]:
-        return [log_identity(view.reader) for view in self._all()]
+        return [LogIdentity(view.reader) for view in self._all()]
 
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """The recording's views with their files, and what was recorded."""
@@ -295,9 +294,9 @@ class RecordedSource(LoggedSource):
         raise AssertionError(f"frame {frame} is in no file")
 
 
-def _only_begun(path: Location) -> bool:
+def _only_begun(path: Path) -> bool:
     """Whether a file is a further part that its recorder had begun, but not a frame of it."""
-    if isinstance(path, Url) or not _FURTHER_PART.fullmatch(path.name):
+    if not _FURTHER_PART.fullmatch(path.name):
         return False
     try:
         with LogReader(path) as reader:
@@ -359,10 +358,9 @@ def _of_several(opened: Sequence[ViewFile]) -> UsageError | None:
     )
 
 
-def _copied(paths: Sequence[Location]) -> str:
+def _copied(paths: Sequence[Path]) -> str:
     """Which file is a copy of another, byte for byte; "" where none is."""
-    files = [path for path in paths if isinstance(path, Path)]
-    for one, two in itertools.combinations(files, 2):
+    for one, two in itertools.combinations(paths, 2):
         if filecmp.cmp(one, two, shallow=False):
             return f"{two} is a copy of {one}: leave one out"
     return ""

@@ -29,8 +29,6 @@ from recorder.log.messages import (
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Segment
 from replay.recordings.rows import ChannelRows, RowLayout
-from replay.storage.location import Location
-from replay.storage.opening import open_store
 
 
 class NoRecordingError(LogDamagedError):
@@ -49,7 +47,7 @@ class ViewFile:
 
     def __init__(
         self,
-        path: Location,
+        path: Path,
         *,
         salvage: bool = False,
         reader: LogReader | None = None,
@@ -67,7 +65,7 @@ class ViewFile:
         """
         self.path = path
         self._by_chunk = reader is not None
-        self.reader = reader or LogReader(open_store(path), salvage=salvage)
+        self.reader = reader or LogReader(path, salvage=salvage)
         try:
             self._open()
         except BaseException:

@@ -13,8 +13,6 @@ from typing import Any, ClassVar, Final
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import check_regular
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import Place
-from replay.storage.location import Url
 from replay.stored import StoredSource
 
 AT_ONCE: Final = 64 * 1024 * 1024
@@ -41,7 +39,7 @@ class Identity(ABC):
         size: bytes that `whole` reads.
     """
 
-    path: Place
+    path: Path
     size: int
 
     @abstractmethod
@@ -159,20 +157,10 @@ class FilesIdentity(_ByteIdentity):
         return found
 
 
-def log_identity(*readers: LogReader) -> Identity:
-    """The identity of a log, given its readers, one at least.
-
-    Of a URL, so that not every byte is read, its size and `index_sha256`: over the file from
-    its data end record on, which holds the checksum of all data and where each chunk is. Where
-    the index does not account for every message, `sha256` over all of it, too.
-    """
-    return (_RemoteIdentity if isinstance(readers[0].path, Url) else _LogIdentity)(*readers)
-
-
-class _LogIdentity(_ByteIdentity):
+class LogIdentity(_ByteIdentity):
     """A log in a file, whose sample holds all from its data end record on."""
 
-    def __init__(self, reader: LogReader, *_: LogReader) -> None:
+    def __init__(self, reader: LogReader) -> None:
         self.path, self.size = reader.path, reader.size
         self._data = reader.data
 
@@ -185,33 +173,10 @@ class _LogIdentity(_ByteIdentity):
         return found.hexdigest()
 
     def sha256(self, counted: Counted) -> str:
-        return self._data.sha256(0, counted)
+        return self._data.sha256(counted)
 
     def changed(self) -> bool:
         return self._data.changed()
-
-
-class _RemoteIdentity(Identity):
-    """A log behind a URL, of which not all is read."""
-
-    def __init__(self, *readers: LogReader) -> None:
-        self.path, self.size = readers[0].path, 0
-        self._readers = readers
-        self._known: dict[str, Any] | None = None
-
-    def sample(self) -> dict[str, Any]:
-        return self.whole(lambda count: None)
-
-    def whole(self, counted: Counted) -> dict[str, Any]:
-        reader = self._readers[0]
-        if self._known is None:
-            name = "index_sha256" if reader.by_index else "sha256"
-            known = {"file": self.path.name, "url": str(self.path), "bytes": reader.size}
-            self._known = {**known, name: reader.digest()}
-        else:
-            for reader in self._readers:
-                reader.confirm()
-        return self._known
 
 
 class LoggedSource(StoredSource):

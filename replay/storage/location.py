@@ -1,146 +1,113 @@
-"""Where a log is, a path or a URL, and how long its server is waited for."""
+"""Where a log is: a path, or a URL, of which fsspec makes a copy on this machine."""
 
 from __future__ import annotations
 
-import contextlib
+import atexit
+import functools
+import hashlib
+import os
 import re
-from collections.abc import Iterator
-from contextvars import ContextVar
-from dataclasses import dataclass
+import shutil
+import tempfile
 from pathlib import Path
-from typing import Final
-from urllib.parse import unquote, urlsplit
+from typing import Any, Final
 
-from cdmisfa.core.errors import UsageError
-from cdmisfa.core.options import setting
+from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 
 SCHEMES: Final = ("s3", "http", "https")
+COPIES: Final = "CDMISFA_COPIES"
+"""Environment variable with the folder of copies, so that processes started here share it."""
+
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@|[?#].*")
-_URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://", re.ASCII)
+_SILENT_SECONDS: Final = 60.0
+"""How long a web server may send nothing: aiohttp's own limit of 300 s in all ends large copies."""
 
 
-@dataclass(frozen=True, slots=True)
-class Url:
-    """A log on a server, by its whole address; as a text it shows no password or signature."""
-
-    address: str
-
-    def __str__(self) -> str:
-        if self.scheme == "s3":
-            return self.address
-        parts = urlsplit(self.address)
-        return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
-
-    @property
-    def scheme(self) -> str:
-        """One of s3, http and https."""
-        return self.address.split("://", 1)[0]
-
-    @property
-    def name(self) -> str:
-        """The last part of its path, fit for a file."""
-        last = str(self).rstrip("/").split("://", 1)[1].rsplit("/", 1)[-1]
-        name = re.sub(r"[/\\\0]", "_", last if self.scheme == "s3" else unquote(last))
-        return "log" if name in ("", ".", "..") else name
-
-    @property
-    def stem(self) -> str:
-        """See `Path.stem`."""
-        return Path(self.name).stem
-
-    @property
-    def suffix(self) -> str:
-        """See `Path.suffix`."""
-        return Path(self.name).suffix
-
-    @property
-    def parent(self) -> Url:
-        """What it lies in, without a password, or what follows the path."""
-        return Url(str(self).rstrip("/").rsplit("/", 1)[0])
-
-    @property
-    def folder(self) -> bool:
-        """Whether it names what is listed; only s3 lists."""
-        return self.scheme == "s3" and self.suffix not in (".mcap", ".partial")
+def is_url(word: str | Path) -> bool:
+    """Return whether a word names a log on a server."""
+    return isinstance(word, str) and "://" in word
 
 
-Location = Path | Url
-"""Where a log is."""
+def location(word: str | Path) -> Path:
+    """Return a path as it is, and for a URL the path of a copy.
 
-
-def location(value: str | Path | Url) -> Location:
-    """Tell a URL from a path.
+    The copy is made once and removed when the process ends.
 
     Raises:
-        UsageError: a URL of a kind that is not read, or no name at all.
+        UsageError: the word is empty, or a URL of a scheme that is not read, or a package that
+            reads URLs is missing.
+        CdmisfaError: the server does not give it.
     """
-    if value == "":
-        raise UsageError("a name is empty: name a path or a URL")
-    found = _URL.match(value) if isinstance(value, str) else None
-    if not isinstance(value, str) or found is None:
-        return value if isinstance(value, Url) else Path(value)
-    scheme = found[1].lower()
+    if not is_url(word):
+        if word == "":
+            raise UsageError("a name is empty: name a path or a URL")
+        return Path(word)
+    return _copied(str(word))
+
+
+def with_urls(text: str) -> str:
+    """Return a text in which the paths of copies are replaced by their URLs."""
+    folder = os.environ.get(COPIES)
+    if folder is None or folder not in text:
+        return text
+    return re.sub(rf"{re.escape(folder)}/\w+/({'|'.join(SCHEMES)})/", r"\1://", text)
+
+
+@functools.cache
+def _copied(address: str) -> Path:
+    shown = _SECRET.sub("", address)
+    scheme, _, place = shown.partition("://")
     if scheme not in SCHEMES:
         raise UsageError(f"{scheme}:// is not read: use one of {', '.join(SCHEMES)}, or a path")
-    url = Url(scheme + value[len(found[1]) :])
-    if scheme == "s3" and url.address.removeprefix("s3://").strip("/"):
-        return url
-    try:
-        parts = urlsplit(url.address)
-    except ValueError:
-        parts = urlsplit("")
-    try:
-        _ = parts.port
-    except ValueError:
-        raise UsageError(f"{url} has no port: a port is a number up to 65535") from None
-    if not (parts.hostname and parts.path.strip("/")):
-        shown = _SECRET.sub("", url.address)
+    key = hashlib.sha256(address.encode()).hexdigest()[:16]
+    parts = [part for part in place.split("/") if part not in ("", ".", "..")]
+    if len(parts) < 2:
         raise UsageError(f"{shown} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
-    return url
-
-
-_PART: Final = 1 << 20
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Time limits for servers, in seconds; `total` is for tries and waits together."""
-
-    total: float = setting(
-        60.0,
-        "Give up on a part of a log at a URL (of a large one, on each MiB) after so long.",
-        unit="SECONDS",
-        name="timeout",
-        least=0.1,
-        most=1e6,
-    )
-    read: float = setting(
-        20.0,
-        "Ask a server again that sends nothing for so long.",
-        unit="SECONDS",
-        name="read-timeout",
-        least=0.1,
-        most=1e6,
-    )
-
-    def of(self, count: int) -> float:
-        """Seconds for `count` bytes."""
-        return self.total * max(1.0, count / _PART)
-
-
-_LIMITS: Final = ContextVar("limits", default=Limits())  # noqa: B039 - it is frozen
-
-
-def limits() -> Limits:
-    """The limits in force."""
-    return _LIMITS.get()
-
-
-@contextlib.contextmanager
-def limited(chosen: Limits) -> Iterator[None]:
-    """Use these limits for the servers that are connected to in the body."""
-    before = _LIMITS.set(chosen)
+    target = _folder().joinpath(key, scheme, *parts)
     try:
-        yield
-    finally:
-        _LIMITS.reset(before)
+        _copy(scheme, address, target)
+    except ImportError as error:
+        raise UsageError(
+            f"{shown}: reading URLs needs packages that are not installed ({one_line(error)}): "
+            "pip install 'cdmisfa[cloud]'"
+        ) from None
+    except FileNotFoundError:
+        raise CdmisfaError(f"{shown}: there is no such file") from None
+    except Exception as error:  # whatever fsspec's file systems raise
+        what = one_line(error).replace(address, shown)
+        raise CdmisfaError(f"{shown}: {what}") from error
+    return target
+
+
+def _copy(scheme: str, address: str, target: Path) -> None:
+    """Copy a file, or the logs right below an S3 prefix, unless another process has done so."""
+    import fsspec
+
+    if target.exists():
+        return
+    options: dict[str, Any] = {}
+    if scheme != "s3":
+        import aiohttp
+
+        options["client_kwargs"] = {
+            "timeout": aiohttp.ClientTimeout(total=None, sock_read=_SILENT_SECONDS)
+        }
+    files = fsspec.filesystem(scheme, **options)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(dir=_folder())) / target.name
+    if scheme == "s3" and files.isdir(address):
+        partial.mkdir()
+        for name in files.ls(address, detail=False):
+            if name.endswith((".mcap", ".mcap.partial")):
+                files.get_file(name, str(partial / name.rpartition("/")[2]))
+    else:
+        files.get_file(address, str(partial))
+    partial.rename(target)
+
+
+def _folder() -> Path:
+    """Return the folder of copies."""
+    if COPIES not in os.environ:
+        os.environ[COPIES] = tempfile.mkdtemp(prefix="cdmisfa-")
+        atexit.register(shutil.rmtree, os.environ[COPIES], ignore_errors=True)
+    return Path(os.environ[COPIES])

@@ -25,7 +25,7 @@ from replay.recordings.source import first_pose
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, Frames, RunHeader
 from replay.runs.run import Outline
-from replay.storage.opening import log_files, open_store
+from replay.storage.opening import log_files
 from replay.view.columns import Column, Target
 from replay.view.labels import label, part
 from replay.view.layouts import Bounds, Lesson, WorldTab
@@ -210,7 +210,7 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
     """
     data, pose = b"{}", None
     for file in log_files(path):  # the first has it, unless they are many
-        with LogReader(open_store(file)) as reader:
+        with LogReader(file) as reader:
             if own := [entry for entry in reader.attachments if entry.name == CONFIG_NAME]:
                 data, pose = bytes(reader.attachment_data(own[0])), first_pose(reader)
                 break

@@ -15,8 +15,8 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
@@ -47,14 +47,12 @@ class Case:
         group: which row of the page's data it belongs to.
         served: whether it is to succeed.
         begin: makes what there is.
-        environment: of the command, where that differs.
     """
 
     words: tuple[object, ...]
     group: str
     served: bool = False
     begin: Callable[[], object] = int
-    environment: Mapping[str, str] = field(default_factory=dict)
 
 
 def _listening(host: str) -> socket.socket:
@@ -144,11 +142,10 @@ def _lying(host: str, lie: Callable[[socket.socket], object]) -> None:
     threading.Thread(target=accept, daemon=True).start()
 
 
-def _reading(host: str) -> list[tuple[str, tuple[object, ...], dict[str, str]]]:
+def _reading(host: str) -> list[tuple[str, tuple[object, ...]]]:
     """List commands that read from a host."""
-    limits = ("--timeout", TIMEOUT, "--read-timeout", TIMEOUT / 2)
-    live = [
-        (kind, ("record", address, "--frames", 2, "--size", "16x12", "-o", "out"), {})
+    return [
+        (kind, ("record", address, "--frames", 2, "--size", "16x12", "-o", "out"))
         for kind, address in {
             "foxglove": f"foxglove://{host}/cam",
             "rtsp": f"rtsp://{host}/cam",
@@ -156,10 +153,6 @@ def _reading(host: str) -> list[tuple[str, tuple[object, ...], dict[str, str]]]:
             "tcp": f"tcp://{host}",
         }.items()
     ]
-    logs = [(kind, ("info", f"{kind}://{host}/a.mcap", *limits), {}) for kind in ("http", "https")]
-    keys = {"AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": PASSWORD}
-    stored = ("info", "s3://bucket/a.mcap", *limits)
-    return [*live, *logs, ("s3", stored, {"AWS_ENDPOINT_URL": f"http://{host}", **keys})]
 
 
 def prepare(folder: Path) -> list[Case]:
@@ -184,17 +177,13 @@ def prepare(folder: Path) -> list[Case]:
         )
     ]
     addresses = [
-        Case(words, f"address: {kind}", environment=more)
-        for host in HOSTS
-        for kind, words, more in _reading(host)
+        Case(words, f"address: {kind}") for host in HOSTS for kind, words in _reading(host)
     ]
     liars = [
-        Case(
-            words, f"{said}: {kind}", begin=lambda h=host, lie=lie: _lying(h, lie), environment=more
-        )
+        Case(words, f"{said}: {kind}", begin=lambda h=host, lie=lie: _lying(h, lie))
         for host in ("127.0.0.1", "::1")
         for said, lie in LIARS.items()
-        for kind, words, more in _reading(f"[{host}]:{PORT}" if ":" in host else f"{host}:{PORT}")
+        for kind, words in _reading(f"[{host}]:{PORT}" if ":" in host else f"{host}:{PORT}")
     ]
     cameras._TIMEOUT = TIMEOUT  # type: ignore[misc]
     found = [*ports, *addresses, *liars]
@@ -210,7 +199,6 @@ def case(job: Job) -> Outcome:
     with socket.socket() as any_socket:
         fcntl.ioctl(any_socket, SIOCSIFFLAGS, struct.pack("16sh14x", b"lo", IFF_UP))
     kept = case.begin()
-    os.environ |= case.environment
     process = (Process if case.begin is _unprivileged else Fork)(job.folder, *case.words)
     # what serves says where, and goes on
     until(lambda: not process.running or "://" in process.ran().out, LIMIT + TIMEOUT)

@@ -16,7 +16,6 @@ CAMPAIGNS = {
     "races": 2,
     "clocks": 0,
     "addresses": 6,
-    "servers": 0,
     "damage": 3,
     "bombs": 0,
     "histories": 1,

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.apply import Application, Totals
     from recorder.cameras.options import LiveOptions
-    from replay.storage.location import Location
 
 MOST_SAID = 20
 """Logs of which is said what went wrong."""
@@ -70,7 +69,6 @@ log_options = options_of(
 @options.jobs
 @options.engine
 @options.retry_failed
-@options.server_limits
 @options.force
 @options.as_json
 @options.quiet
@@ -340,7 +338,6 @@ def logs_of(source: Sequence[str]) -> list[list[str]]:
     from recorder.world.scenes import SCENES
     from replay.corpus.finding import may_be_corpus
     from replay.inputs import locations
-    from replay.storage.location import Url
 
     if any(map(is_live, source)):
         return [list(source)]
@@ -349,13 +346,13 @@ def logs_of(source: Sequence[str]) -> list[list[str]]:
         if word in SCENES:
             found.append([word])
             continue
-        logs: Sequence[Sequence[Location]] | None = None
+        logs: Sequence[Sequence[Path]] | None = None
         if may_be_corpus([word]):
             from replay.corpus.logs import logs_of_corpus
 
             logs = logs_of_corpus([word])
         for log in logs or [[place] for place in locations([word])]:
-            found.append([p.address if isinstance(p, Url) else str(p) for p in log])
+            found.append(list(map(str, log)))
     return found
 
 

@@ -39,7 +39,6 @@ JOBS = number("--jobs", "Parallel processes; by default as many as there are pro
 @flag("--deep", "Decode every log: checksums, gaps, shapes, and what is twice in other files.")
 @flag("--full", "Read every byte: what changed shows by SHA-256, not by size and time.")
 @JOBS
-@options.server_limits
 @options.as_json
 @options.quiet
 @click.pass_context

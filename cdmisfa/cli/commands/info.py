@@ -31,7 +31,6 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
 @click.command("info")
 @click.argument("path", nargs=-1, required=True, type=options.WORD)
-@options.server_limits
 @options.as_json
 @click.pass_context
 def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
@@ -39,7 +38,7 @@ def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> No
 
     PATH may be several, a pattern such as 'logs/*.mcap', or a URL. Exits with 3 when one is cut
     short or damaged, else with 2 when one of several is no log. What only `verify` reads, images
-    in logs of others, videos, bags, tables, all at URLs or above 1 GiB, is called unchecked.
+    in logs of others, videos, bags, tables, all above 1 GiB, is called unchecked.
     """
     from replay.integrity.info import describe
     from replay.integrity.state import EXIT_CODES

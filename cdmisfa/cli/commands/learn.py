@@ -99,7 +99,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
 @options.keyframes
 @options.log_options
 @options.live_options
-@options.server_limits
 @options.force
 @options.as_json
 @options.quiet

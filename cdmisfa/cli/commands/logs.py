@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 @click.command("verify")
 @click.argument("path", nargs=-1, required=True, type=options.WORD)
-@options.server_limits
 @options.as_json
 @click.pass_context
 def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
@@ -60,7 +59,6 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
 @click.command("recover")
 @click.argument("path", type=options.WORD)
 @options.out("The whole log to write.", required=True)
-@options.server_limits
 @options.force
 @options.as_json
 @click.pass_context
@@ -121,7 +119,6 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
     "FILE",
 )
 @word("--split", "LIMIT", "Begin a new file after this size or time: 512MB, 10min.")
-@options.server_limits
 @options.force
 @options.as_json
 def cut_command(log: tuple[str, ...], split: str | None, as_json: bool, **chosen: Any) -> None:
@@ -147,9 +144,8 @@ def cut_command(log: tuple[str, ...], split: str | None, as_json: bool, **chosen
 
 
 @click.command("compare")
-@options.fetched_argument("runs", nargs=-1)
+@options.log_argument("runs", nargs=-1)
 @options.path("--save", "Also write their curves, one over the other, as a view.", "F.rrd")
-@options.server_limits
 @options.force
 @options.as_json
 @click.pass_context
@@ -220,7 +216,7 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
 
 
 @click.command("export")
-@options.fetched_argument("path", nargs=-1)
+@options.log_argument("path", nargs=-1)
 @option(
     "--to",
     "form",
@@ -232,7 +228,6 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
 @flag("--lossless", "Keep every value of images in a video.")
 @word("--task", "TEXT", "What is done in a LeRobot dataset; by default what a log says.")
 @options.look_options
-@options.server_limits
 @options.force
 @options.as_json
 def export_command(

@@ -35,7 +35,6 @@ source = word(
 @options.path_argument("run")
 @click.argument("iterations", metavar="K", type=click.IntRange(0))
 @source
-@options.server_limits
 @options.as_json
 def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: bool) -> None:
     """Say what a learner was after K iterations of a run, exactly.
@@ -89,7 +88,6 @@ def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: boo
     help="End before this one; else at the end.",
 )
 @source
-@options.server_limits
 @options.as_json
 @click.pass_context
 def check_command(
@@ -128,7 +126,6 @@ def check_command(
 @source
 @options.no_rerun
 @options.keyframes
-@options.server_limits
 @options.force
 @options.as_json
 @options.quiet

@@ -185,7 +185,6 @@ def _record_scene(
 @options.live_options
 @options.salvage
 @flag("--resume", "Resume an attempt that was stopped.")
-@options.server_limits
 @options.force
 @options.as_json
 @options.quiet

@@ -10,13 +10,13 @@ from cdmisfa.cli import options
 from cdmisfa.cli.printing import print_document, print_line, quoted, warn
 from cdmisfa.core.errors import one_line
 from replay.camera_logs.options import CameraOptions
+from replay.storage.location import with_urls
 
 
 @click.command("report")
-@options.fetched_argument("source", nargs=-1)
+@options.log_argument("source", nargs=-1)
 @options.out("The page, *.html; by default report.html in the folder of the one run.")
 @options.look_options
-@options.server_limits
 @options.force
 @options.as_json
 def report_command(
@@ -35,7 +35,7 @@ def report_command(
     """
     from cdmisfa.experiments.reports import write_report
 
-    if out is None and any(map(options.is_fetched, source)):
+    if out is None and any(with_urls(str(path)) != str(path) for path in source):
         raise click.UsageError("of what is behind a URL say where the report goes: -o F.html")
     page = write_report(source, out, cameras=cameras, force=force)
     if as_json:

@@ -55,7 +55,6 @@ MOST_SEEDS = 1_000_000
 @options.engine
 @flag("--keep-logs", "Keep the run of every trial, with its log.")
 @options.retry_failed
-@options.server_limits
 @options.as_json
 @options.quiet
 @click.pass_context

@@ -18,7 +18,7 @@ from replay.camera_logs.options import CameraOptions
 
 
 @grouped("view", common=("save", "web", "screenshot", "at", "tab", "every"))
-@options.fetched_argument("run", nargs=-1)
+@options.log_argument("run", nargs=-1)
 @options.path("--save", "Write the view to a file.", "F.rrd")
 @flag("--web", "Serve the view to a browser on this machine only.")
 @options.path("--screenshot", "Draw the view into a file, without a screen.", "F.png")
@@ -49,7 +49,6 @@ from replay.camera_logs.options import CameraOptions
     show_default=True,
 )
 @options.look_options
-@options.server_limits
 @options.force
 def view_command(
     run: tuple[Path, ...],

@@ -39,7 +39,6 @@ from recorder.log.files import (
 from replay.camera_logs.options import CameraOptions
 from replay.corpus.finding import INDEX
 from replay.corpus.index import IndexedLog, index_logs, indexed_logs, is_index
-from replay.storage.location import Limits, limited, limits
 
 STORE: Final = "_applied"
 """Folder of what is known of the logs; programs that read data sets pass over names like it."""
@@ -71,7 +70,6 @@ class ApplyTrial(StoredTrial):
         part: where the file is written until it is whole.
         options: for `Application.open`.
         frames: end after so many.
-        limits: of the time for servers that the log is on.
     """
 
     name: str
@@ -80,7 +78,6 @@ class ApplyTrial(StoredTrial):
     part: Path
     options: Mapping[str, Any]
     frames: int | None
-    limits: Limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +182,6 @@ def apply_to_logs(
                 part=parts / _file_name(name, form),
                 options=options,
                 frames=frames,
-                limits=limits(),
             )
             for name, files, states in logs
         ]
@@ -222,7 +218,7 @@ def compute(trial: ApplyTrial) -> Mapping[str, Any]:
 def _compute(trial: ApplyTrial) -> dict[str, Any]:
     application = trial.application
     named = trial.name if trial.part.suffix in _TABLES else None
-    with limited(trial.limits), contextlib.ExitStack() as opened:
+    with contextlib.ExitStack() as opened:
         source = application.open(trial.files, **trial.options)
         opened.callback(source.close)
         about = source.spec, application.modules
