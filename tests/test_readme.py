@@ -59,7 +59,6 @@ def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
         "runs/live/report.html",
         "signals.parquet",
         "left-again.mcap",
-        "scene.png",
         "runs/icub/run.rrd",
         "applied/view.rrd",
         "applied/all/icub.parquet",

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import io
 import json
 import re
 import shutil
@@ -13,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from PIL import Image
 from report_data import HOSTILE, RULES, Page, pictured_run
 from run_data import IMAGE, PROGRESS, VECTOR, by_progress, module_of, write_run
 
@@ -22,7 +19,6 @@ from cdmisfa.agents.progress import judging
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments import reports
 from cdmisfa.experiments.reports import command_again, write_report
-from replay.camera_logs.options import CameraOptions
 from replay.report import conditions
 from replay.report.conditions import LIVELY, attempts, conditions_of, deciding
 from replay.report.page import MOST_BYTES
@@ -294,49 +290,13 @@ def test_several_runs_a_folder_of_them_and_a_sweep(cdmisfa: Cdmisfa, tmp_path: P
     assert cdmisfa("report", sweep / "trials", "-o", tmp_path / "folder.html").code == 0
 
 
-def test_a_recording_shows_its_streams_and_what_the_world_knew(
-    oscillatory_recording: Path, tmp_path: Path
-) -> None:
-    page = Page(write_report([oscillatory_recording], tmp_path / "r.html"))
-    for text in ("3 streams, 2,000 frames each at 50 a second (40.0 s)", "No stream has a gap."):
-        assert text in page.text
-    for text in ("theta", f"cdmisfa verify {oscillatory_recording}"):
-        assert text in page.text
-
-
-def test_gaps_of_other_logs_are_counted(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    table, page = tmp_path / "arm.csv", tmp_path / "r.html"
-    times = [i / 10 for i in range(300) if not 100 <= i < 160]
-    table.write_text("".join(["time,a,b\n", *(f"{t},{t % 3},{t % 7}\n" for t in times)]))
-    assert cdmisfa("report", table, "--time", "time", "-o", page).code == 0
-    assert "1 stream, 300 frames" in Page(page).text
-    assert re.search(r"missing frames arm 1 (59|60) ", Page(page).text)
-
-
-def test_pictures_of_a_recording_are_those_that_it_holds(tmp_path: Path) -> None:
-    folder, rng = tmp_path / "desk", np.random.default_rng(1)
-    folder.mkdir()
-    for i in range(60):
-        light = np.full((24, 32), 4 * i, np.uint8) + rng.integers(0, 3, (24, 32), np.uint8)
-        Image.fromarray(light).save(folder / f"{i:03}.png")
-    options = CameraOptions(rate=10.0)
-    page = Page(write_report([folder], tmp_path / "r.html", cameras=options))
-    assert "pictures of 32x24." in page.text
-    (shown,) = page.frames.values()
-    data = base64.b64decode(shown["source"].partition(",")[2])
-    sheet = np.asarray(Image.open(io.BytesIO(data)), float)
-    for k, t in enumerate(shown["t"]):
-        y, x = 24 * (k // shown["columns"]), 32 * (k % shown["columns"])
-        assert sheet[y : y + 24, x : x + 32].mean() == pytest.approx(4 * t + 1, abs=2)
-
-
 def test_what_is_refused(
     cdmisfa: Cdmisfa, tmp_path: Path, run: Path, oscillatory_recording: Path
 ) -> None:
     page = tmp_path / "r.html"
     page.write_text("mine")
     for words, said in (
-        ((oscillatory_recording,), "name the file of the report: -o report.html"),
+        ((oscillatory_recording, "-o", tmp_path / "x.html"), "is no run: look at a log with"),
         ((run, run), "name the file of the report"),
         ((run, "-o", page), "exists"),
         ((run, "-o", tmp_path / "r.pdf"), "a report is an HTML page, name it r.html"),

@@ -1,8 +1,7 @@
-"""Reports of runs, sweeps and recordings: one HTML page each, which says what came of them."""
+"""Reports of runs and sweeps: one HTML page each, with the results."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
@@ -26,15 +25,13 @@ def write_report(
     words: Sequence[str | Path],
     out: Path | None = None,
     *,
-    cameras: CameraOptions | None = None,
     force: bool = False,
 ) -> Path:
-    """Write the report of a run, several runs, a sweep, a recording or other logs.
+    """Write the report of a run, of several runs or of a sweep.
 
     Args:
         words: their paths.
         out: the file; by default `report.html` in the folder of the one run, replaced.
-        cameras: what of other logs is shown, and how.
         force: replace an existing file.
 
     Returns:
@@ -53,27 +50,22 @@ def write_report(
         out, force = run_log(paths[0]).parent / REPORT_FILE, True
     refuse_unless(out, "a report is an HTML page", ".html", ".htm")
     refuse_taken(out, force=force)
-    page = _page(paths, runs, cameras or CameraOptions())
+    page = _page(paths, runs)
     with atomic_write(out) as partial:
         partial.write_text(page, encoding="utf-8")
     return out
 
 
-def _page(paths: list[Path], runs: list[Path], cameras: CameraOptions) -> str:
-    from replay.report.page import report_of_recording, report_of_run, report_of_runs
+def _page(paths: list[Path], runs: list[Path]) -> str:
+    from replay.report.page import report_of_run, report_of_runs
 
     if len(paths) == 1 and runs:
         return report_of_run(paths[0], proof_of(paths[0]))
     if len(paths) == 1 and (is_sweep(paths[0]) or runs_in(paths[0])):
         return _of_sweep(paths[0])
-    if runs:
-        if others := [path for path in paths if path not in runs]:
-            raise UsageError(f"{others[0]} is no run: a report compares runs with runs alone")
-        return report_of_runs(paths, f"{len(paths)} runs compared")
-    from replay.inputs import open_to_look  # takes long
-
-    with contextlib.closing(open_to_look(paths, cameras)) as source:
-        return report_of_recording(source, paths)
+    if others := [path for path in paths if path not in runs]:
+        raise UsageError(f"{others[0]} is no run: look at a log with cdmisfa info or cdmisfa view")
+    return report_of_runs(paths, f"{len(paths)} runs compared")
 
 
 def _is_run(path: Path) -> bool:

@@ -5,6 +5,6 @@ from cdmisfa.core.exports import exports
 __getattr__, __dir__, __all__ = exports(
     __name__,
     {
-        "replay.report.page": "report_of_recording report_of_run report_of_runs",
+        "replay.report.page": "report_of_run report_of_runs",
     },
 )

@@ -15,7 +15,6 @@ from markupsafe import Markup
 from replay.palette import CYCLE
 from replay.palette import STATES as STATE_COLOURS
 from replay.report.content import run_content
-from replay.report.recording import recording_content
 from replay.report.several import runs_content
 from replay.report.told import read_told
 from replay.report.trust import Proof
@@ -65,16 +64,6 @@ def report_of_runs(
         LogDamagedError: one cannot be read.
     """
     return rendered(runs_content(paths, title, tables, names))
-
-
-def report_of_recording(source: Any, paths: Sequence[Path]) -> str:
-    """The page of a recording or of other logs.
-
-    Args:
-        source: a `StoredSource`, open.
-        paths: what it reads.
-    """
-    return rendered(recording_content(source, paths))
 
 
 def rendered(content: Mapping[str, Any]) -> str:

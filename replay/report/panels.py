@@ -269,24 +269,13 @@ def world_plot(told: RunTold, module: ModuleTold, fit: Fit) -> Plot:
     return plot
 
 
-def numbers_plot(
-    rows: NDArray[Any], about: str, height: int = 76, t: NDArray[Any] | None = None
-) -> Plot:
-    """Rows of numbers over time, (n, I): the first seven of them.
-
-    Args:
-        rows: the numbers.
-        about: what it shows.
-        height: pixels.
-        t: (n,) their frames, where there shall be axes.
-    """
+def numbers_plot(rows: NDArray[Any], about: str) -> Plot:
+    """Draw rows of numbers over time, (n, I), the first seven of them."""
     values = np.asarray(rows, dtype=np.float64).reshape(len(rows), -1)[:, :7]
     low, high = padded(values, log=False)
-    at = np.arange(len(values), dtype=np.float64) if t is None else t.astype(np.float64)
-    across = Axis(float(at[0]), float(max(at[-1], at[0] + 1)), WIDE)
-    plot = Plot(across, Axis(low, high, height, turned=True), about)
-    if t is not None:
-        plot.grid(4)
+    at = np.arange(len(values), dtype=np.float64)
+    across = Axis(0.0, max(len(values) - 1.0, 1.0), WIDE)
+    plot = Plot(across, Axis(low, high, 76, turned=True), about)
     for i in range(values.shape[1]):
         plot.line(f"c{i}", at, values[:, i])
     return plot

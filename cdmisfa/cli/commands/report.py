@@ -9,35 +9,32 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.printing import print_document, print_line, quoted, warn
 from cdmisfa.core.errors import one_line
-from replay.camera_logs.options import CameraOptions
 from replay.storage.location import with_urls
 
 
 @click.command("report")
-@options.log_argument("source", nargs=-1)
+@options.log_argument("run", nargs=-1)
 @options.out("The page, *.html; by default report.html in the folder of the one run.")
-@options.look_options
 @options.force
 @options.as_json
 def report_command(
-    source: tuple[Path, ...],
+    run: tuple[Path, ...],
     out: Path | None,
     force: bool,
     as_json: bool,
-    cameras: CameraOptions,
 ) -> None:
     """Write what came of a run as one HTML page, to be read, printed or sent.
 
-    SOURCE is the folder of a run; several runs, which are compared; a sweep or another folder of
-    runs; a recording, or camera logs. The page needs no network and no other file: what was
+    RUN is the folder of a run; several runs, which are compared; a sweep or another folder of
+    runs. The page needs no network and no other file: what was
     learned, when, where the learner looked, why it ended, what each module tells apart, and whether
     that can be computed again. `learn` writes that of its run as report.html.
     """
     from cdmisfa.experiments.reports import write_report
 
-    if out is None and any(with_urls(str(path)) != str(path) for path in source):
+    if out is None and any(with_urls(str(path)) != str(path) for path in run):
         raise click.UsageError("of what is behind a URL say where the report goes: -o F.html")
-    page = write_report(source, out, cameras=cameras, force=force)
+    page = write_report(run, out, force=force)
     if as_json:
         print_document(report=page, bytes=page.stat().st_size)
     else:
