@@ -32,7 +32,6 @@ SHOWN: Mapping[str, tuple[object, ...]] = {
     "info": ("rec",),
     "verify": ("rec",),
     "recover": ("rec/x1.mcap", "-o", "saved.mcap"),
-    "cut": ("rec/x1.mcap", "--to", 5, "-o", "part.mcap"),
     "convert": ("sample_logs/icub", "-o", "converted"),
     "export": ("run", "-o", "signals.csv"),
     "compare": ("run", "run"),

@@ -216,7 +216,7 @@ def test_a_log_and_its_conversion_are_learned_alike(
     assert {len(file.get("sha256", "x" * 64)) for file in run["source"]["files"]} == {64}
 
 
-PAGES = ("logs", "numbers", "cutting")
+PAGES = ("logs", "numbers")
 
 
 def test_the_commands_of_the_pages_work(
@@ -234,9 +234,8 @@ def test_the_commands_of_the_pages_work(
     lines = [
         line for block in page.split("```sh")[1:] for line in block.split("```")[0].split("\n")
     ]
-    Path("wanted.csv").write_text("path," + page.split("```\npath,")[1].split("```")[0])
     commands = [shlex.split(line)[1:] for line in lines if line]
-    assert len(commands) == 14
+    assert len(commands) == 10
     for words in commands:
         done = cdmisfa(*words)
         assert done.code == 0, (words, done.err)

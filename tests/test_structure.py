@@ -54,7 +54,6 @@ FORBIDDEN = {
     "replay.camera_logs": ("replay.recordings.source", "replay.view.columns", "rerun"),
     "replay.corpus": ("replay.viewer.program", "cdmisfa.experiments.session", "rerun"),
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
-    "replay.cutting": ("replay.export.frames", "replay.viewer.program", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer.program", "rerun"),
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),
     "replay.report": ("replay.view.columns", "replay.export.frames", "rerun"),

@@ -76,10 +76,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
             "Write a run's signals as a table or arrays, a recording as images, videos or a "
             "dataset.",
         ),
-        "cut": (
-            "logs",
-            "Write a part of MCAP logs, or several joined, messages as they are.",
-        ),
     },
     "Many logs": {
         "index": ("corpus", "Index what is in many logs: streams, times, damage, doubles."),

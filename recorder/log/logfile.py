@@ -18,7 +18,6 @@ from weakref import WeakSet
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import Compression
 from recorder.log.files import partial_path, refuse_held, refuse_special, refuse_taken, to_disk
-from recorder.mcap.records import Channel, Schema, Segment
 from recorder.mcap.writer import McapWriter
 
 FLUSH_NS = 1_000_000_000
@@ -262,15 +261,6 @@ class LogFile:
     ) -> int:
         """Register a channel of messages on a topic, and return its id; schema 0 is none."""
         return self._writer.add_channel(topic, encoding, schema, metadata or {})
-
-    def define(self, schema: Schema | None, channel: Channel) -> None:
-        """Define a channel by the ids that it has in other logs; see `McapWriter.define`."""
-        self._writer.define(schema, channel)
-
-    def add_chunk(self, data: memoryview, chunk: Segment) -> None:
-        """Write a chunk of another log as it is; see `McapWriter.add_chunk`."""
-        self._stream.check()
-        self._writer.add_chunk(data, chunk)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a named string map at once, outside the chunks."""

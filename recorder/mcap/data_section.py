@@ -48,11 +48,6 @@ class DataSection:
         yield (store := OnePass(self.file))
         self.check(store.pass_to(self._structure.data_end))
 
-    @property
-    def vouched(self) -> bool:
-        """Whether a checksum over all of the data is stated."""
-        return bool(self._structure.data_crc)
-
     def check_unproven(self) -> None:
         """Check it for a chunk that has no checksum of its own."""
         if self._structure.by_index:

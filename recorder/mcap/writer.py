@@ -38,11 +38,8 @@ from recorder.mcap.records import (
     INDEX_HEADER,
     MAGIC,
     MESSAGE_HEADER,
-    Segment,
     crc32,
 )
-from recorder.mcap.records import Channel as LogChannel
-from recorder.mcap.records import Schema as LogSchema
 
 _OF_MESSAGE: Final = int(Opcode.MESSAGE)
 _MESSAGE_SIZE: Final = MESSAGE_HEADER.size
@@ -133,17 +130,6 @@ class McapWriter:
         self._define(channel)
         return channel.id
 
-    def define(self, schema: LogSchema | None, channel: LogChannel) -> None:
-        """Define a channel, and its schema, by the ids they have; of a file all are defined so."""
-        self.settle()
-        made: list[Schema | Channel] = []
-        if schema is not None and schema.id not in {known.id for known in self._schemas}:
-            self._schemas.append(Schema(schema.id, schema.data, schema.encoding, schema.name))
-            made.append(self._schemas[-1])
-        of = channel.topic, channel.encoding, channel.metadata, channel.schema_id
-        self._channels.append(Channel(channel.id, *of))
-        self._append(_encoded(*made, self._channels[-1]))
-
     def add_messages(self, messages: Iterable[tuple[int, int, bytes, int, int]]) -> None:
         """Add messages to the chunk: channel, log time, data, publish time and sequence of each."""
         for channel, log_time, data, publish_time, sequence in messages:
@@ -197,35 +183,6 @@ class McapWriter:
             )
         )
         self._append(stored)
-
-    def add_chunk(self, data: memoryview, chunk: Segment) -> None:
-        """Append a chunk of another log as it is, and its message indexes, one a channel.
-
-        Args:
-            data: its bytes from `chunk.offset` to `chunk.stop`; the ids in them are this file's.
-            chunk: what it is, where it was.
-        """
-        self.end_chunk()
-        self.settle()
-        offset = self._out.tell()
-        self._append(data)
-        offsets = {}
-        for part in chunk.indexes:
-            offsets[part.channel] = part.offset - INDEX_HEADER.size - chunk.offset + offset
-            self._counts[part.channel] = self._counts.get(part.channel, 0) + part.count
-        self._chunks.append(
-            ChunkIndex(
-                chunk_length=chunk.data_end - chunk.offset,
-                chunk_start_offset=offset,
-                compression=chunk.compression,
-                compressed_size=chunk.stored,
-                message_end_time=chunk.end,
-                message_index_length=chunk.stop - chunk.data_end,
-                message_index_offsets=offsets,
-                message_start_time=chunk.start,
-                uncompressed_size=chunk.size,
-            )
-        )
 
     def end_chunk(self) -> None:
         """End the chunk in progress, where it holds a message: it is appended, or will be."""

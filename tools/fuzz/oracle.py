@@ -17,10 +17,8 @@ import numpy as np
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError
-from recorder.mcap.chunks import UNUSED
-from recorder.mcap.reader import NO_CHECKSUMS, LogReader, Message
+from recorder.mcap.reader import LogReader, Message
 from recorder.mcap.records import MAX_CHUNK
-from replay.cutting.cut import cut_logs
 from replay.integrity.info import describe
 from replay.integrity.recover import recover_log
 from replay.integrity.verify import check_log
@@ -69,8 +67,6 @@ def check(case: Case, path: Path, number: int = 0) -> None:
         with _only_our_errors():
             check_log(path)
         _recover(path)
-    if number % 5 == 0:
-        _cut(path, seconds=number % 3)
 
 
 def check_memory(case: Case, path: Path) -> None:
@@ -172,26 +168,6 @@ def tabled_rows(view: ViewFile, start: int, frames: np.ndarray, truth: np.ndarra
             places = ends - layout.distances[:, None] + np.arange(layout.width)
             out[at : at + n] = own.data[places].reshape(n, -1)
             at += n
-
-
-def _cut(path: Path, seconds: float) -> None:
-    """Cut from so many seconds on; what is written is sound, and is what a reader gives."""
-    part = path.with_name("part.mcap")
-    with _only_our_errors():
-        made = cut_logs([path], part, start=seconds, force=True)
-        with LogReader(part, check="data") as reader:
-            found = Counter(map(_key, reader.messages()))
-            wrong = [one for one in reader.warnings if not one.endswith((NO_CHECKSUMS, UNUSED))]
-            if wrong:
-                raise BrokenPromise(f"a log that was cut is not sound: {wrong}")
-            lies = any(
-                one.endswith(UNUSED) for one in reader.warnings
-            )  # as in the log that was cut
-        if not lies and found.total() != sum(one.messages for one in made.files):
-            raise BrokenPromise("a cut has other messages than it says")
-        with LogReader(path, salvage=bool(made.problems)) as reader:
-            if found - Counter(map(_key, reader.messages())):
-                raise BrokenPromise("a cut has messages that the log has not")
 
 
 def _recover(path: Path) -> None:

@@ -7,14 +7,12 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks import (
     converting,
-    cutting,
     estimators,
     foreign,
     history,
@@ -35,7 +33,6 @@ from benchmarks import (
     startup,
 )
 from cdmisfa.core.errors import CdmisfaError
-from recorder.mcap.reader import LogReader
 
 
 @pytest.fixture
@@ -263,18 +260,6 @@ def test_converting(tmp_path: Path) -> None:
     ):
         assert converting.decoding(path) == 4
         assert converting.converting(path, tmp_path / "out")() == 4
-
-
-def test_cutting(tmp_path: Path) -> None:
-    logs = [cutting.write(tmp_path / f"{i}.mcap", 40, i) for i in range(2)]
-    how: dict[str, Any] = {"topics": ("/joints",), "stop": 1.0}
-    for of in (logs[:1], logs):
-        ours, theirs = tmp_path / "a.mcap", tmp_path / "b.mcap"
-        assert cutting.cutting(of, ours, **how)() == ours.stat().st_size
-        assert cutting.looping(of, theirs, **how)() == theirs.stat().st_size
-        with LogReader(ours) as one, LogReader(theirs) as two:
-            assert [m.data for m in one.messages()] == [m.data for m in two.messages()]
-    assert cutting.copying(logs[0], tmp_path / "c.mcap")() == logs[0].stat().st_size
 
 
 def test_scaling() -> None:

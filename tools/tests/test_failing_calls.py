@@ -18,7 +18,6 @@ SAMPLED = {
     "learn --resume": 3,
     "convert": 4,
     "sweep": 4,
-    "cut": 4,
     "recover": 4,
     "sweep --keep-logs --jobs 2": 2,
 }

@@ -72,7 +72,6 @@ def _going_on(place: Path, out: Path) -> Words:
 LOGS: tuple[Line, ...] = (
     lambda place, out: ("info", place),
     lambda place, out: ("recover", _first(place), "-o", out.with_suffix(".mcap")),
-    lambda place, out: ("cut", place, "-o", out),
     lambda place, out: ("learn", place, "--salvage", *QUICK),
 )
 RUNS: tuple[Line, ...] = (

@@ -284,7 +284,6 @@ def _torn(folder: Path) -> None:
 
 CONVERT = f"convert {GIVEN}/cameras.mcap --topic /left --topic /right --size 16x12 -o {OUT}"
 SWEEP = f"sweep oscillatory -o {OUT} --grid learner.nu=0.01,0.02 --seeds 2 --max-iterations 20"
-CUT = f"cut {GIVEN} -o {OUT} --from 0.1 --split 1s"
 RECOVER = f"recover {TORN} -o {OUT}/x1.mcap"
 
 STORIES = {
@@ -373,7 +372,6 @@ STORIES = {
             rows,
             progress=done,
         ),
-        Story("cut", CUT, (CUT, f"{CUT} --force"), files, _recording),
         Story("recover", RECOVER, (RECOVER, f"{RECOVER} --force"), files, _torn, done=(0, 3)),
         Story(
             "recover a folder",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.making import WRITTEN, flag, option, word
+from cdmisfa.cli.making import flag, option, word
 from cdmisfa.cli.printing import (
     print_document,
     print_json,
@@ -21,10 +21,7 @@ from cdmisfa.cli.printing import (
     say_about,
     tell,
 )
-from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import LogDamagedError, NotReproducedError
-from cdmisfa.core.names import counted
-from cdmisfa.core.options import TIME
 
 if TYPE_CHECKING:
     from replay.runs.compare import Row
@@ -85,62 +82,6 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
         print_line(f"written {out}")
     if not found.complete:
         ctx.exit(LogDamagedError.exit_code)
-
-
-@click.command("cut")
-@click.argument("log", nargs=-1, type=options.WORD)
-@options.out("An MCAP file, in which all are joined, or a folder for a file each.", required=True)
-@option(
-    "--from",
-    "start",
-    type=WRITTEN[TIME],
-    default=0.0,
-    metavar=TIME,
-    help="Leave out messages before this time after the first, in seconds or as MINUTES:SECONDS.",
-)
-@option(
-    "--to",
-    "stop",
-    type=WRITTEN[TIME],
-    metavar=TIME,
-    help="Leave out messages from then on.",
-)
-@option(
-    "--topic",
-    "topics",
-    metavar="TOPIC",
-    multiple=True,
-    help="Only this topic, or those of a pattern; repeatable.",
-)
-@options.path(
-    "--segments",
-    "A list of what is wanted, CSV or JSON, with path, start, stop and topic; times in "
-    "nanoseconds or as dates.",
-    "FILE",
-)
-@word("--split", "LIMIT", "Begin a new file after this size or time: 512MB, 10min.")
-@options.force
-@options.as_json
-def cut_command(log: tuple[str, ...], split: str | None, as_json: bool, **chosen: Any) -> None:
-    """Write a part of MCAP logs, or several joined, messages as they are.
-
-    LOG may be several, a pattern, a recording, or URLs. Exits with 3 when damage was left out.
-    """
-    from recorder.config import Split
-    from replay.cutting.cut import cut_logs
-
-    limit = None if split is None else Split.parse(split)
-    with bar("cutting", "bytes") as shown:
-        found = cut_logs(log, split=limit, told=shown.update, **chosen)
-    if as_json:
-        print_json(found.as_json())
-    else:
-        for problem in found.problems:
-            tell(f"{problem.where}: {problem.what}")
-        for file in found.files:
-            print_line(f"{counted(file.messages, 'message')} written to {file.file}")
-    if found.problems:
-        click.get_current_context().exit(LogDamagedError.exit_code)
 
 
 @click.command("compare")

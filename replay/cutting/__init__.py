@@ -1,1 +1,0 @@
-"""Parts of logs as logs of their own: messages are copied as they are, and never decoded."""
