@@ -31,8 +31,7 @@ class Module(Shown):
 
     Attributes:
         index: order of learning, from 1.
-        stream: name of the stream that was watched when it was saved; "" where modules.npz is
-            from before that was kept, and no run says.
+        stream: name of the stream that was watched when it was saved.
         stream_index: that stream, from 0.
         iteration: iteration at whose end it was saved.
         phi: (J, I) weights; y = phi (x - mean), x after scaling and expansion.
@@ -43,15 +42,13 @@ class Module(Shown):
         policy: (S,) 0 stay, 1 switch, for each stream.
         centres: (S, C, tau, J) centres of the clusters; empty but for CD-MISFA 1.0.
         counts: (S, C) what each centre has seen; empty but for CD-MISFA 1.0.
-        expansion: how its input was expanded; "" where modules.npz is from before that was
-            kept, see `expansion_of`.
+        expansion: how its input was expanded.
         scale: what one step of a uint8 counts: 1/255, or 1 where it learned from values.
-        frame_shape: of the frames it learned from, (height, width) or (values,); empty where
-            modules.npz is from before that was kept.
+        frame_shape: of the frames it learned from, (height, width) or (values,); empty where that
+            is not known, of a module made by hand.
         slow: (J,) 1 where an output is slow on frames that it had not learned from, 0 where it is
             not; empty but for the progress learner.
-        recipe: what became of a raw picture before; None where nobody said it: of a learner in
-            memory, and in modules.npz from before that was kept, where a run still says it.
+        recipe: what became of a raw picture before; None of a learner in memory.
     """
 
     index: int
@@ -66,7 +63,7 @@ class Module(Shown):
     policy: NDArray[np.int64]
     centres: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
     counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    expansion: str = ""
+    expansion: str = "none"
     scale: float = PIXEL
     frame_shape: tuple[int, ...] = ()
     slow: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -93,9 +90,9 @@ class Module(Shown):
             UsageError: these are no frames as it learned from, a value is no finite number, or it
                 has no such outputs.
         """
-        rows, expansion = self._inputs(self._episode(frames))
+        rows = self._inputs(self._episode(frames))
         phi = np.ascontiguousarray(self._chosen(outputs), np.float64)
-        return _projected(rows, expansion, phi, kernels.mean_output(phi, self._mean))
+        return _projected(rows, self.expansion, phi, kernels.mean_output(phi, self._mean))
 
     @property
     def _mean(self) -> NDArray[np.float64]:
@@ -111,12 +108,12 @@ class Module(Shown):
         frames = self.recipe.frames(given)
         return centred(frames, mean_of([frames])) if len(frames) else frames
 
-    def _inputs(self, frames: Any) -> tuple[NDArray[Any], str]:
-        """Frames or raw pictures as scaled rows, and how they are expanded; see `transform`."""
+    def _inputs(self, frames: Any) -> NDArray[Any]:
+        """Frames or raw pictures as scaled rows; see `transform`."""
         array = self._frames(frames)
         if array.dtype != UINT8 and array.dtype.kind != "f":
             raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float values")
-        rows, expansion = self._rows(array)
+        rows = self._rows(array)
         if rows.dtype != UINT8 and not np.isfinite(rows).all():
             row, place = (int(found[0]) for found in np.nonzero(~np.isfinite(rows)))
             raise UsageError(
@@ -125,7 +122,7 @@ class Module(Shown):
             )
         if rows.dtype != UINT8 or self.scale != PIXEL:
             rows = rows.astype(np.float64)
-        return rows, expansion
+        return rows
 
     def _facts(self) -> Mapping[str, Any]:
         shape = "x".join(map(str, self.frame_shape)) or f"{self.phi.shape[1]} values"
@@ -176,15 +173,14 @@ class Module(Shown):
                 f"no outputs {outputs!r}: this module has {len(self.phi)}, counted from 0"
             ) from error
 
-    def _rows(self, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
-        """Frames as rows, and how they are expanded."""
+    def _rows(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Frames as rows."""
         shape, size, own = array.shape[1:], prod(array.shape[1:]), self.frame_shape
-        expansion = self.expansion_of(size)
-        right = shape in (own, (prod(own),)) if own else expansion is not None
-        if expansion is not None and right and array.ndim > 1:
-            return array.reshape(len(array), size), expansion
+        right = not own or shape in (own, (prod(own),))
+        if array.ndim > 1 and right and self._fits(size):
+            return array.reshape(len(array), size)
         wanted = f"give ({', '.join(map(str, ('n', *(own or ('values',)))))})"
-        if array.shape == own or (not own and self.expansion_of(array.size) is not None):
+        if array.shape == own or (not own and self._fits(array.size)):
             raise UsageError(
                 f"a single frame of shape {array.shape} given: {wanted}, as frame[None]"
             )
@@ -199,14 +195,9 @@ class Module(Shown):
             "output, give frames of the size that it learned from"
         )
 
-    def expansion_of(self, size: int) -> str | None:
-        """The expansion that makes this module's inputs of frames of so many values, if any.
-
-        A module that does not say how its input was expanded was learned when there were only
-        "none" and "quadratic": then it is the one whose width fits.
-        """
-        kinds = (self.expansion,) if self.expansion else ("none", "quadratic")
-        return next((k for k in kinds if expanded_size(k, size) == self.phi.shape[1]), None)
+    def _fits(self, size: int) -> bool:
+        """Whether frames of so many values expand to this module's inputs."""
+        return bool(expanded_size(self.expansion, size) == self.phi.shape[1])
 
 
 def columns_of(modules: Sequence[Module]) -> Iterator[tuple[Module, slice]]:
@@ -240,8 +231,8 @@ class Stack:
             frames: see `Module.transform`, as for what it raises; without the mean of their
                 episode, where they learned from such.
         """
-        rows, expansion = self.modules[0]._inputs(frames)
-        return _projected(rows, expansion, self._phi, self._offset)
+        rows = self.modules[0]._inputs(frames)
+        return _projected(rows, self.modules[0].expansion, self._phi, self._offset)
 
 
 def _projected(

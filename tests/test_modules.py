@@ -102,19 +102,6 @@ def test_a_single_frame_is_not_read_as_many() -> None:
         assert given.transform(np.zeros((1, 48, 128), np.uint8)).shape == (1, 1)
 
 
-def test_files_from_before_are_read_and_the_width_decides(tmp_path: Path) -> None:
-    learner, (y, frames) = learned("uint8", "quadratic")
-    save_modules(tmp_path / "modules.npz", learner.modules)
-    with np.load(tmp_path / "modules.npz") as stored:
-        old = {
-            k: v for k, v in stored.items() if not k.endswith(("_expansion", "_scale", "_shape"))
-        }
-    np.savez(tmp_path / "old.npz", **old)
-    (module, *_) = load_modules(tmp_path / "old.npz")
-    assert (module.expansion, module.frame_shape) == ("", ())
-    np.testing.assert_allclose(module.transform(frames), y, rtol=1e-9, atol=1e-9)
-
-
 def test_modules_come_back_in_order_and_to_the_bit(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     modules = [

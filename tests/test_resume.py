@@ -36,7 +36,6 @@ from replay.recordings.source import RecordedSource
 from replay.runs.compare import first_difference
 from replay.runs.folders import run_log
 from replay.runs.keyframes import KEYFRAME_TOPIC, read_keyframe
-from replay.runs.writer import RunWriter
 
 CONFIG = LearnerConfig(
     tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0
@@ -191,13 +190,6 @@ def killed_at_once(out: Path) -> None:
     (out / "run.mcap.partial").write_bytes(b"")
 
 
-def of_a_version_without_keyframes(out: Path) -> None:
-    with pytest.MonkeyPatch.context() as before:
-        before.setattr(RunWriter, "keyframe", lambda *_: None)
-        go(OscillatorySource(), out, 57)
-    (out / "checkpoint-000000000057.npz").write_bytes(b"")
-
-
 @pytest.mark.parametrize(
     ("leave", "resumed_at"),
     [
@@ -207,7 +199,6 @@ def of_a_version_without_keyframes(out: Path) -> None:
         (cut(0.95), 57),
         (killed_while_resuming, 50),
         (killed_at_once, None),
-        (of_a_version_without_keyframes, None),
     ],
 )
 def test_whatever_is_left_of_a_run_goes_on_from_its_newest_keyframe(
@@ -219,7 +210,6 @@ def test_whatever_is_left_of_a_run_goes_on_from_its_newest_keyframe(
     assert first_difference(whole, out) is None
     said = [event.text for event in parts_of(out, "events") if "resumed" in event.text]
     assert said == ([] if resumed_at is None else [f"resumed at iteration {resumed_at}"])
-    assert not list(out.glob("checkpoint*"))
 
 
 @pytest.mark.parametrize(
@@ -242,15 +232,6 @@ def test_a_changed_run_is_refused_and_left_alone(
     with pytest.raises(UsageError, match=named):
         go(out=out, iterations=30, resume=True, **changed)
     assert contents(out) == before
-
-
-def test_a_run_that_stated_the_clock_of_a_preset_goes_on(tmp_path: Path) -> None:
-    out, source = tmp_path / "run", OscillatorySource(fps=25.0)
-    go(source, out, 20, sections={"record": {"fps": 50.0, "start_ns": 0}})
-    now = {"record": {"fps": source.spec.fps, "start_ns": source.spec.start_ns}}
-    assert go(OscillatorySource(fps=25.0), out, 30, resume=True, sections=now).iterations == 30
-    with pytest.raises(UsageError, match=r"record\.chunk_size = None, not 7"):
-        go(source, out, 40, resume=True, sections={"record": {**now["record"], "chunk_size": 7}})
 
 
 def test_there_must_be_a_run_to_go_on_with(tmp_path: Path) -> None:

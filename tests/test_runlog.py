@@ -22,7 +22,7 @@ from run_data import IMAGE, VECTOR, parts_of, read_signals, rows_of, run_of, sig
 import replay
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
+from cdmisfa.core.signals import SIGNALS, canonical_bytes
 from replay.runs.codec import (
     decode_matrix,
     decode_signals,
@@ -83,7 +83,6 @@ def test_a_run_reads_back_as_written(spec, tmp_path):
     assert [canonical_bytes(s) for s in back] == [canonical_bytes(s) for s in written]
     header = read_header(path)
     assert header.spec == spec
-    assert header.schema == SCHEMA_VERSION
     assert header.setting("learner", "tau") == 40
     assert header.manifest["seed"] == 0
     blocks = [block for _, block in run_of(spec, 30)]

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from cdmisfa.core.names import stream_name, stream_names
 from recorder.cameras.words import live_names
-from replay.runs.modules import load_modules
 
 TOPICS = ("/camera/left/image_raw", "/camera/right é/image_raw")
 NAMES = ("camera_left_image_raw", "camera_right_e_image_raw")
@@ -118,25 +117,3 @@ def test_of_logs_with_one_topic_the_file_is_named_too(cdmisfa: Cdmisfa, tmp_path
     words = (*files, "--topic", TOPICS[0], "--align", "index")
     found = cdmisfa("learn", *words, *QUICK, "--json").json["undecided"]
     assert found == [f"a_{NAMES[0]}", f"b_{NAMES[0]}"]
-
-
-def test_a_run_whose_streams_were_named_by_their_topics_goes_on(
-    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run, fork, words = tmp_path / "run", tmp_path / "fork", (*BOTH, "--loop", *QUICK[2:])
-    log = write_log(tmp_path)
-    straight = cdmisfa("learn", log, *words, "--max-iterations", 450, "--json").json
-    with monkeypatch.context() as before:
-        before.setattr("replay.camera_logs.source.names_of", lambda streams: TOPICS)
-        done = cdmisfa("learn", log, *words, "--max-iterations", 420, "-o", run, "--json")
-    assert {module["stream"] for module in done.json["modules"]} <= set(TOPICS)
-    assert done.json["modules"]
-    assert cdmisfa("check", run).code == cdmisfa("at", run, 417).code == 0
-    assert cdmisfa("fork", run, "--at", 412, "--max-iterations", 430, "-o", fork).code == 0
-    resumed = cdmisfa("learn", "--resume", "-o", run, "--max-iterations", 450, "--json")
-    assert resumed.code == 0, resumed.err
-    assert resumed.json["signals_sha256"] == straight["signals_sha256"]
-    assert resumed.json["modules"] == straight["modules"]
-    assert cdmisfa("check", run).code == cdmisfa("check", fork).code == 0
-    for folder in (run, fork):
-        assert {module.stream for module in load_modules(folder)} <= set(NAMES)

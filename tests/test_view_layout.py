@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 from run_data import IMAGE, PROGRESS, VECTOR, write_run
-from view_data import View, scalars, views_of
+from view_data import View, scalars, tabs_of, views_of
 
 from cdmisfa.core.errors import UsageError
 from recorder.recording import record_scene
@@ -218,3 +219,37 @@ def test_the_picture_has_the_name_of_its_stream(built):
     for record in records:
         stream = named.get(record.t, stream)
         assert stream == IMAGE.streams[record.stream]
+
+
+VERDICT = "Verdict on each block: the last 50 blocks"
+RULES = "Rule 2: share of novel blocks from 0 on", "Rule 3: recent variance from 0 on"
+
+
+def gate_of(run: Path) -> list[str]:
+    """Titles in the gate's tab of a run's layout."""
+    return [view.name for view in views_of(tabs_of(run)["Gate"])]
+
+
+def test_the_gate_of_1_0_shows_its_clusters(tmp_path) -> None:
+    write_run(tmp_path / "run.mcap", VECTOR, 3, learner={"algorithm": "1.0", "roc_error": 3.0})
+    assert gate_of(tmp_path)[1:] == [
+        VERDICT,
+        "Clustering error by module 1: known below 3",
+        "Clustering error by module 2: known below 3",
+        "Rule 1: clustering error of the block and its mean, saved below the line",
+        *RULES,
+    ]
+
+
+def test_the_gate_of_2_0_shows_its_bands(tmp_path) -> None:
+    write_run(tmp_path / "run.mcap", VECTOR, 12)
+    shown = gate_of(tmp_path)
+    assert any("in the band of 2 SD" in name for name in shown)
+    assert not any("Clustering" in name for name in shown)
+
+
+@pytest.mark.parametrize("algorithm", ["1.0", "2.0"])
+def test_the_overview_shows_what_decides_until_a_save(tmp_path, algorithm) -> None:
+    write_run(tmp_path / "run.mcap", VECTOR, 3, learner={"algorithm": algorithm, "roc_error": 0.25})
+    (rules,) = (view for view in views_of(tabs_of(tmp_path)["Overview"]) if "rules" in view.name)
+    assert list(rules.contents) == ["/rules/**"]

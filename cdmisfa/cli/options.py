@@ -19,8 +19,7 @@ from cdmisfa.cli.making import (
     together,
     word,
 )
-from cdmisfa.cli.printing import Stderr, warn_deprecated
-from cdmisfa.core.config import FORMER
+from cdmisfa.cli.printing import Stderr
 from cdmisfa.core.errors import TooSmallError, UsageError, are_for
 from recorder.cameras.options import LiveOptions
 from recorder.images.options import ImageOptions
@@ -150,27 +149,8 @@ def settings(
     unit: str = "KEY=VALUE",
 ) -> Callable[[Command], Command]:
     """`--set`."""
-    how: dict[str, Any] = {"group": "Learner", "callback": _warn_of_former}
-    return option("--set", "settings", multiple=True, metavar=unit, help=about, **how)
-
-
-def _warn_of_former(
-    ctx: click.Context, param: click.Parameter, given: tuple[str, ...]
-) -> tuple[str, ...]:
-    for key in {setting.partition("=")[0] for setting in given} & set(FORMER):
-        warn_deprecated(key)
-    return given
-
-
-def deprecated(name: str) -> Callable[[Command], Command]:
-    """An option of former versions: not shown, and of no effect but a warning."""
-
-    def warned(ctx: click.Context, param: click.Parameter, given: bool) -> None:
-        if given and not ctx.resilient_parsing:
-            warn_deprecated(name)
-
-    how: dict[str, Any] = {"expose_value": False, "hidden": True, "callback": warned}
-    return option(name, is_flag=True, **how)
+    how: dict[str, Any] = {"metavar": unit, "help": about, "group": "Learner"}
+    return option("--set", "settings", multiple=True, **how)
 
 
 def end_after(what: str, about: str) -> Callable[[Command], Command]:

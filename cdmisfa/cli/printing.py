@@ -147,11 +147,6 @@ def warn(line: str) -> None:
     tell(f"warning: {line}")
 
 
-def warn_deprecated(name: str) -> None:
-    """A warning of an option or a key that does nothing any more."""
-    warn(f"{name} does nothing any more, and the next version refuses it: leave it out")
-
-
 def say_counts(source: FrameSource) -> None:
     """Say on stderr what became of each live stream's pictures, or messages with numbers."""
     what = "pictures" if source.spec.images else "messages"

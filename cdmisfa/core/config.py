@@ -47,9 +47,6 @@ _SHORT.maxlevel = 3
 _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 8
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = SHOWN
 
-FORMER = ("learner.portable",)
-"""Keys of earlier versions: they are accepted, and ignored."""
-
 MAX_TAU = 100_000
 """A block of more frames than this does not fit into memory beside its images."""
 
@@ -290,8 +287,6 @@ def build(
     for layer in layers:
         for key, value in layer.items():
             name, dot, rest = key.partition(".")
-            if f"{prefix}.{name}" in FORMER:
-                continue
             if name not in hints:
                 hint = did_you_mean(name, hints, f"{prefix}.")
                 raise UsageError(f"unknown key {prefix}.{shown(key)}: {hint}")
@@ -391,7 +386,7 @@ def section_table(section: Any) -> dict[str, Any]:
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
         if field.metadata.get("unsaid") and value == field.default:
-            continue  # so that tables from before this key are still equal
+            continue  # recordings of scenes without it stay the same bytes
         if dataclasses.is_dataclass(value):
             table[field.name] = section_table(value)
         else:

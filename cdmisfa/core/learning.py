@@ -114,13 +114,13 @@ class Learner(Protocol):
 
 
 ARITHMETIC = "arithmetic"
-"""Key of a run's manifest: `arithmetic_of` its learner; where it is missing, 1."""
+"""Key of a run's manifest: `arithmetic_of` its learner."""
 
 
 def arithmetic_of(learner: Learner) -> int:
     """Version of how a learner computes: with another one all is the same but for the last bits.
 
-    A learner whose arithmetic has changed since its first version says so as `arithmetic`.
+    It is the learner's attribute `arithmetic`, 1 of a learner that has none.
     """
     return int(getattr(learner, "arithmetic", 1))
 

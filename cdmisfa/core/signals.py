@@ -2,9 +2,9 @@
 
 Every consumer walks over its fields: the schema of run.mcap, Rerun's entities and
 layout, the columns of an export, the table of signals in the docs. Adding a signal is
-raising `SCHEMA_VERSION` and adding a field whose `since` is the new version. Its value is
-set in `agents/learner.py` and `agents/progress/learner.py` or, if it is a scalar of the paper's
-iteration, is a field of `OUTCOME` (`agents/agent.py`) set in `kernels/agent.c`.
+adding a field and raising `SCHEMA_VERSION`. Its value is set in `agents/learner.py` and
+`agents/progress/learner.py` or, if it is a scalar of the paper's iteration, is a field of
+`OUTCOME` (`agents/agent.py`) set in `kernels/agent.c`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import accumulate
 from operator import attrgetter, itemgetter
 from typing import Any, Literal, NamedTuple
@@ -34,13 +34,13 @@ STATES = ("learning", "learned", "known", "given_up")
 """Names of the codes of a stream's state."""
 
 NO_STATE = -1
-"""Code of a stream's state where the learner, or a run of an earlier version, has none."""
-
-MISSING: Mapping[str, float | int] = {"float64": math.nan, "int64": NO_STATE}
-"""Value of a signal that is missing, by its type."""
+"""Code of a stream's state where the learner has none."""
 
 SCHEMA_VERSION = 4
-"""Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning."""
+"""Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning.
+
+Runs of another version are refused.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,6 @@ class Signal:
         dtype: numpy name of the element type.
         show: how a viewer shows it.
         about: one sentence for a reader.
-        since: the first `SCHEMA_VERSION` with it.
     """
 
     name: str
@@ -68,7 +67,6 @@ class Signal:
     dtype: str
     show: Show
     about: str
-    since: int = 1
 
 
 _DTYPES: Mapping[str, str] = {
@@ -89,11 +87,10 @@ def _signal(
     *,
     equation: str = "",
     show: Show | None = None,
-    since: int = 1,
 ) -> Any:
     """A field; floats are shown as lines and others as lanes, where nothing else is said."""
     told = {"symbol": symbol, "about": about, "dims": dims, "unit": unit, "equation": equation}
-    return dataclasses.field(metadata={**told, "show": show, "since": since})
+    return dataclasses.field(metadata={**told, "show": show})
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,19 +151,16 @@ class BlockSignals:
         "",
         "Clustering error of the block: distance of the output from its cluster's centre, "
         "CD-MISFA 1.0 only.",
-        since=2,
     )
     roc_error: float = _signal(
         "",
         "Running mean of the clustering error; the abstraction is saved below a threshold, "
         "CD-MISFA 1.0 only.",
-        since=2,
     )
     roc_error_frozen: FloatArray = _signal(
         "",
         "Clustering error of each frozen module; known below the threshold, CD-MISFA 1.0 only.",
         "M",
-        since=2,
     )
     xi: float = _signal(
         "⟨ξ⟩", "Mean change of the abstraction's weights over the block.", equation="5"
@@ -185,40 +179,34 @@ class BlockSignals:
     change: float = _signal(
         "c",
         "Mean change of the candidate's outputs with a block, 0 to 1.41; progress learner only.",
-        since=3,
     )
     tested: float = _signal(
         "η_test",
         "Slowness of the candidate on frames before it learned from them; progress learner only.",
         "",
         "1/frame",
-        since=3,
     )
     fitted: float = _signal(
         "η_fit",
         "Slowness of the candidate on what it learned from; progress learner only.",
         "",
         "1/frame",
-        since=3,
     )
     learning_error: float = _signal(
         "e",
         "Learning error of the candidate, c + |ln(η_test / η_fit)|; progress learner only.",
-        since=3,
     )
     interest: FloatArray = _signal(
         "",
         "What each stream promises: the recent progress of its learning error, 0 where nothing is "
         "being learned; progress learner only.",
         "S",
-        since=3,
     )
     state: IntArray = _signal(
         "",
         "What has become of each stream: 0 learning, 1 learned, 2 known, 3 given up; -1 of a "
         "learner that does not say.",
         "S",
-        since=3,
     )
     typical: float = _signal(
         "η_typ",
@@ -226,13 +214,11 @@ class BlockSignals:
         "progress learner only.",
         "",
         "1/frame",
-        since=4,
     )
     regret: float = _signal(
         "",
         "Log of the slowness that the candidate of some time ago has now over its own: what it has "
         "gained since; progress learner only.",
-        since=4,
     )
 
 
@@ -254,18 +240,9 @@ def signal_table() -> tuple[Signal, ...]:
 SIGNALS: Mapping[str, Signal] = {s.name: s for s in signal_table()}
 
 
-def values(
-    signals: BlockSignals, version: int = SCHEMA_VERSION
-) -> Iterator[tuple[Signal, NDArray[Any]]]:
-    """Each signal with its value as an array of the documented type and number of dimensions.
-
-    Args:
-        signals: the record.
-        version: leave out signals that came later than with this version.
-    """
+def values(signals: BlockSignals) -> Iterator[tuple[Signal, NDArray[Any]]]:
+    """Each signal with its value as an array of the documented type and number of dimensions."""
     for signal in SIGNALS.values():
-        if signal.since > version:
-            continue
         yield signal, np.asarray(getattr(signals, signal.name), dtype=signal.dtype)
 
 
@@ -291,37 +268,24 @@ class SignalsHash:
         return self._hash.hexdigest()
 
 
-def canonical_bytes(signals: BlockSignals, version: int = SCHEMA_VERSION) -> bytes:
-    """The bytes that stand for a record, as a version has it, wherever runs are compared."""
-    known = _fields(version)
-    arrays: list[Any] = list(map(np.ascontiguousarray, known.arrays(signals), known.types))
-    layout = _layout(version, tuple([array.shape for array in arrays]))
+def canonical_bytes(signals: BlockSignals) -> bytes:
+    """The bytes that stand for a record wherever runs are compared."""
+    arrays: list[Any] = list(map(np.ascontiguousarray, _ARRAYS_OF(signals), _ARRAY_TYPES))
+    layout = _layout(tuple([array.shape for array in arrays]))
     data = bytearray(b"".join([arrays[i] for i in layout.order]))
     floats = np.frombuffer(data, "<f8", layout.floats)
     floats[np.isnan(floats)] = math.nan
-    numbers = [x if x == x else math.nan for x in known.numbers(signals)]
+    numbers = [x if x == x else math.nan for x in _NUMBERS_OF(signals)]
     parts = [data[part] for part in layout.parts]
     return layout.struct.pack(*layout.placed([*numbers, *layout.sizes, *parts]))
 
 
-class _Fields(NamedTuple):
-    """How the fields of a version are got from a record: numbers, arrays, types of the latter."""
-
-    numbers: Callable[[BlockSignals], Any]
-    arrays: Callable[[BlockSignals], Any]
-    types: list[np.dtype[Any]]
-
-
-@cache
-def _fields(version: int) -> _Fields:
-    signals = [s for s in SIGNALS.values() if s.since <= version]
-    arrays = [s for s in signals if s.dims]
-    return _Fields(
-        attrgetter(*(s.name for s in signals if not s.dims)),
-        attrgetter(*(s.name for s in arrays)),
-        # Made by this name, the type is numpy's own object, and comparing it costs nothing.
-        [np.dtype("<" + np.dtype(s.dtype).str[1:]) for s in arrays],
-    )
+_SCALARS = [s for s in SIGNALS.values() if not s.dims]
+_ARRAYS = [s for s in SIGNALS.values() if s.dims]
+_NUMBERS_OF = attrgetter(*(s.name for s in _SCALARS))
+_ARRAYS_OF = attrgetter(*(s.name for s in _ARRAYS))
+_ARRAY_TYPES = [np.dtype("<" + np.dtype(s.dtype).str[1:]) for s in _ARRAYS]
+"""Made by this name, the type is numpy's own object, and comparing it costs nothing."""
 
 
 class _Layout(NamedTuple):
@@ -345,17 +309,15 @@ class _Layout(NamedTuple):
 
 
 @lru_cache
-def _layout(version: int, shapes: tuple[tuple[int, ...], ...]) -> _Layout:
-    signals = [s for s in SIGNALS.values() if s.since <= version]
-    arrays = [s for s in signals if s.dims]
-    scalars = [s for s in signals if not s.dims]
+def _layout(shapes: tuple[tuple[int, ...], ...]) -> _Layout:
+    arrays, scalars = _ARRAYS, _SCALARS
     sizes = [struct.pack(f"<{len(shape)}q", *shape) for shape in shapes]
     lengths = [8 * math.prod(shape) for shape in shapes]
     order = sorted(range(len(arrays)), key=lambda i: arrays[i].dtype != "float64")
     starts = dict(zip(order, accumulate((lengths[i] for i in order), initial=0), strict=False))
     formats = ""
     places: list[int] = []
-    for signal in signals:
+    for signal in SIGNALS.values():
         if signal.dims:
             i = arrays.index(signal)
             formats += f"{len(sizes[i])}s{lengths[i]}s"

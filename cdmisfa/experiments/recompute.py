@@ -22,7 +22,6 @@ from cdmisfa.core.errors import (
 )
 from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.names import placed, same_names
 from cdmisfa.experiments.resume import (
     config_history,
     read_command,
@@ -38,14 +37,11 @@ from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.run import other_files, stated_source
 from replay.stored import StoredSource
 
-SAME = ("frame_shape", "dtype", "fps", "start_ns")
-"""What besides its streams a source must have in common with the one that a run learned from."""
+SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
+"""What a source must have in common with the one that a run learned from."""
 
 Words = Sequence[str]
 """What names a source on the command line."""
-
-ROUNDING = 1e-6
-"""Share of a signal's largest number up to which another arithmetic explains a difference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,22 +50,13 @@ class Checked:
 
     Attributes:
         difference: the first one, of the log from what was computed again.
-        arithmetic: version of the log's, and of what was computed again; where they differ, all
-            is compared up to rounding.
         other_files: names of files that are not those the run learned from.
     """
 
     start: int
     stop: int
     difference: Difference | None
-    arithmetic: tuple[int, int] = (1, 1)
     other_files: tuple[str, ...] = ()
-
-    @property
-    def same_arithmetic(self) -> bool:
-        """Whether bits can be compared."""
-        then, now = self.arithmetic
-        return then == now
 
     @property
     def holds(self) -> bool:
@@ -82,10 +69,8 @@ class Checked:
         return {
             "from": self.start,
             "to": self.stop,
-            "identical": found is None and self.same_arithmetic,
-            "same_up_to_rounding": found is None,
+            "identical": found is None,
             "first_difference": None if found is None else found.as_json(),
-            "arithmetic": list(self.arithmetic),
             "other_files": list(self.other_files),
         }
 
@@ -94,18 +79,9 @@ class Checked:
         other = f"{files}: no longer what the run learned from" if files else ""
         if self.difference is None:
             what = f"iterations {self.start} to {self.stop - 1}"
-            how = "identical, bit for bit" if self.same_arithmetic else "the same up to rounding"
-            same = f"{what}: learned again, they are {how}"
-            if not self.same_arithmetic:
-                same += f" ({versions_differ(*self.arithmetic)})"
+            same = f"{what}: learned again, they are identical, bit for bit"
             return f"{same}; but {other}" if other else same
-        why = other or ("" if self.same_arithmetic else versions_differ(*self.arithmetic))
-        return f"{self.difference} when learned again{why and f': {why}'}"
-
-
-def versions_differ(then: int, now: int) -> str:
-    """Two versions of the arithmetic, in words."""
-    return f"the run was learned with arithmetic {then}, this version computes with {now}"
+        return f"{self.difference} when learned again{other and f': {other}'}"
 
 
 class Recomputation:
@@ -123,7 +99,7 @@ class Recomputation:
         t: the source's next frame.
 
     Raises:
-        UsageError: there is no such run.
+        UsageError: there is no such run, or it was learned with another arithmetic.
         LogDamagedError: it cannot be read.
     """
 
@@ -139,6 +115,12 @@ class Recomputation:
         span = [span for span in spans if span.start <= at][-1]
         self._later = [span for span in spans if span.start > at]
         self.learner: Learner = open_learner(span.config, self.header.spec, span.seed)
+        then, now = self.header.arithmetic, arithmetic_of(self.learner)
+        if then != now:
+            raise UsageError(
+                f"{self.log} was learned with arithmetic {then}, and this cdmisfa computes with "
+                f"{now}: learn it again"
+            )
         self.t = 0
         if keyframe is not None:
             restore(self.learner, keyframe, self.header.spec)
@@ -167,20 +149,13 @@ class Recomputation:
             failing.callback(again.close)
             at, found = again.compare(iterations)
             if found is not None:
-                then, now = again.arithmetic
-                why = "name its own source with --source"
-                if then != now:
-                    why = f"{versions_differ(then, now)}: only states at its keyframes are exact"
-                raise NotReproducedError(f"{again.log}: learned again, {found}: {why}")
+                raise NotReproducedError(
+                    f"{again.log}: learned again, {found}: name its own source with --source"
+                )
             if at < iterations:
                 raise UsageError(f"{again.log} holds {at} iterations: name one of 0 to {at}")
             failing.pop_all()
         return again
-
-    @property
-    def arithmetic(self) -> tuple[int, int]:
-        """Version of the log's arithmetic, and of the learner's here."""
-        return self.header.arithmetic, arithmetic_of(self.learner)
 
     @property
     def source(self) -> SeekableSource:
@@ -215,14 +190,13 @@ class Recomputation:
             yield signals
 
     def compare(
-        self, stop: int | None, keyframes: Iterable[Keyframe] = (), rounding: float = 0.0
+        self, stop: int | None, keyframes: Iterable[Keyframe] = ()
     ) -> tuple[int, Difference | None]:
         """Learn up to an iteration, or to the log's end: how far, and the log's first difference.
 
         Args:
             stop: the iteration.
             keyframes: that are compared, too.
-            rounding: see `first_differing`.
         """
         left = iter(keyframes)
         at, kept = self.learner.iteration, next(left, None)
@@ -233,10 +207,10 @@ class Recomputation:
                 for signals in self.steps(len(logged)):
                     records.append(signals)
                     if kept is not None and kept.iteration == self.learner.iteration:
-                        other = other or self._difference_from(kept, rounding)
+                        other = other or self._difference_from(kept)
                         kept = next(left, None)
             learned = columns_of_records(records)
-            found = first_differing(iter([logged]), learned, self.header.schema, at, rounding)
+            found = first_differing(iter([logged]), learned, at)
             at += len(logged)
             both = [one for one in (found, other) if one is not None]
             if both:
@@ -278,15 +252,15 @@ class Recomputation:
             yield columns.rows(0, kept)
             at += kept
 
-    def _difference_from(self, keyframe: Keyframe, rounding: float) -> Difference | None:
+    def _difference_from(self, keyframe: Keyframe) -> Difference | None:
         """Where a keyframe differs from the learner after as many iterations."""
         last, state = keyframe.iteration - 1, self.learner.state
-        kept = arrays_of(placed(keyframe.state, self.header.spec))
+        kept = arrays_of(keyframe.state)
         own = arrays_of(state)
         if kept.keys() != own.keys():
             return Difference(last, "keyframe", (), ", ".join(kept), ", ".join(own))
         for name, array in kept.items():
-            if (found := _first_element(array, own[name], rounding)) is not None:
+            if (found := _first_element(array, own[name])) is not None:
                 return Difference(last, f"keyframe {name}", *found)
         plain = {
             "t": (keyframe.t, self.t),
@@ -306,8 +280,7 @@ class Recomputation:
                 "iterations, where it stands in its log: name it with --source)"
             ) from error
         now, then = source.spec, self.header.spec
-        same = same_names(then.streams, now.streams)
-        if not same or any(getattr(now, name) != getattr(then, name) for name in SAME):
+        if any(getattr(now, name) != getattr(then, name) for name in SAME):
             source.close()
             raise UsageError(
                 f"{' '.join(self._words) or 'its source'} shows other streams than {self.log} was "
@@ -326,7 +299,7 @@ class Run(replay.runs.run.Run):
         path: the run's folder, or its log.
 
     Raises:
-        UsageError: there is no such run, or it is of a later version of this software.
+        UsageError: there is no such run, or it is of another version of the signals.
         LogDamagedError: its log cannot be read, here or in any later access.
     """
 
@@ -367,30 +340,27 @@ def check_run(
             f"from {start} to {stop} there is nothing to check: --from comes before --to"
         )
     with Recomputation(run, start, source) as again:
-        first, arithmetic = again.learner.iteration, again.arithmetic
-        rounding = 0.0 if arithmetic[0] == arithmetic[1] else ROUNDING
-        at, found = again.compare(stop, read_keyframes(again.log, first), rounding)
+        first = again.learner.iteration
+        at, found = again.compare(stop, read_keyframes(again.log, first))
         others = tuple(again.other_files())
     if found is None:
         if at <= start and (at or stop):
             raise UsageError(f"{again.log} holds {at} iterations: choose a part of these")
         if stop is not None and at < stop:
             raise UsageError(f"{again.log} holds {at} iterations: end at one of these")
-    return Checked(first, at, found, arithmetic, others)
+    return Checked(first, at, found, others)
 
 
-def _first_element(
-    a: NDArray[Any], b: NDArray[Any], rounding: float
-) -> tuple[tuple[int, ...], str, str] | None:
+def _first_element(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], str, str] | None:
     """Place and values of the first element in which two arrays differ."""
     if (a.dtype, a.shape) != (b.dtype, b.shape):
         return (), f"{a.dtype} of shape {a.shape}", f"{b.dtype} of shape {b.shape}"
     if a.tobytes() == b.tobytes():
         return None
     if a.dtype.names:
-        fields = (_first_element(a[name], b[name], rounding) for name in a.dtype.names)
+        fields = (_first_element(a[name], b[name]) for name in a.dtype.names)
         return next((found for found in fields if found is not None), None)
-    differ = np.argwhere(differing(a, b, rounding))
+    differ = np.argwhere(differing(a, b))
     if not len(differ):
         return None
     place = tuple(differ[0].tolist())

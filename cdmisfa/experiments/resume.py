@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,9 @@ from cdmisfa.agents.learners import learner_entry, open_learner
 from cdmisfa.core.blocks import SeekableSource, SourceSpec
 from cdmisfa.core.config import build, section_table
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
-from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
+from cdmisfa.core.learning import Keyframe, Learner, LearnerState
 from cdmisfa.core.options import parse_settings
-from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.experiments.names import placed, renamed, same_names
-from cdmisfa.experiments.sources import CLOCK, configure, open_logs
+from cdmisfa.experiments.sources import configure, open_logs
 from recorder.cameras.words import is_live
 from recorder.config import RecordConfig
 from recorder.log.files import found_path, partial_path, relative_path
@@ -84,7 +82,6 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
         for name, value in kept.items()
         if name in OPTIONS
     }
-    options.setdefault("holdout", 0.0)  # of runs from before there was a holdout
     preset = options.get("preset")
     if preset is not None and str(preset).endswith(".toml"):
         options["preset"] = found_path(str(preset), run)
@@ -165,7 +162,7 @@ def header_to_resume(run: Path) -> tuple[Path, RunHeader | None]:
     """The log of a run that was stopped, and its header; None where it was killed before that.
 
     Raises:
-        UsageError: there is no run, or it is of a later version of this software.
+        UsageError: there is no run, or it is of another version of the signals.
         LogDamagedError: the log cannot be read.
     """
     log = log_to_resume(run)
@@ -184,7 +181,8 @@ def restore(learner: Learner, keyframe: Keyframe, spec: SourceSpec) -> None:
         LogDamagedError: the keyframe is of another configuration.
     """
     try:
-        learner.restore(placed(keyframe.state, spec))
+        modules = (replace(m, frame_shape=spec.frame_shape) for m in keyframe.state.modules)
+        learner.restore(replace(keyframe.state, modules=tuple(modules)))
     except (LookupError, TypeError, ValueError) as error:
         what = f"the keyframe after {keyframe.iteration} iterations is of another learner"
         raise LogDamagedError(f"{what} ({one_line(error)})") from error
@@ -238,42 +236,24 @@ def refuse_difference(
     """
     source_then, source_now = known_to_both(stated_source(log), _json(manifest["source"]))
     before = {
-        "signals": header.schema,
-        ARITHMETIC: 1,
         **header.manifest,
         "source": source_then,
         "spec": dataclasses.asdict(header.spec),
         COMMAND: None,
     }
     now = {
-        "signals": SCHEMA_VERSION,
         **manifest,
         "source": source_now,
         "spec": dataclasses.asdict(spec),
         COMMAND: None,
     }
-    streams = manifest["config"].get("scene", {}).get("kind")
-    if same_names(header.spec.streams, spec.streams):
-        names = dict(zip(header.spec.streams, spec.streams, strict=True))
-        before["spec"]["streams"] = spec.streams
-        before["source"] = renamed(source_then, names)
     found = differences(_json(before), _json(now))
     # another learner first: other keys and another arithmetic come of it
     for key, old, new in sorted(found, key=lambda one: one[0] != "config.learner.algorithm"):
-        if key == "config.learner.portable":
-            continue  # stated when it had an effect
-        if key.startswith("config.scene.") and streams is not None and streams not in SCENES:
-            continue  # stated when every source was called a scene
-        if key.removeprefix("config.record.") in CLOCK and _clock(header.spec) == _clock(spec):
-            continue  # stated when every source was given its preset's clock
         raise UsageError(
             f"{log.parent} was made with {key.removeprefix('config.')} = {old}, not {new}: resume "
             "with what it was made with, or choose another folder"
         )
-
-
-def _clock(spec: SourceSpec) -> list[Any]:
-    return [getattr(spec, name) for name in CLOCK]
 
 
 def _json(value: Any) -> Any:

@@ -189,7 +189,6 @@ def opened_log(
         if others := [path for path in logs_in(folder) if path not in logs]:
             raise UsageError(f"{others[0]} is of no run: choose another folder")
         stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE, REPORT_FILE)]
-        stale += folder.glob("checkpoint-*.npz")  # of runs from before keyframes
         if aside is not None:
             try:
                 os.replace(aside, logs[0])

@@ -20,7 +20,6 @@ from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmeti
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.holdout import judged
 from cdmisfa.experiments.loop import INTERRUPTED, BestEffort, Digest, Keyframes, learn_blocks
-from cdmisfa.experiments.names import placed
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
     COMMAND,
@@ -203,13 +202,6 @@ class Session:
         log, folder = run_log(Path(parent)), folder_here(folder)
         if os.path.realpath(log.parent) == os.path.realpath(folder):
             raise UsageError(f"{folder} is the run itself: choose another folder")
-        with Recomputation(log, 0, source) as beginning:
-            then, now = beginning.arithmetic
-        if then != now:
-            raise UsageError(
-                f"{log} was learned with arithmetic {then}, this version computes with {now}: "
-                "learn it anew, and fork that"
-            )
         with cls.at(log, at, source) as stopped:
             manifest = stopped.header.manifest
             span, state = continued(stopped.header, stopped.learner, settings, seed)
@@ -235,7 +227,7 @@ class Session:
             }
             session.before = log
             spec = stopped.source.spec
-            session.keyframe = Keyframe(at, stopped.t, placed(state, spec), session._versions)
+            session.keyframe = Keyframe(at, stopped.t, state, session._versions)
             restore(session.learner, session.keyframe, spec)
             yield session
 

@@ -33,7 +33,7 @@ _POINTERS = {FLOAT64: "double[]", INT64: "int64_t[]", UINT8: "uint8_t[]"}
 ARITHMETIC = 3
 """Version of the order in which the kernels compute, to be raised with every change of their bits.
 
-1 and 2 were of one processor and compiler; since 3 the bits are the same on all of them.
+Runs of another version are neither continued nor checked.
 """
 
 

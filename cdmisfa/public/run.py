@@ -101,7 +101,7 @@ class Run(Shown, RecomputedRun):
         log: its run.mcap.
 
     Raises:
-        UsageError: there is no such run, or it is of a later version of this software.
+        UsageError: there is no such run, or it is of another version of the signals.
         LogDamagedError: its log cannot be read, here or in any later access.
     """
 

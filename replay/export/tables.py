@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cdmisfa.core.signals import SIGNALS, Signal
+from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, Signal
 from recorder.log.files import atomic_write, refuse_taken
 from replay.runs.columns import padded, whole_signals
 from replay.runs.log import RunHeader, read_columns, read_header
@@ -94,7 +94,7 @@ def _about(signal: Signal) -> dict[str, str]:
 
 def _run(header: RunHeader) -> dict[str, str]:
     return {
-        "schema": str(header.schema),
+        "schema": str(SCHEMA_VERSION),
         "spec": json.dumps(asdict(header.spec)),
         "manifest": json.dumps(header.manifest),
     }

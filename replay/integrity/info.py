@@ -37,9 +37,8 @@ from replay.integrity.state import (
     state_of,
     worst,
 )
-from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_METADATA
-from replay.runs.log import SIGNALS_TOPIC, record_version
+from replay.runs.log import SIGNALS_TOPIC
 from replay.storage.arrays import load_numbers
 from replay.storage.opening import log_files
 
@@ -100,14 +99,6 @@ class SizeInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class RecordInfo:
-    """The version of the signals' record in a run, and the signals it lacks: they are NaN."""
-
-    version: int
-    missing: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class LogInfo:
     """What is in a log, or in all logs of a folder.
 
@@ -123,7 +114,6 @@ class LogInfo:
         modules: of a run, where they lie in its folder.
         run: how it was learned, where it is a folder.
         held_out: how slow they are on frames that were held out, where its folder says so.
-        signals: of a run.
         state: the worst of the files; "unchecked" where only `check_log` reads what is in them.
         notes: what is no problem, and what nothing proves.
         size: in bytes.
@@ -144,7 +134,6 @@ class LogInfo:
     modules: tuple[ModuleInfo, ...] = ()
     run: RunInfo | None = None
     held_out: Mapping[str, Any] | None = None
-    signals: RecordInfo | None = None
     state: State = "whole"
     notes: tuple[str, ...] = ()
     size: SizeInfo = SizeInfo()
@@ -209,7 +198,6 @@ def describe(*words: str | Path) -> LogInfo:
         held_out=held_out_of(result),
         modules=() if run is None else modules_of(run),
         run=None if run is None else RunInfo.of(run, result, _iterations(channels)),
-        signals=next((f.signals for f in files if f.signals is not None), None),
         state=worst(f.state for f in files),
         notes=tuple(note for f in files for note in f.notes),
         size=sum((f.size for f in files), SizeInfo()),
@@ -334,7 +322,6 @@ def describe_reader(
     state = state_of(reader)
     if state == "whole" and not (decode and _all_checked(reader)):
         state = "unchecked"
-    version = record_version(metadata.get(RUN_METADATA, {}))
     stored, decompressed = (sum(getattr(s, n) for s in reader.segments) for n in SIZES)
     compression = Counter(s.compression or "none" for s in reader.segments if s.chunked)
     return LogInfo(
@@ -347,7 +334,6 @@ def describe_reader(
         problems=problems_of(reader),
         metadata={name: metadata},
         seed=_seed([*metadata.values()]),
-        signals=RecordInfo(version, missing_signals(version)) if version else None,
         state=state,
         notes=tuple(reader.unproven()),
         size=SizeInfo(reader.size, stored, decompressed, dict(compression)),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
+from cdmisfa.core.signals import SignalsHash
 from cdmisfa.core.untrusted import read_regular
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
@@ -59,7 +59,7 @@ class RunPass:
         self._found: list[Problem] = []
         with self._catching():
             header = read_header(log)
-            if self._stated is not None and header.schema == SCHEMA_VERSION:
+            if self._stated is not None:
                 self._batches = BatchReader(log, header, reader.channels, topics=(SIGNALS_TOPIC,))
 
     def add(self, segment: Segment) -> None:

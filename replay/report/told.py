@@ -157,9 +157,6 @@ def read_told(path: Path, *, frames: int) -> RunTold:
     outline = gathered.tally.outline()
     if len(modules) < len(outline.saved) or not run.result:
         problems += _missing(run, outline, modules)
-    if run.header.missing:
-        lacks = ", ".join(run.header.missing)
-        problems.append(f"The log is of an earlier version, without the signals {lacks}.")
     return RunTold(
         path=run.log.parent,
         header=run.header,

@@ -1,8 +1,7 @@
 """Messages of a run's log, as protobuf: what each signal's field is follows from its declaration.
 
 `cdmisfa.BlockSignals` has a field for each signal, and one with the sizes of all arrays, so that
-an empty array keeps its shape. A field's number never changes: those of a later version of the
-record follow all of the versions before.
+an empty array keeps its shape.
 
 `cdmisfa.Matrix` holds rows of float64 from frame t on: a block's vectors, its ground truth, or
 the abstraction's weights.
@@ -30,7 +29,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.signals import MISSING, SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
+from cdmisfa.core.signals import SIGNALS, BlockSignals, Signal
 from recorder.log.messages import varint
 from replay.runs.columns import SignalColumns, columns_of_records
 
@@ -38,7 +37,7 @@ SIGNALS_SCHEMA = "cdmisfa.BlockSignals"
 MATRIX_SCHEMA = "cdmisfa.Matrix"
 
 SHAPES = "shapes"
-"""Field with the sizes of every dimension of every array, the oldest arrays first."""
+"""Field with the sizes of every dimension of every array."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _VARINT, _FIXED64, _LENGTH_DELIMITED = 0, 1, 2
@@ -60,12 +59,17 @@ _TYPES = {
     "bool": _Type(_FIELD.TYPE_BOOL, _VARINT, np.dtype("u1"), "?"),
 }
 
-_BY_AGE = sorted(SIGNALS.values(), key=lambda s: s.since)
-_FIRST = [s.name for s in _BY_AGE if s.since == 1]
-_LATER = [s.name for s in _BY_AGE if s.since > 1]
-_NUMBERS = {name: number for number, name in enumerate((*_FIRST, SHAPES, *_LATER), start=1)}
-_SCALARS = [s for s in _BY_AGE if not s.dims]
-_ARRAYS = [s for s in _BY_AGE if s.dims]
+_BEHIND_SHAPES = (
+    *("roc_error_inst", "roc_error", "roc_error_frozen", "change", "tested", "fitted"),
+    *("learning_error", "interest", "state", "typical", "regret"),
+)
+"""Signals whose fields are numbered after that of `SHAPES`: numbers of fields stay as they are."""
+
+_STORED = sorted(SIGNALS.values(), key=lambda s: s.name in _BEHIND_SHAPES)
+_FIRST = [s.name for s in _STORED if s.name not in _BEHIND_SHAPES]
+_NUMBERS = {name: n for n, name in enumerate((*_FIRST, SHAPES, *_BEHIND_SHAPES), start=1)}
+_SCALARS = [s for s in _STORED if not s.dims]
+_ARRAYS = [s for s in _STORED if s.dims]
 """The signals in the order in which messages hold them: scalars, then arrays."""
 
 _MATRIX_HEAD = struct.Struct("<BqBIB5s")
@@ -119,32 +123,29 @@ class Layout:
 
 
 @lru_cache
-def _around(shapes: tuple[tuple[int, ...], ...], version: int) -> tuple[bytes, ...]:
+def _around(shapes: tuple[tuple[int, ...], ...]) -> tuple[bytes, ...]:
     """The parts of a message: its scalars, each array after what stands before it, its end.
 
     Args:
         shapes: of all arrays.
-        version: of the record.
 
     Returns:
         Places for the scalars (0) and for the arrays (2, 4, ...) are empty.
     """
     parts, sizes = [b""], b""
     for signal, shape in zip(_ARRAYS, shapes, strict=True):
-        known = signal.since <= version
         size = _TYPES[signal.dtype].stored.itemsize * math.prod(shape)
-        before = _tag(signal) + varint(size) if known and size else b""
-        parts += [before, b""]
-        sizes += b"".join(varint(n) for n in shape if known)
+        parts += [_tag(signal) + varint(size) if size else b"", b""]
+        sizes += b"".join(map(varint, shape))
     end = varint(_NUMBERS[SHAPES] << 3 | _LENGTH_DELIMITED) + varint(len(sizes)) + sizes
     return *parts, end
 
 
 @lru_cache
-def _layout(shapes: tuple[tuple[int, ...], ...], version: int) -> Layout:
-    """Layout of records of a version whose arrays have these shapes."""
-    *before, end = _around(shapes, version)[1::2]
-    scalars = [(s, (), _tag(s)) for s in _SCALARS if s.since <= version]
+def _layout(shapes: tuple[tuple[int, ...], ...]) -> Layout:
+    """Layout of records whose arrays have these shapes."""
+    *before, end = _around(shapes)[1::2]
+    scalars = [(s, (), _tag(s)) for s in _SCALARS]
     arrays = [item for item in zip(_ARRAYS, shapes, before, strict=True) if item[2]]
     fields = [(s.name, _TYPES[s.dtype].stored, shape, tag) for s, shape, tag in scalars + arrays]
     return Layout(fields, end)
@@ -171,58 +172,43 @@ def encode_signals(signals: BlockSignals) -> bytes:
     scalars = _TAGGED.copy()
     scalars[1::2] = _SCALARS_OF(signals)
     arrays = list(map(np.ascontiguousarray, _ARRAYS_OF(signals), _ARRAY_TYPES))
-    parts: list[Any] = list(_around(tuple(map(_SHAPE_OF, arrays)), SCHEMA_VERSION))
+    parts: list[Any] = list(_around(tuple(map(_SHAPE_OF, arrays))))
     parts[0] = _SCALARS_STRUCT.pack(*scalars)
     parts[2::2] = arrays
     return b"".join(parts)
 
 
-def decode_signals(
-    data: bytes, where: str = "record", version: int = SCHEMA_VERSION
-) -> BlockSignals:
-    """The record in what `encode_signals` of a version made; NaN where that lacks a signal.
+def decode_signals(data: bytes, where: str = "record") -> BlockSignals:
+    """The record in what `encode_signals` made.
 
     Raises:
         LogDamagedError: the bytes are not such a message, or its sizes contradict its values.
     """
     decoded = parsed(_SIGNALS, data, where)
     sizes = iter(getattr(decoded, SHAPES))
-    fields: dict[str, Any] = {}
-    known: dict[str, int] = {}
-    for signal in (*_SCALARS, *_ARRAYS):
-        name, stored = signal.name, signal.since <= version
-        if not signal.dims:
-            fields[name] = getattr(decoded, name) if stored else math.nan
-        elif stored:
-            shape = tuple(size for _, size in zip(signal.dims, sizes, strict=False))
-            fields[name] = _array(getattr(decoded, name), shape, signal, where)
-            known.update(zip(signal.dims, shape, strict=True))
-        else:
-            shape = tuple(known[letter] for letter in signal.dims)
-            if math.prod(shape) > len(data):
-                raise LogDamagedError(f"{where}: sizes without values, see cdmisfa verify")
-            fields[name] = np.full(shape, MISSING[signal.dtype], dtype=signal.dtype)
+    fields: dict[str, Any] = {s.name: getattr(decoded, s.name) for s in _SCALARS}
+    for signal in _ARRAYS:
+        shape = tuple(size for _, size in zip(signal.dims, sizes, strict=False))
+        fields[signal.name] = _array(getattr(decoded, signal.name), shape, signal, where)
     return BlockSignals(**fields)
 
 
-def decode_columns(
-    messages: Sequence[bytes], where: str = "record", version: int = SCHEMA_VERSION
-) -> Iterator[SignalColumns]:
+def decode_columns(messages: Sequence[bytes], where: str = "record") -> Iterator[SignalColumns]:
     """The records in messages as arrays, bit for bit what `decode_signals` makes of each."""
     for _, group in groupby(messages, key=len):
         same_size = list(group)
-        first = decode_signals(same_size[0], where, version)
-        layout = _layout(tuple([array.shape for array in _ARRAYS_OF(first)]), version)
+        first = decode_signals(same_size[0], where)
+        layout = _layout(tuple([array.shape for array in _ARRAYS_OF(first)]))
         found = layout.read(same_size)
         if found is None or any(v.dtype == np.uint8 and v.max() > 1 for v in found.values()):
-            records = [decode_signals(data, where, version) for data in same_size]
+            records = [decode_signals(data, where) for data in same_size]
             yield from columns_of_records(records)
             continue
         values = {}
         for name, signal in SIGNALS.items():
             if name in found:
                 values[name] = found[name].astype(signal.dtype, copy=False)
-            else:  # an empty array, or a signal that this version does not have
+            else:  # an empty array
                 value = np.asarray(getattr(first, name), dtype=signal.dtype)
                 values[name] = np.broadcast_to(value, (len(same_size), *value.shape))
         yield SignalColumns(values)
@@ -234,11 +220,6 @@ def _array(values: Any, shape: tuple[int, ...], signal: Signal, where: str) -> N
             f"{where}: {signal.name} has {len(values)} values for shape {shape}, see cdmisfa verify"
         )
     return np.array(values, dtype=signal.dtype).reshape(shape)
-
-
-def missing_signals(version: int) -> tuple[str, ...]:
-    """Names of the signals that a version of the record lacks."""
-    return tuple(s.name for s in SIGNALS.values() if s.since > version)
 
 
 def iteration_of(data: bytes, where: str = "record") -> int:
@@ -327,7 +308,7 @@ def _sentence(signal: Signal) -> str:
 
 _SIZES = ", ".join(f"{s.name} [{s.dims}]" for s in _ARRAYS)
 _SIGNAL_FIELDS = [
-    (s.name, _NUMBERS[s.name], _TYPES[s.dtype].field, bool(s.dims), _sentence(s)) for s in _BY_AGE
+    (s.name, _NUMBERS[s.name], _TYPES[s.dtype].field, bool(s.dims), _sentence(s)) for s in _STORED
 ]
 _SIGNAL_FIELDS.append(
     (SHAPES, _NUMBERS[SHAPES], _FIELD.TYPE_UINT32, True, f"Sizes of the dimensions of {_SIZES}")

@@ -106,7 +106,7 @@ def has_values(name: str, values: NDArray[Any]) -> bool:
     """Whether a signal's values are not all missing."""
     if values.dtype.kind == "f":
         return not bool(np.isnan(values).all())
-    return values.size > 0 and (SIGNALS[name].since == 1 or bool((values != NO_STATE).any()))
+    return values.size > 0 and (name != "state" or bool((values != NO_STATE).any()))
 
 
 def whole_signals(pieces: Iterable[SignalColumns], names: Sequence[str]) -> dict[str, NDArray[Any]]:

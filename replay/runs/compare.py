@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +32,10 @@ class Difference:
     """The first place where two runs differ.
 
     Attributes:
-        iteration: of the record, from 0; -1 where the two are of different versions of the
-            record and what both hold is the same.
+        iteration: of the record, from 0.
         signal: name of its first signal that differs, or "" where one run has ended.
         place: index of the first element that differs; () for a scalar or a shape.
         first: the value in the first run, as text; `second` that in the second one.
-        versions: of the two runs' records, where they are not the same one.
     """
 
     iteration: int
@@ -45,16 +43,8 @@ class Difference:
     place: tuple[int, ...]
     first: str
     second: str
-    versions: tuple[int, int] | None = None
 
     def __str__(self) -> str:
-        if self.versions is None:
-            return self._place()
-        a, b = self.versions
-        shared = "all the same, bit for bit" if self.iteration < 0 else self._place()
-        return f"signals of version {a} against {b}; of those in both: {shared}"
-
-    def _place(self) -> str:
         if not self.signal:
             return f"iteration {self.iteration}: the first {self.first}, the second {self.second}"
         place = f"[{', '.join(map(str, self.place))}]" if self.place else ""
@@ -69,37 +59,21 @@ class Difference:
 def first_difference(first: Path, second: Path) -> Difference | None:
     """The first difference between two runs' signals, or None where every bit is the same.
 
-    Runs of different versions of the record differ by that; the first difference is then
-    sought among the signals that both hold.
-
     Raises:
         UsageError: one of them is no run.
         LogDamagedError: one of them cannot be read.
     """
-    a, b = read_header(first), read_header(second)
-    versions = a.schema, b.schema
-    found = first_differing(read_columns(first, a), read_columns(second, b), min(versions))
-    if versions[0] == versions[1]:
-        return found
-    found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
-    return replace(found, versions=versions)
+    return first_differing(read_columns(first), read_columns(second))
 
 
 def first_differing(
-    first: Iterator[SignalColumns],
-    second: Iterator[SignalColumns],
-    version: int,
-    at: int = 0,
-    rounding: float = 0.0,
+    first: Iterator[SignalColumns], second: Iterator[SignalColumns], at: int = 0
 ) -> Difference | None:
-    """The first difference among the signals of a version of the record, from an iteration on.
-
-    Numbers count as the same that differ by less than `rounding` times the largest beside them.
-    """
+    """The first difference among signals, from an iteration on."""
     a, b = next(first, None), next(second, None)
     while a is not None and b is not None:
         n = min(len(a), len(b))
-        found = _difference(at, a.rows(0, n), b.rows(0, n), version, rounding)
+        found = _difference(at, a.rows(0, n), b.rows(0, n))
         if found is not None:
             return found
         at += n
@@ -111,12 +85,9 @@ def first_differing(
     return Difference(at, "", (), ended if a is None else more, ended if b is None else more)
 
 
-def _difference(
-    iteration: int, a: SignalColumns, b: SignalColumns, version: int, rounding: float
-) -> Difference | None:
+def _difference(iteration: int, a: SignalColumns, b: SignalColumns) -> Difference | None:
     """The first difference between as many records of each run, from an iteration on."""
-    names = [s.name for s in SIGNALS.values() if s.since <= version]
-    rows = {name: _row(a[name], b[name], rounding) for name in names}
+    rows = {name: _row(a[name], b[name]) for name in SIGNALS}
     name = min(rows, key=rows.__getitem__)
     if rows[name] == len(a):
         return None
@@ -124,34 +95,26 @@ def _difference(
     x, y = a[name][rows[name]], b[name][rows[name]]
     if x.shape != y.shape:
         return Difference(at, name, (), f"of shape {x.shape}", f"of shape {y.shape}")
-    differ = differing(a[name], b[name], rounding)[rows[name]]
+    differ = differing(a[name], b[name])[rows[name]]
     place = tuple(int(i) for i in np.argwhere(differ)[0])
     return Difference(at, name, place, repr(x[place].item()), repr(y[place].item()))
 
 
-def _row(x: NDArray[Any], y: NDArray[Any], rounding: float) -> int:
+def _row(x: NDArray[Any], y: NDArray[Any]) -> int:
     """The first row in which two columns differ, their length where there is none."""
     if x.shape != y.shape:
         return 0
-    differ = differing(x, y, rounding)
+    differ = differing(x, y)
     return int(np.argmax(differ.reshape(len(x), -1).any(axis=1))) if differ.any() else len(x)
 
 
-def differing(x: NDArray[Any], y: NDArray[Any], rounding: float = 0.0) -> NDArray[np.bool_]:
-    """Mask of the elements of two arrays that differ in a bit; all NaN are equal.
-
-    Or where they differ by more than `rounding` times the largest number in both.
-    """
+def differing(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
+    """Mask of the elements of two arrays that differ in a bit; all NaN are equal."""
     width = np.dtype(f"u{x.dtype.itemsize}")
     first, second = (np.ascontiguousarray(value).view(width) for value in (x, y))
     differ: NDArray[np.bool_] = (first != second).reshape(x.shape)
-    if not differ.any():
-        return differ
-    differ &= ~(np.isnan(x) & np.isnan(y))
-    if rounding and x.dtype.kind == "f" and differ.any():
-        least = rounding * max(np.abs(v[np.isfinite(v)]).max(initial=0.0) for v in (x, y))
-        with np.errstate(invalid="ignore"):  # of infinities
-            differ &= ~(np.abs(x - y) <= least)
+    if differ.any():
+        differ &= ~(np.isnan(x) & np.isnan(y))
     return differ
 
 

@@ -27,7 +27,6 @@ from replay.runs.codec import (
     decode_columns,
     decode_matrices,
     decode_matrix,
-    missing_signals,
     parsed,
 )
 from replay.runs.columns import Blocks, SignalColumns
@@ -48,20 +47,13 @@ class RunHeader:
     """Header of a run's log.
 
     Attributes:
-        schema: version of `BlockSignals` it was written with.
         spec: what the learner's source delivered.
         manifest: what the run was started with: `config` by sections, `seed`, `source`, and with
             which `arithmetic` its learner computes.
     """
 
-    schema: int
     spec: SourceSpec
     manifest: Mapping[str, Any]
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Signals that this log lacks, being older: they are read as NaN."""
-        return missing_signals(self.schema)
 
     @property
     def delta(self) -> float | None:
@@ -86,9 +78,9 @@ class RunHeader:
 
     @property
     def arithmetic(self) -> int:
-        """With which version of its arithmetic its learner computed; see `arithmetic_of`."""
+        """Version of the arithmetic with which its learner computed; see `arithmetic_of`."""
         version = self.manifest.get(ARITHMETIC)
-        return version if isinstance(version, int) else 1
+        return version if isinstance(version, int) else 0
 
     @property
     def forked_at(self) -> int | None:
@@ -123,7 +115,7 @@ def read_header(path: Path) -> RunHeader:
     """Read the header of a run's log.
 
     Raises:
-        UsageError: the file is no run's log, or of a later version of this software.
+        UsageError: the file is no run's log, or of another version of the signals.
         LogDamagedError: it cannot be read.
     """
     log = run_log(path)
@@ -131,30 +123,24 @@ def read_header(path: Path) -> RunHeader:
         found = next((r.values for r in reader.metadata if r.name == RUN_METADATA), None)
     if found is None:
         raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
-    schema = record_version(found)
-    if schema < 1:  # asked first: all else may look different in a later one
-        text = found.get("schema", "")
+    text = found.get("schema", "")
+    schema = int(text) if text.isascii() and text.isdigit() and len(text) < 10 else 0
+    if schema < 1:  # asked first: all else may look different in another version
         raise LogDamagedError(
             f"{log}: its metadata {RUN_METADATA} is broken (schema {text[:20]!r})"
         )
-    if schema > SCHEMA_VERSION:
+    if schema != SCHEMA_VERSION:
         raise UsageError(
-            f"{log} was written with version {schema} of the signals, this is version "
-            f"{SCHEMA_VERSION}: install a newer cdmisfa to read it"
+            f"{log} was written with version {schema} of the signals, and this cdmisfa reads "
+            f"version {SCHEMA_VERSION}: read it with the cdmisfa that wrote it"
         )
     try:
         spec = parse_json(found["spec"])
         for name in ("streams", "frame_shape", "truth"):
             spec[name] = tuple(spec[name])
-        return RunHeader(schema, SourceSpec(**spec), parse_json(found["manifest"], MAX_LIST))
+        return RunHeader(SourceSpec(**spec), parse_json(found["manifest"], MAX_LIST))
     except (KeyError, TypeError, ValueError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
-
-
-def record_version(metadata: Mapping[str, str]) -> int:
-    """The version of the signals' record that a run's metadata names, 0 where it names none."""
-    text = metadata.get("schema", "")
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 10 else 0
 
 
 TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, PHI_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
@@ -208,7 +194,7 @@ def read_batches(
         start: the frame to begin at, the first of a block.
 
     Raises:
-        UsageError: there is no such run, or it is of a later version of this software.
+        UsageError: there is no such run, or it is of another version of the signals.
         LogDamagedError: a message is damaged, or a finished file is cut short.
     """
     log = run_log(path)
@@ -250,7 +236,7 @@ class BatchReader:
         every: int = 1,
         topics: Sequence[str] = TOPICS,
     ) -> None:
-        self._log, self._spec, self._version, self._every = log, header.spec, header.schema, every
+        self._log, self._spec, self._every = log, header.spec, every
         self._wanted = {n: c.topic for n, c in channels.items() if c.topic in topics}
         self._begin(Blocks.concatenated(()))
 
@@ -306,7 +292,7 @@ class BatchReader:
 
     def _records(self) -> tuple[SignalColumns, ...]:
         where = f"{self._log} {SIGNALS_TOPIC}"
-        found = tuple(decode_columns(self._data[SIGNALS_TOPIC], where, self._version))
+        found = tuple(decode_columns(self._data[SIGNALS_TOPIC], where))
         streams = len(self._spec.streams)
         for columns in found:
             watched, rewards = columns["stream"], columns["R"]

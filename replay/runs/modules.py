@@ -34,9 +34,6 @@ _SCALARS = {
 }
 """Fields that are no arrays, and the kind of numpy type that each is stored as."""
 
-_OPTIONAL = ("centres", "counts", "expansion", "scale", "slow", "stream", "frame_shape", "recipe")
-"""Fields that files of earlier versions lack."""
-
 
 def save_modules(path: Path, modules: Iterable[Module]) -> None:
     """Write modules as arrays `module<index>_<field>`, whole or not at all.
@@ -73,21 +70,14 @@ def load_modules(path: Path) -> tuple[Module, ...]:
 
 
 def _module(stored: Mapping[str, NDArray[Any]], index: int) -> Module:
-    own = {name: array for name in _FIELDS if (array := stored.get(_key(index, name))) is not None}
-    if "stream_index" not in own:  # before streams had names, "stream" was the index
-        own["stream_index"] = own.pop("stream")
-    values: dict[str, Any] = {"stream": ""}
+    values: dict[str, Any] = {}
     for name in _FIELDS:
-        if name not in own and name in _OPTIONAL:
-            continue
-        array, kinds = own[name], _SCALARS.get(name, "fi")
+        array, kinds = stored[_key(index, name)], _SCALARS.get(name, "fi")
         if array.dtype.kind not in kinds:
             raise ValueError(f"{name} is not of type {kinds}")
         values[name] = array.item() if name in _SCALARS else array
-    if "frame_shape" in values:
-        values["frame_shape"] = tuple(map(int, values["frame_shape"].tolist()))
-    if "recipe" in values:
-        values["recipe"] = Recipe.from_json(values["recipe"]) if values["recipe"] else None
+    values["frame_shape"] = tuple(map(int, values["frame_shape"].tolist()))
+    values["recipe"] = Recipe.from_json(values["recipe"]) if values["recipe"] else None
     outputs, size = values["phi"].shape
     shapes = {"mean": size, "band_mean": outputs, "band_sd": outputs, "eta": outputs}
     for name, length in shapes.items():
@@ -99,8 +89,7 @@ def _module(stored: Mapping[str, NDArray[Any]], index: int) -> Module:
 def _indices(stored: Mapping[str, NDArray[Any]]) -> list[int]:
     """The modules' indices, of a file in which every name is that of a module's field.
 
-    A checksum protects the arrays' values, but nothing protects their names and number. A later
-    version may add fields; an unknown field in place of a missing one is a damaged name.
+    A checksum protects the arrays' values, but nothing protects their names and number.
     """
     fields: dict[int, set[str]] = {}
     for name in stored:
@@ -111,11 +100,9 @@ def _indices(stored: Mapping[str, NDArray[Any]]) -> list[int]:
     indices = sorted(fields)
     if indices != list(range(1, len(indices) + 1)):
         raise ValueError(f"there are modules {indices}, one is missing")
-    if any(fields[index] != fields[1] for index in indices):
-        raise ValueError("a module lacks what another has")
-    unknown = sorted(fields[1].difference(_FIELDS)) if indices else []
-    if unknown and not fields[1].issuperset(_FIELDS):
-        raise ValueError(f"{unknown[0][:40]!r} is nothing of a module")
+    for found_fields in fields.values():
+        if other := sorted(found_fields.symmetric_difference(_FIELDS)):
+            raise ValueError(f"{other[0][:40]!r} is missing, or nothing of a module")
     if any(int(stored[_key(index, "index")]) != index for index in indices):
         raise ValueError("the numbers of modules are mixed up")
     return indices

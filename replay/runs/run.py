@@ -46,7 +46,7 @@ class Run:
         path: the run's folder, or its log.
 
     Raises:
-        UsageError: there is no such run, or it is of a later version of this software.
+        UsageError: there is no such run, or it is of another version of the signals.
         LogDamagedError: its log cannot be read, here or in any later access.
     """
 

@@ -85,7 +85,7 @@ class RunWriter(Sink):
         self.spec, self.path = spec, Path(path)
         self._watched_every = max(watched_every, 1)
         self._phi_every = max(phi_every, 1)
-        self._by_progress = RunHeader(SCHEMA_VERSION, spec, manifest).by_progress
+        self._by_progress = RunHeader(spec, manifest).by_progress
         # Learning runs faster than log time: flushing every second of log time would be too
         # often, so the wall clock decides. Of images zstd leaves a tenth less than lz4, and
         # takes twice as long.

@@ -52,8 +52,6 @@ def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str
     settings += [(key, header.setting("learner", key)) for key in keys]
     said = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
     lines += [said, ""]
-    if header.missing:
-        lines.append(f"Signals of version {header.schema}, without {', '.join(header.missing)}.")
     return "\n".join(lines)
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.learning import Learner, Sink, weights_after
-from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals
+from cdmisfa.core.signals import NO_STATE, SIGNALS, BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
 from replay.runs.log import Batch, Frames, RunHeader, read_batches
 from replay.runs.run import LINES, Outline
@@ -73,7 +73,7 @@ class LiveView(Sink):
         run: Path | None = None,
         port: int | None = None,
     ) -> None:
-        outline = _nothing_yet(RunHeader(SCHEMA_VERSION, spec, manifest), tau, outputs)
+        outline = _nothing_yet(RunHeader(spec, manifest), tau, outputs)
         self.broadcast = Broadcast("live", port)
         self._recording = self.broadcast.recording
         self._recording.send_recording_name("live")

@@ -265,7 +265,7 @@ class Candidates(dict[int, Candidate]):
             ValueError: an array is missing or of another shape or type.
         """
         self.clear()
-        for stream in arrays.get("held", np.zeros(0, np.int64)).tolist():
+        for stream in arrays["held"].tolist():
             prefix = f"candidate.{stream}."
             parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
             self[stream] = self._new()

@@ -57,9 +57,6 @@ def _print_info(found: LogInfo) -> None:
         print_line(f"{each.path}: {', '.join(_words_of(each))}")
     for line in (*(f"{p.where}: {p.what}" for p in found.problems), *found.notes):
         print_line(line)
-    if found.signals is not None and found.signals.missing:
-        version, lacks = found.signals.version, ", ".join(found.signals.missing)
-        print_line(f"signals of version {version}: {lacks} are not in it, read as NaN")
     if found.run is not None:
         _print_run(found, found.run)
     for line in (*_times(found), *_room(found.size, found.library)):

@@ -53,7 +53,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
     group="Learner",
 )
-@options.deprecated("--portable")
 @options.end_after("iterations", "End after so many iterations.")
 @options.end_after(
     "modules",

@@ -216,7 +216,7 @@ def _is_film(out: Path) -> bool:
 def signals_command(markdown: bool, as_json: bool) -> None:
     """List every signal that a run records.
 
-    Of each there is more with --json and --markdown: its type, how it is shown, since when.
+    Of each there is more with --json and --markdown: its type, and how it is shown.
     """
     from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
 
@@ -224,7 +224,7 @@ def signals_command(markdown: bool, as_json: bool) -> None:
     if as_json:
         print_document(signals_version=SCHEMA_VERSION, signals=signals)
         return
-    more = ("dtype", "show", "since") if markdown else ()
+    more = ("dtype", "show") if markdown else ()
     columns = ("name", "symbol", "equation", "unit", "dims", *more, "about")
     rows = [[signal[column] for column in columns] for signal in signals]
     if markdown:
@@ -246,8 +246,7 @@ def _page(version: int, columns: tuple[str, ...], rows: list[list[Any]]) -> str:
             "",
             "Letters of `dims`: T frames of the block, J outputs of an abstraction, M frozen",
             "modules, S streams, A actions (stay, switch); nothing is a scalar. `equation` is the",
-            "paper's number. `show` is how the viewer shows it. `since` is the first version of",
-            "the record with it: in a run of an older one it is NaN.",
+            "paper's number. `show` is how the viewer shows it.",
             "",
             markdown(columns, [[f"`{row[0]}`", *row[1:]] for row in rows]),
         ]
