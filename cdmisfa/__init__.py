@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from cdmisfa.public.learning import learn as learn
     from cdmisfa.public.recording import Recording as Recording
     from cdmisfa.public.run import Run as Run
-    from cdmisfa.public.sweeps import Sweep as Sweep
-    from cdmisfa.public.sweeps import sweep as sweep
     from cdmisfa.watching import WatchEnv as WatchEnv
     from recorder.cameras.stepped import ArraySource as ArraySource
     from recorder.cameras.stepped import GymSource as GymSource
@@ -69,7 +67,6 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.public.recording": "Recording",
         "cdmisfa.public.run": "Run",
         "cdmisfa.watching": "WatchEnv",
-        "cdmisfa.public.sweeps": "Sweep sweep",
         "recorder.cameras.stepped": "GymSource",
         "recorder.images.recipe": "Recipe make_frame",
     },

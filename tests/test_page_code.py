@@ -67,9 +67,8 @@ def test_watching(ran: Callable[..., Ran]) -> None:
 
 
 def test_sweeps(ran: Callable[..., Ran]) -> None:
-    first, *points, claim = ran("sweeps.md")["printed"].splitlines()
-    assert first == "4 trials, which differ in {'learner.nu': [0.04, 0.05]}"
-    assert len(points) == 2
+    *points, claim = ran("sweeps.md")["printed"].splitlines()
+    assert [point.split()[0] for point in points] == ["0.04", "0.05"]
     assert "'holds': True" in claim
 
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 import psutil
 import pytest
 from camera_files import write_cameras
@@ -410,35 +409,6 @@ def test_results_are_printed_in_every_form(known: Path) -> None:
     document = json.loads(shown("--json"))
     assert document["points"][1]["measures"]["iterations"] == {"mean": 5.0, "sd": None, "n": 1}
     assert "20 ± 10" in shown()
-
-
-def test_a_grid_keeps_its_types_and_paths_may_be_texts(tmp_path: Path) -> None:
-    grid = {"learner.nu": [0.04, np.float64(0.05)], "learner.tau": [np.int64(40)]}
-    folder = str(tmp_path / "typed")
-    sweep("oscillatory", folder, grid=grid, seeds=[0], max_iterations=5)
-    points = [dict(point.point) for point in reading.results(folder)]
-    assert points == [{"learner.nu": nu, "learner.tau": 40} for nu in (0.04, 0.05)]
-    assert [type(value) for value in points[1].values()] == [float, int]
-    request = json.loads((tmp_path / "typed" / "sweep.json").read_text())
-    assert request["grid"] == {"learner.nu": [0.04, 0.05], "learner.tau": [40]}
-    assert reading.as_table(reading.results(folder))[1][0][:2] == ["0.04", "40"]
-    words = {key: [str(value) for value in values] for key, values in grid.items()}
-    again = sweep("oscillatory", folder, grid=words, seeds=[0], max_iterations=5)
-    assert (again.skipped, again.computed) == (2, 0)
-
-
-@pytest.mark.parametrize(
-    ("how", "said"),
-    [
-        ({"grid": {"learner.nu": 0.04}}, r"give a list of values .*\[0.04\]"),
-        ({"grid": {"learner.nu": "0.04"}}, "give a list of values"),
-        ({"seeds": 3}, r"seeds is 3: give several, as range\(3\)"),
-    ],
-)
-def test_what_is_no_list_is_refused(tmp_path: Path, how: Any, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        sweep("oscillatory", tmp_path / "s", **how)
-    assert not (tmp_path / "s").exists()
 
 
 def test_a_folder_without_a_sweep_is_refused(tmp_path: Path) -> None:

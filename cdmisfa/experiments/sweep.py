@@ -20,7 +20,7 @@ from cdmisfa.agents.learners import LEARNERS, learner_entry
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import MAX_LIST
-from cdmisfa.experiments.documents import as_text, plain, write_json
+from cdmisfa.experiments.documents import as_text, write_json
 from cdmisfa.experiments.run_folder import module_table, with_recipes
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import (
@@ -160,10 +160,6 @@ def plan(
     Raises:
         UsageError: an unknown key, a value that does not fit, or no such source.
     """
-    if any(isinstance(each, str) or not isinstance(each, Iterable) for each in grid.values()):
-        raise UsageError("grid: give a list of values for each key, as {'learner.nu': [0.04]}")
-    if not isinstance(seeds, Iterable):
-        raise UsageError(f"seeds is {seeds!r}: give several, as range({seeds})")
     words = (source,) if isinstance(source, str | Path) else tuple(source)
     cameras = cameras or CameraOptions()
     configured, recorded = _configured(words, preset, loop, cameras)
@@ -173,7 +169,7 @@ def plan(
     each = tuple(dict.fromkeys(seeds))
     trials: dict[str, SweepTrial] = {}
     for values in itertools.product(*grid.values()):
-        point = dict(zip(grid, map(_kept, values), strict=True))
+        point = dict(zip(grid, values, strict=True))
         words_of = (f"{key}={value}" for key, value in zip(grid, values, strict=True))
         told = configured((*settings, *words_of))
         learner = [section_table(told.learner), _own_code(told.learner.algorithm)]
@@ -287,17 +283,11 @@ def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     return {key: value for key, value in told.items() if key not in UNKEPT}
 
 
-def _kept(value: Any) -> Any:
-    """A value of a grid as JSON keeps it, a number as a number."""
-    kept = plain(value)
-    return str(value) if kept is None else kept
-
-
 def _request(grid: Mapping[str, Sequence[Any]], trials: Sequence[SweepTrial]) -> dict[str, Any]:
     return {
         "schema": 1,
         "source": [str(word) for word in trials[0].source] if trials else [],
-        "grid": {key: [_kept(value) for value in values] for key, values in grid.items()},
+        "grid": {key: list(values) for key, values in grid.items()},
         "seeds": sorted({trial.seed for trial in trials}),
         "code": code(),
         "trials": [{"id": trial.id, "point": dict(trial.point)} for trial in trials],
