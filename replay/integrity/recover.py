@@ -174,19 +174,25 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[str, dict[int, ChannelCount]
             log_time=attachment.log_time,
             create_time=attachment.create_time,
         )
-    channels, schemas = reader.channels, reader.schemas
-    kept = {number: ChannelCount() for number in channels}
+    kept: dict[int, ChannelCount] = {}
     written: dict[int, int] = {}
-    for number, channel in sorted(channels.items()):
-        schema = schemas.get(channel.schema_id)
-        written[number] = log.add_channel(
-            channel.topic,
-            log.add_schema(schema.name, schema.encoding, schema.data) if schema else 0,
-            encoding=channel.encoding,
-            metadata=channel.metadata,
-        )
+
+    def add_channels() -> None:
+        for number in sorted(reader.channels.keys() - kept.keys()):
+            channel = reader.channels[number]
+            schema = reader.schemas.get(channel.schema_id)
+            kept[number] = ChannelCount()
+            written[number] = log.add_channel(
+                channel.topic,
+                log.add_schema(schema.name, schema.encoding, schema.data) if schema else 0,
+                encoding=channel.encoding,
+                metadata=channel.metadata,
+            )
+
+    add_channels()
     digest, unverified = hashlib.sha256(), 0
     for segment, table in reader.tables(ordered=False):
+        add_channels()  # the summary may lack channels that are defined in a chunk
         unverified += len(table) if segment.cut and segment.crc else 0
         for number, sequence, log_time, published, data in table.rows():
             if number in written:
