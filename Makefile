@@ -4,7 +4,6 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 KERNELS := $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/kernels/b*.py)
 
-RELEASE := build/release
 SANITIZED := build/sanitized
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
 
@@ -37,12 +36,12 @@ pictures: $(INSTALLED)
 
 fuzz: $(INSTALLED)
 	$(BIN)/python -m tools.fuzz.guided --seconds $(or $(SECONDS),60)
-	$(BIN)/python -m tools.fuzz.logs --cases 1000000 --jobs 2
+	$(BIN)/python -m tools.fuzz.logs --jobs 2
 
-torture: $(INSTALLED) sanitized
-	$(BIN)/python -m tools.torture --seed $(or $(SEED),0) --page docs/results/reliability.md
+torture: $(INSTALLED)
+	$(BIN)/python -m tools.torture --seed $(or $(SEED),0) --minutes $(or $(MINUTES),30)
 
-# Tests of what attacks the product, with some cases of each kind.
+# The tests of tools/, with some cases of each kind of attack, and of the benchmarks.
 attacks: $(INSTALLED)
 	$(BIN)/pytest -n 3 --dist loadgroup tools
 
@@ -54,22 +53,12 @@ sanitized: $(INSTALLED)
 	    $(BIN)/pytest -q -o "pythonpath=$(SANITIZED)/lib ." $(wildcard tests/test_kernels*.py) \
 	    tests/test_incsfa.py tests/test_recursive_sfa.py tests/test_chunks.py
 
-# What a release is, in dist/, made of the commit alone: docs/how-to/release.md.
+# Wheel and source archive of the commit, in dist/.
 release: $(INSTALLED)
-	rm -rf $(RELEASE) dist
-	mkdir -p $(RELEASE)/source dist
-	git archive HEAD | tar -x -C $(RELEASE)/source
-	umask 022 && export PATH="$(CURDIR)/$(BIN):$$PATH" SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) && \
-	    python -m build --outdir $(RELEASE) $(RELEASE)/source && \
-	    auditwheel repair --wheel-dir dist $(RELEASE)/*.whl
-	mv $(RELEASE)/*.tar.gz dist
-	$(PYTHON) -m venv --without-pip $(RELEASE)/environment
-	$(BIN)/python -m pip --python $(RELEASE)/environment install --quiet dist/*.whl
-	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible \
-	    --output-file dist/sbom.cdx.json $(RELEASE)/environment/bin/python
-	$(BIN)/python tools/installed.py $(RELEASE)/environment
-	$(BIN)/twine check --strict dist/*.whl dist/*.tar.gz
-	cd dist && sha256sum * > SHA256SUMS
+	rm -rf dist build/release
+	git clone --quiet . build/release
+	$(BIN)/python -m build --outdir dist build/release
+	$(BIN)/twine check --strict dist/*
 
 install: $(INSTALLED)
 

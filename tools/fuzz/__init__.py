@@ -1,1 +1,1 @@
-"""Fuzzing: broken logs by the million, and whatever else is decoded, guided by coverage."""
+"""Fuzzing: broken MCAP logs by number, and every other decoder guided by coverage."""

@@ -1,7 +1,7 @@
-"""What must hold of any bytes that are given as a log.
+"""Check what must hold for any bytes that are read as a log.
 
-Only our errors escape, in one line each. Nothing is given out that a checksum contradicts.
-Two ways of reading the same thing give the same.
+Only our errors escape, in one line each. No message is returned that a checksum contradicts.
+Two ways of reading the same file give the same.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from replay.recordings.view_file import ViewFile
 from .mutations import Case, bases
 
 MEMORY = MAX_CHUNK + 32 * 1024 * 1024
-"""Most bytes that a small file may make us ask for: a chunk at the limit, and ourselves."""
+"""Most bytes that a small file may make us allocate: a chunk at the limit, and 32 MB."""
 _BLOCK = 7
 
 
 class BrokenPromise(AssertionError):  # noqa: N818 - it names what happened
-    """Something that must not happen to a log of any kind."""
+    """Something that must not happen with any input."""
 
 
 @contextlib.contextmanager
@@ -46,11 +46,9 @@ def _only_our_errors() -> Iterator[None]:
 
 
 def check(case: Case, path: Path, number: int = 0) -> None:
-    """Read a broken log in every way; the rarer and slower ones by its number.
+    """Read a broken log in every way, the slower ones by its number.
 
-    Raises:
-        BrokenPromise: what was read cannot be.
-        Exception: whatever else escaped.
+    Raise BrokenPromise for what must not happen; whatever escapes is a defect, too.
     """
     path.write_bytes(case.raw)
     with _only_our_errors():
@@ -70,11 +68,7 @@ def check(case: Case, path: Path, number: int = 0) -> None:
 
 
 def check_memory(case: Case, path: Path) -> None:
-    """Read a broken log, and see how much memory it makes us ask for at once.
-
-    Raises:
-        BrokenPromise: more than it may.
-    """
+    """Read a broken log; raise BrokenPromise when that allocates more than `MEMORY`."""
     tracemalloc.start()
     try:
         check(case, path)
@@ -82,7 +76,7 @@ def check_memory(case: Case, path: Path) -> None:
     finally:
         tracemalloc.stop()
     if peak > MEMORY:
-        raise BrokenPromise(f"{len(case.raw)} bytes made us ask for {peak}")
+        raise BrokenPromise(f"{len(case.raw)} bytes made us allocate {peak}")
 
 
 def _key(message: Message) -> tuple[str, int, bytes]:
@@ -91,7 +85,7 @@ def _key(message: Message) -> tuple[str, int, bytes]:
 
 @cache
 def _truth(base: str) -> frozenset[tuple[int, bytes]]:
-    """Log times and messages of the log that was broken."""
+    """Return log times and messages of the log that was broken."""
     import tempfile
 
     with tempfile.NamedTemporaryFile(suffix=".mcap") as file:
@@ -112,8 +106,8 @@ def _read(case: Case, path: Path, *, salvage: bool) -> None:
             in_file_order = Counter(map(_key, reader.messages(ordered=False)))
             if in_file_order != Counter(map(_key, found)):
                 raise BrokenPromise("one order has other messages than the other")
-        told = reader.problems or reader.crc_absent() or (salvage and reader.missing)
-        if case.base and case.trusted and not told:
+        reported = reader.problems or reader.crc_absent() or (salvage and reader.missing)
+        if case.trusted and not reported:
             true = _truth(case.base)
             if not all((m.log_time, m.data) in true for m in found):
                 raise BrokenPromise("a message was changed, its checksum does not say so")
@@ -125,18 +119,14 @@ def _play(case: Case, path: Path, *, salvage: bool) -> None:
             raise BrokenPromise(f"{source.frames} frames in {len(case.raw)} bytes")
         blocks: list[Block] = []
         try:
-            while (left := source.first_frame + source.frames - _played(blocks, source)) > 0:
+            while (left := source.frames - sum(map(len, blocks))) > 0:
                 blocks.append(source.take(0, min(left, _BLOCK)))
         finally:
             _same_slowly(path, blocks, salvage=salvage)
 
 
-def _played(blocks: list[Block], source: RecordedSource) -> int:
-    return source.first_frame + sum(map(len, blocks))
-
-
 def _same_slowly(path: Path, blocks: list[Block], *, salvage: bool) -> None:
-    """Compare the blocks that were played with what the reader in Python decodes."""
+    """Compare the blocks of a source with what the reader in Python decodes."""
     if not blocks:
         return
     with contextlib.closing(ViewFile(path, salvage=salvage)) as view:
@@ -158,7 +148,7 @@ def _same_slowly(path: Path, blocks: list[Block], *, salvage: bool) -> None:
 
 
 def tabled_rows(view: ViewFile, start: int, frames: np.ndarray, truth: np.ndarray) -> None:
-    """As `ViewFile.take`, by the tables of chunks alone and with nothing in C."""
+    """Read as `ViewFile.take` does, by the tables of chunks and without C."""
     outs = (frames.reshape(len(frames), -1).view(np.uint8), truth.view(np.uint8))
     for rows, out in zip(view._channels, outs, strict=False):
         at = 0

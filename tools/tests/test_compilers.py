@@ -16,14 +16,11 @@ SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recove
 @pytest.mark.parametrize(
     ("compiler", "flags", "runner"),
     [
-        (("gcc",), ("-O2",), ()),
         (("gcc",), ("-O3",), ()),
         (("gcc",), WIDE, ()),
-        (("gcc",), (*WIDE, "-mavx512f", "-mavx512vl"), ()),
         (("gcc",), SANITIZERS, ()),
         (("gcc",), (*WIDE, *SANITIZERS), ()),
         (("gcc",), ("-O3", "-static"), NEHALEM),
-        (("clang",), ("-O3",), ()),
         (("clang",), WIDE, ()),
         (("aarch64-linux-gnu-gcc",), ("-O3", "-static"), ("qemu-aarch64",)),
     ],

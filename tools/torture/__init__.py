@@ -1,21 +1,14 @@
-"""Campaigns against the project: kills, damage, full disks, races, each case from its seed.
+"""Campaigns against the commands: kill them, damage their files, let system calls fail.
 
-    python -m tools.torture [CAMPAIGN ...] [--minutes 60] --seed 0 --jobs 2 -o build/torture
+    python -m tools.torture [CAMPAIGN ...] [--minutes 10] [--seed 0] [--jobs 2]
+    python -m tools.torture CAMPAIGN --case SEED     run one case again and keep its folder
 
-Each campaign ends when it has had as many cases as it states. A run that was stopped is gone on
-with by the same command at the same commit. One case again, with its folder kept:
+A campaign is a module of this package with
 
-    python -m tools.torture CAMPAIGN --case SEED
+    case(job: Job) -> str           run one case; return RIGHT, REFUSED or SKIPPED, raise `Defect`
+    prepare(folder: Path) -> Any    make what all cases share, once: `job.shared`
+    MEGABYTES, BESIDE               (optional) memory limit; cases at a time for each job
 
-To add a campaign, write a module here and put its name into `CAMPAIGNS` (campaigns.py). It has
-
-    case(job: Job) -> Outcome     one case; raises `Defect` for what must not happen
-    prepare(folder: Path) -> Any  (optional) what all of its cases share, made once: `job.given`
-    LIMITS = Limits(...)          of one case: seconds, megabytes; of all: how many are enough
-
-Each case runs in a forked process of its own, in a new session and an empty folder, with
-everything that `prepare` imported already there; what it leaves running is killed. Everything
-random comes from `job.rng`; a campaign that goes through a list takes `job.seed` modulo its length,
-and where `prepare` gave the list it ends when each was taken once.
-Groups (`Outcome.group`) are counted apart in the data beside the page.
+Each case runs in a forked process in a new session, in an empty folder; processes that it leaves
+are killed. Everything random comes from `job.rng`, which the seed determines.
 """

@@ -1,4 +1,4 @@
-"""Commands as cases run them: in this process, which is the case's own, or as a process."""
+"""Run commands in the process of a case, or in a fork of it, and judge how they end."""
 
 from __future__ import annotations
 
@@ -8,24 +8,22 @@ import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from cdmisfa.cli.interrupts import SIGNALS
 
-from .outcomes import CLEAR_ERROR, HANG, RIGHT, TRACEBACK, WRONG, Defect, Outcome
+from .cases import REFUSED, RIGHT, Defect
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT = 5.0
-"""Seconds in which what was told to end, or was given something broken, must have ended."""
+"""Seconds after which a command that was asked to end, or got a broken file, must have ended."""
 
 CODES = (0, 1, 2, 3, 4, 129, 130, 143)
 ERRORS = (1, 2, 3, 4)
@@ -36,11 +34,7 @@ UNCLEAR = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """A command that ended.
-
-    Attributes:
-        seconds: it took; of this process alone, where it ran in it.
-    """
+    """A command that ended; `seconds` counts the process alone where it ran in this one."""
 
     words: tuple[str, ...]
     code: int
@@ -49,22 +43,18 @@ class Ran:
     seconds: float
 
     @property
-    def line(self) -> str:
-        """The command as one would type it."""
-        return f"cdmisfa {shlex.join(self.words)}"
-
-    @property
     def json(self) -> Any:
-        """The document that it printed."""
+        """The document that the command printed."""
         return json.loads(self.out)
 
-    def told(self) -> str:
-        """Its last line on stderr."""
-        return next(reversed(self.err.strip().splitlines()), "")[:300]
+    def __str__(self) -> str:
+        """Return the command, its exit code and its last line on stderr."""
+        last = next(reversed(self.err.strip().splitlines()), "")[:300]
+        return f"cdmisfa {shlex.join(self.words)}: exit {self.code}: {last}"
 
 
 def here(*words: object) -> Ran:
-    """Run a command in this process, as `main` does; its streams go to files meanwhile."""
+    """Run a command in this process; its streams go to files meanwhile."""
     from cdmisfa.cli import run
 
     args = tuple(map(str, words))
@@ -73,7 +63,7 @@ def here(*words: object) -> Ran:
             began, began_wall = time.process_time(), time.monotonic()
             code = run(list(args))
             seconds = time.process_time() - began
-            # what waits uses no time of a processor, and others may use it meanwhile
+            # A command that waits uses no processor time, and other cases may use it meanwhile.
             if (wall := time.monotonic() - began_wall) > 4 * LIMIT:
                 seconds = wall
         out.seek(0)
@@ -97,51 +87,52 @@ def _instead(number: int, other: int) -> Iterator[None]:
         os.close(kept)
 
 
-def environment() -> dict[str, str]:
-    """That of a command which is run from the code here."""
-    return {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+def must(*words: object, done: tuple[int, ...] = (0,)) -> Ran:
+    """Run a command in this process that has to succeed."""
+    ran = here(*words)
+    if ran.code not in done:
+        raise Defect(f"preparing: {ran}")
+    return ran
 
 
-class Process:
-    """A command as a process of its own; its streams are files beside `folder`.
+class Fork:
+    """A command in a fork of this process, with its streams in files beside `folder`.
 
     Args:
-        folder: where it is begun.
+        folder: working folder.
         words: of the command.
-        shell: redirections.
-        more: variables of its environment.
+        tweak: called before the command.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *words: object,
-        shell: str = "",
-        more: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:
+    def __init__(self, folder: Path, *words: object, tweak: Callable[[], None]) -> None:
         self.words = tuple(map(str, words))
-        self._environment = environment() | more
         self.code: int | None = None
         streams = Path(tempfile.mkdtemp(dir=folder.parent))
         self._out, self._err = streams / "out", streams / "err"
-        with self._out.open("w") as out, self._err.open("w") as err:
-            self.pid = self._begin(folder, out.fileno(), err.fileno(), shell)
         self._began = time.monotonic()
+        with self._out.open("w") as out, self._err.open("w") as err:
+            self.pid = os.fork()
+            if self.pid == 0:
+                self._in_child(folder, out.fileno(), err.fileno(), tweak)
 
-    def _begin(self, folder: Path, out: int, err: int, shell: str) -> int:
-        line = [sys.executable, "-m", "cdmisfa", *self.words]
-        if shell:
-            line = ["sh", "-c", f'exec "$@" {shell}', "sh", *line]
-        process = subprocess.Popen(
-            line,
-            cwd=folder,
-            env=self._environment,
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=err,
-        )
-        process.returncode = 0  # it is waited for here, and by nobody else
-        return process.pid
+    def _in_child(self, folder: Path, out: int, err: int, tweak: Callable[[], None]) -> None:
+        code = 70
+        try:
+            os.chdir(folder)
+            os.dup2(out, 1)
+            os.dup2(err, 2)
+            for number in SIGNALS:  # for a signal that comes after the command has ended
+                signal.signal(number, lambda *_: None)
+            tweak()
+            from cdmisfa.cli import run
+
+            code = run(list(self.words))
+            sys.stdout.flush()
+            sys.stderr.flush()
+        except BaseException:
+            os.write(2, traceback.format_exc().encode())
+        finally:
+            os._exit(code)
 
     @property
     def running(self) -> bool:
@@ -157,105 +148,35 @@ class Process:
         if self.running:
             os.kill(self.pid, number)
 
-    def wait(self, seconds: float, group: str, why: str = "") -> Ran:
-        """What it came to.
-
-        Raises:
-            Defect: it hangs.
-        """
-        if not until(lambda: not self.running, seconds):
+    def wait(self, seconds: float, why: str) -> Ran:
+        """Wait for its end; one that hangs is a defect."""
+        if hangs := not until(lambda: not self.running, seconds):
             self.send(signal.SIGKILL)
             until(lambda: not self.running, 10)
-            ran = self.ran()
-            what = f"{ran.line} {why} did not end within {seconds:g} s: {ran.told()}"
-            raise Defect(HANG, group, what)
-        return self.ran()
-
-    def ran(self) -> Ran:
-        """What it has said until now, and its code, once it has ended."""
-        seconds = time.monotonic() - self._began
         texts = [path.read_text(errors="replace") for path in (self._out, self._err)]
-        return Ran(self.words, -signal.SIGKILL if self.code is None else self.code, *texts, seconds)
+        code = -signal.SIGKILL if self.code is None else self.code
+        ran = Ran(self.words, code, *texts, time.monotonic() - self._began)
+        if hangs:
+            raise Defect(f"no end within {seconds:g} s, {why}: {ran}")
+        return ran
 
 
-class Fork(Process):
-    """The same, forked off this process, so that nothing is imported again.
-
-    Args:
-        folder: as for `Process`, as are `words`.
-        tweak: called there first.
-    """
-
-    def __init__(self, folder: Path, *words: object, tweak: Callable[[], None] = int) -> None:
-        self._tweak = tweak
-        super().__init__(folder, *words)
-
-    def _begin(self, folder: Path, out: int, err: int, shell: str) -> int:
-        pid = os.fork()
-        if pid:
-            return pid
-        code = 70
-        try:
-            os.chdir(folder)
-            os.dup2(out, 1)
-            os.dup2(err, 2)
-            for number in SIGNALS:  # what comes after the command has ended
-                signal.signal(number, lambda *_: None)
-            self._tweak()
-            from cdmisfa.cli import run
-
-            code = run(list(self.words))
-            sys.stdout.flush()
-            sys.stderr.flush()
-        except BaseException:
-            os.write(2, traceback.format_exc().encode())
-        finally:
-            os._exit(code)
-
-
-def call(folder: Path, *words: object, seconds: float = 110, group: str = "setup") -> Ran:
-    """Run a command as a process, to its end."""
-    return Process(folder, *words).wait(seconds, group)
-
-
-def must(folder: Path, *words: object, seconds: float = 600) -> Ran:
-    """Run a command that has to succeed.
-
-    Raises:
-        Defect: it does not.
-    """
-    ran = call(folder, *words, seconds=seconds)
-    if ran.code != 0:
-        raise Defect(WRONG, "setup", f"{ran.line}: exit {ran.code}: {ran.told()}")
-    return ran
-
-
-def judge(ran: Ran, group: str, *, limit: float | None = LIMIT) -> Outcome:
-    """Whether a command gave a result or one clear line, in time.
-
-    Raises:
-        Defect: neither.
-    """
+def judge(ran: Ran, *, limit: float | None = LIMIT) -> str:
+    """Return RIGHT or REFUSED for a result or one clear line in time; all else is a defect."""
     if UNCLEAR.search(ran.err) or ran.code not in CODES:
-        text = ran.told() if ran.code in CODES else f"exit {ran.code}: {ran.told()}"
-        raise Defect(TRACEBACK, group, f"{ran.line}: {text}")
+        raise Defect(f"no clear line: {ran}")
     if limit is not None and ran.seconds > limit:
-        raise Defect(HANG, group, f"{ran.line}: {ran.seconds:.1f} s")
+        raise Defect(f"{ran.seconds:.1f} s: {ran}")
     if ran.code in ERRORS:
-        # 3 and 4 may also be said in what a command prints
+        # 1, 3 and 4 may also be explained on stdout.
         if not ran.err.strip() and not (ran.code in (1, 3, 4) and ran.out.strip()):
-            raise Defect(TRACEBACK, group, f"{ran.line}: exit {ran.code} without a word")
-        return Outcome(CLEAR_ERROR, group, ran.told())
-    return Outcome(RIGHT, group)
-
-
-def worst(outcomes: Sequence[Outcome]) -> Outcome:
-    """An error, if there is one, else what is right."""
-    return next((o for o in outcomes if o.kind == CLEAR_ERROR), outcomes[0])
+            raise Defect(f"no message: {ran}")
+        return REFUSED
+    return RIGHT
 
 
 def until(ready: Callable[[], bool], seconds: float) -> bool:
-    """Wait for something; whether it came."""
+    """Wait for a condition; return whether it came true."""
     deadline = time.monotonic() + seconds
     while not ready():
         if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""What is killed: commands whose results are the same each time, however often they are resumed."""
+"""Commands whose results are the same bytes each time, however often they are resumed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from camera_files import write_pictures
 
 from replay.storage.identity import file_sha256
 
-from .commands import here, must
+from .cases import Defect
+from .commands import UNCLEAR, Ran, here, must
 from .materials import EASY
-from .outcomes import WRONG, Defect
 
 Words = tuple[object, ...]
 FRAMES = 4000
@@ -24,54 +24,62 @@ ITERATIONS = 300
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """A command that is killed.
+    """A command that is interrupted.
 
     Attributes:
-        words: of the command, of where it writes and of the shared folder.
-        again: what is added to go on.
-        result: what it came to, the same each time.
-        share: how often it is killed, relative to others.
-        blocks: how many it writes, each of which is waited for so that it takes some seconds; 0
-            where it takes its own time.
-        log_fps: of what it records.
-        on: what goes on with it, where those are other words.
+        words: returns the command, of its output folder and the shared folder.
+        resume: words that are added to resume it, or the whole command where `-o` is among them.
+        result: reads what must be the same each time.
+        blocks: number of blocks that it writes, each of which can be slowed down; else 0.
+        log_fps: frames per second of log time of what it records.
     """
 
     words: Callable[[Path, Path], Words]
-    again: Words
+    resume: Words
     result: Callable[[Path], Any]
-    share: float
     blocks: int = 0
     log_fps: float = 50.0
-    on: Callable[[Path], Words] | None = None
+
+    def again(self, place: Path, shared: Path) -> Words:
+        """Return the command that resumes what is in `place`, or begins where nothing is."""
+        if not (place.exists() and any(place.iterdir())):
+            return self.words(place, shared)
+        if "-o" in self.resume:
+            return (*self.resume, place)
+        return (*self.words(place, shared), *self.resume)
+
+    def finish(self, place: Path, shared: Path, expected: Any) -> None:
+        """Resume to the end and compare the result."""
+        ran = here(*self.again(place, shared))
+        if not_begun(ran):
+            ran = here(*self.words(place, shared), "--force")
+        if ran.code != 0:
+            raise Defect(f"{'unclear' if UNCLEAR.search(ran.err) else 'not resumed'}: {ran}")
+        if (result := self.result(place)) != expected:
+            raise Defect(f"another result, {result}: {ran}")
 
 
-def files(place: Path) -> dict[str, str]:
-    """Of a recording: every byte."""
+def not_begun(ran: Ran) -> bool:
+    """Return whether a command refused to resume because nothing of use is there yet."""
+    return ran.code == 2 and ("no run to resume" in ran.err or "fork again with --f" in ran.err)
+
+
+def _files(place: Path) -> dict[str, str]:
+    paths = sorted(place.rglob("*.mcap"))
+    return {str(path.relative_to(place)): file_sha256(path) for path in paths}
+
+
+def _run(place: Path) -> dict[str, Any]:
+    result = json.loads((place / "run.json").read_text())["result"]
     return {
-        str(path.relative_to(place)): file_sha256(path) for path in sorted(place.rglob("*.mcap"))
+        "verified": here("verify", place).code == 0,
+        "modules.npz": file_sha256(place / "modules.npz"),
+        **{key: result[key] for key in ("signals_sha256", "iterations", "modules", "ended")},
     }
 
 
-def run(place: Path) -> dict[str, Any]:
-    """Of a run: its signals and modules; also that it proves itself."""
-    verified = here("verify", place)
-    document = json.loads((place / "run.json").read_text())["result"]
-    return {
-        "whole": verified.code == 0,
-        "modules": file_sha256(place / "modules.npz"),
-        **{key: document[key] for key in ("signals_sha256", "iterations", "modules", "ended")},
-    }
-
-
-def sweep(place: Path) -> Any:
-    """Of a sweep: the mean of each point."""
+def _sweep(place: Path) -> Any:
     return here("results", place, "--json").json
-
-
-def reproduction(place: Path) -> Any:
-    """Of a reproduced experiment."""
-    return json.loads((place / "five" / "results.json").read_text())
 
 
 def _learn(*words: object) -> Callable[[Path, Path], Words]:
@@ -87,65 +95,54 @@ def _record(*words: object) -> Callable[[Path, Path], Words]:
     return lambda place, shared: ("record", *words, "--seed", 3, "-o", place)
 
 
-def _sweep(jobs: int) -> Callable[[Path, Path], Words]:
-    grid = ("--grid", "learner.nu=0.03,0.05", "--seeds", "0:3", "--max-iterations", 40)
-    return lambda place, shared: ("sweep", "oscillatory", *grid, "--jobs", jobs, "-o", place)
-
-
-PARTS = ("--split", "20s")
-MODULES = ("--max-modules", 9)
-RESUME = ("--resume",)
 STREAMS = ("oscillatory", "--frames", FRAMES)
+GRID = ("--grid", "learner.nu=0.03,0.05", "--seeds", "0:3", "--max-iterations", 40)
+MODULES = (*EASY, "--max-modules", 9)
+PICTURES = ("--rate", 25, "--size", "16x12")
+RESUME = ("--resume",)
 
 WORKS: Mapping[str, Work] = {
-    "record oscillatory": Work(_record(*STREAMS), RESUME, files, 20, blocks=250),
-    "record oscillatory --split": Work(_record(*STREAMS, *PARTS), RESUME, files, 12, blocks=250),
-    "record icub": Work(_record("icub", "--frames", 60), RESUME, files, 4),
-    "learn, 2.0": Work(_learn("oscillatory", *EASY, *MODULES), RESUME, run, 20, blocks=ITERATIONS),
+    "record": Work(_record(*STREAMS), RESUME, _files, blocks=250),
+    "record --split": Work(_record(*STREAMS, "--split", "20s"), RESUME, _files, blocks=250),
+    "record icub": Work(_record("icub", "--frames", 60), RESUME, _files),
+    "learn, 2.0": Work(_learn("oscillatory", *MODULES), RESUME, _run, ITERATIONS),
     "learn, 2.0, recorded": Work(
-        _learn("@recording", *EASY, *MODULES, "--loop"), RESUME, run, 10, blocks=ITERATIONS
+        _learn("@recording", *MODULES, "--loop"), RESUME, _run, ITERATIONS
     ),
-    "learn, progress": Work(
-        _learn("oscillatory", "--algorithm", "progress"), RESUME, run, 15, blocks=130
-    ),
-    "learn, progress, pictures": Work(
-        _learn("@png/left", "@png/right", "--rate", 25, "--size", "16x12", "--loop"),
-        *(RESUME, run, 8, ITERATIONS),
+    "learn, progress, images": Work(
+        _learn("@png/left", "@png/right", *PICTURES, "--loop"), RESUME, _run, ITERATIONS
     ),
     "fork": Work(
         lambda place, shared: ("fork", shared / "run", "--at", 150, "--no-rerun", "-o", place),
-        *((), run, 10, ITERATIONS // 2),
-        on=lambda place: ("learn", "-o", place, "--resume", "--no-rerun"),
+        ("learn", "--resume", "--no-rerun", "-o"),
+        *(_run, ITERATIONS // 2),
     ),
     "convert": Work(
         lambda place, shared: (
             *("convert", shared / "png" / "left", shared / "png" / "right"),
-            *("--rate", 25, "--size", "16x12", "-o", place),
+            *(*PICTURES, "-o", place),
         ),
-        *(RESUME, files, 12, 50, 25.0),
+        *(RESUME, _files, 50, 25.0),
     ),
-    "sweep": Work(_sweep(1), (), sweep, 5),
-    "sweep --jobs 2": Work(_sweep(2), (), sweep, 2),
-    "reproduce": Work(
-        lambda place, shared: ("reproduce", "five", "--trials", 10, "-o", place),
-        *((), reproduction, 5),
+    "sweep": Work(
+        lambda place, shared: ("sweep", "oscillatory", *GRID, "--jobs", 1, "-o", place), (), _sweep
+    ),
+    "sweep --jobs 2": Work(
+        lambda place, shared: ("sweep", "oscillatory", *GRID, "--jobs", 2, "-o", place), (), _sweep
     ),
 }
 
 
-def prepared(folder: Path, names: Collection[str]) -> dict[str, Any]:
-    """Results of works that nobody stops, and how many seconds each takes."""
-    must(folder, "record", "oscillatory", "-o", folder / "recording", "--frames", FRAMES)
-    must(folder, *WORKS["learn, 2.0"].words(folder / "run", folder))
+def prepare(folder: Path, names: Collection[str]) -> tuple[dict[str, Any], dict[str, float]]:
+    """Make what works read; return the result of each without interruption, and its seconds."""
+    must("record", "oscillatory", "-o", folder / "recording", "--frames", FRAMES)
+    must(*WORKS["learn, 2.0"].words(folder / "run", folder))
     (folder / "png").mkdir()
     for name in ("left", "right"):
         write_pictures(folder / "png" / name, 400)
     results, seconds = {}, {}
     for name in names:
-        work, place = WORKS[name], folder / "done" / name
-        began = time.monotonic()
-        ran = here(*work.words(place, folder))
-        if ran.code != 0:
-            raise Defect(WRONG, "setup", f"{ran.line}: exit {ran.code}: {ran.told()}")
+        work, place, began = WORKS[name], folder / "done" / name, time.monotonic()
+        must(*work.words(place, folder))
         results[name], seconds[name] = work.result(place), time.monotonic() - began
-    return {"folder": folder, "results": results, "seconds": seconds}
+    return results, seconds
