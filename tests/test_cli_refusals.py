@@ -126,7 +126,6 @@ CASES: dict[str, tuple[str, ...]] = {
                 "export RUN --to csv -o",
                 "recover RUN/run.mcap -o",
                 "reproduce stability --trials 1 -o",
-                "reproduce --page",
                 "demo --frames 400 -o",
                 "view RUN --save",
                 "view RUN --screenshot",
@@ -156,8 +155,6 @@ CASES: dict[str, tuple[str, ...]] = {
     "fork RUN --at 16 -o x": ("holds 15 iterations",),
     # experiments that there are not, or not so
     "reproduce stabillity -o x": ("no experiment 'stabillity': did you mean stability?",),
-    "reproduce -o x": ("say which experiment",),
-    "reproduce difficulty -o x --recording LOGS": ("takes more than 4000: record them",),
     # what is read from no URL, and what is the URL of no log
     "results https://host/a/b": ("https://host/a/b is a URL: name a path on this machine",),
     "view RUN --save a.rrd --all-views https://host/a/b": ("https://host/a/b is a URL: name a",),

@@ -363,6 +363,7 @@ def test_what_is_no_file_is_not_replaced(
     out = Path(words.split()[-1])
     NO_FILES[kind](out)
     before = out.stat()
-    done = cdmisfa(*words.replace("RUN", str(oscillatory_run)).split(), "--force")
+    force = () if words.startswith("reproduce") else ("--force",)
+    done = cdmisfa(*words.replace("RUN", str(oscillatory_run)).split(), *force)
     assert (done.code, f"{out} is no file but" in done.err) == (2, True), done.err
     assert os.path.samestat(out.stat(), before)

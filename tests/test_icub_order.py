@@ -14,7 +14,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
 from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.studies.paper import icub
-from cdmisfa.studies.paper.oscillatory import paper_config
+from cdmisfa.studies.paper.experiment import paper_config
 from replay.recordings.source import RecordedSource
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +13,32 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 
+from benchmarks.paper import ablation, costs, difficulty, scenes
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.results import mean_interval
 from cdmisfa.experiments.trial import run_trial
-from cdmisfa.studies.paper import ablation, difficulty, icub, nonstationary, oscillatory, scenes
-from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Trial, groups
-from cdmisfa.studies.paper.oscillatory import Oscillatory, paper_config
-from cdmisfa.studies.paper.reproduce import EXPERIMENTS, reproduce
+from cdmisfa.features.sfa import slowness
+from cdmisfa.studies.paper import icub, nonstationary, oscillatory
+from cdmisfa.studies.paper.experiment import Experiment, Findings, Trial, groups, paper_config
+from cdmisfa.studies.paper.oscillatory import Oscillatory
+from cdmisfa.studies.paper.reproduce import reproduce
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
 
-SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_logs" / "icub"
 
 
 def stability(folder: Path, trials: int = 1, jobs: int = 1) -> tuple[dict[str, Any], list[int]]:
     """The results of an experiment, and how many trials were finished at each report."""
     done: list[int] = []
-    request = Request(trials, True, None, folder, jobs)
-    return reproduce("stability", request, progress=lambda n, _: done.append(n)), done
+    document = reproduce(
+        "stability", folder, trials=trials, jobs=jobs, progress=lambda n, _: done.append(n)
+    )
+    return document, done
 
 
 @pytest.fixture
@@ -48,9 +54,7 @@ def judged(experiment: Experiment, trials: list[Trial]) -> Findings:
     return found
 
 
-@pytest.mark.parametrize(
-    "name", ["oscillatory", "five", "stability", "costs", "ablation", "difficulty"]
-)
+@pytest.mark.parametrize("name", ["oscillatory", "five", "stability"])
 def test_quick_runs_reproduce_the_claim_and_write_everything(
     name: str, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
@@ -61,37 +65,24 @@ def test_quick_runs_reproduce_the_claim_and_write_everything(
     assert document["reproduced"] is True
     assert json.loads((folder / "results.json").read_text()) == document
     assert document["versions"] == versions()
-    assert (folder / "table.md").read_text().startswith("| ")
-    drawn = set() if name in ("five", "costs", "ablation") else {".png", ".svg"}
-    assert {Path(f).suffix for f in document["figures"]} == drawn
+    assert document["figures"] == ([] if name == "five" else [f"{name}.png"])
     assert all((folder / figure).stat().st_size > 1000 for figure in document["figures"])
-    parquet = pytest.importorskip("pyarrow.parquet")
-    assert parquet.read_table(folder / "rows.parquet").num_rows == document["trials"]
+    assert document["trials"] == len((folder / "rows.jsonl").read_text().splitlines())
 
 
 def test_a_change_is_followed_early_and_not_late(tmp_path: Path) -> None:
-    document = reproduce("nonstationary", Request(2, True, None, tmp_path))
+    document = reproduce("nonstationary", tmp_path, trials=2, quick=True)
     assert document["claims"][1]["holds"]
     by_sigma = [row[2] for row in document["tables"][0]["rows"]]
     assert by_sigma[0] == "above 0.86"
 
 
-def test_finished_trials_are_kept_and_the_page_shows_table_and_figures(
-    tmp_path: Path, cdmisfa: Cdmisfa
-) -> None:
-    folder = tmp_path / "r" / "stability"
-    first, done = stability(folder)
+def test_finished_trials_are_kept_and_figures_are_drawn_alike(tmp_path: Path) -> None:
+    first, done = stability(tmp_path)
     assert done == [0, 1, 2]
-    pictures = {f: (folder / f).read_bytes() for f in first["figures"]}
-    assert stability(folder) == (first, [2])
-    assert {f: (folder / f).read_bytes() for f in first["figures"]} == pictures
-    page = tmp_path / "docs" / "reproduction.md"
-    assert cdmisfa("reproduce", "-o", tmp_path / "r", "--page", page).code == 0
-    text = page.read_text()
-    assert (folder / "table.md").read_text() in text
-    assert "](reproduction/stability.png)" in text
-    assert (page.parent / "reproduction" / "stability.png").exists()
-    assert cdmisfa("reproduce", "-o", tmp_path / "none", "--page", page).code == 2
+    picture = (tmp_path / "stability.png").read_bytes()
+    assert stability(tmp_path) == (first, [2])
+    assert (tmp_path / "stability.png").read_bytes() == picture
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -102,40 +93,11 @@ def test_more_trials_run_only_what_is_missing_in_as_many_processes(tmp_path: Pat
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_results_of_more_or_other_trials_are_replaced_only_with_force(
-    tmp_path: Path, cdmisfa: Cdmisfa
-) -> None:
-    command = ("reproduce", "stability", "-o", tmp_path)
-    folder = tmp_path / "stability"
-    assert cdmisfa(*command, "--trials", 2).code in (0, 4)
-    before = {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
-    refused = cdmisfa(*command, "--trials", 1)
-    assert refused.code == 2
-    assert f"{folder} holds results of 4 trials, 2 of them not among the 2" in refused.err
-    assert "--force" in refused.err
-    assert {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()} == before
-    assert cdmisfa(*command, "--trials", 1, "--force").code in (0, 4)
-    assert json.loads((folder / "results.json").read_text())["trials"] == 2
-
-
-def test_trials_with_other_settings_than_the_first_are_known_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Mixed(oscillatory.FiveStreams):
-        def conditions(self, request: Request) -> list[dict[str, Any]]:
-            return [{"keys": {}}, {"keys": {"nu": 0.05}, "recording": "x"}]
-
-    monkeypatch.setitem(EXPERIMENTS, "five", Mixed())
-    first = reproduce("five", Request(1, True, None, tmp_path))
-    assert reproduce("five", Request(1, True, None, tmp_path)) == first
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_a_claim_that_fails_exits_4(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cdmisfa: Cdmisfa
 ) -> None:
     def unstable(self: Experiment, settings: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        row = {"exploration_ends": 1, "changes": 1, "before": "011", "after": "101"}
+        row = {"exploration_ends": 1, "changes": 1, "after": "101"}
         return row, {"R": np.zeros((9, 3)), "policy": np.eye(9, 3, dtype=np.int8)}
 
     monkeypatch.setattr(oscillatory.Stability, "run", unstable)
@@ -194,7 +156,7 @@ def test_the_counted_keys_are_those_that_change_something(algorithm: str) -> Non
         for key, value in OTHERS.items()
         if learned(**{key: value, **fewer.get(key, {})}) != unchanged
     }
-    assert changing == set(oscillatory.used_keys(algorithm))
+    assert changing == set(costs.used_keys(algorithm))
 
 
 def trials_with(midpoints: dict[float, float], spread: float = 0.0) -> list[Trial]:
@@ -238,7 +200,7 @@ def test_the_order_of_table_1_is_judged_where_enough_was_rewarded(
 def test_intervals_of_epsilon_d_are_by_seeds() -> None:
     def interval(spread: float) -> tuple[float, float]:
         (turn,) = (
-            nonstationary._turn(group)
+            nonstationary._turn(group, 0.86)
             for (sigma,), group in groups(trials_with({0.0: 0.66}, spread), "value").items()
         )
         low, high = mean_interval(turn.of_seeds)
@@ -319,55 +281,51 @@ def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
     assert not holds(Trial(old, GOOD, arrays), Trial(old, GOOD, arrays))[5]
     rows = judged(icub.Icub(), trials).tables[0]["rows"]
     assert [row[1:3] for row in rows[1:]] == [["1 of 1", "**0 of 1**"]] * 2
-    if importlib.util.find_spec("pybullet"):
-        assert len(icub.Icub().draw(trials, tmp_path)) == 6
+    assert len(icub.Icub().draw(trials, tmp_path)) == 3
 
 
-def test_what_is_taken_out_and_where_it_still_comes_out() -> None:
-    experiment, request = ablation.Ablation(), Request(None, True, SAMPLE, Path("x"))
-    right = {"streams": [0, 1, 2], "policies": ["011", "101", "110"], "saved_at": [1, 2, 3]}
-    alone = ablation.WITHOUT[ablation.ALONE]
-    conditions = experiment.conditions(dataclasses.replace(request, quick=False))
+def test_ablation_tells_what_comes_out_without_each_reading() -> None:
+    right = {"streams": [0, 1, 2], "policies": ["011", "101", "110"]}
+    none: dict[str, Any] = {"streams": [], "policies": [], "follows": []}
+    both = ablation.SHARE | ablation.VARIANCE
     trials = [
-        Trial(
-            c,
-            {"streams": [], "policies": [], "saved_at": [], "follows": []}
-            if c["keys"] == alone
-            else GOOD
-            if c["scene"] == "icub"
-            else right,
-            {},
-        )
-        for c in conditions
+        Trial(c, none if c["keys"] == both else GOOD if c["scene"] == "icub" else right, {})
+        for c in ablation.CONDITIONS
     ]
-    found = judged(experiment, trials)
-    assert [claim["holds"] for claim in found.claims] == [True]
-    assert "0 of 1 oscillatory trials and 0 of 1 on the iCub" in found.short
-    readings, components = (table["rows"] for table in found.tables)
+    (_, readings), (_, components) = ablation.tables(trials)
     failed = [row[0] for row in readings if row[2] != "1 of 1"]
-    assert failed == [ablation.ALONE]
+    assert failed == ["share and least variance: equation 3 alone"]
     assert len(components) == 12
     assert [row[0] for row in components if row[1] != "1 of 1"] == ["8, neither"]
 
 
 def test_scenes_are_told_by_who_learns_which_object() -> None:
-    experiment = scenes.Scenes()
-    conditions = experiment.conditions(Request(None, True, None, Path("x")))
     one = GOOD | {"streams": [0], "policies": ["011"], "follows": [[0.99, 0.0]], "saved_at": [600]}
     trials = [
         Trial(
             c,
-            (GOOD if c["learner"] == "progress" or c["scene"] == "plain" else one)
+            (GOOD if c["learner"] == "progress" or c["added"] == "plain" else one)
             | {"iterations": 300 if c["learner"] == "progress" else 1400},
             {},
         )
-        for c in conditions
+        for c in scenes.CONDITIONS
     ]
-    found = judged(experiment, trials)
-    (table,) = found.tables
-    assert table["rows"][0] == ["plain", "1 of 1", "1, 1", "1 of 1", "1, 1", "1 of 1", "300"]
-    assert table["rows"][-1][1:4] == ["**0 of 1**", "1, 0", "1 of 1"]
-    assert "scene.room=True" in conditions[-1]["keys"]
+    ((_, rows),) = scenes.tables(trials)
+    assert rows[0] == ["plain", "1 of 1", "1, 1", "1 of 1", "1, 1", "1 of 1", "300"]
+    assert rows[-1][1:4] == ["**0 of 1**", "1, 0", "1 of 1"]
+
+
+@pytest.mark.parametrize("name", ["costs", "difficulty"])
+def test_studies_print_tables_and_write_rows(name: str, tmp_path: Path) -> None:
+    words = ["--trials", "2", "--no-icub", "-o", str(tmp_path)]
+    command = [sys.executable, "-m", f"benchmarks.paper.{name}", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.startswith("| ")
+    trials = json.loads((tmp_path / f"{name}.json").read_text())["trials"]
+    assert len(trials) == 6
+    if name == "difficulty":
+        frames = [row["frames"] for _, row in trials]
+        assert max(frames[:2]) < min(frames[4:])
 
 
 @pytest.mark.skipif(not SAMPLE.exists(), reason="the sample recording is not there")
@@ -376,7 +334,7 @@ def test_the_sample_recording_s_noise_is_not_learnable() -> None:
     with RecordedSource(SAMPLE) as source:
         for view in range(3):
             source.seek(0)
-            frames = source.take(view, 2000).frames.reshape(2000, -1)
+            frames = source.take(view, 2000).frames.reshape(2000, -1) / 255.0
             weights = difficulty.slowest_weights(frames[:1000], 7)
-            eta.append(difficulty.slowness((frames[1000:] / 255.0 @ weights)[:, None])[0])
+            eta.append(slowness((frames[1000:] @ weights)[:, None])[0])
     assert [e < difficulty.LEARNABLE for e in eta] == [True, False, True]

@@ -26,38 +26,26 @@ def test_two_levels_with_much_data_have_the_closed_form_fit() -> None:
     yes = [True] * 1000 + [False] * 9000 + [True] * 6000 + [False] * 4000
     fit = statistics.logistic_midpoint([0.0] * 10_000 + [1.0] * 10_000, yes)
     low, high = math.log(1 / 9), math.log(6 / 4)
-    assert fit.value == pytest.approx(-low / (high - low), abs=1e-3)
-    assert fit.slope == pytest.approx(high - low, rel=0.01)
+    assert fit == pytest.approx(-low / (high - low), abs=1e-3)
 
 
-def test_confidence_interval_covers_the_true_midpoint() -> None:
+def test_the_midpoint_is_near_the_true_one() -> None:
     fits = [statistics.logistic_midpoint(*answers(0.8, 40.0, seed)) for seed in range(25)]
-    covered = sum(fit.low <= 0.8 <= fit.high for fit in fits)
-    assert covered >= 21  # binomial(25, .95) is below 21 once in 4000 times
-    assert all(fit.high - fit.low < 0.1 for fit in fits)
+    assert np.abs(np.array(fits) - 0.8).max() < 0.05
+    assert np.mean(fits) == pytest.approx(0.8, abs=0.01)
 
 
 def test_answers_that_part_cleanly_have_a_midpoint_between_them() -> None:
     x = np.repeat(LEVELS, 10)
-    fit = statistics.logistic_midpoint(x, x > 0.81)
-    assert 0.8 < fit.low < fit.value < fit.high < 0.83
+    assert 0.8 < statistics.logistic_midpoint(x, x > 0.81) < 0.83
 
 
 @pytest.mark.parametrize(
-    ("x", "yes", "bounds"),
-    [
-        ([0.2, 0.9], [False, False], (0.9, math.inf)),
-        ([0.2, 0.9], [True, True], (-math.inf, 0.2)),
-        ([0.5, 0.5], [False, True], (-math.inf, math.inf)),
-        ([0, 0, 1, 1] * 5, [0, 1, 0, 1] * 5, (-math.inf, math.inf)),
-    ],
+    ("x", "yes"),
+    [([0.2, 0.9], [False, False]), ([0.2, 0.9], [True, True]), ([0.5, 0.5], [False, True])],
 )
-def test_answers_that_do_not_turn_bound_no_midpoint(
-    x: list[float], yes: list[bool], bounds: tuple[float, float]
-) -> None:
-    fit = statistics.logistic_midpoint(x, yes)
-    assert (fit.low, fit.high) == bounds
-    assert math.isnan(fit.value) == (len(x) == 2)
+def test_answers_that_do_not_turn_have_no_midpoint(x: list[float], yes: list[bool]) -> None:
+    assert math.isnan(statistics.logistic_midpoint(x, yes))
 
 
 @settings(max_examples=10, deadline=None)
@@ -66,7 +54,7 @@ def test_midpoint_moves_with_the_axis(shift: float, scale: float) -> None:
     x, yes = answers(0.75, 20.0, seed=3)
     plain = statistics.logistic_midpoint(x, yes)
     moved = statistics.logistic_midpoint(np.array(x) * scale + shift, yes)
-    assert moved.value == pytest.approx(plain.value * scale + shift, abs=2e-3 * scale)
+    assert moved == pytest.approx(plain * scale + shift, abs=2e-3 * scale)
 
 
 def test_wilson_interval_has_the_textbook_values() -> None:
@@ -81,12 +69,6 @@ def test_summary_leaves_out_what_is_not_a_number() -> None:
     )
     assert statistics.summary([]).n == 0
     assert math.isnan(statistics.summary([1.0]).sd)
-
-
-def test_stays_above_counts_from_the_last_fall() -> None:
-    assert statistics.stays_above([0.99, 0.9, 0.96, 0.97], 0.95) == 2
-    assert statistics.stays_above([0.99, 0.96], 0.95) == 0
-    assert statistics.stays_above([0.99, math.nan], 0.95) == -1
 
 
 def test_correlation_has_known_answers() -> None:

@@ -10,6 +10,7 @@ import itertools
 import json
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,7 @@ def main(arguments: list[str] | None = None) -> None:
     sets = dict.fromkeys(name for word in given.sets for name in GROUPS.get(word, [word]))
     seeds, rows = range(*map(int, given.seeds.split(":"))), []
     given.out.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(given.jobs) as pool:
+    with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
         tasks = itertools.product(sets, [learners], seeds, [given.set])
         for done in pool.map(run_trials, *zip(*tasks, strict=True)):
             rows += done

@@ -95,70 +95,40 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
     return found.mean - half, found.mean + half
 
 
-@dataclass(frozen=True, slots=True)
-class Midpoint:
-    """Where a yes-or-no answer turns, from a logistic fit.
-
-    Attributes:
-        value: x at which yes and no are equally likely; NaN where only one answer was seen, or
-            the question was asked at one x alone.
-        low, high: 95 % profile likelihood interval; infinite where the data bound no side.
-        slope: of the fit, per unit of x; positive where yes lies at large x.
-        n: number of answers.
-    """
-
-    value: float
-    low: float
-    high: float
-    slope: float
-    n: int
-
-
-def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> Midpoint:
-    """Fit P(yes) = 1 / (1 + exp(-k (x - m))), k > 0, and say where m lies.
+def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> float:
+    """Fit P(yes) = 1 / (1 + exp(-k (x - m))), k > 0, and return m.
 
     The likelihood is penalised with Jeffreys' prior (Firth 1993), so that answers that part
-    cleanly have a finite fit; the interval is that of the penalised profile likelihood.
+    cleanly have a finite fit.
 
     Args:
         x: (n,) where the question was asked.
         yes: (n,) true or false.
+
+    Returns:
+        NaN where only one answer was seen, or the question was asked at one x alone.
     """
     at, answer = np.asarray(x, dtype=float), np.asarray(yes, dtype=float)
-    n = len(at)
-    if n == 0 or answer.min() == answer.max():
-        never = n > 0 and answer.max() == 0
-        low = float(at.max()) if never else -math.inf
-        high = float(at.min()) if n > 0 and not never else math.inf
-        return Midpoint(math.nan, low, high, math.nan, n)
     levels, inverse = np.unique(at, return_inverse=True)
+    if len(levels) < 2 or answer.min() == answer.max():
+        return math.nan
     total: FloatArray = np.bincount(inverse).astype(np.float64)
     hits = np.asarray(np.bincount(inverse, weights=answer), dtype=np.float64)
-    if len(levels) == 1:
-        return Midpoint(math.nan, -math.inf, math.inf, math.nan, n)
     span = float(levels[-1] - levels[0])
     slopes = np.geomspace(FLATTEST / span, STEEPEST / span, 61)
     low, high = float(levels[0] - 2 * span), float(levels[-1] + 2 * span)
-    bounds = (-math.inf, math.inf)
-    for _ in range(4):
+    for _ in range(4):  # finer each time, within the 95 % profile likelihood interval
         m = np.linspace(low, high, 121)
-        used = slopes
-        heights = _log_likelihood(levels, hits, total, m, used)
+        heights = _log_likelihood(levels, hits, total, m, slopes)
         profile = heights.max(axis=1)
         top = int(np.argmax(profile))
         inside = np.flatnonzero(profile > profile[top] - CHI_SQUARE_95 / 2)
-        first, last = int(inside[0]), int(inside[-1])
-        bounds = (
-            float(m[first]) if first > 0 else bounds[0],
-            float(m[last]) if last < len(m) - 1 else bounds[1],
-        )
-        low, high = float(m[max(first - 1, 0)]), float(m[min(last + 1, len(m) - 1)])
+        low, high = m[max(inside[0] - 1, 0)], m[min(inside[-1] + 1, len(m) - 1)]
         likely = np.flatnonzero(heights[inside].max(axis=0) > profile[top] - CHI_SQUARE_95)
         slopes = np.geomspace(
             slopes[max(likely[0] - 1, 0)], slopes[min(likely[-1] + 1, len(slopes) - 1)], 61
         )
-        slope = float(used[int(np.argmax(heights[top]))])
-    return Midpoint(float(m[top]), bounds[0], bounds[1], slope, n)
+    return float(m[top])
 
 
 def _log_likelihood(
@@ -185,18 +155,6 @@ def correlation(a: FloatArray, b: FloatArray) -> float:
     a, b = a - a.mean(), b - b.mean()
     lengths = float(np.linalg.norm(a) * np.linalg.norm(b))
     return abs(float(a @ b)) / lengths if lengths > 0 else 0.0
-
-
-def stays_above(values: Sequence[float] | FloatArray, threshold: float) -> int:
-    """First index from which on all values are above a threshold; -1 where the last is not.
-
-    Example:
-        >>> stays_above([0.1, 0.99, 0.2, 0.96, 0.97], 0.95)
-        3
-    """
-    below = np.flatnonzero(~(np.asarray(values) > threshold))
-    first = int(below[-1]) + 1 if len(below) else 0
-    return first if first < len(values) else -1
 
 
 SCHEMA = 1

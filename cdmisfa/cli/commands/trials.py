@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -25,12 +25,6 @@ from cdmisfa.cli.printing import (
     tell,
 )
 from cdmisfa.cli.progress import Bar, bar
-from cdmisfa.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from cdmisfa.studies.paper.experiment import Request
-
-ALL = "all"
 
 MOST_SEEDS = 1_000_000
 
@@ -164,93 +158,45 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
 
 
 @click.command("reproduce")
-@click.argument("name", required=False)
+@click.argument("name")
 @options.out("Folder of the results [default: reproduction].")
 @number("--trials", "Trials per condition, instead of the paper's number.", 1)
 @options.jobs
 @options.engine
 @options.path("--recording", "Recording of the iCub scene.")
 @flag("--quick", "Few trials, enough to test the claim.")
-@options.path("--page", "Write this Markdown page of all results.")
-@flag("--force", "Replace results of more or other trials.")
 @options.as_json
 @options.quiet
 def reproduce_command(
-    name: str | None,
-    out: Path | None,
-    trials: int | None,
-    jobs: int,
-    recording: Path | None,
-    quick: bool,
-    page: Path | None,
-    force: bool,
-    as_json: bool,
-    **where: Any,
+    name: str, out: Path | None, recording: Path | None, as_json: bool, **how: Any
 ) -> None:
     """Reproduce an experiment of the paper: numbers, tables and figures.
 
-    NAME is oscillatory, five, stability, costs, nonstationary, icub, ablation, scenes, difficulty
-    or all.
-    Finished trials are kept and not run again; results of more or other trials than are asked
-    for now are not replaced without --force. Exit code 4 says that a claim of the paper did
-    not come out. Without NAME, --page makes the page from the results that are there.
+    NAME is oscillatory, five, stability, nonstationary, icub or all. Finished trials are kept and
+    not run again. Exit code 4 says that a claim of the paper did not come out.
     """
-    from cdmisfa.studies.paper.experiment import Request
     from cdmisfa.studies.paper.reproduce import (
         EXPERIMENTS,
-        VERDICTS,
         check_claims,
         markdown_tables,
-        write_paper_page,
+        reproduce,
     )
 
-    root = out or Path("reproduction")
-    if name is None and page is None:
-        raise UsageError(f"say which experiment: {', '.join(EXPERIMENTS)} or all")
-    names = tuple(EXPERIMENTS) if name == ALL else (name,) if name else ()
-    documents: list[dict[str, Any]] = []
-    for each in names:
-        if each in ("icub", "ablation") and recording is None:
+    root, documents = out or Path("reproduction"), []
+    for each in EXPERIMENTS if name == "all" else (name,):
+        if each == "icub" and recording is None:
             tell(f"{each}: records the scene into {root}/icub-recording, unless it is there")
-        request = Request(trials, quick, recording, root / each, jobs, force)
-        documents.append(_reproduce(each, request, **where))
-    if page is not None:
-        write_paper_page(root, page)
-        tell(f"page {page}")
+        with bar(each, "trials") as shown:
+            document = reproduce(
+                each, root / each, recording=recording, progress=shown.update, **how
+            )
+        documents.append(document)
     if as_json:
         print_document(experiments=documents)
-    lines: list[str] = []
-    for document in documents:
-        lines += [document["title"], "", markdown_tables(document)]
-        for claim in document["claims"]:
-            holds = VERDICTS[claim["holds"]]
-            lines.append(f"{holds}  {claim['claim']}: {claim['detail']}")
-        lines.append("")
-    if not as_json:
-        print_text("\n".join(lines))
+    else:
+        print_text("\n".join(f"{d['title']}\n\n{markdown_tables(d)}" for d in documents))
     for document in documents:
         check_claims(document)
-
-
-def _reproduce(name: str, request: Request, **where: Any) -> dict[str, Any]:
-    """Reproduce an experiment, and say on stderr how it went."""
-    from cdmisfa.studies.paper.reproduce import reproduce
-
-    started, finished = time.monotonic(), list[int]()
-    with bar(name, "trials") as shown:
-
-        def progress(done: int, total: int) -> None:
-            finished.append(done)
-            shown.update(done, total)
-
-        document = reproduce(name, request, progress=progress, **where)
-    seconds, ran = time.monotonic() - started, finished[-1] - finished[0]
-    tell(
-        f"{name}: {document['trials']} trials, {ran} of them now, {seconds:.1f} s, "
-        f"{ran / seconds:.1f} trials/s, "
-        f"{'reproduced' if document['reproduced'] else 'NOT reproduced'}"
-    )
-    return document
 
 
 @click.command("demo")

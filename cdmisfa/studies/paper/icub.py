@@ -21,13 +21,11 @@ from cdmisfa.experiments.documents import plain, write_json
 from cdmisfa.experiments.loop import learn_blocks
 from cdmisfa.experiments.results import correlation
 from cdmisfa.modules import Module
-from cdmisfa.studies import pages
+from cdmisfa.studies.paper import figures
 from cdmisfa.studies.paper.experiment import (
-    FIRST_SEED,
     Experiment,
     Findings,
     Output,
-    Request,
     Settings,
     Trial,
     first_above,
@@ -36,8 +34,9 @@ from cdmisfa.studies.paper.experiment import (
     mean_of,
     module_row,
     of_all,
+    paper_config,
 )
-from cdmisfa.studies.paper.oscillatory import paper_config, stay_rewards
+from cdmisfa.studies.paper.oscillatory import GAIN, gains, stay_rewards
 from recorder.world.icub.config import IcubConfig
 from replay.recordings.source import RecordedSource
 
@@ -62,7 +61,7 @@ FOLLOWS = 0.9
 LEARNERS = (("2.0", 0.1), ("1.0", 0.1), ("1.0", 0.6))
 """Algorithm and 1.0's threshold of the clustering error: that of decision 0014, and a looser one.
 
-As 1.0's labels serve the head's positions.
+1.0 gets the head's positions as labels.
 """
 
 
@@ -71,14 +70,16 @@ class Icub(Experiment):
 
     title = "Curiosity-driven, vision-enabled iCub"
     trials = (10, 2)
+    sees = True
 
-    def conditions(self, request: Request) -> list[Settings]:
-        """Each learner, on one recording; it is made where none is given."""
-        source = recording_of(request)
-        return [{**source, "algorithm": a, "roc_error": error} for a, error in LEARNERS]
+    def conditions(self, quick: bool, recording: Path | None) -> list[Settings]:
+        """Each learner, on one recording."""
+        with contextlib.closing(RecordedSource(str(recording))) as source:
+            about = {"recording": str(recording), "identity": plain(source.describe())}
+        return [{**about, "algorithm": a, "roc_error": error} for a, error in LEARNERS]
 
     def run(self, settings: Settings) -> Output:
-        """One trial: 1400 iterations, or as many as the recording has."""
+        """Learn for 1400 iterations, or as many as the recording has."""
         keys = {key: settings[key] for key in ("algorithm", "roc_error")}
         with contextlib.closing(RecordedSource(settings["recording"])) as source:
             return learn_curves(source, paper_config("icub", **keys), settings["seed"])
@@ -89,14 +90,12 @@ class Icub(Experiment):
         new, old, loose = (by_learner[which] for which in LEARNERS)
         rows = []
         for (algorithm, error), group in by_learner.items():
-            name = "2.0" if algorithm == "2.0" else f"1.0, threshold {error:g}"
-            first, second = ([best(t.row, number) for t in group] for number in range(2))
-            saved = [
-                [t.row["saved_at"][k] for t in group if len(t.row["saved_at"]) > k] for k in (0, 1)
-            ]
-            shares = (of_all(count(group), len(group)) for count in (in_order, follow_both))
-            rs = (mean_of(values, 3) for values in (first, second))
-            rows.append([name, *shares, *rs, *(mean_of(own, 0) for own in saved)])
+            row = ["2.0" if algorithm == "2.0" else f"1.0, threshold {error:g}"]
+            row += [of_all(count(group), len(group)) for count in (in_order, follow_both)]
+            row += [mean_of([best(t.row, number) for t in group], 3) for number in (0, 1)]
+            saved = [t.row["saved_at"] for t in group]
+            row += [mean_of([at[k] for at in saved if len(at) > k], 0) for k in (0, 1)]
+            rows.append(row)
         head = ("learner", "order and policies as the paper's", f"both objects, |r| >= {FOLLOWS}")
         of = ("|r| with object 1", "|r| with object 3", "first saved at", "second saved at")
         found.table((*head, *of), rows)
@@ -107,8 +106,8 @@ class Icub(Experiment):
         found.claim_all("iCub: no third module is learned", ended, n)
         for part, key in (("curiosity reward", "curiosity"), ("reward in all", "reward")):
             earned = np.array([t.row[key] for t in new]).T
-            most = first_above(*earned)
             means = ", ".join(f"{value:.5f}" for value in earned.mean(axis=1))
+            most = first_above(*earned)
             found.claim(f"iCub: view 1 earns more {part} than views 2 and 3", most, means)
         tight, wide = (follow_both(group) for group in (old, loose))
         found.claim(
@@ -119,95 +118,62 @@ class Icub(Experiment):
         )
         found.notes.append(
             f"|r|: the largest of the modules', on {HELD_OUT} frames after those learned from. 1.0 "
-            "is given the head's positions as labels. All seeds learn from one recording; in the "
-            "table of scenes each has its own."
-        )
-        found.sum_up(
-            "The iCub",
-            f"object 1, then object 3, with the optimal policies in {good} of {n} trials (paper: "
-            f"10 of 10), no third module in {ended}; on held-out frames both positions are "
-            f"followed in {both}.",
+            "is given the head's positions as labels. All seeds learn from one recording."
         )
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
-        """Value function, policy, eta-dot; the modules' outputs over time and the objects."""
+        """Draw the scene; value function, policy, eta-dot; the modules' outputs and the objects."""
         trials = [t for t in trials if t.settings["algorithm"] == "2.0"]
-        figure, axes = pages.new_figure(1, 3)
+        scene, axes = figures.new_figure(1, 1)
+        views = np.pad(trials[0].arrays["shown"], ((0, 0), (1, 1), (0, 0)), constant_values=255)
+        axes[0, 0].imshow(np.concatenate(views), cmap="gray", vmin=0, vmax=255)
+        axes[0, 0].set(xticks=[], yticks=[])
+        figures.letter_panel(axes[0, 0], "a", "what it sees: left, center, right", "")
+        figure, axes = figures.new_figure(1, 3)
         Q, policy, eta_dot = ([t.arrays[k] for t in trials] for k in ("Q", "policy", "eta_dot"))
-        pages.draw_value_gains(axes[0, 0], Q, "c")
-        pages.draw_policies(axes[0, 1], policy, "d", "share of trials that stay")
-        pages.draw_eta_dot(axes[0, 2], eta_dot, paper_config("icub").delta, "e")
-        paths = pages.save_figure(figure, folder, "icub")
-        scene, axes = pages.new_figure(1, 1)
-        shown = next(t.arrays["shown"] for t in trials)
-        views = [np.pad(view, ((1, 1), (0, 0)), constant_values=255) for view in shown]
-        panel = axes[0, 0]
-        panel.imshow(np.concatenate(views), cmap="gray", vmin=0, vmax=255)
-        panel.set(xticks=[], yticks=[])
-        pages.letter_panel(panel, "a", "what it sees: left, center, right", "")
-        paths = [*pages.save_figure(scene, folder, "icub-scene"), *paths]
-        outputs, axes = pages.new_figure(2, 2, sharey=True)
+        figures.draw_means(axes[0, 0], gains(Q), "c", GAIN)
+        figures.draw_policies(axes[0, 1], policy, "d", "share of trials that stay")
+        figures.draw_eta_dot(axes[0, 2], eta_dot, paper_config("icub").delta, "e")
+        outputs, axes = figures.new_figure(2, 2, sharey=True)
         for i, name in enumerate(OBJECTS):
-            one = next((t for t in trials if f"truth{i + 1}" in t.arrays), None)
+            one = next((t.arrays for t in trials if f"truth{i + 1}" in t.arrays), None)
             if one is None:
                 continue
-            y, truth = one.arrays[f"y{i + 1}"], one.arrays[f"truth{i + 1}"]
-            axes[i, 0].plot(y, color=pages.COLOURS[0], linewidth=0.8)
-            pages.letter_panel(axes[i, 0], "ac"[i], "frame", f"output y of module {i + 1}")
-            axes[i, 1].plot(truth, y, ".", color=pages.COLOURS[0], markersize=3)
-            x = np.linspace(truth.min(), truth.max(), 100)
-            degree = min(3, len(np.unique(np.round(truth, 6))) - 1)
-            if degree > 0:
-                axes[i, 1].plot(x, np.polynomial.Polynomial.fit(truth, y, degree)(x), color="black")
-            pages.letter_panel(axes[i, 1], "bd"[i], f"{name}, m", "")
+            y, truth = one[f"y{i + 1}"], one[f"truth{i + 1}"]
+            axes[i, 0].plot(y, color=figures.COLOURS[0], linewidth=0.8)
+            figures.letter_panel(axes[i, 0], "ac"[i], "frame", f"output y of module {i + 1}")
+            axes[i, 1].plot(truth, y, ".", color=figures.COLOURS[0], markersize=3)
+            figures.letter_panel(axes[i, 1], "bd"[i], f"{name}, m", "")
             axes[i, 1].locator_params(axis="x", nbins=5)
-        return paths + pages.save_figure(outputs, folder, "icub-outputs")
+        drawn = {"icub-scene": scene, "icub": figure, "icub-outputs": outputs}
+        return [figures.save_figure(each, folder, name) for name, each in drawn.items()]
 
 
-def made_recording(request: Request) -> Path:
-    """Where the recording is that `make_recording` makes, once it is finished."""
-    return request.folder.parent / "icub-recording" / "finished.json"
-
-
-def make_recording(request: Request) -> Path:
-    """A recording in the folder of the results, made unless it is there."""
-    finished = made_recording(request)
-    folder = finished.parent
+def make_recording(folder: Path, seed: int, jobs: int) -> Path:
+    """Return a recording of the scene in a folder; it is made or finished where it is not there."""
+    finished = folder / "finished.json"
     if not finished.exists():
         from recorder.recording import record_scene
 
-        scene, resume = IcubConfig(seed=FIRST_SEED), folder.exists()
+        scene, resume = IcubConfig(seed=seed), folder.exists()
         frames = ITERATIONS * paper_config("icub").tau + HELD_OUT
-        views = record_scene("icub", folder, scene, frames=frames, jobs=request.jobs, resume=resume)
+        views = record_scene("icub", folder, scene, frames=frames, jobs=jobs, resume=resume)
         write_json(finished, {"views": [view.as_json() for view in views]})
     return folder
 
 
-def recording_of(request: Request) -> dict[str, Any]:
-    """The recording that trials learn from, as settings; it is made where none is given."""
-    path = str(request.recording or make_recording(request))
-    return {"recording": path, "identity": describe_recording(path)}
-
-
-def describe_recording(path: str) -> dict[str, Any]:
-    """What a recording is, wherever it lies."""
-    with contextlib.closing(RecordedSource(path)) as source:
-        described: dict[str, Any] = plain(source.describe())
-    return described
-
-
 def in_order(trials: Sequence[Trial]) -> int:
-    """How many of the trials began with both modules as they should be."""
+    """Count the trials that began with both modules as they should be."""
     return sum(learned_order(t.row)[:2] == OPTIMAL for t in trials)
 
 
 def follow_both(trials: Sequence[Trial]) -> int:
-    """How many of the trials have a module that follows object 1, and one that follows 3."""
-    return sum(all(best(t.row, number) >= FOLLOWS for number in range(2)) for t in trials)
+    """Count the trials that have a module that follows object 1, and one that follows 3."""
+    return sum(all(best(t.row, number) >= FOLLOWS for number in (0, 1)) for t in trials)
 
 
 def best(row: Mapping[str, Any], number: int) -> float:
-    """The largest |r| of a trial's modules with one of `OBJECTS`; 0 without modules."""
+    """Return the largest |r| of a trial's modules with one of `OBJECTS`; 0 without modules."""
     return max((of[number] for of in row["follows"]), default=0.0)
 
 
@@ -221,10 +187,8 @@ class Curves(Sink):
     def __init__(self, tau: int, truth: Sequence[str]) -> None:
         self.arrays: dict[str, NDArray[Any]] = {}
         self._truth = truth
-        self._curves: dict[str, list[NDArray[Any]]] = {
-            name: []
-            for name in ("eta_dot", "Q", "policy", "stream", "epsilon", "curiosity", "reward")
-        }
+        names = ("eta_dot", "Q", "policy", "stream", "epsilon", "curiosity", "reward")
+        self._curves: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
         self._recent: deque[tuple[NDArray[Any], NDArray[Any]]] = deque(maxlen=-(-DRAWN // tau))
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
@@ -248,7 +212,7 @@ class Curves(Sink):
 
 
 def learn_curves(source: RecordedSource, config: LearnerConfig, seed: int) -> Output:
-    """Learn from a recording: a trial's row, and the curves and each module's last outputs."""
+    """Learn from a recording; return a trial's row, curves, and each module's last outputs."""
     curves = Curves(config.tau, source.spec.truth)
     row = learn_and_judge(source, config, seed, source.frames - HELD_OUT, curves)
     row |= stay_rewards(curves.arrays, config)
@@ -260,7 +224,7 @@ def learn_curves(source: RecordedSource, config: LearnerConfig, seed: int) -> Ou
 def learn_and_judge(
     source: SeekableSource, config: Any, seed: int, frames: int, *sinks: Sink
 ) -> dict[str, Any]:
-    """Learn up to a frame, or for `ITERATIONS`, and judge the modules on what follows: a row.
+    """Learn up to a frame, or for `ITERATIONS`; return a row that judges modules on what follows.
 
     Raises:
         UsageError: there are not enough frames for a block.
@@ -278,7 +242,7 @@ def learn_and_judge(
 
 
 def follows(module: Module, source: SeekableSource, first: int) -> list[float]:
-    """|r| of a module's slowest output with each of `OBJECTS`, on `HELD_OUT` frames from one on."""
+    """Return |r| of a module's slowest output with each of `OBJECTS`, on `HELD_OUT` frames."""
     source.seek(first)
     parts = [source.take(module.stream_index, 40) for _ in range(HELD_OUT // 40)]
     y = np.concatenate([module.transform(part.frames, 0)[:, 0] for part in parts])

@@ -13,17 +13,16 @@ import numpy as np
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.experiments.results import logistic_midpoint, mean_interval
 from cdmisfa.experiments.trial import Swap, run_trial
-from cdmisfa.studies import pages
+from cdmisfa.studies.paper import figures
 from cdmisfa.studies.paper.experiment import (
     Experiment,
     Findings,
     Output,
-    Request,
     Settings,
     Trial,
     groups,
+    paper_config,
 )
-from cdmisfa.studies.paper.oscillatory import paper_config
 
 CHANGES = (1.0, 0.96, 0.93, 0.9, 0.86, 0.83, 0.8, 0.76, 0.73, 0.7, 0.6, 0.5, 0.3, 0.1)
 """The paper's values of epsilon^c."""
@@ -58,11 +57,11 @@ CONTRADICTION = (
 
 OLD, NEW = "101", "011"
 
-PICTURED = (0.008, 0.0001)
+PICTURED = (0.0001, 0.008)
 """The values of sigma that the paper shows a figure of."""
 
-MARKERS = (("o", 7), ("s", 5), ("^", 3))
-"""Marks and their sizes that stay apart where they lie on each other; one for each stream."""
+STYLES = (("o", 7, "-"), ("s", 5, (0, (4, 2))), ("^", 3, (0, (1, 1.5))))
+"""Marker, its size and dashes of each stream, which stay apart where they lie on each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +74,7 @@ class Turn:
             whose spread tells how certain it is: trials of a seed are not independent.
         followed, neither: trials that ended with the new optimum, and with none of the two.
         n: trials.
+        limit: the largest epsilon^c that is judged.
     """
 
     value: float
@@ -82,26 +82,36 @@ class Turn:
     followed: int
     neither: int
     n: int
+    limit: float
+
+    @property
+    def rank(self) -> float:
+        """Epsilon^d for comparison; 2 where it lies above every epsilon^c, 0 where below."""
+        if math.isnan(self.value):
+            return 0.0 if self.followed else 2.0
+        return self.value
+
+    def __str__(self) -> str:
+        return f"{self.value:.3f}" if self.rank <= self.limit else f"above {self.limit:g}"
 
 
 class NonStationary(Experiment):
     """Late changes must leave the old optimum; epsilon^d must be lower for a smaller sigma."""
 
     title = "Non-stationary environments"
-
     trials = (20, 3)
 
-    def conditions(self, request: Request) -> list[Settings]:
+    def conditions(self, quick: bool, recording: Path | None) -> list[Settings]:
         """Tables 1 and 2: every epsilon^c for every value of a key."""
         return [
             {"key": key, "value": value, "epsilon_c": epsilon}
-            for key, values in (QUICK_COLUMNS if request.quick else COLUMNS).items()
+            for key, values in (QUICK_COLUMNS if quick else COLUMNS).items()
             for value in values
-            for epsilon in (QUICK_CHANGES if request.quick else CHANGES)
+            for epsilon in (QUICK_CHANGES if quick else CHANGES)
         ]
 
     def run(self, settings: Settings) -> Output:
-        """Streams zero, x2, x3; the first becomes x1 when epsilon falls below epsilon^c."""
+        """Show zero, x2, x3; the first becomes x1 when epsilon falls below epsilon^c."""
         keys = {settings["key"]: settings["value"]}
         decays = dict.fromkeys(("epsilon_decay", "epsilon_tail_decay"), DECAY)
         result = run_trial(
@@ -113,81 +123,67 @@ class NonStationary(Experiment):
             curves=True,
         )
         curves: Any = result.curves
-        before = curves["reward"][: result.swapped] if result.swapped >= 0 else curves["reward"]
+        before = curves["reward"][: result.swapped if result.swapped >= 0 else None]
         policy = result.modules[0].policy if result.modules else result.final_policy
-        row = {
-            "policy": "".join(map(str, policy)),
-            "saved": bool(result.modules),
-            "iterations": result.iterations,
-            "swapped": result.swapped,
-            "rewarded": int(np.isfinite(before).sum()),
-        }
-        return row, {}
+        rewarded = int(np.isfinite(before).sum())
+        return {"policy": "".join(map(str, policy)), "rewarded": rewarded}, {}
 
     def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
-        """What of both tables comes out, and what of the text, where it can be judged."""
+        """Judge what of both tables comes out, and what of the text, where that can be judged."""
         judged = _judged(trials)
         limit = max(t.settings["epsilon_c"] for t in judged)
-        turns = {at: _turn(of) for at, of in groups(judged, "key", "value").items()}
+        turns = {at: _turn(of, limit) for at, of in groups(judged, "key", "value").items()}
         rows = []
         for (key, value), turn in turns.items():
             low, high = mean_interval(turn.of_seeds)
             between = f"{low:.3f} .. {high:.3f}" if turn.value <= limit else "-"
-            paper, neither = f"{COLUMNS[key][value]:g}", f"{turn.n - turn.neither} of {turn.n}"
-            rows.append([f"{key} = {value:g}", paper, _in_words(turn, limit), between, neither])
+            paper, ends = f"{COLUMNS[key][value]:g}", f"{turn.n - turn.neither} of {turn.n}"
+            rows.append([f"{key} = {value:g}", paper, str(turn), between, ends])
         head = ("at", "paper's epsilon^d", "ours", "95 % interval, by seeds", "old or new optimum")
         found.table(head, rows)
         _claim_about_changes(found, judged, turns)
-        _claim_about_order(found, turns, limit)
-        seeds = len({t.settings["seed"] for t in trials})
-        found.notes = [_unjudged(trials, limit), CONTRADICTION]
-        of_sigma = {value: turn for (key, value), turn in turns.items() if key == "sigma"}
-        smallest = min(of_sigma)
-        found.sum_up(
-            "The point of no return",
-            f"late changes are ignored and epsilon^d falls with sigma, to "
-            f"{_in_words(of_sigma[smallest], limit)} instead of {SIGMAS[smallest]:g} "
-            f"({seeds} seeds), but {sum(turn.neither for turn in turns.values())} of "
-            f"{len(judged)} trials end in neither optimum.",
+        _claim_about_order(found, turns)
+        rewarded = ", ".join(
+            f"{epsilon:g}: {_rewarded(group):.0f}"
+            for (epsilon,), group in groups(trials, "epsilon_c").items()
+            if epsilon >= 0.7
         )
+        note = (
+            f"Blocks rewarded before the change, by epsilon^c: {rewarded}. Above {limit:g} they "
+            f"are fewer than {REWARDED}, and the agent has hardly an optimum to leave: changes "
+            "there are left out, and where epsilon^d lies there it is only said to be above "
+            f"{limit:g}."
+        )
+        found.notes = [note, CONTRADICTION]
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
-        """Policy against epsilon^c for two values of sigma, grey where it is not judged."""
-        by_sigma = {
-            value: group
-            for (key, value), group in groups(trials, "key", "value").items()
-            if key == "sigma"
-        }
-        smallest = PICTURED[1] if PICTURED[1] in by_sigma else min(by_sigma)
-        figure, axes = pages.new_figure(1, 2)
-        for panel, sigma, letter in zip(axes[0], (smallest, max(by_sigma)), "ab", strict=True):
-            _draw_policies(panel, by_sigma[sigma])
+        """Draw policies against epsilon^c for two values of sigma, grey where it is not judged."""
+        of_sigma = {v: of for (k, v), of in groups(trials, "key", "value").items() if k == "sigma"}
+        shown = PICTURED if of_sigma.keys() >= {*PICTURED} else (min(of_sigma), max(of_sigma))
+        figure, axes = figures.new_figure(1, 2)
+        for panel, sigma, letter in zip(axes[0], shown, "ab", strict=True):
+            _draw_policies(panel, of_sigma[sigma])
             axis = rf"$\epsilon^c$   ($\sigma$ = {sigma:g})"
-            pages.letter_panel(panel, letter, axis, "policy, mean")
-            pages.stay_to_switch(panel)
-        return pages.save_figure(figure, folder, "nonstationary")
+            figures.letter_panel(panel, letter, axis, "policy, mean")
+            panel.set_ylim(-0.07, 1.07)
+            panel.set_yticks([0, 1], ["stay", "switch"])
+        return [figures.save_figure(figure, folder, "nonstationary")]
 
 
 def point_of_no_return(trials: Sequence[Trial]) -> float:
-    """Epsilon^d: the midpoint of "converged to the new optimum" against epsilon^c."""
+    """Return epsilon^d: the midpoint of "converged to the new optimum" against epsilon^c."""
     changes = [t.settings["epsilon_c"] for t in trials]
-    return logistic_midpoint(changes, [_is_new(t) for t in trials]).value
+    return logistic_midpoint(changes, [_is_new(t) for t in trials])
 
 
-def _turn(trials: Sequence[Trial]) -> Turn:
-    """Epsilon^d of trials at one value of a key, and what it is without each seed."""
-    value, seeds = point_of_no_return(trials), {t.settings["seed"] for t in trials}
+def _turn(trials: Sequence[Trial], limit: float) -> Turn:
+    value, seeds = point_of_no_return(trials), sorted({t.settings["seed"] for t in trials})
     without = [
-        point_of_no_return([t for t in trials if t.settings["seed"] != seed])
-        for seed in sorted(seeds)
+        point_of_no_return([t for t in trials if t.settings["seed"] != seed]) for seed in seeds
     ]
-    return Turn(
-        value,
-        value + (len(seeds) - 1) * (np.mean(without) - np.array(without)),
-        sum(_is_new(t) for t in trials),
-        sum(t.row["policy"] not in (OLD, NEW) for t in trials),
-        len(trials),
-    )
+    of_seeds = value + (len(seeds) - 1) * (np.mean(without) - np.array(without))
+    neither = sum(t.row["policy"] not in (OLD, NEW) for t in trials)
+    return Turn(value, of_seeds, sum(map(_is_new, trials)), neither, len(trials), limit)
 
 
 def _is_new(trial: Trial) -> bool:
@@ -197,7 +193,7 @@ def _is_new(trial: Trial) -> bool:
 def _claim_about_changes(
     found: Findings, judged: Sequence[Trial], turns: Mapping[tuple[str, float], Turn]
 ) -> None:
-    """Whether changes are followed early, and not late, and where the others end."""
+    """Claim that changes are followed early, and not late, and where the others end."""
     smallest = min(value for key, value in turns if key == "sigma")
     changes = groups(judged, "key", "value", "epsilon_c")
     largest = max(c for key, value, c in changes if (key, value) == ("sigma", smallest))
@@ -219,45 +215,43 @@ def _claim_about_changes(
     found.claim(ends, lost == 0, f"{lost} of {n} trials in neither{most}")
 
 
-def _claim_about_order(
-    found: Findings, turns: Mapping[tuple[str, float], Turn], limit: float
-) -> None:
-    """How epsilon^d depends on sigma and, where they were asked, on nu and tau."""
+def _claim_about_order(found: Findings, turns: Mapping[tuple[str, float], Turn]) -> None:
+    """Claim how epsilon^d depends on sigma and, where trials vary them, on nu and tau."""
     columns: dict[str, dict[float, Turn]] = {}
-    for (key, value), turn in turns.items():
+    for (key, value), turn in sorted(turns.items()):
         columns.setdefault(key, {})[value] = turn
-    of_sigma = [columns["sigma"][sigma] for sigma in sorted(columns["sigma"], reverse=True)]
-    order = [min(_rank(turn), limit) for turn in of_sigma]
+    of_sigma = list(columns["sigma"].values())[::-1]
+    order = [min(turn.rank, turn.limit) for turn in of_sigma]
     falls = order == sorted(order, reverse=True) and order[0] > order[-1]
-    words = ", ".join(_in_words(turn, limit) for turn in of_sigma)
+    words = ", ".join(map(str, of_sigma))
     found.claim("epsilon^d falls with sigma, and nowhere rises", falls, words)
     for key, reference, claim in (
         ("nu", 0.05, "nu has no significant effect on epsilon^d"),
         ("tau", 100, "tau of 30 and more has none"),
     ):
-        others = [v for v in columns.get(key, ()) if v != reference and (key, v) != ("tau", 10)]
-        if others:
-            differ = {v: _difference(columns[key][v], columns[key][reference]) for v in others}
-            words = ", ".join(
-                f"{v:g}: {low:+.3f} .. {high:+.3f}" for v, (low, high) in differ.items()
-            )
-            same: bool | None = all(low <= 0 <= high for low, high in differ.values())
-            if same and any(_rank(columns[key][v]) > limit for v in (*others, reference)):
-                same = None  # where one of them lies cannot be judged
-            found.claim(claim, same, f"against {reference:g}, 95 % intervals: {words}")
+        of_key = {v: turn for v, turn in columns.get(key, {}).items() if (key, v) != ("tau", 10)}
+        if len(of_key) < 2:
+            continue
+        against = of_key[reference]
+        differ = {
+            v: mean_interval(turn.of_seeds - against.of_seeds)
+            for v, turn in of_key.items()
+            if v != reference
+        }
+        words = ", ".join(f"{v:g}: {low:+.3f} .. {high:+.3f}" for v, (low, high) in differ.items())
+        same: bool | None = all(low <= 0 <= high for low, high in differ.values())
+        if same and any(turn.rank > turn.limit for turn in of_key.values()):
+            same = None  # where one of them lies cannot be judged
+        found.claim(claim, same, f"against {reference:g}, 95 % intervals: {words}")
     if "tau" in columns:
-        shortest, *others = (_rank(columns["tau"][tau]) for tau in sorted(columns["tau"]))
-        words = ", ".join(_in_words(columns["tau"][tau], limit) for tau in sorted(columns["tau"]))
-        found.claim("epsilon^d is higher at tau = 10", shortest > max(others), words)
-
-
-def _difference(one: Turn, other: Turn) -> tuple[float, float]:
-    """95 % interval of the difference of two epsilon^d, seed by seed."""
-    return mean_interval(one.of_seeds - other.of_seeds)
+        shortest, *others = columns["tau"].values()
+        words = ", ".join(map(str, columns["tau"].values()))
+        higher = shortest.rank > max(turn.rank for turn in others)
+        found.claim("epsilon^d is higher at tau = 10", higher, words)
 
 
 def _judged(trials: Sequence[Trial]) -> list[Trial]:
-    """The trials of those epsilon^c before which blocks enough were rewarded, in the mean."""
+    """Return the trials of those epsilon^c before which enough blocks were rewarded on average."""
     by_change = groups(trials, "epsilon_c").values()
     return [trial for group in by_change if _rewarded(group) >= REWARDED for trial in group]
 
@@ -266,50 +260,19 @@ def _rewarded(trials: Sequence[Trial]) -> float:
     return float(np.mean([t.row["rewarded"] for t in trials]))
 
 
-def _unjudged(trials: Sequence[Trial], limit: float) -> str:
-    """From which epsilon^c on there was little to follow a change from, in words."""
-    words = ", ".join(
-        f"{epsilon:g}: {_rewarded(group):.0f}"
-        for (epsilon,), group in groups(trials, "epsilon_c").items()
-        if epsilon >= 0.7
-    )
-    return (
-        f"Blocks rewarded before the change, by epsilon^c: {words}. Above {limit:g} they are fewer "
-        f"than {REWARDED}, and the agent has hardly an optimum to leave: changes there are left "
-        f"out, and where epsilon^d lies there it is only said to be above {limit:g}."
-    )
-
-
-def _in_words(turn: Turn, limit: float) -> str:
-    return f"{turn.value:.3f}" if _rank(turn) <= limit else f"above {limit:g}"
-
-
-def _rank(turn: Turn) -> float:
-    """Epsilon^d for comparison; 2 where it lies above every epsilon^c, 0 where below."""
-    if math.isnan(turn.value):
-        return 0.0 if turn.followed else 2.0
-    return turn.value
-
-
 def _draw_policies(panel: Any, trials: Sequence[Trial]) -> None:
-    by_change = groups(trials, "epsilon_c")
-    epsilons = [epsilon for (epsilon,) in sorted(by_change)]
-    policies = [[[*map(int, t.row["policy"])] for t in by_change[e,]] for e in epsilons]
-    mean = np.array([np.mean(policy, axis=0) for policy in policies])
-    for s, (marker, size) in enumerate(MARKERS):
-        panel.plot(
-            epsilons,
-            mean[:, s],
-            marker=marker,
-            markersize=size,
-            linewidth=1,
-            linestyle=pages.DASHES[s],
-            color=pages.COLOURS[s],
-            label=pages.STREAM_NAMES[s],
-        )
-    point = point_of_no_return(_judged(trials))
+    by_change = sorted(groups(trials, "epsilon_c").items())
+    epsilons = [epsilon for (epsilon,), _ in by_change]
+    mean = [np.mean([[*map(int, t.row["policy"])] for t in of], axis=0) for _, of in by_change]
+    for s, (marker, size, dashes) in enumerate(STYLES):
+        style = {"linewidth": 1, "linestyle": dashes, "color": figures.COLOURS[s]}
+        values = [policy[s] for policy in mean]
+        name = figures.STREAM_NAMES[s]
+        panel.plot(epsilons, values, marker=marker, markersize=size, label=name, **style)
+    judged = _judged(trials)
+    point = point_of_no_return(judged)
     if math.isfinite(point):
         panel.axvline(point, color="grey", linestyle="-.", linewidth=1, label=r"$\epsilon^d$")
-    least = max(t.settings["epsilon_c"] for t in _judged(trials))
+    least = max(t.settings["epsilon_c"] for t in judged)
     panel.axvspan(least, max(epsilons), color="grey", alpha=0.15, linewidth=0)
-    pages.explain_above(panel)
+    figures.explain_above(panel)
