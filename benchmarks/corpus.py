@@ -1,4 +1,4 @@
-"""The index of many logs: made, brought up to date, and asked."""
+"""The index of many logs: made, and brought up to date."""
 
 from __future__ import annotations
 
@@ -19,15 +19,12 @@ from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from replay.corpus import index as indexing
 from replay.corpus.finding import INDEX, Found
-from replay.corpus.query import ask, summary
 from replay.corpus.rows import SCHEMA
 from replay.integrity.info import describe_reader
 
 FRAMES = 1000
 MADE = 20
 """Recordings that are made; the others are links to their files."""
-
-QUESTION = "SELECT log, sum(seconds) FROM streams WHERE topic = '/view/x1' GROUP BY log LIMIT 10"
 
 WITHOUT_PANDAS = "import sys; sys.modules['pandas'] = None; import cdmisfa.cli; cdmisfa.cli.main()"
 """A command as where pandas is not installed, which pyarrow imports where it is."""
@@ -68,8 +65,6 @@ def commands(folder: Path, recordings: int) -> list[list[object]]:
     work: list[tuple[str, tuple[object, ...]]] = [
         ("index, the first time", ("index", folder, "--jobs", 2)),
         ("index, nothing changed", ("index", folder)),
-        ("query, a question", ("query", folder, QUESTION)),
-        ("query, the summary", ("query", folder)),
         ("--version, to compare with", ("--version",)),
     ]
     rows: list[list[object]] = []
@@ -128,7 +123,7 @@ def made_up(logs: int) -> tuple[pa.Table, list[Found]]:
 
 
 def simulated(folder: Path, recordings: int) -> list[list[object]]:
-    """Bring an index of made-up rows up to date, where one of a hundred changed, and ask it."""
+    """Bring an index of made-up rows up to date, where one of a hundred changed."""
     table, found = made_up(3 * recordings)
     index = folder / INDEX
     indexing.pq.write_table(table, index, compression="zstd")
@@ -150,22 +145,7 @@ def simulated(folder: Path, recordings: int) -> list[list[object]]:
     again()
     cost = time.perf_counter() - start, time.process_time() - busy
     row: list[object] = ["index again, 1 % changed", recordings]
-    return [[*row, *(round(one, 3) for one in cost)], *asked(index, recordings)]
-
-
-def asked(index: Path, recordings: int) -> list[list[object]]:
-    """Ask an index."""
-    work: dict[str, Callable[[], object]] = {
-        "a question": lambda: ask(index, QUESTION),
-        "the summary": lambda: summary(index),
-    }
-    rows: list[list[object]] = []
-    for name, call in work.items():
-        start, busy = time.perf_counter(), time.process_time()
-        call()
-        cost = time.perf_counter() - start, time.process_time() - busy
-        rows.append([name, recordings, *(round(one, 3) for one in cost)])
-    return rows
+    return [[*row, *(round(one, 3) for one in cost)]]
 
 
 def main(*, quick: bool = False, full: bool = False) -> None:
@@ -175,8 +155,6 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         corpus = Path(folder)
         rows = commands(corpus, few)
         files = per_file(corpus, 20 if quick else 100)
-        asked(corpus / INDEX, few)  # imports what it needs
-        answers = asked(corpus / INDEX, few)
     with tempfile.TemporaryDirectory() as folder:
         simulated(Path(folder), 1000)  # imports what it needs
         again = simulated(Path(folder), many)
@@ -187,11 +165,11 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "are processes of their own: seconds by the wall's clock, of all processors, and the peak "
         "of one process, without pandas, which no command needs and pyarrow imports where it is "
         "installed: about a second of CPU. Below, a file's row by its summary and by decoding it, "
-        "and answers of that index and of a larger one whose rows are made up, with real joins and "
-        "queries, in one process that has imported all.",
+        "and a larger index whose rows are made up, brought up to date with real joins, in one "
+        "process that has imported all.",
         [
             (["command", "recordings", "seconds", "CPU, seconds", "peak, MB"], rows),
             (["a file by its summary, ms", "by decoding, ms", "ratio"], [files]),
-            (["index", "recordings", "seconds", "CPU, seconds"], [*answers, *again]),
+            (["index", "recordings", "seconds", "CPU, seconds"], again),
         ],
     )

@@ -44,7 +44,6 @@ SHOWN: Mapping[str, tuple[object, ...]] = {
     "sweep": ("oscillatory", "--seeds", "0:1", "--max-iterations", 2, "-o", "sweep"),
     "results": ("sweep",),
     "index": ("corpus",),
-    "query": ("corpus",),
     "doctor": (),
 }
 """Commands whose documents are looked at, with what they are given."""

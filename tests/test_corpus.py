@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import shlex
@@ -26,8 +27,7 @@ from recorder.log.files import held
 from replay.corpus import index as indexing
 from replay.corpus import rows as looking
 from replay.corpus.finding import INDEX, found_logs
-from replay.corpus.index import index_logs, read_index
-from replay.corpus.query import ask, summary
+from replay.corpus.index import MOST_NAMED, index_logs, read_index
 from replay.corpus.rows import MARK, SCHEMA, Answer, Task
 from replay.integrity.info import LogInfo
 
@@ -122,8 +122,8 @@ class TestRows:
         assert {(r["path"], r["log"], r["seed"]) for r in found} == {
             ("runs/first/run.mcap", "runs/first", 0)
         }
-        sql = "SELECT DISTINCT configuration->>'$.config.learner.tau' AS tau FROM streams WHERE "
-        assert ask(corpus / INDEX, sql + "kind = 'run'").to_pylist() == [{"tau": "100"}]
+        for stated in (json.loads(r["configuration"]) for r in found):
+            assert stated["config"]["learner"]["tau"] == 100
 
     def test_what_is_broken_is_a_row_that_says_why(self, corpus: Path) -> None:
         index_logs([corpus])
@@ -218,15 +218,14 @@ class TestUpToDate:
         index_logs([corpus])
         moved = corpus.rename(tmp_path / "elsewhere")
         assert index_logs([moved]).read == 0
-        paths = ask(moved / INDEX, "SELECT DISTINCT path FROM logs")["path"].to_pylist()
-        assert all(Path(path).exists() for path in paths)
+        assert all((moved / r["path"]).exists() for r in rows_of(moved))
 
     def test_an_index_of_several_lies_where_it_is_told(self, corpus: Path, tmp_path: Path) -> None:
         out = tmp_path / "all.parquet"
         made = index_logs([f"{corpus}/*.mcap", corpus / "night"], out)
         assert made.logs == 4 + 3
-        paths = ask(out, "SELECT path FROM logs")["path"].to_pylist()
-        assert all(Path(path).exists() for path in paths)
+        paths = read_index(out)["path"].to_pylist()
+        assert all((tmp_path / path).exists() for path in paths)
         with pytest.raises(UsageError, match="say where, with -o"):
             index_logs([f"{corpus}/*.mcap"])
 
@@ -280,13 +279,12 @@ class TestBadInput:
         index_logs([corpus])
         table = read_index(corpus / INDEX)
         pq.write_table(table.replace_schema_metadata({MARK: b"7"}), corpus / INDEX)
-        done = cdmisfa("query", corpus)
-        assert done.code == 2
-        assert "version 7, this program has 1: make it again with cdmisfa index" in done.err
+        with pytest.raises(UsageError, match="version 7, this program has 1: make it again"):
+            read_index(corpus / INDEX)
         done = cdmisfa("index", corpus)
         assert done.code == 0
         assert "version 7: it is made anew" in done.err
-        assert cdmisfa("query", corpus).code == 0
+        assert len(rows_of(corpus)) == table.num_rows
 
     def test_what_is_no_index_is_left_alone(self, corpus: Path, tmp_path: Path) -> None:
         other = tmp_path / "other.parquet"
@@ -353,81 +351,40 @@ class TestBadInput:
         assert (made.logs, made.broken) == (500, 500)
 
 
-class TestQuery:
-    def test_the_summary_says_how_much_what_is_broken_and_what_is_double(
+class TestSummary:
+    def test_it_says_how_much_there_is_and_what_is_broken(
         self, cdmisfa: Cdmisfa, corpus: Path
     ) -> None:
         shutil.copytree(corpus / "night" / "one", corpus / "night" / "two")
-        (corpus / "night" / "two" / "x2.mcap").rename(corpus / "night" / "two" / "named.mcap")
-        assert cdmisfa("index", corpus).code == 0
-        said = cdmisfa("query", corpus).out
-        assert "recording  3" in said  # the torn one is the third
-        assert "broken: 3\n" in said
-        assert "double: 3, " in said
-        assert f"{corpus}/night/one/x2.mcap = {corpus}/night/two/named.mcap" in said
-        document = cdmisfa("query", corpus, "--json").json
-        assert document["counts"]["double"] == 3
+        done = cdmisfa("index", corpus)
+        assert done.code == 0
+        assert "recording  3" in done.out  # the torn one is the third
+        assert "text.mcap: not an MCAP file" in done.out
+        document = cdmisfa("index", corpus, "--json").json
+        assert document["broken"] == len(document["problems"]) == 3
         kinds = {kind["kind"]: kind for kind in document["kinds"]}
-        assert kinds["recording"]["files"] == 3 + 3 + 1
-        assert kinds["recording"]["seconds"] > 2 * 39
+        recordings = kinds["recording"]
+        assert (recordings["files"], recordings["streams"]) == (3 + 3 + 1, 2 * (3 + 3 + 1))
+        files = [*(corpus / "night").rglob("*.mcap"), corpus / "torn.mcap"]
+        assert recordings["bytes"] == sum(file.stat().st_size for file in files)
+        assert 2 * 39.98 < recordings["seconds"] < 3 * 39.98
+        assert (kinds["run"]["logs"], kinds["not read"]["logs"]) == (1, 2)
 
-    def test_deep_finds_the_same_messages_in_other_files(self, corpus: Path) -> None:
+    def test_long_lists_of_broken_logs_end(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        for number in range(MOST_NAMED + 3):
+            (tmp_path / f"{number:02}.mcap").touch()
+        said = cdmisfa("index", tmp_path).out
+        assert said.count("empty, nothing was written") == MOST_NAMED
+        assert "and 3 more logs with a problem" in said
+
+    def test_deep_names_the_same_messages_in_other_files(self, corpus: Path) -> None:
         repacked(corpus / "night" / "one" / "x1.mcap", corpus / "again.mcap")
-        index_logs([corpus])
-        assert summary(corpus / INDEX).counts["double"] == 0
         index_logs([corpus], deep=True)
-        (double,) = summary(corpus / INDEX).double
-        assert [Path(path).name for path in double["paths"]] == ["again.mcap", "x1.mcap"]
+        one, two = (row(corpus, f"{name}.mcap", "/truth") for name in ("again", "night/one/x1"))
+        assert one["contents"] == two["contents"] != row(corpus, "robot.mcap")["contents"]
+        assert one["identity"] != two["identity"]
 
-    def test_answers_as_table_json_and_parquet(
-        self, cdmisfa: Cdmisfa, corpus: Path, tmp_path: Path
-    ) -> None:
-        cdmisfa("index", corpus)
-        sql = "SELECT kind, count(*) AS n FROM logs WHERE problem IS NULL GROUP BY kind ORDER BY n"
-        expected = [
-            {"kind": "run", "n": 1},
-            {"kind": "recording", "n": 3},
-            {"kind": "foreign", "n": 3},
-        ]
-        found = cdmisfa("query", corpus, sql, "--json").json
-        assert sorted(found["rows"], key=str) == sorted(expected, key=str)
-        assert "kind       n" in cdmisfa("query", corpus, sql).out
-        out = tmp_path / "answer.parquet"
-        assert cdmisfa("query", corpus, sql, "-o", out).code == 0
-        assert sorted(pq.read_table(out).to_pylist(), key=str) == sorted(expected, key=str)
-        assert cdmisfa("query", corpus, sql, "-o", out).code == 2  # it is there
-
-    @pytest.mark.parametrize(
-        "sql",
-        [
-            "SELEC",
-            "SELECT nothing FROM streams",
-            "SELECT * FROM '{corpus}/secret.csv'",
-            "COPY streams TO '{corpus}/out.csv'",
-            "ATTACH '{corpus}/out.db'",
-            "SET enable_external_access = true",
-            "SELECT * FROM rows_of",
-            "INSTALL httpfs",
-        ],
-    )
-    def test_a_query_fails_in_one_line_and_reaches_no_file(
-        self, cdmisfa: Cdmisfa, corpus: Path, sql: str
-    ) -> None:
-        (corpus / "secret.csv").write_text("a,b\n1,2\n")
-        cdmisfa("index", corpus)
-        before = sorted(corpus.iterdir())
-        done = cdmisfa("query", corpus, sql.format(corpus=corpus))
-        assert (done.code, done.out) == (2, "")
-        assert done.err.startswith("cdmisfa: the query fails: ")
-        assert done.err.count("\n") == 1
-        assert sorted(corpus.iterdir()) == before
-
-    def test_without_an_index_it_says_how_to_make_one(
-        self, cdmisfa: Cdmisfa, tmp_path: Path
-    ) -> None:
-        done = cdmisfa("query", tmp_path)
-        assert (done.code, done.out) == (2, "")
-        assert f"has no index: make one with cdmisfa index {tmp_path}" in done.err
+    def test_a_folder_that_is_not_there_is_refused(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
         assert cdmisfa("index", tmp_path / "missing").code == 2
 
 
@@ -443,10 +400,5 @@ def test_the_commands_of_the_pages_work(
         assert program == "cdmisfa"
         done = cdmisfa(*words)
         assert done.code == 0, done.err
-        if "AS hours" in words[-1]:  # as the summary says, not once a stream
-            (kind,) = cdmisfa("query", "recordings", "--json").json["kinds"]
-            (row,) = cdmisfa(*words, "--json").json["rows"]
-            assert row["hours"] == pytest.approx(kind["seconds"] / 3600)
-    assert pq.read_table("broken.parquet").num_rows == 0
     columns = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| .* \|", page, re.MULTILINE))))
     assert set(SCHEMA.names) <= columns

@@ -431,4 +431,3 @@ def test_recordings_in_one_folder_are_episodes_of_their_own(
     corpus = tmp_path / "logs"
     assert cdmisfa("index", corpus).code == 0
     assert "3 episodes" in cdmisfa("learn", corpus, "--max-iterations", 1).err
-    assert f"look at {corpus / 'corpus.html'}" in cdmisfa("view", corpus).err

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 import cdmisfa
+from recorder.recording import record_scene
+from replay.corpus.index import index_logs
 
 ROOT = Path(__file__).parents[1]
 Ran = dict[str, Any]
@@ -49,6 +51,17 @@ def test_from_python(ran: Callable[..., Ran]) -> None:
     assert abs(np.corrcoef(found["slowest"][:, 0], found["frames"][:, 0])[0, 1]) > 0.9
     assert len(found["rewards"]) == 50
     assert found["left"].shape == (100, 48, 128)
+
+
+def test_corpus(ran: Callable[..., Ran], tmp_path: Path) -> None:
+    pytest.importorskip("duckdb")
+    pytest.importorskip("polars")
+    record_scene("oscillatory", tmp_path / "recordings" / "monday", frames=500)
+    (tmp_path / "recordings" / "empty.mcap").touch()
+    index_logs([tmp_path / "recordings"])
+    found = ran("corpus.md")
+    assert found["printed"].count("empty, nothing was written") >= 1
+    assert "9.98" in found["printed"]
 
 
 def test_estimators(ran: Callable[..., Ran]) -> None:

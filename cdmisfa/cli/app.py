@@ -79,7 +79,6 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "Many logs": {
         "index": ("corpus", "Index what is in many logs: streams, times, damage, doubles."),
-        "query": ("corpus", "Ask an index in SQL, or say what it has: how much, broken, double."),
     },
     "Studies": {
         "reproduce": (

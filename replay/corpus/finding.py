@@ -64,16 +64,12 @@ def found_logs(words: Sequence[str | Path]) -> Iterator[Found]:
 
 
 def may_be_corpus(words: Sequence[str | Path]) -> bool:
-    """Whether words are a folder that has an index, or a file that may be one."""
+    """Return whether words are a folder that has an index, or a file that may be one."""
     if len(words) != 1:
         return False
     place = Path(words[0])
-    return has_index(place) or (place.suffix == ".parquet" and place.is_file())
-
-
-def has_index(folder: Path) -> bool:
-    """Whether a folder has an index of the logs in it; what is too long for a name has none."""
-    return os.path.isfile(folder / INDEX)
+    # `os.path` says no of a name that is too long, where `Path` raises.
+    return os.path.isfile(place / INDEX) or (place.suffix == ".parquet" and place.is_file())
 
 
 def state_of_log(place: Path) -> tuple[int, str]:

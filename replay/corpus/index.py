@@ -9,12 +9,13 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_line
 from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.untrusted import check_regular, parse_json
@@ -26,6 +27,9 @@ from replay.storage.opening import no_such
 
 BATCH: Final = 32
 """Logs that a process looks at in one go."""
+
+MOST_NAMED: Final = 20
+"""Logs with a problem that `index` prints, so that they fit on a screen."""
 
 SAVED_EVERY: Final = 5000
 """Logs after which what is known is written, so that a kill costs no more than these."""
@@ -57,6 +61,9 @@ class Indexed:
         kept: logs that were as before.
         gone: logs that it had and that are not there any more, and those that went meanwhile.
         broken: logs with a problem.
+        kinds: for each kind of log how many there are, their files, streams, bytes and seconds; a
+            recording is one log, however many files it has.
+        problems: `path` and `problem` of the first `MOST_NAMED` of those with one.
         anew: why nothing was kept of an index that was there; "" where something may be.
         stopped: it was stopped before all logs were looked at; the rest is for the next time.
     """
@@ -68,6 +75,8 @@ class Indexed:
     kept: int = 0
     gone: list[str] = field(default_factory=list)
     broken: int = 0
+    kinds: list[dict[str, Any]] = field(default_factory=list)
+    problems: list[dict[str, Any]] = field(default_factory=list)
     anew: str = ""
     stopped: bool = False
 
@@ -141,21 +150,6 @@ def is_index(path: Path) -> bool:
         return False
 
 
-def index_path(place: str | Path) -> Path:
-    """The index of a folder, or one that is named by itself.
-
-    Raises:
-        UsageError: there is none.
-    """
-    path = Path(place)
-    found = path / INDEX if path.is_dir() else path
-    if path.is_dir() and not found.exists():
-        raise UsageError(f"{path} has no index: make one with cdmisfa index {path}")
-    if not found.exists():
-        raise no_such(path)
-    return found
-
-
 def index_logs(
     words: Sequence[str | Path],
     out: Path | None = None,
@@ -215,8 +209,42 @@ def index_logs(
             table = _write(old, answers, index)
     made.gone += itertools.chain(*(answer.gone for answer in answers.values()))
     made.streams, made.logs = table.num_rows, len(pc.unique(table["path"]))
-    made.broken = len(pc.unique(table.filter(pc.is_valid(table["problem"]))["path"]))
+    first = pc.equal(table["number"], 0)
+    broken = table.filter(pc.and_(first, pc.is_valid(table["problem"])))
+    made.broken = len(broken)
+    made.problems = broken.slice(0, MOST_NAMED).select(["path", "problem"]).to_pylist()
+    made.kinds = _kinds(table, first)
     return made
+
+
+def _kinds(table: pa.Table, first: pa.ChunkedArray) -> list[dict[str, Any]]:
+    """Return for each kind of log how much there is, as `Indexed.kinds` has it.
+
+    Args:
+        table: rows of streams.
+        first: whether each is the first of its file, whose size it states.
+    """
+    of_log = ("log", "topic", "start_ns", "end_ns")
+    columns = {name: table[name] for name in of_log}
+    columns["kind"] = pc.cast(table["kind"], pa.string())
+    columns["files"] = pc.cast(first, pa.int64())
+    columns["bytes"] = pc.if_else(first, table["bytes"], 0)
+    logs = pa.table(columns).group_by("log", use_threads=False).aggregate(
+        [("kind", "first"), ("files", "sum"), ("topic", "count"), ("bytes", "sum"),
+         ("start_ns", "min"), ("end_ns", "max")]
+    )  # fmt: skip
+    found: dict[str, dict[str, Any]] = {}
+    for log in logs.to_pylist():
+        kind = log["kind_first"] or "not read"
+        none = {"kind": kind, "logs": 0, "files": 0, "streams": 0, "bytes": 0, "seconds": 0.0}
+        own = found.setdefault(kind, none)
+        own["logs"] += 1
+        own["files"] += log["files_sum"]
+        own["streams"] += log["topic_count"]
+        own["bytes"] += log["bytes_sum"] or 0
+        if log["start_ns_min"] is not None and log["end_ns_max"] is not None:
+            own["seconds"] += (log["end_ns_max"] - log["start_ns_min"]) / NANOSECONDS
+    return [found[kind] for kind in sorted(found)]
 
 
 def read_index(path: Path) -> pa.Table:

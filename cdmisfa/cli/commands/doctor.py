@@ -28,7 +28,6 @@ EXTRAS = {
     "rl": (("gymnasium", "stable_baselines3"), "examples/ppo.py"),
     "foxglove": (("websockets",), "foxglove:// streams of robots"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
-    "corpus": (("duckdb",), "query"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "sklearn": (("sklearn",), "RecursiveSFA and IncSFA, estimators of scikit-learn"),
     "river": (("river",), "OnlineSFA, a transformer of river"),

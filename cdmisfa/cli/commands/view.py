@@ -67,8 +67,7 @@ def view_command(
 
     RUN is the folder of a run, or its run.mcap, a recording, an .rrd file, or one or several
     camera logs; of a log behind a URL a copy is made. A sweep that kept its logs is served as a
-    table, one row per run that it was asked for last, until interrupted. Of what cdmisfa index
-    indexed a page is written: when what was recorded, what is broken or double, first frames.
+    table, one row per run that it was asked for last, until interrupted.
     """
     if sum((save is not None, web, screenshot is not None)) > 1:
         raise click.UsageError("choose one of --save, --web and --screenshot")
@@ -81,11 +80,6 @@ def view_command(
 
     check_limit(memory_limit)
     path, *beside = run
-    if not beside and cameras == CameraOptions() and (index := _index_of(path)) is not None:
-        if web or screenshot or at or size or port or shown["tab"]:
-            raise click.UsageError(f"{path} is many logs, of which a page is made: --save F.html")
-        _view_index(index, save, force=force)
-        return
     if not beside and runs_in(path):
         if save is not None:
             raise click.UsageError(f"{path} holds many runs, which --save cannot: name one run")
@@ -122,25 +116,6 @@ def view_command(
             serve(path, at=at, memory_limit=memory_limit, port=port, **shown)
         else:
             open_window(path, at=at, memory_limit=memory_limit, size=size, **shown)
-
-
-def _index_of(path: Path) -> Path | None:
-    """The index of many logs that a path names; None of what is looked at by itself."""
-    from replay.corpus.finding import has_index
-
-    if path.suffix != ".parquet" and not has_index(path):
-        return None
-    from replay.corpus.view import index_to_view
-
-    return index_to_view(path)
-
-
-def _view_index(index: Path, save: Path | None, *, force: bool) -> None:
-    from replay.corpus.view import view_index
-
-    with bar("looking", "logs") as shown:
-        page = view_index(index, save, force=force, told=shown.update)
-    tell(f"look at {page}")
 
 
 def _view_sweep(
