@@ -9,7 +9,7 @@ import contextlib
 import itertools
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
@@ -28,7 +28,7 @@ from recorder.mcap.records import (
     Segment,
     crc32,
 )
-from recorder.mcap.store import FileStore, OnePass, Store
+from recorder.mcap.store import FileStore, Store
 from recorder.mcap.tables import MessageTable, Pairs, walked_table
 
 UNUSED: Final = "(the index is not used)"
@@ -126,16 +126,6 @@ class Chunks:
                 pairs = np.frombuffer(data, np.uint64, 2 * part.count, part.offset - first)
                 found.append((part.channel, pairs.reshape(-1, 2)))
         return found
-
-    @contextlib.contextmanager
-    def passing(self) -> Iterator[OnePass]:
-        """Read each byte of the file once, as far as chunks are asked for in its order."""
-        before = self._file
-        self._file = store = OnePass(before)
-        try:
-            yield store
-        finally:
-            self._file = before
 
     def forget(self, but: Collection[int] = ()) -> None:
         """Drop the decoded chunks, except those at some places of the file."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from recorder.mcap.records import RECORD_HEADER, Segment, crc32
-from recorder.mcap.store import OnePass, Store
+from recorder.mcap.store import Store
 from recorder.mcap.walk import LogStructure
 
 _CHUNK_HEADER: Final = 256
@@ -41,12 +40,6 @@ class DataSection:
         self._checked = end
         if (self.file.crc(0, end) if crc is None else crc) != stated:
             self._damaged()
-
-    @contextlib.contextmanager
-    def passing(self) -> Iterator[OnePass]:
-        """The log, of which each byte is read once, as far as it is read forwards, and checked."""
-        yield (store := OnePass(self.file))
-        self.check(store.pass_to(self._structure.data_end))
 
     def check_unproven(self) -> None:
         """Check it for a chunk that has no checksum of its own."""

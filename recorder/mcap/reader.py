@@ -25,7 +25,7 @@ from recorder.mcap.records import (
     Schema,
     Segment,
 )
-from recorder.mcap.store import FileStore, Store
+from recorder.mcap.store import FileStore, OnePass, Store
 from recorder.mcap.tables import MessageTable, Pairs, in_order
 from recorder.mcap.walk import LogStructure
 
@@ -72,8 +72,9 @@ class LogReader:
             log: path of a file, or what has its bytes, which is closed with the reader.
             salvage: leave out what is damaged.
             check: "chunks" believes a summary that accounts for every message; "data" looks at
-                every record of a file and at the checksum over its data, "pass" leaves the latter
-                to `one_pass`. By default "chunks", with `salvage` "data".
+                every record of a file and at the checksum over its data; "pass" leaves to
+                `one_pass` the latter, and without `salvage` also the former. By default "chunks",
+                with `salvage` "data".
 
         Raises:
             UsageError: it cannot be opened.
@@ -84,10 +85,12 @@ class LogReader:
         self._failed: set[int] = set()
         self._defined, self._searched = 0, False
         self._file = log if isinstance(log, Store) else FileStore(Path(log))
+        if check == "pass":
+            self._file = OnePass(self._file)
         self.path = self._file.path
         try:
             check = check or ("data" if salvage else "chunks")
-            by_index = check == "chunks"
+            by_index = check == "chunks" or (check == "pass" and not salvage)
             found = LogStructure(self._file, self._refuse, by_index=by_index, resync=salvage)
             self._structure = found
             self.data = DataSection(self._file, found, self._refuse_data)
@@ -233,16 +236,24 @@ class LogReader:
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
         """Give every chunk in file order, None for one that is damaged and left out.
 
-        The file is read once, and the checksum over all of its data is checked at the end.
+        Without `salvage` each byte is read once, and every record is looked at on the way. The
+        checksum over all of the data is checked at the end. The log was opened with check "pass".
 
         Raises:
             LogDamagedError: at the first damage, without `salvage`.
         """
-        with self._chunks.passing() as store:
-            for segment in self.segments:
+        file = self._file
+        assert isinstance(file, OnePass)
+        if self.by_index:
+            for segment in self._structure.walk(file):
                 yield segment, self.table(segment)
-            crc = store.pass_to(self._structure.data_end)
-        self.data.check(crc)
+            self._settle()
+        else:
+            file.start(file.size)
+            for segment in self.segments:
+                file.pass_to(segment.offset)
+                yield segment, self.table(segment)
+        self.data.check(file.crc_to(self._structure.data_end))
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
         """Say which chunks, or only `indexes` of them, will be read one after the other."""

@@ -29,6 +29,8 @@ _PEEK_FAR: Final = 256
 """Bytes read ahead at a place that is far from the last."""
 _AHEAD: Final = 16 * 1024 * 1024
 """Most bytes of a file that are read ahead at once."""
+_BLOCK: Final = 1024 * 1024
+"""Bytes that a pass over a file reads at once."""
 
 
 class Store(ABC):
@@ -279,39 +281,79 @@ _OPEN: Final[OrderedDict[FileStore, _Descriptor]] = OrderedDict()
 
 
 class OnePass(Store):
-    """A store that is read forwards, with the checksum of every byte up to where that got.
+    """A log that is read forwards, each byte once, with the checksum of what was passed.
 
-    What was read before is read again from the store, if it is asked for once more.
+    From `start` on a window of the file moves with the reads that begin in it. What is before or
+    behind it is read apart. A small file is one window from the beginning.
     """
 
     def __init__(self, store: Store) -> None:
         super().__init__(store.path)
-        self.size = store.size
+        self.size = self._end = store.size
         self._store = store
-        self._at = 0
-        self._crc = 0
+        self._passed_crc = 0
+        self._window_at = -1
+        if self.size <= _BLOCK:
+            self._window, self._window_at = store.read(0, self.size), 0
+
+    def start(self, end: int) -> None:
+        """Begin at the first byte, and read ahead no further than a place."""
+        self._end = end
+        if len(self._window) < self.size:
+            self._window, self._window_at, self._passed_crc = b"", 0, 0
 
     def read_at(self, offset: int, count: int) -> bytes:
-        self.pass_to(offset)
-        data = self._store.read(offset, count)
-        self._take(offset, data)
-        return data
+        if not self._reaches(offset):
+            return self._store.read_at(offset, count)
+        at = offset - self._window_at
+        if at + count > len(self._window):
+            self._pass(at)
+            self._read_on(count)
+            at = 0
+        return self._window[at : at + count]
+
+    def peek(self, offset: int, count: int) -> bytes:
+        if self._window_at < 0:
+            return self._store.peek(offset, count)
+        return self.read(offset, count)
 
     def read_into(self, offset: int, out: memoryview) -> int:
-        self.pass_to(offset)
-        count = self._store.read_into(offset, out)
-        self._take(offset, out[:count])
-        return count
+        held = self._window[offset - self._window_at :] if self._reaches(offset) else b""
+        if not self._reaches(offset) or len(out) - len(held) < _BLOCK:
+            return super().read_into(offset, out)
+        # What is left, which may be large, goes through no window.
+        out[: len(held)] = held
+        rest = self._store.read_into(offset + len(held), out[len(held) :])
+        self._pass(len(self._window))
+        self._passed_crc = crc32(out[len(held) : len(held) + rest], self._passed_crc)
+        self._window_at += rest
+        return len(held) + rest
 
-    def pass_to(self, place: int) -> int:
-        """Read on to a place; return the checksum of all bytes up to where reading got."""
-        for block in self._store.blocks(self._at, place):
-            self._take(self._at, block)
-        return self._crc
+    def pass_to(self, place: int) -> None:
+        """Read on to a place."""
+        while self._window_at + len(self._window) < min(place, self.size):
+            self._pass(len(self._window))
+            self._read_on(0)
+
+    def crc_to(self, place: int) -> int:
+        """Read on to a place that is not before the window; return the CRC-32 of all before it."""
+        self.pass_to(place)
+        return crc32(memoryview(self._window)[: place - self._window_at], self._passed_crc)
 
     def close(self) -> None:
-        """Nothing: the store stays open."""
+        self._store.close()
 
-    def _take(self, offset: int, data: bytes | memoryview) -> None:
-        self._crc = crc32(memoryview(data)[max(self._at - offset, 0) :], self._crc)
-        self._at = max(self._at, offset + len(data))
+    def _reaches(self, offset: int) -> bool:
+        """Return whether a place is in the window, or at its end."""
+        return 0 <= self._window_at <= offset <= self._window_at + len(self._window)
+
+    def _pass(self, count: int) -> None:
+        """Drop the first bytes of the window."""
+        self._passed_crc = crc32(memoryview(self._window)[:count], self._passed_crc)
+        self._window, self._window_at = self._window[count:], self._window_at + count
+
+    def _read_on(self, count: int) -> None:
+        """Lengthen the window, to `count` bytes at least."""
+        end = self._window_at + len(self._window)
+        ahead = min(_BLOCK, max(self._end - end, 0))
+        self._window += self._store.read(end, max(count - len(self._window), ahead, 1))

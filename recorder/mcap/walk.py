@@ -8,6 +8,7 @@ summary claims is compared with what was found.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from typing import Final
 
 from mcap.opcode import Opcode
@@ -30,7 +31,7 @@ from recorder.mcap.records import (
     no_log,
 )
 from recorder.mcap.resync import fitting, leave_chunks, next_chunk, own_end, stands
-from recorder.mcap.store import Store
+from recorder.mcap.store import OnePass, Store
 from recorder.mcap.summary import Summary, read_summary
 
 LOOSE_BYTES: Final = 1024 * 1024
@@ -97,6 +98,28 @@ class LogStructure:
         if not by_index or not self._take_index():
             self._walk_data()
 
+    def walk(self, file: OnePass) -> Iterator[Segment]:
+        """Walk over every record of a log that was opened by its index.
+
+        Args:
+            file: the log, which is read on to each record.
+
+        Yields:
+            Each chunk that the index names, before the walk goes on to the record behind it.
+        """
+        assert self._limit is not None
+        file.start(self._limit)
+        self._file = file
+        stated, self.segments, self.attachments = self.segments, [], []
+        self.metadata, self._metadata_bytes, self._attachment_ranges = [], 0, []
+        self.by_index, self.complete = False, False
+        self._at, self.data_crc = len(MAGIC), None
+        for segment in stated:
+            self._walk_data(segment.offset)
+            file.pass_to(segment.offset)
+            yield segment
+        self._walk_data()
+
     def resume(self) -> int:
         """Walk over what was appended; how many of the segments before are as they were."""
         if self._last_chunk is not None:
@@ -153,8 +176,9 @@ class LogStructure:
         self._at = start
         self._take(found, start + RECORD_HEADER.size, length)
 
-    def _walk_data(self) -> None:
-        while self.data_crc is None:
+    def _walk_data(self, stop: int | None = None) -> None:
+        """Walk over the records up to a place, or to the end of the data."""
+        while self.data_crc is None and (stop is None or self._at < stop):
             limit = self._file.size if self._limit is None else self._limit
             where = f"byte {self._at}"
             try:
@@ -165,6 +189,8 @@ class LogStructure:
                 if not self._resume_after():
                     self.missing = f"everything from byte {self._at} on is unreadable"
                     break
+        if stop is not None:
+            return
         self._close_loose()
         if self.data_crc is not None and self._limit is None and not self.missing:
             self.missing = "cut short: its summary is not all there, every message is"

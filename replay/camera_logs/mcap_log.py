@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from recorder.images.decoding import MessageKind, decoder_of
+from recorder.images.messages import Decoder
 from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Channel, MalformedRecord, Segment
@@ -81,8 +82,7 @@ class McapImages(MessageImages):
         self.reader = self._readers.reader(path, salvage=salvage)
         try:
             _refuse_nothing(self.reader)
-            channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
-            own, self.decode = choose_images(path, topic, channels, reading)
+            own, self.decode = channels_on(self.reader, topic, reading)
             self._channels = [channel.id for channel in own]
             self.topic, self.kind = own[0].topic, _kind(self.reader, own[0])
             found = list(self._by_index() if self.reader.by_index else self._by_pass())
@@ -153,9 +153,22 @@ def mcap_topics(path: Path, reading: Reading = IMAGES) -> list[str]:
     """
     with LogReader(path, salvage=True) as reader:
         _refuse_nothing(reader)
-        channels = reader.channels.values()
-        found = (c.topic for c in channels if decoder_of(_kind(reader, c), reading) is not None)
-        return list(dict.fromkeys(found))
+        return topics_in(reader, reading)
+
+
+def topics_in(reader: LogReader, reading: Reading) -> list[str]:
+    """Return the topics of a log with what is wanted."""
+    channels = reader.channels.values()
+    found = (c.topic for c in channels if decoder_of(_kind(reader, c), reading) is not None)
+    return list(dict.fromkeys(found))
+
+
+def channels_on(
+    reader: LogReader, topic: str | None, reading: Reading
+) -> tuple[list[Channel], Decoder]:
+    """Return the channels of a topic and the decoder of their messages; see `choose_images`."""
+    channels = [(c.topic, _kind(reader, c), c) for c in reader.channels.values()]
+    return choose_images(reader.path, topic, channels, reading)
 
 
 def _refuse_nothing(reader: LogReader) -> None:

@@ -23,6 +23,7 @@ from replay.arrays import are_arrays
 from replay.camera_logs.alignment import Times, missing
 from replay.camera_logs.opening import identity_of, image_topics, only_foreign, open_images
 from replay.corpus.finding import state_of_log
+from replay.integrity.counting import read_once
 from replay.integrity.info import ChannelInfo, LogInfo, describe_log, describe_reader
 from replay.integrity.state import failed_state
 from replay.storage.identity import FilesIdentity, Identity, LogIdentity
@@ -232,10 +233,12 @@ def _described(place: Path, deep: bool) -> tuple[LogInfo, str | None, Sequence[M
         if not deep:
             info = describe_reader(reader, decode=False)
             return info, identity, [{} for _ in info.channels]
-    with LogReader(place, salvage=True, check="pass") as reader:
+
+    def all_of(reader: LogReader) -> tuple[LogInfo, list[dict[str, Any]]]:
         content = _Content(reader)
-        info = describe_reader(reader, decode=True, told=content.add)
-        found = content.found()
+        return describe_reader(reader, decode=True, told=content.add), content.found()
+
+    info, found = read_once(place, all_of)
     if info.kind != "foreign":
         return info, identity, found
     images = set(image_topics(place))

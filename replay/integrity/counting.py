@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
 from recorder.mcap.tables import MessageTable
 
 Times = NDArray[np.uint64]
+Result = TypeVar("Result")
 
 
 @dataclass(slots=True)
@@ -38,13 +42,33 @@ class ChannelCount:
             self.end = high if self.end is None else max(self.end, high)
 
 
+def read_once(path: Path, work: Callable[[LogReader], Result]) -> Result:
+    """Apply a function to the reader of a log, of which each byte is read once if it is whole.
+
+    A log with damage is read again with `salvage`, for what is wrong and where.
+
+    Args:
+        path: the log.
+        work: reads the log with `LogReader.one_pass`; may raise a CdmisfaError.
+
+    Raises:
+        CdmisfaError: it is no log, or of `work`.
+    """
+    with contextlib.suppress(CdmisfaError), LogReader(path, check="pass") as reader:
+        result = work(reader)
+        if not reader.problems:
+            return result
+    with LogReader(path, salvage=True, check="pass") as reader:
+        return work(reader)
+
+
 def count_messages(
     reader: LogReader, *, decode: bool, told: Callable[[Segment], None] = lambda _: None
 ) -> dict[int, ChannelCount]:
     """Count the messages of each channel.
 
     Args:
-        reader: of a log; of one behind a URL the summary and few message indexes are read.
+        reader: of a log.
         decode: decode every chunk, which finds all damage. The file is read in one pass.
         told: of every chunk that is decoded, in file order.
 

@@ -13,13 +13,12 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
-from recorder.mcap.reader import Check, LogReader
+from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Channel, Problem, Segment
-from recorder.mcap.store import FileStore
 from replay.arrays import are_arrays
 from replay.camera_logs.opening import channels_of, log_format, only_foreign
 from replay.camera_logs.pictures import FolderImages
-from replay.integrity.counting import count_messages
+from replay.integrity.counting import count_messages, read_once
 from replay.integrity.learned import (
     ModuleInfo,
     RunInfo,
@@ -240,11 +239,10 @@ def describe_log(log: Path, *, decode: bool | None = None) -> LogInfo:
         return _describe_foreign(log, 0 if decode is False else CHECK_BYTES)
     if are_arrays([log]):
         return _describe_arrays(log)
-    store = FileStore(log)
-    small = store.size <= CHECK_BYTES
-    check: Check = "pass" if (small if decode is None else decode) else "chunks"
-    with LogReader(store, salvage=True, check=check) as reader:
-        return describe_reader(reader, decode=decode)
+    if decode or (decode is None and log.stat().st_size <= CHECK_BYTES):
+        return read_once(log, lambda reader: describe_reader(reader, decode=decode))
+    with LogReader(log, salvage=True, check="chunks") as reader:
+        return describe_reader(reader, decode=False)
 
 
 def _unread(place: str | Path, error: CdmisfaError) -> LogInfo:
@@ -306,9 +304,9 @@ def describe_reader(
     decode: bool | None = None,
     told: Callable[[Segment], None] = lambda _: None,
 ) -> LogInfo:
-    """Describe an MCAP file, opened with `salvage`; `told` of each chunk that is decoded."""
+    """Describe an MCAP file; `told` is called with each chunk that is decoded."""
     if decode is None:
-        decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
+        decode = sum(s.size for s in reader.segments) <= CHECK_BYTES
     counts, channels = count_messages(reader, decode=decode, told=told), []
     name = reader.path.name
     for number, found in sorted(counts.items()):

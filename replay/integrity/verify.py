@@ -12,11 +12,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.core.untrusted import read_regular
+from recorder.images.messages import Decoder
+from recorder.images.options import IMAGES
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
+from replay.camera_logs.mcap_log import channels_on, topics_in
 from replay.camera_logs.opening import (
     channels_of,
     image_topics,
@@ -24,15 +29,15 @@ from replay.camera_logs.opening import (
     only_foreign,
     open_images,
 )
-from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.stream import ImageStream, explained, sorted_times
 from replay.camera_logs.table import table_notes
-from replay.integrity.counting import count_messages
+from replay.integrity.counting import count_messages, read_once
 from replay.integrity.info import SCHEMA, as_problem, kind_of, problems_of
 from replay.integrity.state import Crc, State, crc_of, failed_state, located, state_of, worst
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
-from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, read_header
+from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, header_in
 from replay.runs.modules import load_modules
 from replay.runs.run import facts_sha256
 from replay.storage.arrays import MAX_BYTES
@@ -58,7 +63,7 @@ class RunPass:
         self._batches: BatchReader | None = None
         self._found: list[Problem] = []
         with self._catching():
-            header = read_header(log)
+            header = header_in(reader)
             if self._stated is not None:
                 self._batches = BatchReader(log, header, reader.channels, topics=(SIGNALS_TOPIC,))
 
@@ -231,10 +236,10 @@ def check_log(path: str | Path) -> LogCheck:
             notes.append(f"{file}: {NO_CHECKSUMS}")
         if isinstance(passed, _ViewPass):
             views.append(passed)
-        elif passed is not None and not found:
+        elif isinstance(passed, RunPass) and not found:
             problems += passed.problems()
             notes += passed.notes()
-        elif not found:
+        elif passed is None and not found:
             told = _check_topics(file, image_topics(file))
             problems += told.problems
             notes += told.notes
@@ -318,37 +323,70 @@ class _ViewPass:
             self.error = error
 
 
-def _check_file(
-    path: Path, *, beside: bool
-) -> tuple[FileCheck, list[Problem], _ViewPass | RunPass | None]:
+class _ImagesPass:
+    """Decodes the images of an external log while its chunks are decoded.
+
+    It raises if one is broken: then the log is read again.
+    """
+
+    def __init__(self, path: Path, reader: LogReader) -> None:
+        self._path, self._reader = path, reader
+        self._decoders: dict[int, Decoder] = {}
+        for topic in topics_in(reader, IMAGES):
+            channels, decode = channels_on(reader, topic, IMAGES)
+            self._decoders |= dict.fromkeys((channel.id for channel in channels), decode)
+
+    def add(self, segment: Segment) -> None:
+        table = self._reader.table(segment)
+        assert table is not None
+        rows = np.flatnonzero(np.isin(table.channel, list(self._decoders)))
+        if len(rows):
+            sorted_times(str(self._path), np.sort(table.log_time[rows]))
+        with explained(self._path, "its decoder", held=table.data.nbytes):
+            for row in rows.tolist():
+                self._decoders[int(table.channel[row])](table.view(row))
+
+    def finish(self) -> None:
+        """Nothing is left to check."""
+
+
+Pass = _ViewPass | RunPass | _ImagesPass
+Checked = tuple[FileCheck, list[Problem], Pass | None]
+
+
+def _check_file(path: Path, *, beside: bool) -> Checked:
     try:
-        with LogReader(path, salvage=True, check="pass") as reader:
-            passed = _pass_of(path, reader, beside)
-            told = passed.add if passed else lambda _: None
-            counts = count_messages(reader, decode=True, told=told)
-            if passed:
-                passed.finish()
-            wrong = [
-                f"holds messages of channel {number}, never defined"
-                for number in counts.keys() - reader.channels.keys()
-            ]
-            there = sum(channel.messages for channel in counts.values())
-            stated = reader.statistics.messages if reader.statistics else there
-            if stated != there and not reader.problems:
-                wrong.append(f"its summary states {stated} messages, there are {there}")
-            problems = [Problem(str(path), what) for what in wrong]
-            checked = FileCheck(str(path), crc_of(reader), state_of(reader))
-            return checked, [*problems, *problems_of(reader)], passed
+        return read_once(path, lambda reader: _checked(path, reader, beside=beside))
     except LogDamagedError as error:
         return FileCheck(str(path), "bad", "damaged"), [as_problem(path, error)], None
 
 
-def _pass_of(path: Path, reader: LogReader, beside: bool) -> _ViewPass | RunPass | None:
-    """The check of a log's content while it is decoded, if it is a recording or a run."""
+def _checked(path: Path, reader: LogReader, *, beside: bool) -> Checked:
+    passed = _pass_of(path, reader, beside)
+    counts = count_messages(reader, decode=True, told=passed.add if passed else lambda _: None)
+    if passed:
+        passed.finish()
+    wrong = [
+        f"holds messages of channel {number}, never defined"
+        for number in counts.keys() - reader.channels.keys()
+    ]
+    there = sum(channel.messages for channel in counts.values())
+    stated = reader.statistics.messages if reader.statistics else there
+    if stated != there and not reader.problems:
+        wrong.append(f"its summary states {stated} messages, there are {there}")
+    problems = [Problem(str(path), what) for what in wrong]
+    checked = FileCheck(str(path), crc_of(reader), state_of(reader))
+    return checked, [*problems, *problems_of(reader)], passed
+
+
+def _pass_of(path: Path, reader: LogReader, beside: bool) -> Pass | None:
+    """Return the check of a log's content while it is decoded; None if images are checked later."""
     kind = kind_of(reader)
     if kind == "run" and reader.complete:
         return RunPass(path, reader, beside=beside)
-    return _ViewPass(path, reader) if kind == "recording" else None
+    if kind == "recording":
+        return _ViewPass(path, reader)
+    return None if reader.salvage else _ImagesPass(path, reader)
 
 
 def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:

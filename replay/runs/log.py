@@ -118,9 +118,14 @@ def read_header(path: Path) -> RunHeader:
         UsageError: the file is no run's log, or of another version of the signals.
         LogDamagedError: it cannot be read.
     """
-    log = run_log(path)
-    with LogReader(log) as reader:
-        found = next((r.values for r in reader.metadata if r.name == RUN_METADATA), None)
+    with LogReader(run_log(path)) as reader:
+        return header_in(reader)
+
+
+def header_in(reader: LogReader) -> RunHeader:
+    """Return the header of a run's log that is open; raises as `read_header`."""
+    log = reader.path
+    found = next((r.values for r in reader.metadata if r.name == RUN_METADATA), None)
     if found is None:
         raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
     text = found.get("schema", "")
