@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-import struct
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
 from benchmarks.foreign import VGA, pictures
 from benchmarks.live_streams import FPS
@@ -24,8 +20,7 @@ from benchmarks.report import SAMPLE, interleaved, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.apply import Application, Totals, follow
 from cdmisfa.experiments.session import run
-from cdmisfa.modules import Module, Stack
-from recorder.cameras.foxglove import HEADER, PROTOCOLS
+from cdmisfa.modules import Module
 from recorder.images.recipe import Recipe
 from replay.arrays import ArrayLog
 from replay.camera_logs.options import CameraOptions
@@ -45,8 +40,6 @@ FORMS = ("", "parquet", "mcap", "rrd")
 
 SHAPE = (48, 128)
 FRAMES, FILMED, READ = 4000, 200, 640
-STEP = 1e9 / FPS
-"""Nanoseconds from frame to frame of live streams."""
 
 
 def make_run(folder: Path, outputs: int) -> Path:
@@ -135,83 +128,30 @@ def throughput(folder: Path, rounds: int) -> tuple[Rows, Rows]:
     return cpu, wall
 
 
-def projecting(folder: Path, rounds: int) -> Rows:
-    """Rows of the outputs of a module: their product with frames, and numpy's of the same values.
-
-    Returns:
-        CPU microseconds a frame of one thread, and how many multiply-adds ours does in one.
-    """
-    frames = np.random.default_rng(2).integers(0, 255, (READ, np.prod(SHAPE)), np.uint8)
-    values, rows = frames / 255, []
-    for outputs in OUTPUTS:
-        stack = Stack(Application(folder / f"run{outputs}").modules)
-        phi = np.concatenate([module.phi for module in stack.modules])
-        work: dict[str, Callable[[], int]] = {
-            "ours": lambda own=stack: len(own.transform(frames)),
-            "numpy": lambda own=phi: len(values @ own.T),
-        }
-        with threadpool_limits(1):
-            times = interleaved(work, 5 * rounds)
-        ours = middle(times["ours"], 1)
-        against = f"{ratio(times['numpy'], times['ours']):.2f}x"
-        rows.append(
-            [outputs, ours, middle(times["numpy"], 1), against, round(phi.size / ours / 1000, 1)]
-        )
-    return rows
-
-
-def by_lines(command: Any) -> Iterator[float]:
-    """How much later a block's line is read than the block lasts, in nanoseconds, of each."""
-    for line in command.stdout:
-        now, block = time.time_ns(), json.loads(line)
-        yield now - block["log_time"] - block["frames"] * STEP
-
-
-def by_messages(command: Any) -> Iterator[float]:
-    """The same of the last module's message of the block's last frame, to a viewer."""
-    served = next(line.split()[-1] for line in command.stderr if "applying at" in line)
-    how: Any = {"subprotocols": PROTOCOLS, "compression": None}
-    with connect(served, **how) as viewer, contextlib.suppress(ConnectionClosed):
-        said = (json.loads(message) for message in viewer if isinstance(message, str))
-        channels = (channel for one in said for channel in one.get("channels", ()))
-        wanted = f"/module{MODULES}/"
-        number = next(own["id"] for own in channels if own["topic"].startswith(wanted))
-        time.sleep(0.5)  # the server says its channels before it knows them
-        subscribed = [{"id": 1, "channelId": number}]
-        viewer.send(json.dumps({"op": "subscribe", "subscriptions": subscribed}))
-        for message in viewer:
-            now = time.time_ns()
-            frame = struct.unpack("<q", message[-8:])[0] if isinstance(message, bytes) else 0
-            if frame % TAU == TAU - 1:
-                yield now - HEADER.unpack_from(message)[2] - STEP
-
-
-def latency(folder: Path, blocks: int, way: str) -> list[object]:
-    """How much later than its own duration after its first frame a block is told, ms."""
+def latency(folder: Path, blocks: int) -> list[object]:
+    """Return how much later than its own duration after its first frame a block is told, ms."""
     words = [sys.executable, "-m", "benchmarks.live_streams"]
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    late = []
     with subprocess.Popen(words, **pipes) as sender:
         port = int(sender.stdout.readline())
         named = [str(folder / f"run{OUTPUTS[-1]}"), f"http://127.0.0.1:{port}/0.mjpg"]
-        options = ["--rate", str(FPS), "--frames", str(blocks * TAU), "--to", way]
+        options = ["--rate", str(FPS), "--frames", str(blocks * TAU), "--to", "stdout"]
         command = [sys.executable, "-m", "cdmisfa", "apply", *named, *options]
-        served = [*command, "--port", "0"] if way == "foxglove" else command
-        with subprocess.Popen(served, stderr=subprocess.PIPE, **pipes) as told:
-            found = by_messages(told) if way == "foxglove" else by_lines(told)
-            late = [one / 1e6 for one in found]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, **pipes) as told:
+            for line in told.stdout:
+                now, block = time.time_ns(), json.loads(line)
+                late.append((now - block["log_time"] - block["frames"] * 1e9 / FPS) / 1e6)
         sender.stdin.close()
-    at = [round(float(value), 1) for value in np.percentile(late, [50, 95, 100])]
-    return [way, len(late), *at]
+    return [len(late), *(round(float(v), 1) for v in np.percentile(late, [50, 95, 100]))]
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/applying.json."""
-    del full
     with tempfile.TemporaryDirectory() as place:
         rounds = 2 if quick else 5
         cpu, wall = throughput(Path(place), rounds)
-        products = projecting(Path(place), rounds)
-        late = [latency(Path(place), 5 if quick else 30, way) for way in ("stdout", "foxglove")]
+        late = latency(Path(place), 5 if quick else 30)
     head = "log", "outputs of a module"
     forms = [f"to {form}" if form else "to nothing" for form in FORMS]
     save(
@@ -222,22 +162,12 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "by the wall's clock, which counts whatever else runs, frames a second of reading, and the "
         "share of them that is left. A recording of ours is read faster than it can be projected: "
         "each output takes 6,144 multiply-adds in double precision a frame, whose sums keep their "
-        "order, so that the bits are those of `module.transform`. Then this product alone, of "
-        "pixels, against numpy's BLAS of the same frames as float64, of one thread. Last how much "
-        "later a block is told than it lasts, counted from the time of its first frame: its JSON "
-        "line, or to a viewer the last module's message of its last frame; JPEGs of 640x480 at 30 "
-        "Hz over HTTP, ten modules of eight outputs, milliseconds; below 0 where the last frame is "
-        "shown before the block's duration is over.",
+        "order, so that the bits are those of `module.transform`. Last how much later than it "
+        "lasts a block is printed as a JSON line, counted from the time of its first frame: JPEGs "
+        "of 640x480 at 30 Hz over HTTP, ten modules of eight outputs, milliseconds.",
         [
-            (
-                ["log", "outputs of a module", "reading, us", *(f"{form}, us" for form in forms)],
-                cpu,
-            ),
+            ([*head, "reading, us", *(f"{form}, us" for form in forms)], cpu),
             ([*head, "read, frames a second", *forms], wall),
-            (
-                [head[1], "product, us", "numpy's, us", "vs numpy", "10^9 multiply-adds a second"],
-                products,
-            ),
-            (["to", "blocks", "median, ms", "95 %, ms", "most, ms"], late),
+            (["blocks", "median, ms", "95 %, ms", "most, ms"], [late]),
         ],
     )

@@ -66,9 +66,8 @@ def converting(path: Path, folder: Path) -> Callable[[], int]:
     return call
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/converting.json."""
-    del full
     rounds, n = (2, 60) if quick else (5, 400)
     rows = []
     with tempfile.TemporaryDirectory() as made:

@@ -87,9 +87,8 @@ def slowness(y: FloatArray) -> float:
     return float(np.sqrt(moves / y.var(axis=0)).min() / (2 * np.pi))
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/estimators.json."""
-    del full
     rows = []
     with threadpool_limits(1):
         for n, size in CASES[: 1 if quick else None]:

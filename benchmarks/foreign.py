@@ -226,9 +226,8 @@ def measured(
     return rows
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/foreign.json."""
-    del full
     rounds, n = (2, 300) if quick else (7, 400)
     read: dict[str, list[list[object]]] = {clock: [] for clock in CLOCKS}
     shown: dict[str, list[list[object]]] = {clock: [] for clock in CLOCKS}

@@ -94,9 +94,8 @@ def watch(folder: Path, seconds: float, streams: int = STREAMS) -> list[object]:
     return found + [sum(count[name] for count in counts.values()) for name in _LOST]
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/live_streams.json."""
-    del full
     with tempfile.TemporaryDirectory() as folder:
         watch(Path(folder) / "first", 1)  # imports what it needs
         row = watch(Path(folder) / "recording", 8 if quick else 60)

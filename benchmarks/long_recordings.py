@@ -98,9 +98,9 @@ def measured(work: str, path: Path) -> tuple[float, float, float]:
     return seconds, peak, read
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
-    """Measure, and write results/long_recordings.json; 10 GB with `full`."""
-    short, long = (100, 10_000) if full else (50, 100 if quick else 500)
+def main(*, quick: bool = False) -> None:
+    """Measure, and write results/long_recordings.json."""
+    short, long = 50, 100 if quick else 500
     rows: dict[str, list[object]] = {work: [work] for work in WORK}
     for size in (short, long):
         with tempfile.TemporaryDirectory() as folder:

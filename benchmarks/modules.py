@@ -90,7 +90,7 @@ def matrix_product(
     return np.asarray((frames * (1 / 255)) @ phi.T - offset)
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/modules.json."""
     source = RecordedSource(SAMPLE, loop=True)
     counts = MODULES[:3] if quick else MODULES

@@ -121,7 +121,7 @@ def _seconds(out: Path, at: int) -> float:
     return time.process_time() - begin
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/moments.json."""
     rows: list[list[Any]] = []
     frames = FRAMES // 50 if quick else FRAMES

@@ -109,10 +109,10 @@ def seconds(
     return middle(found, 3)
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
-    """Measure, and write results/opening.json; a log of 10 GB with `full`."""
+def main(*, quick: bool = False) -> None:
+    """Measure, and write results/opening.json."""
     rows, learned = [], []
-    for size in (100, 10_000) if full else (10, 100 if quick else 1000):
+    for size in (10, 100 if quick else 1000):
         with tempfile.TemporaryDirectory() as folder:
             path = write(Path(folder) / "log.mcap", size * MEGABYTE)
             first_picture(path)

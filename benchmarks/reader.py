@@ -95,10 +95,8 @@ def copying(frames: int) -> Callable[[], int]:
     return call
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
-    """Measure, and write results/reader.json; with `full` a recording of 10 GB, too."""
-    if full:
-        long_recordings.main(full=True)
+def main(*, quick: bool = False) -> None:
+    """Measure, and write results/reader.json."""
     rounds, noisy = (3, 400) if quick else (9, 2000)
     with tempfile.TemporaryDirectory() as folder:
         cases = {

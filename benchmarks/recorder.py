@@ -54,10 +54,10 @@ def steady_and_start(
     return min(found)
 
 
-def main(*, quick: bool = False, full: bool = False, scene: str = "icub") -> None:
-    """Measure, and write results/recorder.json; with `full` the jobs on more frames."""
+def main(*, quick: bool = False, scene: str = "icub") -> None:
+    """Measure, and write results/recorder.json."""
     rounds, frames = (2, 40) if quick else (3, 400)
-    more = 100 if quick else (5000 if full else 1000)
+    more = 100 if quick else 1000
     with tempfile.TemporaryDirectory() as folder:
         work = {
             "rendering": rendering(scene, frames),

@@ -88,11 +88,11 @@ def sweeping(trials: int) -> dict[str, Callable[[], int]]:
     return {"planned": planned, "configured": configured, "computed": computed}
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/scaling.json."""
     rounds = 3 if quick else 9
     streams = STREAMS[:2] if quick else STREAMS
-    lengths = (1_000, 10_000) if quick else (10_000, 100_000, *((1_000_000,) if full else ()))
+    lengths = (1_000, 10_000) if quick else (10_000, 100_000)
     work = {str(n): agent_steps(n, 20_000 // n + 200) for n in streams}
     steps = interleaved(work, rounds)
     by_streams = [

@@ -63,9 +63,8 @@ def seconds(
     return took
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/spreading.json."""
-    del full
     with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as stack:
         run, logs = make_run(Path(place) / "run", OUTPUTS[-1]), Path(place) / "logs"
         logs.mkdir()

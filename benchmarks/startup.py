@@ -48,7 +48,7 @@ def cpu_ms(words: tuple[str, ...], folder: Path, bytecode: str) -> float:
     return 1e3 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
 
 
-def main(*, quick: bool = False, full: bool = False) -> None:
+def main(*, quick: bool = False) -> None:
     """Measure, and write results/startup.json."""
     rounds = 2 if quick else 7
     times: dict[str, list[float]] = {name: [] for name in WARM}
