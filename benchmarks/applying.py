@@ -21,9 +21,9 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.apply import Application, Totals, follow
 from cdmisfa.experiments.session import run
 from cdmisfa.modules import Module
+from recorder.images.options import InputOptions
 from recorder.images.recipe import Recipe
 from replay.arrays import ArrayLog
-from replay.camera_logs.options import CameraOptions
 from replay.export.applied import written
 from replay.export.frames import write_film
 from replay.inputs import open_log
@@ -106,7 +106,7 @@ def throughput(folder: Path, rounds: int) -> tuple[Rows, Rows]:
         clock, and the shares of them that are left.
     """
     film = folder / "film.mp4"
-    shown = ArrayLog({"cam": np.stack(pictures(FILMED, *VGA))}, CameraOptions(size=VGA))
+    shown = ArrayLog({"cam": np.stack(pictures(FILMED, *VGA))}, InputOptions(size=VGA))
     write_film(shown, 0, film, lossless=False)
     cpu: Rows = []
     wall: Rows = []

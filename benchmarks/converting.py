@@ -15,7 +15,7 @@ from PIL import Image
 from benchmarks import foreign
 from benchmarks.report import interleaved, middle, save
 from benchmarks.report import ratio as times_ratio
-from cdmisfa.experiments.sources import convert
+from recorder.recording import record
 from recorder.world.scenes import BLOCK
 from replay.camera_logs.source import ForeignSource
 
@@ -59,7 +59,7 @@ def converting(path: Path, folder: Path) -> Callable[[], int]:
     def call() -> int:
         out = folder / str(next(numbers))
         with contextlib.closing(ForeignSource(path, rate=RATE)) as source:
-            count = sum(file.frames for file in convert(source, out))
+            count = sum(file.frames for file in record(source, out))
         shutil.rmtree(out)
         return count
 

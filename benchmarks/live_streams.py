@@ -21,8 +21,8 @@ from benchmarks.report import save
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.experiments.session import run
 from recorder.cameras.live import LiveSource
-from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import open_live
+from recorder.images.options import InputOptions
 from recorder.live import RecordedWhileWatched
 
 STREAMS = 4
@@ -77,7 +77,7 @@ def watch(folder: Path, seconds: float, streams: int = STREAMS) -> list[object]:
         assert sender.stdout is not None
         port = int(sender.stdout.readline())
         named = [f"http://127.0.0.1:{port}/{i}.mjpg" for i in range(streams)]
-        source = open_live(named, LiveOptions(rate=FPS, on_loss="end"))
+        source = open_live(named, InputOptions(rate=FPS, lost="end"))
         assert isinstance(source, LiveSource)
         cpu, wall = time.process_time(), time.perf_counter()
         end = wall + seconds

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -17,11 +17,11 @@ from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, are_for
 from recorder.images.framing import Framing, framings
+from recorder.images.options import OF_EVERY_SOURCE, InputOptions
 from recorder.images.pixels import Shown, raw_image
 from recorder.images.recipe import pixels_of
 from replay.camera_logs.hue import CHOSEN, shows_hue
 from replay.camera_logs.opening import fits_topic
-from replay.camera_logs.options import CameraOptions
 from replay.storage.arrays import load_numbers
 from replay.storage.identity import FilesIdentity, Identity, LoggedSource
 
@@ -70,12 +70,12 @@ class ArrayLog(LoggedSource):
     def __init__(
         self,
         streams: Mapping[str, Any],
-        options: CameraOptions | None = None,
+        options: InputOptions | None = None,
         *,
         loop: bool = False,
         files: Sequence[Path] = (),
     ) -> None:
-        options = options or CameraOptions()
+        options = options or InputOptions()
         _refuse_options(options)
         if options.color == "auto":
             colors = type(self)(streams, replace(options, color=True), loop=loop, files=files)
@@ -164,7 +164,7 @@ def are_arrays(paths: Sequence[Path]) -> bool:
 
 
 def open_arrays(
-    paths: Sequence[Path], options: CameraOptions | None = None, *, loop: bool = False
+    paths: Sequence[Path], options: InputOptions | None = None, *, loop: bool = False
 ) -> ArrayLog:
     """Open files of NumPy, .npy with a stream each or .npz with one an array.
 
@@ -177,7 +177,7 @@ def open_arrays(
         UsageError: no such file or array, or as for `ArrayLog`.
         LogDamagedError: a file holds something else.
     """
-    options = options or CameraOptions()
+    options = options or InputOptions()
     streams: dict[str, NDArray[Any]] = {}
     files = list(map(Path, map(str, paths)))
     for path in files:
@@ -194,11 +194,8 @@ def open_arrays(
         raise type(error)(f"{', '.join(map(str, paths))}: {error}") from None
 
 
-def _refuse_options(options: CameraOptions) -> None:
-    plain = CameraOptions()
-    rest = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in TAKES}
-    if any(value != getattr(plain, name) for name, value in rest.items()):
-        of_logs = CameraOptions(**rest).given()
+def _refuse_options(options: InputOptions) -> None:
+    if of_logs := options.named(set(options.chosen()) - {*TAKES, *OF_EVERY_SOURCE}):
         raise UsageError(f"{are_for(of_logs, 'logs')}, and arrays tell neither times nor fields")
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.options import InputOptions
 from recorder.mcap.records import no_log
 from replay.arrays import ENDINGS, ArrayLog, are_arrays, open_arrays
 from replay.camera_logs.opening import (
@@ -20,7 +21,6 @@ from replay.camera_logs.opening import (
     image_topics,
     only_foreign,
 )
-from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.pictures import by_number
 from replay.camera_logs.source import ForeignSource, UnequalError
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
@@ -38,7 +38,7 @@ About = Callable[[Logged], None]
 
 def open_log(
     paths: Sequence[Path],
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     *,
     loop: bool = False,
     salvage: bool = False,
@@ -48,7 +48,7 @@ def open_log(
 
     Args:
         paths: the folder of a recording or its views' files, or logs of others.
-        cameras: how images of others become frames; given, the paths are taken as such logs.
+        inputs: how images of others become frames; given, the paths are taken as such logs.
         loop: start again at the end.
         salvage: pass over what is damaged.
         goal: the command and the folder of its result that a refusal names in what would work.
@@ -57,22 +57,22 @@ def open_log(
         UsageError: no such log, a run, or as for `ForeignSource`.
         LogDamagedError: a log is damaged.
     """
-    cameras = cameras or CameraOptions()
+    inputs = inputs or InputOptions()
     for path in paths:
         refuse_what_is_no_log(path)
     if are_arrays(paths):
-        return open_arrays(paths, cameras, loop=loop)
+        return open_arrays(paths, inputs, loop=loop)
     left_out: list[str] = []
     if salvage:
-        paths, cameras, left_out = _readable(paths, cameras)
-    if cameras == CameraOptions() and not any(map(only_foreign, paths)):
+        paths, inputs, left_out = _readable(paths, inputs)
+    if not inputs.external and not any(map(only_foreign, paths)):
         with contextlib.suppress(NoRecordingError):
             return _without(left_out, RecordedSource(paths, loop=loop, salvage=salvage))
-    return _without(left_out, _open(paths, cameras, loop=loop, salvage=salvage, goal=goal))
+    return _without(left_out, _open(paths, inputs, loop=loop, salvage=salvage, goal=goal))
 
 
 def open_to_look(
-    paths: Sequence[Path], cameras: CameraOptions | None = None, *, salvage: bool = False
+    paths: Sequence[Path], inputs: InputOptions | None = None, *, salvage: bool = False
 ) -> Logged:
     """Open logs to view, export or play: every topic of images, aligned by time if need be.
 
@@ -87,19 +87,19 @@ def open_to_look(
     """
     for path in paths:
         refuse_what_is_no_log(path)
-    cameras = cameras or CameraOptions()
-    chosen = bool(cameras.topics or cameras.fields)
+    inputs = inputs or InputOptions()
+    chosen = bool(inputs.topics or inputs.fields)
     if not (chosen or are_arrays(paths) or any(map(only_foreign, paths))):
         with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
             return _checked(RecordedSource(paths, salvage=salvage))
     goal = ("convert", "REC")
     if not chosen:
-        cameras = replace(cameras, topics=ALL)
+        inputs = replace(inputs, topics=ALL)
     try:
-        return _checked(open_cameras(paths, cameras, salvage=salvage, goal=goal))
+        return _checked(open_cameras(paths, inputs, salvage=salvage, goal=goal))
     except UnequalError:
-        cameras = replace(cameras, align="time")
-        return _checked(open_cameras(paths, cameras, salvage=salvage, goal=goal))
+        inputs = replace(inputs, align="time")
+        return _checked(open_cameras(paths, inputs, salvage=salvage, goal=goal))
 
 
 def _checked(source: Logged) -> Logged:
@@ -114,7 +114,7 @@ def _checked(source: Logged) -> Logged:
 
 def open_cameras(
     paths: Sequence[str | Path],
-    cameras: CameraOptions,
+    inputs: InputOptions,
     *,
     loop: bool = False,
     salvage: bool = False,
@@ -127,21 +127,21 @@ def open_cameras(
     """
     places = list(map(location, paths))
     if are_arrays(places):
-        return open_arrays(places, cameras, loop=loop)
+        return open_arrays(places, inputs, loop=loop)
     left_out: list[str] = []
     if salvage:
-        paths, cameras, left_out = _readable(image_logs(paths), cameras)
-    return _without(left_out, _open(paths, cameras, loop=loop, salvage=salvage, goal=goal))
+        paths, inputs, left_out = _readable(image_logs(paths), inputs)
+    return _without(left_out, _open(paths, inputs, loop=loop, salvage=salvage, goal=goal))
 
 
-def _open(paths: Sequence[str | Path], cameras: CameraOptions, **how: Any) -> ForeignSource:
-    chosen: dict[str, Any] = {each.name: getattr(cameras, each.name) for each in fields(cameras)}
+def _open(paths: Sequence[str | Path], inputs: InputOptions, **how: Any) -> ForeignSource:
+    chosen: dict[str, Any] = {each.name: getattr(inputs, each.name) for each in fields(inputs)}
     return ForeignSource(paths, **chosen, **how)
 
 
 def _readable(
-    paths: Sequence[Path], cameras: CameraOptions
-) -> tuple[list[Path], CameraOptions, list[str]]:
+    paths: Sequence[Path], inputs: InputOptions
+) -> tuple[list[Path], InputOptions, list[str]]:
     """The logs of several that can be read, with their topics, and why the others cannot.
 
     Raises:
@@ -158,11 +158,11 @@ def _readable(
             broken[path] = error
     if len(broken) == len(paths):
         raise broken[paths[0]]
-    if len(cameras.topics) == len(paths):  # one of each
-        pairs = zip(paths, cameras.topics, strict=True)
-        cameras = replace(cameras, topics=tuple(t for path, t in pairs if path not in broken))
+    if len(inputs.topics) == len(paths):  # one of each
+        pairs = zip(paths, inputs.topics, strict=True)
+        inputs = replace(inputs, topics=tuple(t for path, t in pairs if path not in broken))
     said = [f"{error}: this log is left out" for error in broken.values()]
-    return [path for path in paths if path not in broken], cameras, said
+    return [path for path in paths if path not in broken], inputs, said
 
 
 Opened = TypeVar("Opened", RecordedSource, ForeignSource)

@@ -67,14 +67,14 @@ def test_an_mcap_has_a_topic_a_module_beside_the_frames(
 ) -> None:
     log, out = camera(tmp_path / "a.mcap", 50), tmp_path / "o.mcap"
     assert cdmisfa("apply", run, log, "-o", out).code == 0
-    from replay.camera_logs.options import CameraOptions
+    from recorder.images.options import InputOptions
     from replay.inputs import open_log
 
     frames = ForeignSource(log, size=SIZE).take(0, 50).frames
     again = ForeignSource(out, ["/view/cam"]).take(0, 50).frames
     np.testing.assert_array_equal(again, frames)
     for module in Run(run).modules:
-        options = CameraOptions(topics=(f"/module{module.index}/cam",), fields=("y",))
+        options = InputOptions(topics=(f"/module{module.index}/cam",), fields=("y",))
         y = open_log([out], options).take(0, 50).frames
         np.testing.assert_array_equal(y, module.transform(frames))
     with out.open("rb") as file:
@@ -215,12 +215,12 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
         ("apply a.mcap a.mcap", 2, "a.mcap"),
         ("apply EMPTY a.mcap", 2, "has no modules: learn longer"),
         ("apply RUN a.mcap --to csv", 2, "name it with -o"),
-        ("apply RUN a.mcap --to tea", 2, "--to tea: name parquet, csv, mcap"),
+        ("apply RUN a.mcap --to tea", 2, "'tea' is not one of 'parquet', 'csv', 'mcap'"),
         ("apply RUN a.mcap -o o.csv --to mcap", 2, "name it o.mcap"),
         ("apply RUN a.mcap -o there.csv", 2, "there.csv exists"),
         ("apply RUN a.mcap -o v.xlsx", 2, "v.xlsx: name a file with .parquet, .csv, .mcap, .rrd,"),
         ("apply RUN a.mcap -o v.pqt --to csv", 2, "v.pqt: name a file with .parquet, .csv"),
-        ("apply RUN a.mcap --from 5 --to 3", 2, "--from 5 is no earlier than --to 3"),
+        ("apply RUN a.mcap --start 5 --end 3", 2, "--start 5 is no earlier than --end 3"),
         ("apply RUN RUN", 2, "is a run, not a recording"),
     ],
 )
@@ -252,7 +252,7 @@ def test_what_cannot_be_applied_is_refused_in_a_line(
 
 def test_a_part_and_a_loop_are_applied(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     log = camera(tmp_path / "a.mcap", 100)
-    part = cdmisfa("apply", run, log, "--from", 0.2, "--to", 1, "--json").json
+    part = cdmisfa("apply", run, log, "--start", 0.2, "--end", 1, "--json").json
     assert part["logs"][0]["frames"] == 40
     out = tmp_path / "o.csv"
     done = cdmisfa("apply", run, log, "--loop", "--frames", 250, "--to", "csv", "-o", out, "--json")
@@ -328,10 +328,9 @@ def test_a_reader_that_goes_away_ends_it(run: Path) -> None:
     ("words", "why"),
     [
         ((LIVE, "a.mcap"), "a.mcap is no live stream, as the others are"),
-        ((LIVE, "--from", "3"), "is a live stream: --from is for logs"),
+        ((LIVE, "--start", "3"), "is a live stream: --start is for logs"),
         ((LIVE, "--loop"), "live streams cannot go back: leave out --loop"),
         (("a.mcap", "--to", "stdout", "--json"), "use one of them"),
-        (("a.mcap", "--hold", "1"), "is no live stream: --hold"),
     ],
 )
 def test_what_is_not_for_live_streams_is_refused(

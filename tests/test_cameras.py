@@ -32,21 +32,19 @@ BOTH = ("--topic", "/cam_left", "--topic", "/cam_right")
 NO_IMAGES = "holds no images; numbers are taken with --field"
 REFUSED = {
     "learn oscillatory --topic /left": "is a scene: --topic is for cameras",
-    "learn oscillatory --range 0.3:5 --from 1 --stamp header": (
-        "a scene: --range, --stamp and --from are for cameras"
-    ),
+    "learn oscillatory --set input.range=0.3,5 --start 1": ("a scene: --start is for cameras"),
     "learn oscillatory --size 12": "128x48",
     "learn pictures": "--rate",
     "learn a.mcap --topic /cam_* --rate 25": "50 images a second, not 25",
-    "learn a.mcap --topic /cam_* --from 12 --to 5": "--from 12 is no earlier than --to 5",
-    "learn a.mcap --topic /cam_* --range 0.3:5": (
-        "a.mcap: it holds no distances (16UC1, 32FC1): --range is for these"
+    "learn a.mcap --topic /cam_* --start 12 --end 5": "--start 12 is no earlier than --end 5",
+    "learn a.mcap --topic /cam_* --set input.range=0.3,5": (
+        "a.mcap: it holds no distances (16UC1, 32FC1): input.range is for these"
     ),
-    "learn uneven.mcap --topic /cam_* --gaps hold --from 0.2 --to 1": (
-        "--from 0.2 --to 1 --gaps hold --align time --rate 50"
+    "learn uneven.mcap --topic /cam_* --set input.gaps=hold --start 0.2 --end 1": (
+        "--start 0.2 --end 1 --set input.gaps=hold --align time --rate 50"
     ),
-    "view t.csv uneven.mcap --time s --save v": "these show a number and images",
-    "learn t.csv b.mcap --time s --field a": (
+    "view t.csv uneven.mcap --set input.time=s --save v": "these show a number and images",
+    "learn t.csv b.mcap --set input.time=s --field a": (
         "there is no a, it has data; --field is of every stream, images are no numbers"
     ),
     "view apart.mcap --save v.rrd": (
@@ -124,18 +122,6 @@ def test_a_run_on_cameras_says_of_what_its_streams_are(cdmisfa: Cdmisfa, logs: P
         assert config["scene"] == {"kind": "foreign"}
 
 
-def test_a_run_that_called_its_cameras_a_scene_is_resumed(
-    cdmisfa: Cdmisfa, logs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = ("learn", logs / "a.mcap", *BOTH, "--no-rerun", "--set", "learner.tau=10", "-o")
-    with monkeypatch.context() as before:
-        before.setattr("cdmisfa.experiments.sources.streams_of", lambda described: "icub")
-        assert cdmisfa(*words, logs / "run", "--max-iterations", "2").code == 0
-    found = json.loads((logs / "run" / "run.json").read_text())["config"]
-    assert found["scene"] == {"kind": "icub"}
-    assert cdmisfa(*words, logs / "run", "--max-iterations", "4", "--resume").code == 0
-
-
 def test_recordings_named_together_are_refused_with_what_would_work(
     cdmisfa: Cdmisfa, logs: Path
 ) -> None:
@@ -164,11 +150,13 @@ def test_streams_with_gaps_are_not_put_together_by_number(cdmisfa: Cdmisfa, logs
         rows = "\n".join(f"{time},{i}" for i, time in enumerate(times))
         (logs / f"{name}.csv").write_text(f"stamp,{name}\n{rows}\n")
     files = (logs / "one.csv", logs / "two.csv")
-    refused = cdmisfa("learn", *files, "--time", "stamp")
+    refused = cdmisfa("learn", *files, "--set", "input.time=stamp")
     assert refused.code == 2
     assert "no time in common, and gaps" in refused.err
     assert "take each by itself" in refused.err
-    part = cdmisfa("learn", *files, "--time", "stamp", "--align", "index", "--max-iterations", 1)
+    part = cdmisfa(
+        "learn", *files, "--set", "input.time=stamp", "--align", "index", "--max-iterations", 1
+    )
     assert part.code == 0
 
 

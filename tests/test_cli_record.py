@@ -16,9 +16,8 @@ from conftest import Cdmisfa
 from folders import contents
 from waiting import started, wait_for
 
-from cdmisfa.experiments.sources import convert
 from recorder.config import Split
-from recorder.recording import RecordingStoppedError, record_scene
+from recorder.recording import RecordingStoppedError, record, record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.camera_logs.source import ForeignSource
 
@@ -112,7 +111,7 @@ def test_a_conversion_is_resumed_by_convert(cdmisfa: Cdmisfa, tmp_path: Path) ->
     log, folder = tmp_path / "a.mcap", tmp_path / "rec"
     write_cameras(log, {"/left": (200, 20)})
     with pytest.raises(RecordingStoppedError):
-        convert(ForeignSource([log], size=(12, 16)), folder, stop=lambda: True)
+        record(ForeignSource([log], size=(12, 16)), folder, stop=lambda: True)
     for scene in ((), ("oscillatory",)):
         refused = cdmisfa("record", *scene, "--resume", "-o", folder)
         remedy = f"resume it with cdmisfa convert SOURCE -o {folder} --resume"

@@ -55,8 +55,10 @@ CASES: dict[str, tuple[str, ...]] = {
     "learnn": ("did you mean learn?",),
     "view x --web --save y.rrd": ("--save",),
     # options that would do nothing, and values that are none
-    "record oscillatory -o x --hold 3": ("oscillatory is no live stream: --hold is for live str",),
-    "learn LOGS --stall 3 --lost end": ("is no live stream: --lost and --stall are for live str",),
+    "record oscillatory -o x --set input.hold=3": (
+        "oscillatory is a scene: input.hold is for logs",
+    ),
+    "convert LOGS --set learner.nu=1 -o x": ("learner.* is not for this command",),
     "learn oscillatory --loop --salvage": ("is a scene: --loop and --salvage are for logs",),
     "view RUN --topic /a --save v.rrd": ("is a run: --topic is for logs",),
     "sweep oscillatory -o x --seeds 1,4,0:2": ("--seeds 1,4,0:2: 1 stands there twice",),
@@ -137,9 +139,10 @@ CASES: dict[str, tuple[str, ...]] = {
     **{f"learn {run}": (A_RUN,) for run in ("RUN", "RUN/run.mcap")},
     # options that are written otherwise
     "learn nothing.mcap --size 0x48": ("--size",),
-    "learn nothing.mcap --from 1:2:3:4": ("--from",),
-    "learn nothing.mcap --range 3:1": ("--range",),
-    "learn nothing.mcap --hold -1": ("--hold",),
+    "learn nothing.mcap --start 1:2:3:4": ("--start",),
+    "learn nothing.mcap --set input.range=3,1": ("input.range",),
+    "learn nothing.mcap --set input.hold=-1": ("input.hold",),
+    "learn nothing.mcap --set input.fit=cut": ("input.fit is cut: choose one of crop",),
     # a grid is checked before anything runs, and live streams are recorded first
     "sweep oscillatory --seeds 0 -o s --grid learner.sigm=1": ("did you mean learner.sigma",),
     "sweep oscillatory --seeds 0 -o s --grid learner.tau=40,many": ("learner.tau",),

@@ -87,7 +87,14 @@ def test_what_is_too_slow_to_convert_is_converted_as_is_said(
 ) -> None:
     rows = [f"{1800 * row},{row % 7}" for row in range(50)]
     (tmp_path / "slow.csv").write_text("\n".join(["time,x", *rows]))
-    convert = ("convert", tmp_path / "slow.csv", "--time", "time:s", "-o", tmp_path / "out")
+    convert = (
+        "convert",
+        tmp_path / "slow.csv",
+        "--set",
+        "input.time=time:s",
+        "-o",
+        tmp_path / "out",
+    )
     refused = cdmisfa(*convert)
     assert refused.code == 2
     assert "0.001 to 1000000 frames a second, not 0.000555556" in refused.err

@@ -13,10 +13,10 @@ from PIL import Image
 
 from cdmisfa import GymSource
 from cdmisfa.core.errors import UsageError
-from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import CAMERAS, CameraKind, open_live
 from recorder.images.framing import Framing
 from recorder.images.messages import image_decoder
+from recorder.images.options import InputOptions
 from recorder.images.videos import frame_colors
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
@@ -129,7 +129,7 @@ def test_what_has_no_colours_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
         ForeignSource(tmp_path / "t.csv", rate=5, color=True)
     monkeypatch.setitem(CAMERAS, "plain", CameraKind(lambda word, name: None))
     with pytest.raises(UsageError, match="plain:1 shows gray images: leave out --color"):
-        open_live(["plain:1"], LiveOptions(color=True))
+        open_live(["plain:1"], InputOptions(color=True))
 
 
 def test_a_scene_is_recorded_and_learned_in_colours(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from cdmisfa.core.config import (
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.options import parse_settings
 from recorder.config import RecordConfig
+from recorder.images.options import InputConfig
 from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatoryConfig
 
@@ -264,7 +265,8 @@ def test_fields_that_cannot_be_configured_are_a_programmers_error() -> None:
 
 
 @pytest.mark.parametrize(
-    "section", [LearnerConfig, ProgressConfig, RecordConfig, IcubConfig, OscillatoryConfig]
+    "section",
+    [LearnerConfig, ProgressConfig, RecordConfig, InputConfig, IcubConfig, OscillatoryConfig],
 )
 def test_docstrings_tell_every_key(section: type) -> None:
     """The page of keys is made of them."""

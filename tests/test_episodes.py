@@ -192,7 +192,7 @@ def test_a_log_damaged_in_the_middle_is_left_out_from_there_on(
     assert "what follows in it is left out" in done.err
     assert 18 <= done.json["iterations"] < 24
     assert cdmisfa("check", run).code == 0
-    centre = ("--centre", "episode", "--json")
+    centre = ("--set", "input.centre=episode", "--json")
     without = cdmisfa("learn", folder, *QUICK, *centre)
     assert (without.code, without.json["iterations"]) == (3, 18)  # its mean is not known
     assert "the log is left out" in without.err
@@ -210,14 +210,14 @@ def test_a_log_that_changes_meanwhile_is_left_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("oscillatory", "--centre", "episode"), "oscillatory is a scene"),
+        (("oscillatory", "--set", "input.centre=episode"), "oscillatory is a scene"),
         (("oscillatory", "--episodes"), "oscillatory is a scene"),
-        (("av:lavfi:testsrc", "--centre", "episode"), "live streams cannot go back"),
+        (("av:lavfi:testsrc", "--set", "input.centre=episode"), "input.centre is for logs"),
         (("CORPUS", "--color", "auto"), "--color auto looks at one log"),
         (("CORPUS", "--topic", "/no"), "no topic /no"),
         (("CORPUS", "--follow", "--episodes"), "--follow takes the folder of one recording"),
         (("CORPUS/../broken",), "corpus.parquet is damaged"),
-        (("CORPUS", "--holdout", "0.5", "--loop"), "--holdout is for camera logs"),
+        (("CORPUS", "--set", "input.holdout=0.5", "--loop"), "input.holdout is for camera logs"),
         (
             ("--episodes", "CORPUS/ep0.mcap", "CORPUS/none.mcap"),
             "none.mcap: no such file or folder",
@@ -238,7 +238,7 @@ def test_what_episodes_cannot_be_is_refused_in_a_line(
 
 def test_python_refuses_another_centre_and_episodes_of_arrays(tmp_path: Path) -> None:
     path = write_log(tmp_path / "1.mcap", scenes(1, 12)[0])
-    with pytest.raises(UsageError, match="centre is 'all': give run or episode"):
+    with pytest.raises(UsageError, match="centre is all: choose one of run, episode"):
         package.learn(str(path), centre="all")
     with pytest.raises(UsageError, match="episodes are logs"):
         package.Recording(np.zeros((10, 2)), episodes=True)
@@ -263,8 +263,8 @@ def test_killed_in_the_middle_of_many_episodes_it_is_resumed_with_the_same_signa
         x = np.stack([np.sin((t + 40 * i) / 30), *rng.normal(size=(3, 25))]) + rng.normal()
         np.save(folder / f"ep{i}.npy", x.T)
     assert cdmisfa("index", folder).code == 0
-    words = (folder, *QUICK, "--set", "learner.watch=9999", "--centre", "episode")
-    words = (*words, "--keyframes", 20, "--holdout", 0)
+    words = (folder, *QUICK, "--set", "learner.watch=9999", "--set", "input.centre=episode")
+    words = (*words, "--keyframes", 20, "--set", "input.holdout=0")
     whole = cdmisfa("learn", *words, "--json").json
     assert whole["iterations"] == 300
     run = tmp_path / "run"
@@ -319,7 +319,14 @@ def backgrounds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i, images in enumerate(scenes(110, 45)):
         write_log(folder / "logs" / f"ep{i}.mcap", images, i * 1000)
     assert run(["index", str(folder / "logs")]) == 0
-    words = ["learn", str(folder / "logs"), "--centre", "episode", "-o", str(folder / "run")]
+    words = [
+        "learn",
+        str(folder / "logs"),
+        "--set",
+        "input.centre=episode",
+        "-o",
+        str(folder / "run"),
+    ]
     assert run([*words, "--no-rerun"]) == 0
     return folder
 
@@ -330,7 +337,9 @@ def test_centred_episodes_show_what_moves_before_backgrounds_that_change(
     plain = cdmisfa("learn", backgrounds / "logs")
     assert plain.code == 0
     assert "no module was learned" in plain.out
-    assert "of its variance is between episodes, not within; --centre episode" in plain.err
+    assert (
+        "of its variance is between episodes, not within; --set input.centre=episode" in plain.err
+    )
     run = backgrounds / "run"
     (module,) = package.Run(run).modules
     assert module.recipe is not None

@@ -135,10 +135,10 @@ def test_distances_are_shown_in_a_range(kind: tuple[str, str], encoding: str) ->
     step, data = 5 * values.itemsize, values.tobytes()
     made = RAW[kind](height=2, width=5, encoding=encoding, big=0, step=step, data=data)
     np.testing.assert_array_equal(shown(kind, made, depth=(1.0, 2.0)), expected)
-    with pytest.raises(UsageError, match="--range: no distance is below 0"):
+    with pytest.raises(UsageError, match=r"input\.range: no distance is below 0"):
         shown(kind, made, depth=(-1.0, 2.0))
     if encoding == "32FC1":
-        with pytest.raises(UsageError, match="--range"):
+        with pytest.raises(UsageError, match=r"input\.range"):
             shown(kind, made)
 
 
@@ -189,7 +189,7 @@ def test_compressed_distances_are_shown_in_a_range() -> None:
                 high = (metres * 1000).astype(np.uint16) >> 8
                 np.testing.assert_array_equal(shown(kind, message), high)
             else:
-                with pytest.raises(UsageError, match="--range"):
+                with pytest.raises(UsageError, match=r"input\.range"):
                     shown(kind, message)
 
 

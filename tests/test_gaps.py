@@ -18,12 +18,10 @@ from folders import contents, coverage
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from cdmisfa.experiments.sources import convert
 from recorder.config import Split
 from recorder.images.framing import FRAME_PIXELS, default_size, fitted
-from recorder.images.options import Fit
-from recorder.recording import RecordingStoppedError, recorded
-from replay.camera_logs.options import Align
+from recorder.images.options import Align, Fit
+from recorder.recording import RecordingStoppedError, record, recorded
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import intersection
@@ -112,7 +110,7 @@ def test_a_gap_of_more_frames_than_there_can_be_names_where_it_is(tmp_path: Path
     with pytest.raises(UsageError) as refused:
         ForeignSource(path)
     assert str(refused.value).startswith(f"{path}: /cam: it has a gap of 1.7e+09 s after 0 s, ")
-    assert str(refused.value).endswith("choose a part without, with --from or --to")
+    assert str(refused.value).endswith("choose a part without, with --start or --end")
     assert ForeignSource(path, start=1).frames == 30
 
 
@@ -138,22 +136,22 @@ def test_a_few_images_that_are_late_are_no_gap(tmp_path: Path) -> None:
 
 def test_a_part_of_a_log_is_taken(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.mcap", range(0, 4000, STEP_MS))
-    source = ForeignSource(log, start=1.0, stop=2.0)
+    source = ForeignSource(log, start=1.0, end=2.0)
     assert (source.frames, source.spec.start_ns) == (50, 10**9)
     assert values(source, 50) == (0, list(range(50, 100)))
 
 
 def test_a_part_is_written_as_minutes_and_seconds(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     log, out = write_log(tmp_path / "log.mcap", PAUSED, [(240, 320)]), tmp_path / "run"
-    words = ("learn", log, "-o", out, "--from", "1", "--to", "0:08", "--max-iterations", 1)
+    words = ("learn", log, "-o", out, "--start", "1", "--end", "0:08", "--max-iterations", 1)
     done = cdmisfa(*words, "--no-rerun")
     assert done.code == 0
     assert "320x240, shown as 80x60" in done.err
     source = json.loads((out / "run.json").read_text())["source"]
     assert (source["frames"], source["rate"], source["size"]) == (350, 50.0, [60, 80])
     assert list(source["gaps"].values()) == [[[50, 200]]]
-    assert cdmisfa("learn", log, "--from", "later").code == 2
-    assert "choose another --from" in cdmisfa("learn", log, "--from", "1:00").err
+    assert cdmisfa("learn", log, "--start", "later").code == 2
+    assert "choose another --start" in cdmisfa("learn", log, "--start", "1:00").err
 
 
 def test_a_run_across_a_gap_is_checked_and_resumed(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
@@ -185,14 +183,14 @@ def test_a_conversion_keeps_its_clock_and_has_the_gaps_of_its_logs(
     cdmisfa: Cdmisfa, tmp_path: Path, gaps: str, said: str, frames: int, held: list[Any]
 ) -> None:
     log, rec = write_log(tmp_path / "log.mcap", PAUSED), tmp_path / "rec"
-    done = cdmisfa("convert", log, "-o", rec, "--gaps", gaps, "--json")
+    done = cdmisfa("convert", log, "-o", rec, "--set", f"input.gaps={gaps}", "--json")
     assert said in done.err
     assert done.json["frames"] == frames
     assert coverage(rec) == {"cam": held}
     assert cdmisfa("verify", rec).code == 0
     options = ["--set", "learner.tau=30", "--json", "--max-iterations"]
     for words in (["8"], ["30", "--loop"]):
-        logs = ([log, "--gaps", gaps], [rec])
+        logs = ([log, "--set", f"input.gaps={gaps}"], [rec])
         runs = [cdmisfa("learn", *named, *options, *words) for named in logs]
         assert [run.code for run in runs] == [0, 0]
         assert runs[0].json["signals_sha256"] == runs[1].json["signals_sha256"]
@@ -209,7 +207,7 @@ def test_a_conversion_with_gaps_is_resumed(tmp_path: Path, split: Split | None) 
         how = {"stop": lambda: len(told) > after, "progress": told.append}
         source = ForeignSource([left, right], align="time", rate=50, start=0.4)
         with contextlib.closing(source), contextlib.suppress(RecordingStoppedError):
-            convert(source, tmp_path / name, split=split, resume=resume, **how)
+            record(source, tmp_path / name, split=split, resume=resume, **how)
         return tmp_path / name
 
     whole = converted("whole", 999)

@@ -29,7 +29,15 @@ from replay.camera_logs.source import ForeignSource
 from replay.runs.modules import load_modules
 
 FRAMES = 6000
-LEARN = ("--time", "t", "--set", "learner.expansion=none", "--set", "learner.outputs=2", "--json")
+LEARN = (
+    "--set",
+    "input.time=t",
+    "--set",
+    "learner.expansion=none",
+    "--set",
+    "learner.outputs=2",
+    "--json",
+)
 
 
 def values(frames: int = FRAMES) -> NDArray[Any]:
@@ -82,10 +90,10 @@ def test_frames_held_out_are_not_learned_from_and_judged_as_batch_sfa_is(
     ("options", "held"),
     [
         ((), 600),
-        (("--holdout", "0.25"), 1500),
-        (("--from", "10", "--to", "50"), 400),
-        (("--holdout", "0"), 0),
-        (("--to", "15"), 0),  # too few
+        (("--set", "input.holdout=0.25"), 1500),
+        (("--start", "10", "--end", "50"), 400),
+        (("--set", "input.holdout=0"), 0),
+        (("--end", "15"), 0),  # too few
         (("--loop",), 0),
         (("--algorithm", "2.0"), 0),
     ],
@@ -97,26 +105,26 @@ def test_a_share_of_what_is_learned_from_once_is_held_out(
     done = cdmisfa("learn", log, *said, "--json", "--max-iterations", "3", *options)
     assert done.json["source"].get("held_out", 0) == held
     assert ("held_out" in done.json) == (held > 0)
-    few = "150 of 1500 frames are too few to judge on: none are held out (--holdout)"
+    few = "150 of 1500 frames are too few to judge on: none are held out (input.holdout)"
     assert (few in done.err) == ("15" in options)
 
 
 def test_what_never_is_held_out_is_refused_where_it_is_asked_for(
     cdmisfa: Cdmisfa, log: Path, oscillatory_recording: Path
 ) -> None:
-    share = ("--holdout", "0.2")
+    share = ("--set", "input.holdout=0.2")
     for words in (
         ("oscillatory",),
         (oscillatory_recording,),
         (oscillatory_recording, "--algorithm", "progress"),
-        (log, "--time", "t", "--loop"),
-        (log, "--time", "t", "--algorithm", "2.0"),
+        (log, "--set", "input.time=t", "--loop"),
+        (log, "--set", "input.time=t", "--algorithm", "2.0"),
         ("av:lavfi:testsrc",),
     ):
         refused = cdmisfa("learn", *words, *share)
         assert refused.code == 2
-        assert "--holdout" in refused.err
-    assert cdmisfa("learn", log, "--holdout", "0.95").code == 2
+        assert "input.holdout" in refused.err
+    assert cdmisfa("learn", log, "--set", "input.holdout=0.95").code == 2
     recorded = cdmisfa("learn", oscillatory_recording, "--algorithm", "progress", "--json")
     assert "held_out" not in recorded.json
 
@@ -128,7 +136,10 @@ def test_going_on_keeps_to_what_the_run_learns_from(
     how = (*LEARN[:-1], "--no-rerun")
     whole = cdmisfa("learn", log, *how, "-o", once, "--json").json
     cdmisfa("learn", log, *how, "-o", resumed, "--max-iterations", "20")
-    assert cdmisfa("learn", log, *how, "-o", resumed, "--resume", "--holdout", "0.2").code == 2
+    assert (
+        cdmisfa("learn", log, *how, "-o", resumed, "--resume", "--set", "input.holdout=0.2").code
+        == 2
+    )
     more = ("--max-iterations", "1000", "--no-rerun", "--json")
     assert cdmisfa("learn", "--resume", "-o", resumed, *more).json["held_out"] == whole["held_out"]
     assert cdmisfa("check", once).code == 0

@@ -11,8 +11,6 @@ from conftest import Cdmisfa
 from numpy.typing import NDArray
 from PIL import Image
 
-from cdmisfa.core.errors import UsageError
-from recorder.images.options import ImageOptions
 from replay.camera_logs.hue import hue_varies
 
 N, H, W = 120, 24, 32
@@ -118,8 +116,6 @@ def test_what_has_no_first_frames_or_colours_to_look_at_is_refused(
         refused = cdmisfa("learn", *words, "--color", "auto")
         assert refused.code == 2
         assert remedy in refused.err
-    with pytest.raises(UsageError, match="give on, off or auto"):
-        ImageOptions(color="red")  # type: ignore[arg-type]
 
 
 def test_arrays_of_pictures_are_looked_at_as_logs_are(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -33,9 +33,9 @@ from websockets.sync.server import ServerConnection, serve
 from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from recorder.cameras.options import LiveOptions
 from recorder.cameras.video import VideoCamera
 from recorder.cameras.words import is_live, live_names, open_live
+from recorder.images.options import InputOptions
 from replay.recordings.source import RecordedSource
 
 RAW = "foxglove.RawImage"
@@ -207,9 +207,9 @@ def test_a_video_is_recorded_until_it_ends(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     ("word", "shape"), [(TEST, (60, 80)), ("gym:CartPole-v1", (57, 85))], ids=["camera", "task"]
 )
 def test_frames_keep_the_ratio_of_the_sides(word: str, shape: tuple[int, int]) -> None:
-    with open_live([word], LiveOptions()) as source:
+    with open_live([word], InputOptions()) as source:
         assert source.spec.frame_shape == shape
-    wide = LiveOptions(size=(30, 80), fit="pad")
+    wide = InputOptions(size=(30, 80), fit="pad")
     with open_live([word], wide) as source:
         frames = source.take(0, 3).frames
         assert frames.shape == (3, 30, 80)
@@ -254,7 +254,7 @@ def web_camera() -> Iterator[str]:
 
 def test_a_web_camera_that_breaks_is_connected_to_anew(web_camera: str) -> None:
     said: list[str] = []
-    options = LiveOptions(size=(48, 64), rate=25)
+    options = InputOptions(size=(48, 64), rate=25)
     with open_live([web_camera], options, say=said.append) as source:
         blocks = [block for _ in range(3) for block in source.take_all(25)]
     assert said[0] == "stream is gone: Input/output error: connecting to it anew"
@@ -265,7 +265,7 @@ def test_a_web_camera_that_breaks_is_connected_to_anew(web_camera: str) -> None:
 def test_a_web_camera_that_is_not_there_is_one_line(web_camera: str) -> None:
     word = web_camera.replace("stream", "gone")
     with pytest.raises(UsageError) as refused:
-        open_live([word], LiveOptions())
+        open_live([word], InputOptions())
     assert str(refused.value) == f"{word} cannot be opened: Server returned 404 Not Found"
 
 
@@ -276,13 +276,13 @@ def test_a_web_camera_that_does_not_answer_is_not_waited_for_long(
     with socket.create_server(("127.0.0.1", 0)) as server:  # it accepts, and says nothing
         word = f"http://127.0.0.1:{server.getsockname()[1]}/stream.mjpg"
         with pytest.raises(UsageError, match="cannot be opened: it did not answer in time"):
-            open_live([word], LiveOptions())
+            open_live([word], InputOptions())
 
 
 def test_pictures_of_a_web_camera_were_taken_when_they_come(web_camera: str) -> None:
     # MJPEG tells no times, and those that FFmpeg makes up are those of 25 pictures a second.
     word = web_camera.replace("stream", "slow")
-    with open_live([word], LiveOptions(size=(48, 64))) as source:
+    with open_live([word], InputOptions(size=(48, 64))) as source:
         assert 5 < source.spec.fps < 11
         source.take(0, 12)
         counts = source.alignment["slow"]  # type: ignore[attr-defined]
@@ -311,7 +311,7 @@ def test_a_stream_over_tcp_ends_where_that_is_asked_for(tmp_path: Path) -> None:
 
         thread = threading.Thread(target=send)
         thread.start()
-        options = LiveOptions(size=(48, 64), on_loss="end")
+        options = InputOptions(size=(48, 64), lost="end")
         with open_live([f"tcp://127.0.0.1:{port}"], options) as source:
             assert source.take(0, 10).frames.shape == (10, 48, 64)
             with pytest.raises(LogExhaustedError, match=rf"127\.0\.0\.1_{port}"):
@@ -362,18 +362,18 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
     image = RawImage(width=5, height=4, encoding="32FC1", step=20, data=data)
     words = [f"{robot.address}/depth"]
     with robot.showing(RawImageChannel, "/depth", lambda _: image):
-        with open_live(words, LiveOptions(depth=(1, 3))) as source:
+        with open_live(words, InputOptions(range=(1, 3))) as source:
             assert source.take(0, 2).frames[1, 0].tolist() == [0, 0, 128, 255, 255]
             assert source.describe()["range_metres"] == [1, 3]
-        with pytest.raises(UsageError, match="say which to show, as --range"):
-            open_live(words, LiveOptions())
+        with pytest.raises(UsageError, match=r"say which to show, as --set input\.range"):
+            open_live(words, InputOptions())
 
 
 def test_a_range_for_images_of_a_running_robot_without_distances_is_refused(robot: Robot) -> None:
     words = [f"{robot.address}/cam/left", f"{robot.address}/cam/right"]
     for shown in (words[:1], words[1:], words):
-        with pytest.raises(UsageError, match=r"shows no distances \(16UC1, 32FC1\): --range"):
-            open_live(shown, LiveOptions(depth=(1, 3)))
+        with pytest.raises(UsageError, match=r"shows no distances \(16UC1, 32FC1\): input.range"):
+            open_live(shown, InputOptions(range=(1, 3)))
 
 
 def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
@@ -386,9 +386,9 @@ def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
         assert (source.spec.frame_shape, source.spec.dtype) == ((1,), "float64")
         assert (np.diff(source.take(0, 20).frames[:, 0]) <= 3).all()
     with pytest.raises(UsageError, match="there is no z, it has k"):
-        open_live([f"{robot.address}/words"], LiveOptions(fields=("z",)))
+        open_live([f"{robot.address}/words"], InputOptions(fields=("z",)))
     with pytest.raises(UsageError, match="shows images: --field is for messages"):
-        open_live([TEST], LiveOptions(fields=("k",)))
+        open_live([TEST], InputOptions(fields=("k",)))
 
 
 @pytest.mark.parametrize(
@@ -406,7 +406,7 @@ def test_a_topic_that_is_no_image_is_refused(
     monkeypatch.setattr("recorder.cameras.foxglove._QUIET", 0.2)
     said: list[str] = []
     with pytest.raises(UsageError, match=why):
-        open_live([robot.address + topic], LiveOptions(), say=said.append)
+        open_live([robot.address + topic], InputOptions(), say=said.append)
     waits = "it has images on /cam/left, /cam/right; waiting"
     assert [waits in line for line in said] == ([True] if topic == "/cam/front" else [])
 
@@ -416,7 +416,7 @@ def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
     words = [f"{robot.address}/cam/late"]
     with (
         robot.showing(RawImageChannel, "/cam/late", raw_image, after=said),
-        open_live(words, LiveOptions(), say=said.append) as source,
+        open_live(words, InputOptions(), say=said.append) as source,
     ):
         assert source.take(0, 2).frames.shape == (2, 48, 64)
 
@@ -442,7 +442,7 @@ def test_a_topic_that_the_server_does_not_know_yet_is_subscribed_to_again() -> N
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         word = f"foxglove://127.0.0.1:{server.socket.getsockname()[1]}/cam"
-        with open_live([word], LiveOptions(rate=100)) as source:
+        with open_live([word], InputOptions(rate=100)) as source:
             assert source.take(0, 1).frames.shape == (1, 4, 5)
         server.shutdown()
         thread.join()
@@ -477,7 +477,7 @@ REFUSED = {
     "record rtsp://me:secret@127.0.0.1:9/x -o x": "rtsp://127.0.0.1:9/x cannot",
     "record foxglove://127.0.0.1:9/x -o x": "does not answer",
     "record camera:/dev/video99 -o x": "/dev/video99: there is no such device",
-    f"learn {TEST} --range 0.3:5": "shows no distances: --range is for those of",
+    f"learn {TEST} --set input.range=0.3,5": "shows no distances: input.range is for those of",
     f"learn {TEST} icub": "icub is no live stream, as the others are",
     f"learn {TEST} gym:CartPole-v1": "record each apart",
     f"learn {TEST} --loop": "live streams cannot go back",
@@ -485,9 +485,9 @@ REFUSED = {
     f"learn {TEST} --topic /x": "is a live stream: --topic is for logs",
     "learn oscillatory --record x": "--record is for live streams",
     f"record {TEST} -o x --resume": "leave out --resume",
-    f"convert {TEST} -o x --resume": "live streams cannot go back",
+    f"convert {TEST} -o x": "is a live stream: cdmisfa record",
     "record icub oscillatory -o x": "record one scene at a time",
-    "record icub --fit pad -o x": "icub is a scene: --fit is for cameras",
+    "record icub --set input.fit=pad -o x": "icub is a scene: input.fit is for logs and cameras",
     "record icub --size 32x24 -o x": "icub is a scene: --size is for cameras",
 }
 

@@ -84,7 +84,7 @@ def test_what_is_no_number_is_refused_in_words(path: str, why: str) -> None:
 
 def test_what_is_not_finite_is_refused_or_kept_in_a_range() -> None:
     ranges = {"ranges": [0.5, float("inf"), float("nan"), 50.0, -1.0]}
-    with pytest.raises(UsageError, match=r"holds inf at place 1.* as --range"):
+    with pytest.raises(UsageError, match=r"holds inf at place 1.* as --set input.range"):
         numbers_of([Field("ranges")], ranges, None)
     kept = numbers_of([Field("ranges")], ranges, (0.1, 10.0))
     assert kept.tolist() == [0.5, 0.1, 0.1, 10.0, 0.1]
@@ -93,7 +93,7 @@ def test_what_is_not_finite_is_refused_or_kept_in_a_range() -> None:
 def test_null_is_no_finite_number_and_a_missing_key_is_an_error() -> None:
     message = {"a": None, "p": {"x": None}, "l": [1, None], "q": None}
     for path in ("a", "p.x", "l", "q.x"):
-        with pytest.raises(UsageError, match=r"holds NaN or null at place .* as --range"):
+        with pytest.raises(UsageError, match=r"holds NaN or null at place .* as --set input.range"):
             numbers_of([Field(path)], message, None)
     fields = [Field(path) for path in ("a", "p.x", "l", "q.x", "q[0]")]
     assert numbers_of(fields, message, (-5, 9)).tolist() == [-5, -5, 1, -5, -5, -5]
@@ -285,7 +285,10 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ({}, "tells no rate: set one with --rate, or name the column of its times with --time"),
+        (
+            {},
+            "set one with --rate, or name the column of its times with --set input.time",
+        ),
         ({"fields": ["z"], "rate": 5}, "there is no column z; it has s, a, word"),
         ({"fields": ["z [rad]"], "rate": 5}, r"there is no column z \[rad\]; it has s, a, w"),
         ({"fields": ["word"], "rate": 5}, "t.csv: --field word is no number but a text"),
@@ -293,9 +296,9 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
         ({"time": "word"}, "word holds string, neither numbers nor dates"),
         ({"time": "s:h"}, "A unit is one of s, ms, us, ns"),
         ({"time": "big"}, "big holds no times since 1970, counted in s: say what they count"),
-        ({"time": "us"}, r"say what they count \(s, ms, us, ns\), as --time us:ns"),
+        ({"time": "us"}, r"say what they count \(s, ms, us, ns\), as --set input.time=us:ns"),
         ({"rate": 5, "size": (4, 4)}, "as they are: --size is for images"),
-        ({"rate": 5, "size": (4, 4), "fit": "pad"}, "--size and --fit are for images"),
+        ({"rate": 5, "size": (4, 4), "fit": "pad"}, "--size and input.fit are for images"),
         ({"rate": 5, "topics": ["x"]}, "a table has no topics, leave x out; see --field"),
     ],
 )
@@ -369,7 +372,9 @@ def test_a_slow_sine_hidden_in_fields_of_noise_is_learned(cdmisfa: Cdmisfa, tmp_
         write_table(tmp_path / f"{name}.csv", columns)
     logs = [tmp_path / "arm.csv", tmp_path / "noise.csv"]
     run = tmp_path / "run"
-    done = cdmisfa("learn", *logs, "--time", "stamp", "-o", run, "--no-rerun", "--json").json
+    done = cdmisfa(
+        "learn", *logs, "--set", "input.time=stamp", "-o", run, "--no-rerun", "--json"
+    ).json
     assert done["ended"] == "all_decided"
     arm, noisy = done["streams"]
     assert (arm["state"], noisy["state"]) == ("learned", "given_up")

@@ -11,8 +11,8 @@ from camera_files import HEIGHT, WIDTH, encoded, pictures, write_cameras
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
 
-from cdmisfa.experiments.sources import convert
 from recorder.mcap.reader import LogReader
+from recorder.recording import record
 from replay.camera_logs.source import ForeignSource
 
 COUNT = 200
@@ -46,7 +46,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("peers")
     write_cameras(folder / "a.mcap", {"/cam": (COUNT, 20)})
     source = ForeignSource(folder / "a.mcap", size=SIZE)
-    (written,) = convert(source, folder / "rec")
+    (written,) = record(source, folder / "rec")
     source.close()
     return written.file
 

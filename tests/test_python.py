@@ -22,8 +22,8 @@ import cdmisfa
 from cdmisfa import Recording, Run, learn
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.recompute import check_run
+from recorder.images.options import InputOptions
 from replay.arrays import ArrayLog
-from replay.camera_logs.options import CameraOptions
 
 ROOT = Path(__file__).parents[1]
 FEW: dict[str, Any] = {"max_iterations": 12, "tau": 20}
@@ -50,7 +50,7 @@ class TestArrays(SourceContract):
 
     def open(self) -> ArrayLog:
         rows = pictures(8, 12, 3)[:100]
-        return ArrayLog({"left": rows, "right": 255 - rows}, CameraOptions(size=(4, 6), rate=10))
+        return ArrayLog({"left": rows, "right": 255 - rows}, InputOptions(size=(4, 6), rate=10))
 
 
 class TestNumbers(SourceContract):

@@ -63,7 +63,7 @@ def test_a_raw_picture_becomes_the_frame_that_the_log_shows(
     dtype, shape, color, depth = KINDS[encoding]
     pictures = of_type(dtype, *shape)
     log = logged(tmp_path / "a.mcap", pictures, encoding)
-    source = ForeignSource(log, size=(8, 16), fit=fit, color=color, depth=depth)
+    source = ForeignSource(log, size=(8, 16), fit=fit, color=color, range=depth)
     frames = source.take(0, len(pictures)).frames
     recipe = Recipe.of(source.describe(), frames.shape[1:])
     assert (recipe.fit, recipe.color, recipe.range) == (fit, color, depth)
@@ -84,7 +84,16 @@ def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) 
     log, out = logged(tmp_path / "a.mcap", pictures, "bgr8"), tmp_path / "run"
     easy = ("delta=1", "eta_dot_window=3", "min_variance=0", "warm_up=0", "tau=20", "novel_share=0")
     settings = [word for key in easy for word in ("--set", f"learner.{key}")]
-    options = ("--size", "8x8", "--fit", "stretch", "--algorithm", "2.0", "--max-modules", "1")
+    options = (
+        "--size",
+        "8x8",
+        "--set",
+        "input.fit=stretch",
+        "--algorithm",
+        "2.0",
+        "--max-modules",
+        "1",
+    )
     done = cdmisfa("learn", log, "-o", out, *options, *settings, "--no-rerun", "--json")
     assert done.code == 0, done.err
     said = {"shape": [8, 8], "fit": "stretch", "color": False, "range": None, "fields": []}
@@ -104,7 +113,9 @@ def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) 
 def test_a_recording_of_a_log_keeps_its_recipe(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     pictures = np.repeat(of_type("u1", 12, 16, 3), 60, 0)
     log = logged(tmp_path / "a.mcap", pictures, "rgb8")
-    cdmisfa("convert", log, "--color", "--size", "8x8", "--fit", "pad", "-o", tmp_path / "rec")
+    cdmisfa(
+        "convert", log, "--color", "--size", "8x8", "--set", "input.fit=pad", "-o", tmp_path / "rec"
+    )
     learned = (*("learn", tmp_path / "rec", "-o", tmp_path / "run"), "--no-rerun")
     assert cdmisfa(*learned, "--set", "learner.tau=40", "--max-iterations", 12).code == 0
     module = Run(tmp_path / "run").modules

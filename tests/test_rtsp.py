@@ -7,12 +7,12 @@ import pytest
 from rtsp_camera import RATE, rtsp_camera
 
 from cdmisfa.core.errors import UsageError
-from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import open_live
+from recorder.images.options import InputOptions
 
 
 def test_a_network_camera_shows_what_it_sees_at_its_own_rate() -> None:
-    with rtsp_camera(100) as word, open_live([word], LiveOptions()) as source:
+    with rtsp_camera(100) as word, open_live([word], InputOptions()) as source:
         assert source.spec.streams == ("left",)
         assert source.spec.fps == RATE
         frames = source.take(0, 20).frames
@@ -25,7 +25,7 @@ def test_a_network_camera_shows_what_it_sees_at_its_own_rate() -> None:
 
 def test_a_network_camera_that_breaks_is_connected_to_anew() -> None:
     said: list[str] = []
-    options = LiveOptions(rate=RATE)
+    options = InputOptions(rate=RATE)
     with (
         rtsp_camera(40) as word,
         open_live([word], options, say=said.append) as source,
@@ -36,4 +36,4 @@ def test_a_network_camera_that_breaks_is_connected_to_anew() -> None:
 
 def test_a_network_camera_that_shows_nothing_is_said() -> None:
     with rtsp_camera(1) as word, pytest.raises(UsageError, match="left ended before a picture"):
-        open_live([word], LiveOptions())
+        open_live([word], InputOptions())

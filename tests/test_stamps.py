@@ -93,8 +93,8 @@ def test_what_says_no_time_is_refused(tmp_path: Path) -> None:
     for path, topics, options, why in (
         (bag(tmp_path, ros1=True), ["/chatter"], {"fields": ["data"]}, "have no header"),
         (bag(tmp_path, ros1=False), ["/joint_states"], {"fields": ["position"]}, "all say 7000"),
-        (tmp_path / "a.mcap", [], {}, "the headers on /cam all say 0 ns: leave out --stamp"),
-        (tmp_path / "t.csv", [], {"time": "s"}, "is no topic of messages: leave out --stamp"),
+        (tmp_path / "a.mcap", [], {}, "the headers on /cam all say 0 ns: leave out --set"),
+        (tmp_path / "t.csv", [], {"time": "s"}, "is no topic of messages: leave out input.stamp"),
     ):
         with pytest.raises(UsageError, match=why):
             ForeignSource(path, topics, stamp="header", **options)
@@ -110,4 +110,4 @@ def test_learning_by_headers_is_the_same_from_the_conversion(
 ) -> None:
     what, messages = LOGS["protobuf"]
     path = write_mcap(tmp_path / "a.mcap", what, {"/cam": every(STEP, messages())})
-    learned_alike(cdmisfa, tmp_path, path, "--stamp", "header")
+    learned_alike(cdmisfa, tmp_path, path, "--set", "input.stamp=header")

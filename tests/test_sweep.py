@@ -152,7 +152,7 @@ def test_logs_are_swept_as_the_options_say(tmp_path: Path, cdmisfa: Cdmisfa) -> 
     assert row["result"] == {key: value for key, value in learned.items() if key not in UNKEPT}
     again = cdmisfa(*swept, *LEFT, "--json").json
     assert (again["skipped"], again["computed"]) == (1, 0)
-    later = cdmisfa(*swept, "--topic", "/left", "--from", 0.2, "--json").json
+    later = cdmisfa(*swept, "--topic", "/left", "--start", 0.2, "--json").json
     assert (later["skipped"], later["computed"]) == (0, 1)
 
 

@@ -69,7 +69,7 @@ def test_what_is_not_finite_is_left_out_by_its_name_or_kept_in_a_range(
     frames, said = taken(path)
     assert [a for (a,) in frames] == [*range(-4, -1), *range(8)]
     assert said[0].endswith(f"left out, the first is {place}")
-    kept, said = taken(path, depth=(-3.0, 5.0))
+    kept, said = taken(path, range=(-3.0, 5.0))
     assert [a for (a,) in kept] == [-3, -3, -2, -3, *range(6), 5, 5]
     assert said == ()
     with pytest.raises(UsageError, match=f"{place} lacks a finite number: name"):
@@ -103,7 +103,12 @@ def test_semicolons_and_tabs_separate_cells(tmp_path: Path, separator: str) -> N
         ("t,a\n0,1\n\xff,2,3\n", {}, LogDamagedError, "Row #3: Expected 2 columns, got 3"),
         ("# a log\nt,a\n0,1\n", {}, LogDamagedError, "Row #2: Expected 1 columns, got 2: t,a"),
         ("t,a\n0,\n1,\n", {"fields": ["a"]}, UsageError, "a holds no numbers"),
-        ("t,a\n0,1\n1,2\n2,3\n", {"time": "t:ns"}, UsageError, "1e.09 rows a second.*--time COL"),
+        (
+            "t,a\n0,1\n1,2\n2,3\n",
+            {"time": "t:ns"},
+            UsageError,
+            "1e.09 rows a second.*time=COL",
+        ),
         ("t,a\n0,1\n.1,2\n.2,3\n", {"time": "t:ns"}, UsageError, "say what its times count, as"),
     ],
 )
@@ -133,17 +138,17 @@ def test_what_is_missing_is_left_out_and_is_not_the_end_of_a_range(
 ) -> None:
     values = [0, 1, 2, None, 4, np.inf, *range(6, ROWS)]
     path = write_table(tmp_path / name, {"t": np.arange(ROWS) / 10, "a": values})
-    kept, said = taken(path, depth=(1.0, 8.0), gaps="hold", align="index")
+    kept, said = taken(path, range=(1.0, 8.0), gaps="hold", align="index")
     assert [a for (a,) in kept] == [1, 1, 2, 4, 1, 6, 7, 8, 8, 8, 8]
     assert said[0].endswith(f"left out, the first is {place}")
     with pytest.raises(UsageError, match=f"{place} lacks a finite number: name"):
-        taken(path, time=None, rate=5, depth=(1.0, 8.0))
+        taken(path, time=None, rate=5, range=(1.0, 8.0))
 
 
 def test_distances_in_a_list_that_were_not_measured_are_the_end_of_a_range(tmp_path: Path) -> None:
     lists = [[1.0, None], [np.nan, 2.0], None, [3.0, np.inf]]
     path = write_table(tmp_path / "t.parquet", {"t": np.arange(4) / 10, "r": lists})
-    kept, said = taken(path, fields=["r"], depth=(0.5, 9.0), align="index")
+    kept, said = taken(path, fields=["r"], range=(0.5, 9.0), align="index")
     assert kept == [[1, 0.5], [0.5, 2], [3, 0.5]]
     assert said[0].endswith("left out, the first is row 2")
 
@@ -155,7 +160,7 @@ def test_numbers_that_float64_rounds_are_said(tmp_path: Path, name: str) -> None
     assert [line.partition(": ")[2] for line in taken(path)[1]] == [
         "numbers beyond 2^53 may be rounded, to float64"
     ]
-    assert taken(path, fields=["b"])[1] == taken(path, depth=(0, 9))[1] == ()
+    assert taken(path, fields=["b"])[1] == taken(path, range=(0, 9))[1] == ()
 
 
 @pytest.mark.parametrize(
@@ -185,25 +190,27 @@ def test_commands_take_tables_and_say_what_was_left_out(cdmisfa: Cdmisfa, tmp_pa
         ["learn", path, "--set", "learner.tau=10", "--max-iterations", 1],
         ["convert", path, "-o", tmp_path / "rec"],
         ["export", path, "--to", "lerobot", "-o", tmp_path / "set"],
-        ["view", path, "--range", "-3:3", "--save", tmp_path / "v.rrd"],
+        ["view", path, "--set", "input.range=-3,3", "--save", tmp_path / "v.rrd"],
     ):
-        done = cdmisfa(*words, "--time", "t")
+        done = cdmisfa(*words, "--set", "input.time=t")
         assert done.code == 0, done.err
-        if "--range" not in words:
+        if "input.range=-3,3" not in words:
             assert f"warning: {path}: 1 of 58 rows lack a finite number" in done.err, words[0]
             assert done.err.count("(3 missing): 1.2 s of it become 1.14 s of frames") == 1
         assert "H.264" not in done.err
     checked = cdmisfa("verify", path)
     assert checked.code == 0
     assert "58 rows of 2 columns can be read; a table has no checksums" in checked.out
-    refused = cdmisfa("export", path, "--time", "t", "--to", "npz", "-o", tmp_path / "a.npz")
+    refused = cdmisfa(
+        "export", path, "--set", "input.time=t", "--to", "npz", "-o", tmp_path / "a.npz"
+    )
     assert refused.code == 2
     assert f"{path} is no run, npz is for the signals of one: choose images or mp4" in refused.err
 
 
 def test_a_recording_of_values_says_how_it_is_taken(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     rec, again = tmp_path / "rec", tmp_path / "again"
-    assert cdmisfa("convert", written(tmp_path, {}), "--time", "t", "-o", rec).code == 0
+    assert cdmisfa("convert", written(tmp_path, {}), "--set", "input.time=t", "-o", rec).code == 0
     for words in (["convert", rec, "-o", again], ["learn", rec, "--color"]):
         done = cdmisfa(*words)
         assert done.code == 2
@@ -219,10 +226,10 @@ def test_frames_that_are_held_in_a_gap_are_counted(tmp_path: Path) -> None:
         assert (source.frames, source.alignment["t"]["repeated"]) == (51, 0)
 
 
-@pytest.mark.parametrize("value", ["-3.2:3.2", "-10:-5", "0:1"])
+@pytest.mark.parametrize("value", ["-3.2,3.2", "-10,-5", "0,1"])
 def test_a_range_of_numbers_may_begin_below_0(cdmisfa: Cdmisfa, tmp_path: Path, value: str) -> None:
     path = written(tmp_path, {})
-    convert = ("convert", path, "--time", "t", "-o", tmp_path / "rec", "--range")
-    assert cdmisfa(*convert, value).code == 0
-    done = cdmisfa(*convert, "5:-5")
-    assert (done.code, "or LOW:HIGH of numbers" in done.err) == (2, True)
+    convert = ("convert", path, "--set", "input.time=t", "-o", tmp_path / "rec", "--set")
+    assert cdmisfa(*convert, f"input.range={value}").code == 0
+    done = cdmisfa(*convert, "input.range=5,-5")
+    assert (done.code, "the smaller first" in done.err) == (2, True)

@@ -17,9 +17,9 @@ from message_files import STEP, every, write_mcap
 from video_packets import COUNT, ENCODERS, FOXGLOVE, GROUP, KINDS, video
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import open_live
 from recorder.images.decoding import MessageKind
+from recorder.images.options import InputOptions
 from recorder.images.videos import frame_gray
 from replay.camera_logs.opening import open_images
 from replay.camera_logs.source import ForeignSource
@@ -99,7 +99,7 @@ def test_a_running_robots_video_is_shown_from_its_first_whole_picture() -> None:
 
     robot = Robot()
     with contextlib.closing(robot), robot.showing(CompressedVideoChannel, "/cam", message):
-        word, options = f"{robot.address}/cam", LiveOptions(rate=50)
+        word, options = f"{robot.address}/cam", InputOptions(rate=50)
         with open_live([word], options) as source:
             frames = source.take(0, 30).frames
     shown = decoded("h264")

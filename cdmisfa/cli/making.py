@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 import re
-import types
-import typing
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, TypeVar
 
 import click
-
-from cdmisfa.core.options import RANGE, SIZE, TIME, option_name
-from recorder.images.options import Color
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -41,17 +35,6 @@ class GroupedCommand(click.Command):
     def __init__(self, *args: Any, common: Sequence[str], **how: Any) -> None:
         super().__init__(*args, **how)
         self._common = common
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """See `click.Command`; what follows a `Switch` and is none of its words is an argument."""
-        for param in self.params:
-            if isinstance(kind := param.type, Switch):
-                pairs = zip(args, [*args[1:], ""], strict=False)
-                args = [
-                    f"{word}=on" if word in param.opts and after not in kind.choices else word
-                    for word, after in pairs
-                ]
-        return super().parse_args(ctx, args)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """See `click.Command`."""
@@ -87,17 +70,6 @@ class WholeRange(click.IntRange):
         except ValueError:
             self.fail(f"{value!r} is no whole number", param, ctx)
         return super().convert(value, param, ctx)
-
-
-class Switch(click.Choice[str]):
-    """On, off, or what else there is; an option of it that stands alone is on."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """See `click.ParamType`."""
-        if isinstance(value, bool):
-            return value
-        found = super().convert(value, param, ctx)
-        return {"on": True, "off": False}.get(found, found)
 
 
 class FiniteRange(click.FloatRange):
@@ -188,84 +160,13 @@ def _seconds(parts: Sequence[str | None]) -> float:
     return hours * 3600 + minutes * 60 + seconds
 
 
-def _range(parts: Sequence[str | None]) -> tuple[float, float] | None:
-    low, high = (float(part or 0) for part in parts)
-    return (low, high) if low < high else None
-
-
-_NUMBER = r"(-?\d{1,9}(?:\.\d{1,9})?)"
-
 WRITTEN = {
-    SIZE: Written("size", "WIDTHxHEIGHT, as 128x48", r"([1-9]\d{0,3})x([1-9]\d{0,3})", _size),
-    TIME: Written(
+    "WxH": Written("size", "WIDTHxHEIGHT, as 128x48", r"([1-9]\d{0,3})x([1-9]\d{0,3})", _size),
+    "TIME": Written(
         "time",
         "seconds, or MINUTES:SECONDS, as 1:30",
         r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d{1,9})?)",
         _seconds,
     ),
-    RANGE: Written(
-        "range",
-        "NEAR:FAR in metres, as 0.3:5, or LOW:HIGH of numbers, as -3.2:3.2",
-        f"{_NUMBER}:{_NUMBER}",
-        _range,
-    ),
 }
 """How values of these units are read."""
-
-
-def options_of(settings: type, argument: str, *names: str) -> Callable[[Command], Command]:
-    """Options made of the fields of a dataclass; see `cdmisfa.core.options.setting`.
-
-    Args:
-        settings: the dataclass.
-        argument: name of the command's argument that gets an object of it.
-        names: of the fields; by default all.
-    """
-    fields = [
-        field
-        for field in dataclasses.fields(settings)
-        if field.metadata and (not names or field.name in names)
-    ]
-
-    def wrapped(command: Command) -> Command:
-        @functools.wraps(command)
-        def with_settings(*args: Any, **values: Any) -> Any:
-            chosen = {field.name: values.pop(field.name) for field in fields}
-            return command(*args, **{argument: settings(**chosen)}, **values)
-
-        made = together(*(option_of(settings, field) for field in fields))
-        return made(cast(Command, with_settings))
-
-    return wrapped
-
-
-def option_of(
-    settings: type, field: dataclasses.Field[Any], **how: Any
-) -> Callable[[Command], Command]:
-    """The option of one field of a dataclass.
-
-    Args:
-        settings: the dataclass.
-        field: of it, with the metadata of `setting`.
-        how: more for `option`.
-    """
-    told = field.metadata
-    kind = typing.get_type_hints(settings)[field.name]
-    if types.NoneType in typing.get_args(kind):
-        kind = next(each for each in typing.get_args(kind) if each is not types.NoneType)
-    of: dict[str, Any] = {"type": kind, "show_default": field.default is not None}
-    if told["unit"] in WRITTEN:
-        of = {"type": WRITTEN[told["unit"]]}
-    elif typing.get_origin(kind) is Literal:
-        of["type"] = click.Choice(typing.get_args(kind))
-    elif kind is bool:
-        of = {"is_flag": True}
-    elif kind == Color:
-        of = {"type": Switch(["on", "off", "auto"]), "is_flag": False, "flag_value": "on"}
-    elif typing.get_origin(kind) is tuple:
-        of = {"multiple": True}
-    elif kind in (int, float):
-        ranges = {int: WholeRange, float: FiniteRange}
-        of["type"] = ranges[kind](told["least"], told["most"])
-    of |= {"default": field.default, "help": told["about"], "metavar": told["unit"] or None}
-    return option(option_name(field), field.name, group=told["group"], **(of | how))

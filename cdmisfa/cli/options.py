@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
 from cdmisfa.cli.making import (
+    WRITTEN,
     Command,
     choice,
     flag,
     number,
     option,
-    options_of,
     together,
     word,
 )
 from cdmisfa.cli.printing import Stderr
-from cdmisfa.core.errors import TooSmallError, UsageError, are_for
-from recorder.cameras.options import LiveOptions
-from recorder.images.options import ImageOptions
-from replay.camera_logs.options import CameraOptions
+from cdmisfa.core.errors import TooSmallError, UsageError
+from cdmisfa.core.options import parse_settings
 from replay.storage.location import location
+
+if TYPE_CHECKING:
+    from recorder.images.options import InputOptions
 
 
 class LocalPath(click.Path):
@@ -40,49 +41,104 @@ class LocalPath(click.Path):
 
 
 OUT = LocalPath(path_type=Path)
+"""Type of every option that says where something is written, and of what is read from no URL."""
 
 WORD = click.Path(readable=False)
 """A path, URL or other word of a source; a shell completes it as a file."""
-"""Type of every option that says where something is written, and of what is read from no URL."""
 
 
-def _with_size(made: Callable[[Command], Command]) -> Callable[[Command], Command]:
-    """Options of which --size is one, which an error about small images then names."""
+INPUTS: Mapping[str, Callable[[Command], Command]] = {
+    "topics": option(
+        "--topic",
+        "topics",
+        metavar="TOPIC",
+        help="A topic of a log, a stream each, or a pattern of them, as '/cam*'; repeatable.",
+        multiple=True,
+    ),
+    "fields": option(
+        "--field",
+        "fields",
+        metavar="FIELD",
+        help="Take numbers instead of images: a field of a topic's messages, as pose.position.x or "
+        "ranges[0:100], or a column of a table; several are one vector.",
+        multiple=True,
+    ),
+    "size": word(
+        "--size",
+        "WxH",
+        "Shrink images to this size; by default to what has their ratio of the sides and no more "
+        "pixels than 128x48.",
+        type=WRITTEN["WxH"],
+    ),
+    "rate": number("--rate", "Frames a second; by default the first stream's.", *(1e-3, 1e6, "HZ")),
+    "start": word(
+        "--start",
+        "TIME",
+        "Leave out what a log has before this time, in seconds or as MINUTES:SECONDS.",
+        type=WRITTEN["TIME"],
+        default="0",
+    ),
+    "end": word(
+        "--end", "TIME", "Leave out what a log has from this time on.", type=WRITTEN["TIME"]
+    ),
+    "align": option(
+        "--align",
+        type=click.Choice(["index", "time"]),
+        help="Put streams that differ on one clock: the i-th image of each, or the last image at "
+        "each time. By default they are refused.",
+    ),
+    "color": option(
+        "--color",
+        type=click.Choice(["on", "off", "auto"]),
+        is_flag=False,
+        flag_value="on",
+        default="off",
+        help="Show red, green and blue beside one another, as a frame of three times the width; "
+        "auto does so where hue varies in the first frames of a log and brightness does not.",
+    ),
+}
+"""Options of commands that read external logs, by the names of `InputOptions`."""
+
+
+def input_options(*names: str, keys: bool = False) -> Callable[[Command], Command]:
+    """Options of `INPUTS`, all or those named; the command gets them as `inputs`.
+
+    Args:
+        names: of `InputOptions`.
+        keys: also `--set`, for keys `input.*` alone.
+    """
+    chosen = names or tuple(INPUTS)
 
     def wrapped(command: Command) -> Command:
         @functools.wraps(command)
-        def naming_size(*args: Any, **values: Any) -> Any:
-            try:
-                return command(*args, **values)
-            except TooSmallError as error:
-                raise UsageError(f"{error}, or a smaller --size") from None
+        def with_inputs(*args: Any, **values: Any) -> Any:
+            from recorder.images.options import InputOptions
 
-        return made(cast(Command, naming_size))
+            given = {name: values.pop(name) for name in chosen}
+            if "color" in given:  # a run keeps it as a truth value
+                given["color"] = {"on": True, "off": False}.get(given["color"], given["color"])
+            inputs = InputOptions(**given)
+            if keys:
+                inputs = _with_keys(inputs, values.pop("settings"))
+            try:
+                return command(*args, inputs=inputs, **values)
+            except TooSmallError as error:
+                remedy = ", or a smaller --size" if "size" in given else ""
+                raise UsageError(f"{error}{remedy}") from None
+
+        each = [INPUTS[name] for name in chosen]
+        if keys:
+            each.append(settings("Set a key input.*, as input.fit=pad; repeatable.", "KEY=VALUE"))
+        return together(*each)(cast(Command, with_inputs))
 
     return wrapped
 
 
-image_options = _with_size(options_of(ImageOptions, "images"))
-"""How images of cameras, live or stored, become frames."""
-
-log_options = _with_size(options_of(CameraOptions, "cameras"))
-"""What of camera logs becomes frames, and how."""
-
-look_options = options_of(CameraOptions, "cameras", "topics", "fields", "time", "rate", "depth")
-"""What of camera logs is shown or exported."""
-
-live_options = options_of(LiveOptions, "live", "hold", "on_loss", "stall")
-"""How live streams are put on one clock."""
-
-
-def refuse_live_options(live: LiveOptions, source: Sequence[str]) -> None:
-    """Refuse options of live streams for a source that is none.
-
-    Raises:
-        UsageError: some are given.
-    """
-    if given := live.given():
-        raise UsageError(f"{source[0]} is no live stream: {are_for(given, 'live streams')}")
+def _with_keys(inputs: InputOptions, settings: Sequence[str]) -> InputOptions:
+    words = parse_settings(settings)
+    if other := next((section for section in words if section != "input"), None):
+        raise UsageError(f"{other}.* is not for this command, which takes input.* alone")
+    return inputs.configured(words.get("input", {}))
 
 
 loop = flag("--loop", "Start a recording or log again at its end.", group="Source")
@@ -193,3 +249,7 @@ def log_argument(
 
     how: dict[str, Any] = {"callback": opened, "type": WORD}
     return click.argument(name, nargs=nargs, required=required, **how)
+
+
+look_options = input_options("topics", "fields", "rate", keys=True)
+"""Which streams of external logs are shown or exported."""

@@ -48,8 +48,8 @@ def hold_out(source: FrameSource, share: float | None, *, judged: bool) -> None:
     if not judged or logged is None or logged.spec.length is None:
         if share is not None:
             raise UsageError(
-                "--holdout is for camera logs that the progress learner learns from once: leave it "
-                "out, or leave out --loop and --algorithm"
+                "input.holdout is for camera logs that the progress learner learns from once: "
+                "leave it out, or leave out --loop and --algorithm"
             )
         return
     count = int(logged.frames * (HOLDOUT if share is None else share))
@@ -57,7 +57,7 @@ def hold_out(source: FrameSource, share: float | None, *, judged: bool) -> None:
         logged.hold_out(count)
     else:
         said = f"{count} of {logged.frames} frames are too few to judge on: none are held out"
-        logged.notes = (*logged.notes, f"{said} (--holdout)")
+        logged.notes = (*logged.notes, f"{said} (input.holdout)")
 
 
 def judged(

@@ -212,7 +212,9 @@ class BetweenEpisodes(Sink):
                 name = self._source.spec.streams[stream]
                 said = f"{name}: {share:.0%} of its variance is between episodes, not within"
                 for other in self._others:
-                    other.event(*self._at, f"{said}; --centre episode leaves it out", "WARNING")
+                    other.event(
+                        *self._at, f"{said}; --set input.centre=episode leaves it out", "WARNING"
+                    )
 
 
 class _Spread:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.options import option_words
 from cdmisfa.experiments.recompute import Recomputation
 from cdmisfa.experiments.resume import read_command
+from recorder.images.options import OPTIONS, InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
-from replay.camera_logs.options import CameraOptions
 from replay.runs.folders import REPORT_FILE, is_run, is_sweep, read_request, run_log, runs_in
 from replay.runs.log import read_header
 
@@ -139,7 +137,7 @@ def proof_of(run: Path) -> Proof:
     )
 
 
-PLAIN = (("seed", 0), ("centre", "run"))
+PLAIN = (("seed", 0),)
 """Options of a command that say what is so without them."""
 
 
@@ -149,10 +147,9 @@ def command_again(run: Path) -> str:
         words, options = read_command(Path(run))
     except CdmisfaError:
         return ""
-    fields = {field.name for field in dataclasses.fields(CameraOptions)}
-    said = option_words(CameraOptions(**{k: v for k, v in options.items() if k in fields}))
+    said = InputOptions(**{k: v for k, v in options.items() if k in OPTIONS}).words()
     for name, value in options.items():
-        if name in fields or value in (None, False, ()) or (name, value) in PLAIN:
+        if name in OPTIONS or value in (None, False, ()) or (name, value) in PLAIN:
             continue
         flag = "--set" if name == "settings" else f"--{name.replace('_', '-')}"
         if value is True:

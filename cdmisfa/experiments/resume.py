@@ -19,9 +19,10 @@ from cdmisfa.core.options import parse_settings
 from cdmisfa.experiments.sources import configure, open_logs
 from recorder.cameras.words import is_live
 from recorder.config import RecordConfig
+from recorder.images.options import OF_EVERY_SOURCE, InputOptions
+from recorder.images.options import OPTIONS as INPUTS
 from recorder.log.files import found_path, partial_path, relative_path
 from recorder.world.scenes import SCENES, open_scene
-from replay.camera_logs.options import CameraOptions
 from replay.runs.compare import differences
 from replay.runs.folders import RUN_FILE
 from replay.runs.keyframes import read_keyframe
@@ -31,16 +32,13 @@ from replay.runs.run import known_to_both, stated_source
 COMMAND = "command"
 """Key of a manifest: the command that began the run, which may differ when it is resumed."""
 
-CAMERAS = tuple(field.name for field in dataclasses.fields(CameraOptions))
-"""Options of a command that say how images of others become frames."""
-
 OPTIONS = (
     "seed",
     "preset",
     "settings",
     "algorithm",
-    *("loop", "salvage", "episodes", "centre", "follow", "holdout"),
-    *CAMERAS,
+    *("loop", "salvage", "episodes", "follow"),
+    *INPUTS,
     "max_iterations",
     "max_modules",
     "keyframes",
@@ -139,12 +137,14 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
         from replay.inputs import is_recording
 
         recorded = not may_be_corpus(words) and is_recording(words)
-    kept = () if recorded else CAMERAS
-    cameras = CameraOptions(**{name: begun[name] for name in kept if name in begun})
-    if words[0] not in SCENES:
-        how: dict[str, Any] = {n: bool(begun.get(n)) for n in ("loop", "salvage", "episodes")}
-        return open_logs(words, cameras=cameras, centre=begun.get("centre", "run"), **how)
     told = read_header(log_to_resume(run)).manifest.get("config", {})
+    if words[0] not in SCENES:
+        keys = told.get("input", {})
+        kept = {name: begun[name] for name in INPUTS if name in begun}
+        if recorded:
+            kept, keys = {}, {name: keys[name] for name in OF_EVERY_SOURCE if name in keys}
+        how: dict[str, Any] = {n: bool(begun.get(n)) for n in ("loop", "salvage", "episodes")}
+        return open_logs(words, inputs=InputOptions(**kept).configured(keys), **how)
     if told.get("scene", {}).get("kind") != words[0]:
         return configure(words[0], seed=begun.get("seed", 0)).open_scene()
     scene = build(SCENES[words[0]].config, "scene", told["scene"])

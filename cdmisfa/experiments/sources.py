@@ -14,23 +14,19 @@ from cdmisfa.core.config import LearnerConfig, build, load_preset, section_table
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.options import parse_settings
 from cdmisfa.core.registry import did_you_mean
-from recorder.cameras.options import LiveOptions
-from recorder.cameras.words import CAMERAS, is_live, live_options, open_live
+from recorder.cameras.words import CAMERAS, is_live, open_live, refuse_stored
 from recorder.config import RecordConfig, SceneConfig
-from recorder.images.options import Centre, ImageOptions
+from recorder.images.options import InputConfig, InputOptions
 from recorder.world.scenes import SCENES, open_scene
-from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
-    from recorder.recording import ViewRecording
     from replay.corpus.logs import Told
-    from replay.storage.identity import LoggedSource
     from replay.stored import StoredSource
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
 
-SECTIONS = ("learner", "scene", "record")
+SECTIONS = ("learner", "scene", "record", "input")
 """Configuration tables that a run knows."""
 
 CLOCK = ("fps", "start_ns")
@@ -49,6 +45,7 @@ class Configuration:
             "foreign"; "" of a scene.
         clock: frames a second, and log time of frame 0 in nanoseconds, where the source says
             them; None where `record` does.
+        inputs: how an external log or a live stream is read; None of a live scene.
     """
 
     learner: Any
@@ -56,6 +53,7 @@ class Configuration:
     record: RecordConfig
     streams: str = ""
     clock: tuple[float, int] | None = None
+    inputs: InputOptions | None = None
 
     def seeded(self, seed: int) -> Configuration:
         """The same with a seed of the scene, where it has none of its own."""
@@ -68,10 +66,13 @@ class Configuration:
         return open_scene(self.scene.kind, self.scene, self.record)
 
     def tables(self) -> dict[str, Any]:
-        """The world's part as plain tables, for a manifest."""
+        """All but the learner's part as plain tables, for a manifest."""
         scene = {"kind": self.streams} if self.streams else section_table(self.scene)
         clock = {} if self.clock is None else dict(zip(CLOCK, self.clock, strict=True))
-        return {"scene": scene, "record": section_table(self.record) | clock}
+        tables = {"scene": scene, "record": section_table(self.record) | clock}
+        if self.inputs is not None and (self.streams or self.inputs.config != InputConfig()):
+            tables["input"] = section_table(self.inputs.config)
+        return tables
 
 
 def configure(
@@ -90,7 +91,10 @@ def configure(
         UsageError: an unknown scene, preset, learner, section or key, or a value that misfits.
     """
     chosen = {} if preset is None else load_preset(preset)
-    filled = _configure(kind, preset, chosen, parse_settings(settings))
+    words = parse_settings(settings)
+    if vain := [f"input.{key}" for key in words.get("input", {})]:
+        raise UsageError(f"{kind} is a scene: {are_for(vain, 'logs and cameras')}")
+    filled = _configure(kind, preset, chosen, words)
     return filled if seed is None else filled.seeded(seed)
 
 
@@ -121,6 +125,7 @@ def configure_for(
     preset: str | None = None,
     words: Mapping[str, Mapping[str, str]] | None = None,
     seed: int | None = 0,
+    inputs: InputOptions | None = None,
 ) -> Configuration:
     """Fill the configuration for a source that is no live scene.
 
@@ -134,6 +139,7 @@ def configure_for(
         preset: see `configure`.
         words: see `log_settings`.
         seed: see `configure`.
+        inputs: how it is read.
 
     Raises:
         UsageError: as for `configure`.
@@ -144,9 +150,11 @@ def configure_for(
         kind = str(chosen.get("scene", {}).get("kind"))
     if kind not in SCENES:
         kind = "icub" if len(spec.frame_shape) == 2 else "oscillatory"
-    streams = streams_of(described)
+    scene = str(described.get("scene", ""))
+    streams = "" if scene in SCENES else scene or str(described["kind"])
     filled = _configure(kind, preset, chosen, words or {}, OF_CAMERAS if streams else None)
-    filled = replace(filled, streams=streams, clock=(spec.fps, spec.start_ns))
+    clock = spec.fps, spec.start_ns
+    filled = replace(filled, streams=streams, clock=clock, inputs=inputs or InputOptions())
     return filled if seed is None else filled.seeded(seed)
 
 
@@ -214,19 +222,13 @@ def _refuse_keys_of_others(algorithm: str, keys: Iterable[str], preset: str | No
                 )
 
 
-def streams_of(described: Mapping[str, Any]) -> str:
-    """Of what kind a source's streams are where they are no scene's; "" of a scene."""
-    scene = str(described.get("scene", ""))
-    return "" if scene in SCENES else scene or str(described["kind"])
-
-
 def open_source(
     words: Sequence[str | Path],
     *,
     preset: str | None = None,
     settings: Sequence[str] = (),
     seed: int = 0,
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     resumed: bool = False,
     **how: Any,
 ) -> tuple[SeekableSource, Configuration]:
@@ -237,30 +239,44 @@ def open_source(
         preset: instead of the source's own.
         settings: `section.key=value` words.
         seed: of the scene, where `scene.seed` is not set.
-        cameras: see `open_logs`.
+        inputs: see `open_logs`; keys `input.*` of the preset and of settings are added.
         resumed: the settings are those of a run that is resumed; see `log_settings`.
         how: further arguments of `open_logs`.
 
     Raises:
         CdmisfaError: there is no such scene, log or setting, or a log is damaged.
     """
-    if how.get("follow") is None and is_scene(words, cameras):
-        if how.get("episodes") or how.get("centre", "run") != "run":
+    if how.get("follow") is None and is_scene(words, inputs):
+        if how.get("episodes"):
             raise UsageError(f"{words[0]} is a scene: episodes are of logs, as of recordings of it")
-        scene = configure(str(words[0]), preset, of_scene(settings, cameras), seed)
+        scene = configure(str(words[0]), preset, of_scene(settings, inputs), seed)
         return scene.open_scene(), scene
     told = log_settings(settings, None if resumed else words[0])
-    source = open_logs(words, cameras=cameras, **how)
+    inputs = read_inputs(inputs, preset, told)
+    source = open_logs(words, inputs=inputs, **how)
     try:
         described = description(source, at_once=True)
-        configuration = configure_for(source.spec, described, preset, told, seed)
+        configuration = configure_for(source.spec, described, preset, told, seed, inputs)
     except BaseException:
         source.close()
         raise
     return source, configuration
 
 
-def is_scene(words: Sequence[str | Path], cameras: ImageOptions | None = None) -> bool:
+def read_inputs(
+    inputs: InputOptions | None, preset: str | None, words: Mapping[str, Mapping[str, str]]
+) -> InputOptions:
+    """Add the keys `input.*` of a preset and of settings by section to options.
+
+    Raises:
+        UsageError: there is no such preset or key, or a value does not fit.
+    """
+    chosen = {} if preset is None else load_preset(preset)
+    inputs = inputs or InputOptions()
+    return inputs.configured(chosen.get("input", {}), words.get("input", {}))
+
+
+def is_scene(words: Sequence[str | Path], inputs: InputOptions | None = None) -> bool:
     """Whether words name a live scene, which no options of cameras are for but `--color`.
 
     Raises:
@@ -268,15 +284,15 @@ def is_scene(words: Sequence[str | Path], cameras: ImageOptions | None = None) -
     """
     if len(words) != 1 or words[0] not in SCENES:
         return False
-    if cameras is not None and (given := replace(cameras, color=cameras.color == "auto").given()):
+    if inputs is not None and (given := replace(inputs, color=inputs.color == "auto").named()):
         clock = "; its rate is --set record.fps=HZ" if "--rate" in given else ""
         raise UsageError(f"{words[0]} is a scene: {are_for(given, 'cameras')}{clock}")
     return True
 
 
-def of_scene(settings: Sequence[str], cameras: ImageOptions | None) -> Sequence[str]:
+def of_scene(settings: Sequence[str], inputs: InputOptions | None) -> Sequence[str]:
     """The settings of a scene with what options of cameras say of it: whether it has colours."""
-    return (*settings, "scene.color=true") if cameras is not None and cameras.color else settings
+    return (*settings, "scene.color=true") if inputs is not None and inputs.color else settings
 
 
 def open_logs(
@@ -284,10 +300,9 @@ def open_logs(
     *,
     loop: bool = False,
     salvage: bool = False,
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     follow: float | None = None,
     episodes: bool = False,
-    centre: Centre = "run",
     told: Told = lambda done, total: None,
     goal: tuple[str, str] = ("learn", "RUN"),
 ) -> SeekableSource:
@@ -297,10 +312,9 @@ def open_logs(
         words: paths, URLs or patterns: of a recording, logs of others, or an index of many.
         loop: start again at the end.
         salvage: pass over damaged parts.
-        cameras: how images of others become frames; given, paths are taken as such logs.
+        inputs: how images of others become frames; given, paths are taken as such logs.
         follow: wait so many seconds for more frames of a recording being written.
         episodes: each path is an episode of its own; those of an index always are.
-        centre: see `StoredSource.centre_by`.
         told: how many of the episodes were opened.
         goal: see `open_log`.
 
@@ -308,11 +322,11 @@ def open_logs(
         UsageError: no path that exists.
         LogDamagedError: the log is damaged.
     """
-    cameras = cameras or CameraOptions()
+    inputs = inputs or InputOptions()
     if follow is not None and (
         len(words) > 1
         or words[0] in SCENES
-        or any((loop, salvage, episodes, centre != "run", cameras != CameraOptions()))
+        or any((loop, salvage, episodes, inputs != InputOptions()))
     ):
         raise UsageError("--follow takes the folder of one recording, and neither loops nor skips")
     if scene := next((word for word in words if word in SCENES and not Path(word).exists()), None):
@@ -337,9 +351,9 @@ def open_logs(
         if episodes or may_be_corpus(words):
             from replay.corpus.episodes import open_episodes
 
-            source = open_episodes(words, episodes and paths, cameras, told=told, **how)
-        source = source or open_log(paths, cameras, goal=goal, **how)
-        source.centre_by(centre)
+            source = open_episodes(words, episodes and paths, inputs, told=told, **how)
+        source = source or open_log(paths, inputs, goal=goal, **how)
+        source.centre_by(inputs.centre)
         return source
     from replay.recordings.followed import FollowedSource
 
@@ -347,51 +361,34 @@ def open_logs(
 
 
 def open_cameras_now(
-    words: Sequence[str | Path],
-    live: LiveOptions,
+    words: Sequence[str],
+    inputs: InputOptions | None = None,
     *,
-    cameras: ImageOptions,
     preset: str | None = None,
     settings: Sequence[str] = (),
+    seed: int = 0,
     say: Callable[[str], None] = lambda line: None,
 ) -> tuple[FrameSource, Configuration]:
     """Open live streams, as `is_live` finds them, on one clock; see `open_live`.
 
     Args:
         words: a stream each.
-        live: how they become frames; its seed is also that of the configuration.
-        cameras: how their images become frames; what is of logs alone is refused.
+        inputs: how their images become frames; what is of logs alone is refused.
         preset: instead of that of cameras.
         settings: `section.key=value` words.
+        seed: of simulated tasks, and of the configuration.
         say: told in a line when a camera's state changes.
 
     Raises:
         UsageError: a word names no live stream that can be opened, or a wrong configuration.
     """
-    live = live_options(words, live, cameras)
     told = log_settings(settings, words[0])
-    source = open_live([str(word) for word in words], live, say=say)
+    inputs = read_inputs(inputs, preset, told)
+    refuse_stored(words, inputs)
+    source = open_live(words, inputs, seed=seed, say=say)
     try:
-        configuration = configure_for(source.spec, source.describe(), preset, told, live.seed)
+        configuration = configure_for(source.spec, source.describe(), preset, told, seed, inputs)
     except BaseException:
         source.close()
         raise
     return source, configuration
-
-
-def convert(source: LoggedSource, folder: Path, **options: Any) -> list[ViewRecording]:
-    """Write every stream of a source as a view of a recording, whose config.json states it.
-
-    Args:
-        source: does not loop; left open.
-        folder: made if it does not exist.
-        options: those of `record`.
-
-    Raises:
-        CdmisfaError: the source loops, its images are too small or damaged, or as for `record`.
-    """
-    from recorder.recording import record
-
-    if source.spec.length is None:
-        raise UsageError("a source that loops has no end: convert it without looping")
-    return record(source, folder, **options)

@@ -19,6 +19,7 @@ from typing import Any, cast
 from cdmisfa.agents.learners import LEARNERS, learner_entry
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.options import parse_settings
 from cdmisfa.core.untrusted import MAX_LIST
 from cdmisfa.experiments.documents import as_text, write_json
 from cdmisfa.experiments.run_folder import module_table, with_recipes
@@ -31,6 +32,7 @@ from cdmisfa.experiments.sources import (
     log_settings,
     of_scene,
     open_logs,
+    read_inputs,
 )
 from cdmisfa.experiments.store import (
     StoredTrial,
@@ -41,9 +43,9 @@ from cdmisfa.experiments.store import (
     trial_id,
 )
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
+from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write
 from recorder.world.oscillatory import OscillatoryConfig
-from replay.camera_logs.options import CameraOptions
 
 REQUEST = "sweep.json"
 """What was asked for last."""
@@ -60,7 +62,7 @@ class SweepTrial(StoredTrial):
         source: a scene's name, or the paths of a recording.
         configuration: preset, settings, the grid's point and the seed, all together.
         loop: whether a recording starts again at its end.
-        cameras: how images of others become frames.
+        inputs: how images of others become frames.
         max_iterations: end after so many.
         max_modules: end after so many.
     """
@@ -68,7 +70,7 @@ class SweepTrial(StoredTrial):
     source: tuple[str, ...]
     configuration: Configuration
     loop: bool
-    cameras: CameraOptions
+    inputs: InputOptions
     max_iterations: int | None
     max_modules: int | None
 
@@ -138,7 +140,7 @@ def plan(
     preset: str | None = None,
     settings: Sequence[str] = (),
     loop: bool = False,
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     max_iterations: int | None = None,
     max_modules: int | None = None,
     logs: Path | None = None,
@@ -152,7 +154,7 @@ def plan(
         preset: instead of the source's own.
         settings: `section.key=value` words for all trials.
         loop: start a recording again at its end.
-        cameras: how images of others become frames; see `open_source`.
+        inputs: how images of others become frames; see `open_source`.
         max_iterations: end each trial after so many.
         max_modules: end each trial after so many.
         logs: folder in which each trial keeps its run.
@@ -160,9 +162,13 @@ def plan(
     Raises:
         UsageError: an unknown key, a value that does not fit, or no such source.
     """
+    if keys := [key for key in grid if key.startswith("input.")]:
+        raise UsageError(f"grid: {keys[0]} is the same for all trials: give it with --set")
     words = (source,) if isinstance(source, str | Path) else tuple(source)
-    cameras = cameras or CameraOptions()
-    configured, recorded = _configured(words, preset, loop, cameras)
+    if not is_scene(words, inputs):
+        inputs = read_inputs(inputs, preset, parse_settings(settings))
+    inputs = inputs or InputOptions()
+    configured, recorded = _configured(words, preset, loop, inputs)
     # Workers may have another working directory.
     scene = recorded is None
     paths = tuple(str(w) if scene or "://" in str(w) else str(Path(w).resolve()) for w in words)
@@ -178,8 +184,8 @@ def plan(
             depends: list[Any] = [*learner]
             if scene:  # the world's part counts only where it is live
                 depends.append(configuration.tables())
-            if cameras != CameraOptions():
-                depends.append(dataclasses.asdict(cameras))
+            if inputs != InputOptions():
+                depends.append(dataclasses.asdict(inputs))
             name = trial_id(depends, seed, recorded, [max_iterations, max_modules], code())
             trial = SweepTrial(
                 id=name,
@@ -188,7 +194,7 @@ def plan(
                 point=point,
                 seed=seed,
                 loop=loop,
-                cameras=cameras,
+                inputs=inputs,
                 max_iterations=max_iterations,
                 max_modules=max_modules,
                 log=logs / name if logs is not None else None,
@@ -207,17 +213,18 @@ def _own_code(algorithm: str) -> str:
 
 
 def _configured(
-    words: tuple[str | Path, ...], preset: str | None, loop: bool, cameras: CameraOptions
+    words: tuple[str | Path, ...], preset: str | None, loop: bool, inputs: InputOptions
 ) -> tuple[Callable[[Sequence[str]], Configuration], dict[str, Any] | None]:
     """The configuration for settings, and what a source says of itself; None of a live scene."""
-    if is_scene(words, cameras):
-        return lambda told: configure(str(words[0]), preset, of_scene(told, cameras), None), None
-    source = open_logs(words, loop=loop, cameras=cameras, goal=("sweep", "SWEEP"))
+    if is_scene(words, inputs):
+        return lambda told: configure(str(words[0]), preset, of_scene(told, inputs), None), None
+    source = open_logs(words, loop=loop, inputs=inputs, goal=("sweep", "SWEEP"))
     with contextlib.closing(source):
         recorded, spec = dict(source.describe()), source.spec
 
     def configured(settings: Sequence[str]) -> Configuration:
-        return configure_for(spec, recorded, preset, log_settings(settings, words[0]), None)
+        told = log_settings(settings, words[0])
+        return configure_for(spec, recorded, preset, told, None, inputs)
 
     return configured, recorded
 
@@ -264,7 +271,7 @@ def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     if is_scene(trial.source):
         source = configuration.open_scene()
     else:
-        source = open_logs(trial.source, loop=trial.loop, cameras=trial.cameras)
+        source = open_logs(trial.source, loop=trial.loop, inputs=trial.inputs)
     with contextlib.closing(source), contextlib.ExitStack() as opened:
         log = None
         if trial.log is not None:

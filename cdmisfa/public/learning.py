@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from cdmisfa.core.blocks import FrameSource, description
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 from cdmisfa.experiments.holdout import hold_out
-from cdmisfa.experiments.resume import CAMERAS, command_of
+from cdmisfa.experiments.resume import command_of
 from cdmisfa.experiments.session import run as run_to_its_end
 from cdmisfa.experiments.sources import (
     OF_CAMERAS,
@@ -26,12 +27,12 @@ from cdmisfa.experiments.sources import (
     log_settings,
     open_cameras_now,
     open_source,
+    read_inputs,
 )
 from cdmisfa.public.recording import Given, Recording
 from cdmisfa.public.run import Run
-from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import is_live
-from recorder.images.options import Centre, ImageOptions
+from recorder.images.options import OPTIONS, Centre, InputOptions
 from replay.arrays import ArrayLog
 from replay.stored import StoredSource
 
@@ -78,7 +79,7 @@ def learn(
             judge on it what was learned; by default a tenth.
         loop: begin logs or arrays again at their end.
         episodes: see `Recording`.
-        centre: see `Recording`.
+        centre: "episode" learns from frames without the mean of their episode.
         force: replace an existing run.
         view: also write the view, run.rrd.
         sinks: told of every iteration; one that raises is let go with a warning.
@@ -92,20 +93,21 @@ def learn(
     """
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise UsageError(f"seed is {seed!r}: give a whole number from 0 on")
-    if misplaced := [name for name in settings if name in CAMERAS]:
-        name = misplaced[0]
+    if misplaced := {field.name for field in fields(InputOptions)} & settings.keys():
+        name = min(misplaced)
         raise UsageError(f"{name} is of a recording: learn(Recording(source, {name}=...))")
     seed = int(seed)
     words = [f"learner.{name}={value}" for name, value in settings.items()]
     if algorithm is not None:
         words.append(f"learner.algorithm={algorithm}")
+    words += InputOptions(holdout=holdout, centre=centre).settings()
     how: dict[str, Any] = {"preset": preset, "settings": words, "seed": seed}
     limits: dict[str, Any] = {"max_iterations": max_iterations, "max_modules": max_modules}
-    logs: dict[str, Any] = {"loop": loop, "episodes": episodes, "centre": centre}
+    logs: dict[str, Any] = {"loop": loop, "episodes": episodes}
     with _opened(source, logs, how) as (frames, configuration, told), _folder(out) as folder:
         by_progress = configuration.learner.algorithm == OF_CAMERAS
-        hold_out(frames, holdout, judged=by_progress)
-        limits["holdout"] = holdout
+        share = None if configuration.inputs is None else configuration.inputs.holdout
+        hold_out(frames, share, judged=by_progress)
         run_to_its_end(
             frames,
             configuration.learner,
@@ -159,19 +161,15 @@ def _opened(
         with contextlib.closing(found):
             yield found, configuration, (words, {} if is_scene(words) else logs)
         return
-    asked = [name for name in ("episodes", "centre") if logs[name] not in (False, "run")]
-    if asked and (words or not isinstance(source, Recording | StoredSource)):
-        raise UsageError(f"{asked[0]} is for logs: record or write what is shown first")
+    if logs["episodes"]:
+        if isinstance(source, Recording):
+            raise UsageError("episodes is of a recording: learn(Recording(source, episodes=True))")
+        raise UsageError("episodes is for logs: record or write what is shown first")
     if words:
-        live = LiveOptions(seed=how["seed"])
-        cameras = ImageOptions()
-        told = {"preset": how["preset"], "settings": how["settings"]}
-        streams, configuration = open_cameras_now(words, live, cameras=cameras, **told)
+        streams, configuration = open_cameras_now(words, **how)
         with contextlib.closing(streams):
             yield streams, configuration, (words, {})
         return
-    if isinstance(source, StoredSource) and "centre" in asked:
-        source.centre_by(logs["centre"])
     if isinstance(source, FrameSource):
         yield source, _configured(source, how), None
         return
@@ -183,19 +181,26 @@ def _opened(
             yield made, _configured(made, how), None
         return
     recording = Recording.of(source)
-    if "episodes" in asked:
-        raise UsageError("episodes is of a recording: learn(Recording(source, episodes=True))")
     with recording.source(loop=logs["loop"]) as frames:
-        if "centre" in asked:
-            frames.centre_by(logs["centre"])
-        options = {"loop": logs["loop"] or recording.loop, "centre": frames.centre}
-        options |= {"salvage": recording.salvage, "episodes": recording.episodes}
-        options |= recording.options
-        named = (recording.words, options) if recording.words else None
-        yield frames, _configured(frames, how), named
+        how["settings"] = [*recording.inputs.settings(), *how["settings"]]
+        configuration = _configured(frames, how, recording.inputs)
+        options = {"loop": logs["loop"] or recording.loop, "salvage": recording.salvage}
+        options |= {"episodes": recording.episodes}
+        options |= {
+            name: getattr(recording.inputs, name) for name in recording.inputs.chosen(OPTIONS)
+        }
+        yield frames, configuration, (recording.words, options) if recording.words else None
 
 
-def _configured(source: FrameSource, how: dict[str, Any]) -> Configuration:
-    described = description(source, at_once=True)
+def _configured(
+    source: FrameSource, how: dict[str, Any], inputs: InputOptions | None = None
+) -> Configuration:
+    """The configuration of an open source, which shows its frames as keys `input.*` say."""
     told = log_settings(how["settings"], None)
-    return configure_for(source.spec, described, how["preset"], told, how["seed"])
+    inputs = read_inputs(inputs, how["preset"], told)
+    if inputs.centre != "run":
+        if not isinstance(source, StoredSource):
+            raise UsageError("centre is for logs: record or write what is shown first")
+        source.centre_by(inputs.centre)
+    described = description(source, at_once=True)
+    return configure_for(source.spec, described, how["preset"], told, how["seed"], inputs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
@@ -13,12 +14,10 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.shown import Shown
-from cdmisfa.experiments.resume import CAMERAS
 from cdmisfa.experiments.sources import open_logs
 from cdmisfa.public.shown import view
-from recorder.images.options import Centre
+from recorder.images.options import InputOptions
 from replay.arrays import ArrayLog
-from replay.camera_logs.options import CameraOptions
 
 Given: TypeAlias = Any
 """What `learn` takes: arrays, tables, mappings of these by streams' names, paths and URLs of logs,
@@ -37,13 +36,13 @@ class Recording(Shown):
         salvage: leave out what is damaged.
         episodes: each path is an episode, one after the other; those of a corpus, a folder that
             cdmisfa index indexed, always are.
-        centre: "episode" shows frames without the mean of their episode.
-        options: which streams, and how they become frames, as those of `cdmisfa learn`: `topics`,
-            `size`, `fit`, `rate`, `color`, `fields`, `time`, `align`, `start`, `stop`, `gaps`,
-            `depth` (--range), `stamp`.
+        options: which streams, and how they become frames: the input options of `cdmisfa learn`,
+            `topics`, `fields`, `size`, `rate`, `start`, `end`, `align`, `color`, and the keys
+            `input.*`, as `fit="pad"` or `centre="episode"`; see docs/reference/configuration.md.
 
     Attributes:
         spec: names of the streams, shape, type, rate and number of frames.
+        inputs: the options.
 
     Raises:
         UsageError: there is no such log, or arrays hold no numbers.
@@ -56,19 +55,16 @@ class Recording(Shown):
         loop: bool = False,
         salvage: bool = False,
         episodes: bool = False,
-        centre: Centre = "run",
         **options: Any,
     ) -> None:
-        unknown = [name for name in options if name not in CAMERAS]
-        if unknown:
-            raise UsageError(f"no option {unknown[0]}: {did_you_mean(unknown[0], CAMERAS)}")
+        known = [field.name for field in fields(InputOptions)]
+        if unknown := [name for name in options if name not in known]:
+            raise UsageError(f"no option {unknown[0]}: {did_you_mean(unknown[0], known)}")
         if not given:
             raise UsageError("nothing given: name a log, or give an array")
-        lists = {k: tuple(v) for k, v in options.items() if isinstance(v, list)}
-        self._options = CameraOptions(**{**options, **lists})
+        self.inputs = InputOptions(**options)
         self._given = given
         self.loop, self.salvage, self.episodes = loop, salvage, episodes
-        self.centre: Centre = centre
         words = all(isinstance(one, str | Path) for one in given)
         self.words: tuple[str, ...] = tuple(map(str, given)) if words else ()
         if episodes and not words:
@@ -86,13 +82,6 @@ class Recording(Shown):
         paths = isinstance(given, list | tuple) and all(isinstance(w, str | Path) for w in given)
         return cls(*given) if paths and given else cls(given)
 
-    @property
-    def options(self) -> Mapping[str, Any]:
-        """Options that say other than the defaults, by name."""
-        plain = CameraOptions()
-        found = {name: getattr(self._options, name) for name in CAMERAS}
-        return {k: value for k, value in found.items() if value != getattr(plain, k)}
-
     def source(self, *, loop: bool = False) -> Any:
         """Its streams, open to be read, for `with`: a `SeekableSource`.
 
@@ -101,12 +90,12 @@ class Recording(Shown):
         """
         loop = loop or self.loop
         if self.words:
-            how: dict[str, Any] = {"loop": loop, "salvage": self.salvage, "centre": self.centre}
-            return open_logs(self.words, cameras=self._options, episodes=self.episodes, **how)
+            how: dict[str, Any] = {"loop": loop, "salvage": self.salvage}
+            return open_logs(self.words, inputs=self.inputs, episodes=self.episodes, **how)
         (given,) = self._given
         streams = given if isinstance(given, Mapping) else {"stream": given}
-        source = ArrayLog(streams, self._options, loop=loop)
-        source.centre_by(self.centre)
+        source = ArrayLog(streams, self.inputs, loop=loop)
+        source.centre_by(self.inputs.centre)
         return source
 
     def frames(
@@ -151,7 +140,7 @@ class Recording(Shown):
         """
         if not self.words:
             raise UsageError("recordings and logs are shown: of arrays, view the run")
-        view(self, [Path(word) for word in self.words], save, tab=tab, cameras=self._options)
+        view(self, [Path(word) for word in self.words], save, tab=tab, inputs=self.inputs)
 
     def _facts(self) -> Mapping[str, Any]:
         return {"recording": ", ".join(self.words) or "arrays", **self.spec.facts()}

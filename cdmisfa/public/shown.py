@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.shown import ROW, WIDTH, Shown, png
-from replay.camera_logs.options import CameraOptions
+from recorder.images.options import InputOptions
 from replay.palette import colour
 
 HEIGHT = 600
@@ -45,7 +45,7 @@ def view(
     save: str | Path | None,
     *,
     tab: str | None = None,
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
 ) -> None:
     """Show a run or a recording: in the notebook, else in a window, or write its view to a file.
 
@@ -54,12 +54,12 @@ def view(
         paths: the run's folder, or the files of the recording.
         save: the file.
         tab: the name of the tab that is open.
-        cameras: which streams of logs, and how they become frames.
+        inputs: which streams of logs, and how they become frames.
     """
     from replay.view.build import build_view
 
     def build(out: Path) -> None:
-        build_view(paths[0], out, beside=paths[1:], tab=tab, cameras=cameras)
+        build_view(paths[0], out, beside=paths[1:], tab=tab, inputs=inputs)
 
     if save is not None:
         build(Path(save))

@@ -23,7 +23,6 @@ from cdmisfa.core.blocks import (
 )
 from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS, time_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from recorder.cameras.options import HOLD
 from recorder.cameras.readers import Picture, Readers
 from recorder.images.pixels import Shown
 
@@ -112,7 +111,7 @@ class LiveSource(ForwardSource):
         about: Mapping[str, Any],
         *,
         rate: float | None = None,
-        hold: float = HOLD,
+        hold: float = 0.25,
     ) -> None:
         self.stop: Callable[[], bool] = lambda: False
         self._readers = readers

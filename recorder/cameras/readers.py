@@ -11,10 +11,9 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
-from recorder.cameras.options import STALL, OnLoss
 from recorder.images.fields import rounded
 from recorder.images.framing import Framing, Vector, framings, size_of
-from recorder.images.options import Fit, Size
+from recorder.images.options import Fit, OnLoss, Size
 from recorder.images.pixels import Shown
 
 QUEUE_BYTES: Final = 64 * 1024 * 1024
@@ -188,7 +187,7 @@ class Readers:
         frame: Callable[[int, Shown], Shown | None] = lambda camera, image: image,
         *,
         on_loss: OnLoss = "reconnect",
-        stall: float = STALL,
+        stall: float = 5.0,
         queue_bytes: int = QUEUE_BYTES,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:

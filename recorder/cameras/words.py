@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
@@ -12,13 +12,12 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.names import stream_names
 from cdmisfa.core.registry import Registry
-from recorder.cameras.options import LiveOptions
 from recorder.images.options import (
     COLOR_RECIPE,
     NUMBERS_RECIPE,
     RECIPE,
     VIDEO_RECIPE,
-    ImageOptions,
+    InputOptions,
     Reading,
 )
 
@@ -30,7 +29,7 @@ _VIDEO: Final = ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp"
 _STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
 
 _NO_FIELDS: Final = "shows images: --field is for messages, of foxglove://"
-_NO_DISTANCES: Final = "shows no distances: --range is for those of foxglove://"
+_NO_DISTANCES: Final = "shows no distances: input.range is for those of foxglove://"
 
 _TIMEOUT: Final = 10.0
 """Seconds that opening a network stream may take."""
@@ -43,7 +42,7 @@ class CameraKind:
     Attributes:
         open: makes the camera of a word, KIND included, with the name of its stream; what it
             cannot open is a UsageError.
-        takes: what `open` takes besides, by name: of `LiveOptions` what it can heed ("depth",
+        takes: what `open` takes besides, by name: of the input options what it can heed ("depth",
             "fields", "color"), and "say", to be told what the user should know, in a line.
         recipe: how what it shows becomes gray and small, for the record.
     """
@@ -87,34 +86,26 @@ def is_live(word: str) -> bool:
     return ":" in word and (scheme == "gym" or scheme in CAMERAS)
 
 
-def live_options(words: Sequence[Any], live: LiveOptions, cameras: ImageOptions) -> LiveOptions:
-    """How live streams are put on one clock and become frames.
-
-    Args:
-        words: a stream each.
-        live: how they are put on one clock.
-        cameras: how their images become frames.
+def refuse_stored(words: Sequence[str], options: InputOptions) -> None:
+    """Refuse words that name no live stream, and options that are of logs alone.
 
     Raises:
-        UsageError: a word names no live stream, or what is of logs alone is chosen.
+        UsageError: there is one.
     """
-    stored = [str(word) for word in words if not is_live(str(word))]
-    if stored:
+    if stored := [word for word in words if not is_live(word)]:
         raise UsageError(
             f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
             "and logs apart"
         )
-    framing = {field.name: getattr(cameras, field.name) for field in fields(ImageOptions)}
-    theirs = ImageOptions(**framing).given()
-    if of_logs := [option for option in cameras.given() if option not in theirs]:
+    if of_logs := options.named(("topics", "start", "end", "align", "centre", "holdout")):
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
-    return replace(live, **framing)
 
 
 def open_live(
     words: Sequence[str],
-    options: LiveOptions,
+    options: InputOptions,
     *,
+    seed: int = 0,
     say: Callable[[str], None] = lambda line: None,
 ) -> FrameSource:
     """Open live streams on one clock.
@@ -122,6 +113,7 @@ def open_live(
     Args:
         words: a stream each.
         options: see there.
+        seed: of simulated tasks.
         say: told in a line when a camera's state changes.
 
     Raises:
@@ -133,10 +125,10 @@ def open_live(
     names = live_names(words)
     schemes = [word.partition(":")[0].lower() for word in words]
     if "gym" in schemes:
-        return _simulated(words, names, options)
+        return _simulated(words, names, options, seed)
     kinds = [CAMERAS[scheme] for scheme in schemes]
     _refuse_inapplicable(words, [kind.takes for kind in kinds], options)
-    told = {"depth": options.depth, "fields": options.fields, "color": options.color, "say": say}
+    told = {"depth": options.range, "fields": options.fields, "color": options.color, "say": say}
     cameras = [
         kind.open(word, name, **{key: told[key] for key in kind.takes})
         for kind, word, name in zip(kinds, words, names, strict=True)
@@ -150,23 +142,23 @@ def open_live(
         about |= {"recipe": NUMBERS_RECIPE, "fields": list(options.fields)}
     if options.color:
         about["recipe"] = COLOR_RECIPE
-    if options.depth is not None:
-        about["range_metres"] = list(options.depth)
+    if options.range is not None:
+        about["range_metres"] = list(options.range)
     frames = CameraFrames(names, options.size, options.fit, color=bool(options.color), say=say)
-    readers = Readers(cameras, frames.frame, on_loss=options.on_loss, stall=options.stall, say=say)
+    readers = Readers(cameras, frames.frame, on_loss=options.lost, stall=options.stall, say=say)
     source = LiveSource(readers, names, about, rate=options.rate, hold=options.hold)
     may_show = [
         "depth" in kind.takes and getattr(camera, "distances", None) is not False
         for kind, camera in zip(kinds, cameras, strict=True)
     ]
-    if options.depth is not None and not any(may_show):
+    if options.range is not None and not any(may_show):
         source.close()
-        raise UsageError(f"{words[0]} shows no distances (16UC1, 32FC1): --range is for these")
+        raise UsageError(f"{words[0]} shows no distances (16UC1, 32FC1): input.range is for these")
     return source
 
 
 def _refuse_inapplicable(
-    words: Sequence[str], takes: Sequence[Sequence[str]], options: LiveOptions
+    words: Sequence[str], takes: Sequence[Sequence[str]], options: InputOptions
 ) -> None:
     """Refuse options that do not apply to the named streams, given what each takes."""
     if options.color == "auto":
@@ -176,11 +168,13 @@ def _refuse_inapplicable(
             raise UsageError(f"{word} {_NO_FIELDS}")
         if options.color and "color" not in taken:
             raise UsageError(f"{word} shows gray images: leave out --color")
-    if options.depth is not None and not any("depth" in taken for taken in takes):
+    if options.range is not None and not any("depth" in taken for taken in takes):
         raise UsageError(f"{words[0]} {_NO_DISTANCES}")
 
 
-def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions) -> FrameSource:
+def _simulated(
+    words: Sequence[str], names: Sequence[str], options: InputOptions, seed: int
+) -> FrameSource:
     """Simulated tasks on one clock."""
     from recorder.cameras.stepped import GymSource
 
@@ -195,7 +189,7 @@ def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions)
         size=options.size,
         fit=options.fit,
         fps=options.rate,
-        seed=options.seed,
+        seed=seed,
         color=bool(options.color),
     )
 

@@ -123,7 +123,7 @@ def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> F
             held = "NaN or null" if np.isnan(own[place]) else own[place]
             raise UsageError(
                 f"--field {field.path} holds {held} at place {place}, which is no finite "
-                "number: leave it out, or keep numbers in a range, as --range 0.1:10"
+                "number: leave it out, or keep numbers in a range, as --set input.range=0.1,10"
             )
         found += own
     if not 0 < len(found) <= MOST:

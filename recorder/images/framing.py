@@ -136,7 +136,7 @@ def framings(
             + " and ".join(dict.fromkeys(_shown_in_words(first) for first in firsts))
             + ": take as many numbers of each, as with --field position[0:6], or each apart"
         )
-    given = {"--size": size is not None, "--fit": fit != "crop", "--color": color}
+    given = {"--size": size is not None, "input.fit": fit != "crop", "--color": color}
     if refused := [option for option, said in given.items() if said]:
         raise UsageError(f"numbers are taken as they are: {are_for(refused, 'images')}")
     return [Vector(count) for count in counts]

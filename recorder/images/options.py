@@ -1,12 +1,15 @@
-"""How images of cameras, live or stored, become frames."""
+"""How images of cameras, live or stored, become frames, and external logs streams of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, Literal
+import math
+import typing
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final, Literal, cast
 
+from cdmisfa.core.config import build, convert_value, in_range
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.options import RANGE, SIZE, check_settings, given, option_name, setting
 
 RECIPE: Final = (
     "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
@@ -49,63 +52,186 @@ Centre = Literal["run", "episode"]
 Clock = Literal["log", "header"]
 """Which time of a message counts: when it was logged, or that in its header."""
 
+Gaps = Literal["skip", "hold"]
+"""What frames show where a camera paused: nothing, or its last image."""
+
+Align = Literal["index", "time"]
+"""How streams that differ are put on one clock: the i-th images, or the last ones at each time."""
+
+OnLoss = Literal["reconnect", "wait", "end"]
+"""What is done about a live stream that stalls or goes away."""
+
+
+@dataclass(frozen=True, slots=True)
+class InputConfig:
+    """Rare settings of how external logs and live streams are read (keys `input.*`).
+
+    Attributes:
+        fit: an image of another ratio of the sides than `--size` is cut (`crop`), gets black
+            sides (`pad`), or changes its ratio (`stretch`).
+        range: `NEAR,FAR`: distances of depth cameras, in metres, are shown from black to white;
+            numbers are kept within it.
+        time: column of a table's times: dates, or seconds; `stamp:ns` counts in ns, us or ms.
+        stamp: time of a message: when it was logged (`log`), or the time in its `header`.
+        gaps: where a camera paused for more than ten of its steps, `skip` the pause, so that
+            nothing is learned across it, or `hold` the last image.
+        centre: learn from frames as they are over the `run`, or without the mean of their
+            `episode`: a log, or a stretch between two gaps.
+        holdout: share of an external log, at its end, that the progress learner does not learn
+            from and is judged on; `auto`: 0.1 if the log is long enough.
+        hold: seconds for which an image of a live stream replaces missing ones; then it has a gap.
+        lost: what to do if a live stream stalls or goes away: `reconnect`, `wait`, or `end`.
+        stall: seconds without an image after which a live stream has stalled.
+    """
+
+    fit: Fit = "crop"
+    range: Depth | None = None
+    time: str | None = None
+    stamp: Clock = "log"
+    gaps: Gaps = "skip"
+    centre: Centre = "run"
+    holdout: float | None = None
+    hold: float = 0.25
+    lost: OnLoss = "reconnect"
+    stall: float = 5.0
+
+
+OPTIONS: Final = {
+    "topics": "--topic",
+    "fields": "--field",
+    "size": "--size",
+    "rate": "--rate",
+    "start": "--start",
+    "end": "--end",
+    "align": "--align",
+    "color": "--color",
+}
+"""Options of the command line for the settings that are no keys `input.*`."""
+
+OF_EVERY_SOURCE: Final = ("centre", "holdout", "hold", "lost", "stall")
+"""Keys that do not make a recording of ours be read as an external log."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ImageOptions:
-    """How images of cameras, live or stored, become frames, or their messages numbers."""
+class InputOptions(InputConfig):
+    """How external logs and live streams become streams of frames.
 
-    size: Size | None = setting(
-        None,
-        "Shrink camera images to this size; by default to what has their ratio of the sides "
-        "and no more pixels than 128x48.",
-        unit=SIZE,
-        group="Images",
-    )
-    fit: Fit = setting(
-        "crop",
-        "Where images have another ratio of the sides than --size: cut two sides, put black "
-        "at them, or change the ratio.",
-        group="Images",
-    )
-    rate: float | None = setting(
-        None,
-        "Frames a second of cameras and logs; by default the first stream's.",
-        unit="HZ",
-        least=1e-3,
-        most=1e6,
-        group="Images",
-    )
-    fields: tuple[str, ...] = setting(
-        (),
-        "Take numbers instead of images: a field of a topic's messages, such as "
-        "pose.position.x or ranges[0:100], or a column of a table; several are one vector.",
-        unit="FIELD",
-        name="field",
-        group="Images",
-    )
-    color: Color = setting(
-        False,
-        "Show red, green and blue beside one another, as a frame of three times the width; auto "
-        "does where hue varies in the first frames of a log and brightness does not.",
-        group="Images",
-    )
-    depth: Depth | None = setting(
-        None,
-        "Show distances of depth cameras, in metres, from black to white, as 0.3:5; keep numbers "
-        "within, as -3.2:3.2.",
-        unit=RANGE,
-        name="range",
-        group="Images",
-    )
+    Attributes:
+        topics: topics of a log, a stream each, or patterns of them.
+        fields: numbers that are taken instead of images; see `Field`.
+        size: of frames; by default that with the images' ratio and at most 128x48 pixels.
+        rate: frames a second; by default those of the first stream.
+        start: seconds of a log before this time are left out.
+        end: seconds of a log from this time on are left out.
+        align: how streams that differ are put on one clock; without it they are refused.
+        color: whether frames show red, green and blue beside one another.
+    """
+
+    topics: tuple[str, ...] = ()
+    fields: tuple[str, ...] = ()
+    size: Size | None = None
+    rate: float | None = None
+    start: float = 0.0
+    end: float | None = None
+    align: Align | None = None
+    color: Color = False
 
     def __post_init__(self) -> None:
-        check_settings(self)
+        """Check values of logs and callers, too, which no option checked before.
+
+        Raises:
+            UsageError: a value that does not fit; it names the option or the key.
+        """
+        for name, hint in _HINTS.items():
+            if name != "color":
+                value = convert_value(getattr(self, name), hint, option_name(name))
+                object.__setattr__(self, name, value)
         if self.color not in (False, True, "auto"):
             raise UsageError(f"--color is {self.color}: give on, off or auto")
+        if self.size is not None and min(self.size) < 1:
+            raise UsageError(f"--size is {self.size}: give height and width above 0")
+        for name, low, high in (
+            ("start", 0.0, math.inf),
+            ("end", 0.0, math.inf),
+            ("rate", 1e-3, 1e6),
+        ):
+            value = getattr(self, name)
+            if value is not None and not (low <= value <= high and math.isfinite(value)):
+                raise UsageError(
+                    f"{option_name(name)} is {value}: it must be in [{low:g}, {high:.0f}]"
+                )
+        if self.range is not None and not self.range[0] < self.range[1]:
+            raise UsageError(f"input.range is {self.range}: write NEAR,FAR, the smaller first")
+        if self.holdout is not None:
+            in_range(self, "input", 0.0, 0.9, "holdout")
+        in_range(self, "input", 0.0, 1e6, "hold")
+        in_range(self, "input", 0.1, 1e6, "stall")
 
-    def given(self) -> tuple[str, ...]:
-        """The options of the command line that say other than the defaults."""
-        return tuple(option_name(field) for field in given(self))
+    def chosen(self, names: Collection[str] | None = None) -> tuple[str, ...]:
+        """Names of settings that are not the defaults, of all or of these."""
+        return tuple(
+            field.name
+            for field in fields(self)
+            if getattr(self, field.name) != field.default and (names is None or field.name in names)
+        )
+
+    def named(self, names: Collection[str] | None = None) -> list[str]:
+        """The options and keys of `chosen`, as errors name them."""
+        return [option_name(name) for name in self.chosen(names)]
+
+    @property
+    def external(self) -> bool:
+        """Whether a setting is chosen with which a recording of ours is read as an external log."""
+        return any(name not in OF_EVERY_SOURCE for name in self.chosen())
+
+    @property
+    def reading(self) -> Reading:
+        """What is taken of messages and files."""
+        return Reading(self.range, self.fields, self.time, self.stamp, self.color is True)
+
+    @property
+    def config(self) -> InputConfig:
+        """The keys `input.*`."""
+        return InputConfig(
+            **{field.name: getattr(self, field.name) for field in fields(InputConfig)}
+        )
+
+    def configured(self, *layers: Mapping[str, Any]) -> InputOptions:
+        """The same options with keys `input.*` of layers of values, the last one winning.
+
+        Raises:
+            UsageError: an unknown key, or a value that does not fit.
+        """
+        return cast(InputOptions, build(InputConfig, "input", *layers, base=self))
+
+    def settings(self) -> list[str]:
+        """The keys `input.*` that are not the defaults, as `--set` takes them."""
+        chosen = ((name, getattr(self, name)) for name in self.chosen() if name not in OPTIONS)
+        return [
+            f"input.{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}"
+            for name, v in chosen
+        ]
+
+    def words(self) -> list[str]:
+        """Words of a command line that give these settings; of defaults, none."""
+        words: list[str] = []
+        for name in self.chosen(OPTIONS):
+            value = getattr(self, name)
+            each: tuple[Any, ...] = value if name in ("topics", "fields") else (value,)
+            for one in each:
+                words += [OPTIONS[name], _written(one)]
+        return [*words, *(word for key in self.settings() for word in ("--set", key))]
+
+
+def option_name(name: str) -> str:
+    """How the command line calls a setting: its option, or its key."""
+    return OPTIONS.get(name, f"input.{name}")
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"{value[1]}x{value[0]}"
+    return "on" if value is True else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,3 +255,5 @@ class Reading:
 
 IMAGES = Reading()
 """Images, and no numbers."""
+
+_HINTS: Final = typing.get_type_hints(InputOptions)

@@ -127,7 +127,9 @@ def raw_image(
     """
     number, metres = DISTANCES.get(encoding, ("", 0.0))
     if encoding == "32FC1" and depth is None:
-        raise UsageError("its images are distances (32FC1): say which to show, as --range 0.3:5")
+        raise UsageError(
+            "its images are distances (32FC1): say which to show, as --set input.range=0.3,5"
+        )
     if number and depth is not None:
         size = int(number[1])
     elif encoding in _BAYER:
@@ -198,7 +200,7 @@ def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray
     """Distances as gray; 0, infinity and NaN, which are none, as black."""
     near, far = depth
     if near < 0:
-        raise UsageError("--range: no distance is below 0, write NEAR:FAR in metres, as 0.3:5")
+        raise UsageError("input.range: no distance is below 0, write NEAR,FAR in metres, as 0.3,5")
 
     def gray(part: NDArray[Any]) -> Any:
         distance = part.astype(np.float64) * metres

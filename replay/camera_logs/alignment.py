@@ -62,10 +62,10 @@ def rate_of(streams: Sequence[ImageStream]) -> float:
     """
     timed = next((s for s in streams if len(s.times)), streams[0])
     step, table = step_of(timed.times), isinstance(timed, TableNumbers)
-    count = "say what its times count, as --time COLUMN:s (or ms, us, ns)"
+    count = "say what its times count, as --set input.time=COLUMN:s (or ms, us, ns)"
     if not step > 0:
         what = f"{timed.path}: {timed.topic}" if len(timed.times) else timed.path
-        remedy = ", or name the column of its times with --time" if table else ""
+        remedy = ", or name the column of its times with --set input.time=COLUMN" if table else ""
         if table and len(timed.times):
             what = f"{timed.path}: most of its rows are of the time of the row before, which"
             remedy = f", or {count}"
@@ -116,7 +116,7 @@ def by_time(streams: Sequence[Times], start: int, stop: int, fps: float) -> list
     if ticks > MAX_FRAMES:
         raise UsageError(
             f"--rate {fps:g} makes {ticks:.0f} frames: choose a lower one, or a part of the log "
-            "with --from and --to"
+            "with --start and --end"
         )
     clock = times_of(np.arange(int(ticks)), fps, start).astype(np.uint64)
     return [np.searchsorted(times, clock, side="right") - 1 for times in streams]
@@ -188,7 +188,7 @@ def by_index(streams: Sequence[Times], fps: float, *, gaps: bool) -> tuple[Rows,
     found = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
     if count and frame[-1] > MAX_FRAMES:
         said = f"it has {gaps_in_words(found, fps)}, {frame[-1] + 1} frames in all"
-        raise UsageError(f"{said}: choose a part without, with --from or --to")
+        raise UsageError(f"{said}: choose a part without, with --start or --end")
     return np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1, found
 
 

@@ -159,7 +159,7 @@ def by_stamps(images: ImageStream) -> ImageStream:
     if len(stamps) > 1 and stamps.min() == stamps.max():
         raise UsageError(
             f"{images.path}: the headers on {images.topic} all say {stamps[0]} ns: leave out "
-            "--stamp header"
+            "--set input.stamp=header"
         )
     order = np.argsort(stamps, kind="stable")
     times = sorted_times(f"{images.path}: {images.topic}", stamps[order])
@@ -192,7 +192,7 @@ def excerpts(
             lasts = (int(own[-1]) - zero) / NANOSECONDS
             raise UsageError(
                 f"{images.path}: {images.topic} has no images there, its last is at {lasts:g} s: "
-                "choose another --from or --to"
+                "choose another --start or --end"
             )
         found.append(selected(images, np.arange(low, high), images.times[low:high]))
     return found

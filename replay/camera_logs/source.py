@@ -13,10 +13,9 @@ import numpy as np
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.options import option_words
 from recorder.images.fields import rounded
 from recorder.images.framing import framings
-from recorder.images.options import COLOR_RECIPE
+from recorder.images.options import COLOR_RECIPE, Align, InputOptions
 from recorder.images.pixels import DISTANCES, Shown, UnknownPixels
 from replay.camera_logs.ahead import AheadSource
 from replay.camera_logs.alignment import (
@@ -38,7 +37,6 @@ from replay.camera_logs.alignment import (
 from replay.camera_logs.hue import CHOSEN, shows_hue
 from replay.camera_logs.mcap_log import Readers
 from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
-from replay.camera_logs.options import Align, CameraOptions
 from replay.camera_logs.selected import (
     BROKEN,
     SALVAGE,
@@ -66,7 +64,7 @@ class ForeignSource(AheadSource):
         loop: begin again at the end.
         salvage: leave out what is damaged, and broken images; see `WholeImages`.
         goal: the command and the folder of its result that a refusal names in what would work.
-        **chosen: how images become frames; see `CameraOptions`.
+        **chosen: how images become frames; see `InputOptions`.
 
     Attributes:
         alignment: for each stream the counts of its messages, of repeated frames and of
@@ -100,7 +98,7 @@ class ForeignSource(AheadSource):
                 need `align`.
             LogDamagedError: a log is damaged.
         """
-        self._options = options = CameraOptions(topics=tuple(topics), **chosen)
+        self._options = options = InputOptions(topics=tuple(topics), **chosen)
         if options.color == "auto":
             how = {"loop": loop, "salvage": salvage, "goal": goal, **chosen, "color": True}
             with contextlib.closing(type(self)(paths, topics, **how)) as shown:
@@ -119,9 +117,10 @@ class ForeignSource(AheadSource):
             except UsageError as error:
                 raise self._of_copies(error) from None
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
-            if options.depth and firsts[0].ndim > 1 and not self._may_show_distances():
+            if options.range and firsts[0].ndim > 1 and not self._may_show_distances():
                 raise UsageError(
-                    f"{self._files[0]}: it holds no distances (16UC1, 32FC1): --range is for these"
+                    f"{self._files[0]}: it holds no distances (16UC1, 32FC1): input.range is for "
+                    "these"
                 )
             self.framings = framings(firsts, options.size, options.fit, color=self.color)
             for stream, rows in enumerate(self._rows):  # refused before anything is written
@@ -145,9 +144,9 @@ class ForeignSource(AheadSource):
     def _open(self) -> None:
         """Open the streams, and find what is taken of them and when each image was."""
         options, reading = self._options, self._options.reading
-        if options.stop is not None and not options.start < options.stop:
+        if options.end is not None and not options.start < options.end:
             raise UsageError(
-                f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in "
+                f"--start {options.start:g} is no earlier than --end {options.end:g}, both in "
                 "seconds after the first image: no image lies between them"
             )
         for path, topic in named_streams(self._files, options.topics, reading):
@@ -159,8 +158,8 @@ class ForeignSource(AheadSource):
             framings(self._firsts(), None, options.fit)
         self._fps = options.rate or rate_of(self._streams)
         self._times = known_times(self._streams, self._fps)
-        if options.start or options.stop is not None:
-            self._streams = excerpts(self._streams, self._times, options.start, options.stop)
+        if options.start or options.end is not None:
+            self._streams = excerpts(self._streams, self._times, options.start, options.end)
             self._times = known_times(self._streams, self._fps)
         if self._salvage:
             self._streams = [WholeImages(stream) for stream in self._streams]
@@ -227,8 +226,8 @@ class ForeignSource(AheadSource):
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
         if options.fit != "crop" or any(framing.lossy for framing in self.framings):
             chosen["fit"] = options.fit
-        if options.depth is not None:
-            chosen["range_metres" if self._spec.images else "range"] = list(options.depth)
+        if options.range is not None:
+            chosen["range_metres" if self._spec.images else "range"] = list(options.range)
         if not self._spec.images:
             chosen["fields"] = [list(s.fields) for s in self._streams]
         if options.time is not None:
@@ -341,7 +340,7 @@ class ForeignSource(AheadSource):
                 raise UnequalError(
                     f"{two} have no time in common, and gaps, across which --align index takes "
                     "images for neighbours: take each by itself, with --topic, or a part "
-                    "without with --from and --to"
+                    "without with --start and --end"
                 )
             raise UnequalError(
                 f"{two} have no time in common: take the i-th image of each together, as with: "
@@ -366,6 +365,6 @@ class ForeignSource(AheadSource):
         words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
-        words += option_words(replace(self._options, topics=(), align=None, rate=None))
+        words += replace(self._options, topics=(), align=None, rate=None).words()
         words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])

@@ -125,7 +125,9 @@ class ImageStream(ABC):
             UsageError: it is in no message, or this states no time.
             MalformedRecord, LogDamagedError: as for `image`.
         """
-        raise UsageError(f"{self.path}: {self.topic} is no topic of messages: leave out --stamp")
+        raise UsageError(
+            f"{self.path}: {self.topic} is no topic of messages: leave out input.stamp"
+        )
 
     def pixels(self) -> str | None:
         """The format of pixels that the message of its first image states, "" of none.
@@ -181,7 +183,8 @@ class MessageImages(ImageStream):
     def stamp(self, row: int) -> int:
         if self._stamp is None:
             raise UsageError(
-                f"{self.path}: messages on {self.topic} have no header: leave out --stamp header"
+                f"{self.path}: messages on {self.topic} have no header: leave out "
+                "input.stamp=header"
             )
         return self.taken(row, self._stamp)
 

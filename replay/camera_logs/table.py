@@ -75,7 +75,7 @@ class TableNumbers(ImageStream):
         with arrow_explained(path, remedy="take fewer columns, with --field"):
             columns = {name: _column(path, table, name) for name in names}
         numbers = np.concatenate(list(columns.values()), axis=1)
-        # A missing number is not out of bounds: --range keeps no row without one.
+        # A missing number is not out of bounds: input.range keeps no row without one.
         whole = ~np.any([np.isnan(own).all(axis=1) for own in columns.values()], axis=0)
         whole &= np.isfinite(numbers).all(axis=1) | (reading.depth is not None)
         if times is not None:
@@ -83,7 +83,7 @@ class TableNumbers(ImageStream):
         elif not whole.all():
             raise UsageError(
                 f"{path}: {_called(path, int(np.argmin(whole)))} lacks a finite number: name the "
-                "column of its times with --time, so that it can be left out"
+                "column of its times with --set input.time=COLUMN, so that it can be left out"
             )
         if not whole.any():
             raise UsageError(f"{path}: there is no row with all of {', '.join(names)}")
@@ -270,7 +270,7 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, 
     if name not in table.column_names or unit not in UNITS:
         raise UsageError(
             f"{path}: there is no column {named}; it has {', '.join(table.column_names[:20])}. A "
-            f"unit is one of {', '.join(UNITS)}, as --time COLUMN:ns"
+            f"unit is one of {', '.join(UNITS)}, as --set input.time=COLUMN:ns"
         )
     import pyarrow
     import pyarrow.types as kinds
@@ -290,7 +290,7 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, 
     if not known.any() or (rough[known] < 0).any() or (rough[known] >= LAST_NS).any():
         raise UsageError(
             f"{path}: {name} holds no times since 1970, counted in {unit}: say what they count "
-            f"({', '.join(UNITS)}), as --time {name}:ns"
+            f"({', '.join(UNITS)}), as --set input.time={name}:ns"
         )
     if kinds.is_floating(column.type):
         exact = np.round(np.where(known, rough, -1.0)).astype(np.int64)

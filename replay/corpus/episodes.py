@@ -11,9 +11,9 @@ from typing import Any, Final, Literal
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import counted
+from recorder.images.options import InputOptions
 from replay.camera_logs.alignment import UNEVEN
 from replay.camera_logs.lerobot import PAUSE
-from replay.camera_logs.options import CameraOptions
 from replay.corpus.logs import (
     Episode,
     Found,
@@ -41,7 +41,7 @@ _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "ti
 def open_episodes(
     words: Sequence[str | Path],
     paths: Sequence[Path] | Literal[False],
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     **how: Any,
 ) -> EpisodeSource | None:
     """Open the logs of an index, or each path by itself, as episodes.
@@ -49,7 +49,7 @@ def open_episodes(
     Args:
         words: what was named.
         paths: what the words stand for, where each is an episode whatever it is.
-        cameras: see `EpisodeSource`.
+        inputs: see `EpisodeSource`.
         how: see there.
 
     Returns:
@@ -60,7 +60,7 @@ def open_episodes(
         LogDamagedError: the same.
     """
     logs = logs_of_corpus(words) or ([[path] for path in paths] if paths else None)
-    return None if logs is None else EpisodeSource(logs, cameras, **how)
+    return None if logs is None else EpisodeSource(logs, inputs, **how)
 
 
 class EpisodeSource(LoggedSource):
@@ -82,7 +82,7 @@ class EpisodeSource(LoggedSource):
     def __init__(
         self,
         logs: Sequence[Log],
-        cameras: CameraOptions | None = None,
+        inputs: InputOptions | None = None,
         *,
         loop: bool = False,
         salvage: bool = False,
@@ -92,7 +92,7 @@ class EpisodeSource(LoggedSource):
 
         Args:
             logs: what is opened as one, each.
-            cameras: how images of others become frames.
+            inputs: how images of others become frames.
             loop: begin again at the end.
             salvage: pass over what is damaged of a log; else what follows in it is left out.
             told: how many of the logs were opened.
@@ -101,13 +101,13 @@ class EpisodeSource(LoggedSource):
             UsageError: none of them shows frames.
             LogDamagedError: nor can any be read.
         """
-        if cameras is not None and cameras.color == "auto":
+        if inputs is not None and inputs.color == "auto":
             raise UsageError("--color auto looks at one log: say --color or not, for all episodes")
         if len(logs) > MOST:
             raise UsageError(
                 f"{len(logs):,} logs are more episodes than one run lists, {MOST:,}: index fewer"
             )
-        self._cameras, self._loop, self._salvage = cameras, loop, salvage
+        self._inputs, self._loop, self._salvage = inputs, loop, salvage
         self._open_now: tuple[int, Logged] | None = None
         self._reading = 0, 0
         self._lost: list[str] = []
@@ -256,7 +256,7 @@ class EpisodeSource(LoggedSource):
         return self._open_now[1]
 
     def _opened(self, log: Log) -> Logged:
-        return open_log(log, self._cameras, salvage=self._salvage)
+        return open_log(log, self._inputs, salvage=self._salvage)
 
     def _leave_out(self, error: LogDamagedError) -> None:
         """Leave out a log that is damaged, from the block that was read on."""

@@ -11,9 +11,9 @@ from typing import Any, Final, Literal
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry, did_you_mean
+from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
 from replay.camera_logs.opening import only_foreign
-from replay.camera_logs.options import CameraOptions
 from replay.export.frames import write_film, write_films, write_images
 from replay.export.lerobot import write_dataset
 from replay.export.tables import TABLES, export_signals
@@ -75,7 +75,7 @@ def export(
     *,
     force: bool = False,
     lossless: bool = False,
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     task: str | None = None,
     about: About = lambda source: None,
 ) -> int:
@@ -88,7 +88,7 @@ def export(
         form: one of `FORMS`; see `export_signals`.
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images that become a video.
-        cameras: which streams of camera logs; by default all of images.
+        inputs: which streams of camera logs; by default all of images.
         task: for LeRobot, what is done, in words.
         about: given a recording or camera logs before they are written, to say what they are.
 
@@ -125,10 +125,10 @@ def export(
         if form == "lerobot":
             words |= {"name": out.name, "task": task}
         if form != "lerobot" or not _are_recordings(paths):
-            return _export_recording(paths, out, form, words, cameras, about)
+            return _export_recording(paths, out, form, words, inputs, about)
         _refuse_others(out)
         with (
-            contextlib.closing(_opened_in_turn(paths, cameras, about)) as opened,
+            contextlib.closing(_opened_in_turn(paths, inputs, about)) as opened,
             atomic_write(out) as place,
         ):
             return write_dataset(opened, place, **words)
@@ -152,13 +152,13 @@ def _export_recording(
     out: Path,
     form: str,
     words: Mapping[str, Any],
-    cameras: CameraOptions | None,
+    inputs: InputOptions | None,
     about: About,
 ) -> int:
     path = paths[0]
     if holds_run(path):
         raise UsageError(f"{path} is a run, {form} is for recordings: name the recording")
-    with contextlib.closing(open_to_look(paths, cameras)) as source:
+    with contextlib.closing(open_to_look(paths, inputs)) as source:
         if form in ("images", "mp4") and not source.spec.images:
             raise UsageError(f"{path} holds no images: its frames are values")
         if form == "mp4" and out.suffix == ".mp4" and not out.is_dir():
@@ -187,7 +187,7 @@ def _are_recordings(paths: Sequence[Path]) -> bool:
 
 
 def _opened_in_turn(
-    paths: Sequence[Path], cameras: CameraOptions | None, about: About
+    paths: Sequence[Path], inputs: InputOptions | None, about: About
 ) -> Generator[Logged]:
     """Yield each recording, open until the next is asked for.
 
@@ -197,7 +197,7 @@ def _opened_in_turn(
     """
     first = None
     for path in paths:
-        with contextlib.closing(open_to_look([path], cameras)) as source:
+        with contextlib.closing(open_to_look([path], inputs)) as source:
             about(source)
             first = first or source.spec
             for what in _ALIKE:

@@ -19,8 +19,8 @@ from rerun.chunk import Chunk
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError, are_for
 from cdmisfa.core.untrusted import check_regular
+from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
-from replay.camera_logs.options import CameraOptions
 from replay.inputs import About, Logged, holds_run, open_to_look
 from replay.recordings.source import RecordedSource, head_poses
 from replay.runs.columns import Blocks
@@ -54,7 +54,7 @@ def build_view(
     all_views: Path | None = None,
     tab: str | None = None,
     beside: Sequence[Path] = (),
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     body: bool = True,
     about: About = lambda source: None,
 ) -> None:
@@ -68,7 +68,7 @@ def build_view(
         all_views: the recording that the run learned from, to show what was not watched too.
         tab: name of the tab that is open; by default the first.
         beside: more camera logs, or files of the recording.
-        cameras: which streams of camera logs; by default all of images.
+        inputs: which streams of camera logs; by default all of images.
         body: show the robot's body in a run's view.
         about: given a recording or camera logs before they are shown, to say what they are.
 
@@ -83,7 +83,7 @@ def build_view(
     if every < 1:
         raise UsageError(f"every {every} frames: it must be at least 1")
     if any(map(holds_run, (path, *beside))):
-        if cameras is not None and (given := cameras.given()):
+        if inputs is not None and (given := inputs.named()):
             raise UsageError(f"{path} is a run: {are_for(given, 'logs')}")
         if beside:
             raise UsageError(f"{path}: one run is shown at a time; compare --save shows several")
@@ -94,7 +94,7 @@ def build_view(
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
         with recording_to(out, path.resolve().stem, path, force=force) as recording:
-            write_recording(recording, [path, *beside], every, tab, cameras, about)
+            write_recording(recording, [path, *beside], every, tab, inputs, about)
 
 
 @contextlib.contextmanager
@@ -222,7 +222,7 @@ def write_recording(
     paths: Sequence[Path],
     every: int,
     tab: str | None = None,
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     about: About = lambda source: None,
 ) -> None:
     """Write a recording's views and ground truth, and the layout for them.
@@ -232,14 +232,14 @@ def write_recording(
         paths: the recording's folder, or files of its views; or camera logs of others.
         every: show images of every this many frames; values are all shown.
         tab: name of the tab that is open.
-        cameras: which streams of camera logs; by default all of images.
+        inputs: which streams of camera logs; by default all of images.
         about: see `build_view`.
 
     Raises:
         UsageError: there is no such recording or tab.
         LogDamagedError: it cannot be read.
     """
-    with contextlib.closing(open_to_look(paths, cameras)) as source:
+    with contextlib.closing(open_to_look(paths, inputs)) as source:
         about(source)
         first, count, spec = source.t, source.frames, source.spec
         ours = isinstance(source, RecordedSource)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.interrupts import Stop, stoppable
-from cdmisfa.cli.making import WRITTEN, grouped, number, option, options_of
+from cdmisfa.cli.making import grouped, number, option
 from cdmisfa.cli.printing import (
     print_document,
     print_line,
@@ -27,25 +26,18 @@ from cdmisfa.cli.printing import (
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.names import counted
-from cdmisfa.core.options import TIME
-from replay.camera_logs.options import CameraOptions
+from recorder.images.options import InputOptions
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.apply import Application, Totals
-    from recorder.cameras.options import LiveOptions
+    from recorder.images.options import InputOptions
 
 MOST_SAID = 20
 """Logs of which is said what went wrong."""
 
 FILE_FORMS = ("parquet", "csv", "mcap", "rrd")
 STDOUT = "stdout"
-
-log_options = options_of(
-    CameraOptions,
-    "cameras",
-    *("topics", "fields", "time", "stamp", "start", "gaps", "align", "rate", "depth"),
-)
 
 
 @grouped("apply", common=("out", "to", "frames", "loop", "jobs"))
@@ -56,16 +48,14 @@ log_options = options_of(
 )
 @option(
     "--to",
-    multiple=True,
-    metavar="FORM|TIME",
-    help=f"Format of the files, {', '.join(FILE_FORMS)}; or {STDOUT}: print each block as a JSON "
-    "line as soon as it is complete; or leave out images from this TIME on.",
+    type=click.Choice([*FILE_FORMS, STDOUT]),
+    help=f"Format of the files in a folder, by default {FILE_FORMS[0]}; or {STDOUT}: print each "
+    "block as a JSON line as soon as it is complete.",
 )
 @number("--frames", "End after so many frames of each stream.", 1)
 @options.loop
 @options.salvage
-@log_options
-@options.live_options
+@options.input_options("topics", "fields", "rate", "start", "end", "align", keys=True)
 @options.jobs
 @options.engine
 @options.retry_failed
@@ -79,12 +69,11 @@ def apply_command(
     run: Path,
     source: tuple[str, ...],
     out: Path | None,
-    to: tuple[str, ...],
+    to: str | None,
     frames: int | None,
     loop: bool,
     salvage: bool,
-    cameras: CameraOptions,
-    live: LiveOptions,
+    inputs: InputOptions,
     force: bool,
     as_json: bool,
     **where: Any,
@@ -103,13 +92,12 @@ def apply_command(
     """
     from cdmisfa.experiments.apply import Application
 
-    outlet = outlet_of(ctx, to)
-    refuse_unfit(source, outlet, live, again=loop or salvage, as_json=as_json)
-    cameras = replace(cameras, stop=outlet.until)
+    form, lines = None if to == STDOUT else to, to == STDOUT
+    refuse_unfit(source, again=loop or salvage, lines=lines, as_json=as_json)
     if out is not None and is_folder(out) and are_logs(source):
-        if outlet.lines:
+        if lines:
             raise UsageError("--to stdout is for what is applied at once: leave out -o FOLDER")
-        where |= {"form": outlet.form or FILE_FORMS[0], "cameras": cameras, "force": force}
+        where |= {"form": form or FILE_FORMS[0], "inputs": inputs, "force": force}
         where |= {"frames": frames, "loop": loop, "salvage": salvage}
         _apply_to_many(ctx, run, source, out, as_json=as_json, **where)
         return
@@ -117,17 +105,18 @@ def apply_command(
     if given := [name for name in where if ctx.get_parameter_source(name) == typed]:
         raise UsageError(f"--{given[0].replace('_', '-')} goes with logs, and a folder as -o")
     logs = logs_of(source)
-    place = place_of(out, outlet.form, logs, force=force)
+    place = place_of(out, form, logs, force=force)
     application = Application(run)
-    told: dict[str, Any] = {"cameras": cameras, "live": live}
-    told |= {"loop": loop, "salvage": salvage, "say": tell}
+    told: dict[str, Any] = {"inputs": inputs, "loop": loop, "salvage": salvage, "say": tell}
     rows, failed = list[dict[str, Any]](), list[CdmisfaError]()
     with stoppable() as stop:
         for words in logs:
             row: dict[str, Any] = {"log": " ".join(words), "out": place and str(place)}
             try:
                 with contextlib.closing(application.open(words, **told)) as opened:
-                    totals = applied(application, opened, place, outlet, frames, stop, force=force)
+                    totals = applied(
+                        application, opened, place, frames, stop, lines=lines, force=force
+                    )
             except CdmisfaError as error:
                 if len(logs) == 1:
                     raise
@@ -142,7 +131,7 @@ def apply_command(
                 rows[-1]["error"] = str(damaged)
             if stop.number:
                 break
-    if not outlet.lines:
+    if not lines:
         print_applied(str(run), rows, as_json=as_json)
     if stop.number:
         ctx.exit(stop.exit_code)
@@ -192,9 +181,7 @@ def _apply_to_many(
         ctx.exit(found.exit_code)
 
 
-def refuse_unfit(
-    source: Sequence[str], outlet: Outlet, live: LiveOptions, *, again: bool, as_json: bool
-) -> None:
+def refuse_unfit(source: Sequence[str], *, again: bool, lines: bool, as_json: bool) -> None:
     """Refuse options that do not go with the source, or with one another.
 
     Raises:
@@ -202,23 +189,20 @@ def refuse_unfit(
     """
     from recorder.cameras.words import is_live
 
-    if outlet.lines and as_json:
+    if lines and as_json:
         raise UsageError("--to stdout prints JSON lines, --json one document: use one of them")
-    if any(map(is_live, source)):
-        if again:
-            raise UsageError("live streams cannot go back: leave out --loop and --salvage")
-        return
-    options.refuse_live_options(live, source)
+    if again and any(map(is_live, source)):
+        raise UsageError("live streams cannot go back: leave out --loop and --salvage")
 
 
 def applied(
     application: Application,
     source: FrameSource,
     place: Path | None,
-    outlet: Outlet,
     frames: int | None,
     stop: Stop,
     *,
+    lines: bool,
     force: bool,
 ) -> Totals:
     """Apply modules to an open source, into its file and to where blocks go as they come."""
@@ -235,7 +219,7 @@ def applied(
     with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
         if place is not None:
             sinks.append(stack.enter_context(written_to(place, spec, modules, force=force)))
-        if outlet.lines:
+        if lines:
             sinks.append(LinesSink(print_line, spec, modules))
         blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))
         total = None if spec.length is None else spec.length * len(spec.streams)
@@ -245,37 +229,6 @@ def applied(
     else:
         say_changes(source)
     return totals
-
-
-@dataclass(frozen=True, slots=True)
-class Outlet:
-    """Values of --to.
-
-    Attributes:
-        form: format of the files; None where --to names none.
-        lines: whether each block is printed as a JSON line.
-        until: time of a log from which on images are left out.
-    """
-
-    form: str | None = None
-    lines: bool = False
-    until: float | None = None
-
-
-def outlet_of(ctx: click.Context, words: Sequence[str]) -> Outlet:
-    """Parse the values of --to."""
-    found = Outlet()
-    for word in words:
-        if word in FILE_FORMS:
-            found = replace(found, form=word)
-        elif word == STDOUT:
-            found = replace(found, lines=True)
-        elif word[:1].isdigit():
-            found = replace(found, until=WRITTEN[TIME].convert(word, None, ctx))
-        else:
-            names = ", ".join((*FILE_FORMS, STDOUT))
-            raise UsageError(f"--to {word}: name {names}, or a time, as 1:30")
-    return found
 
 
 def place_of(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,7 @@ import click
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
-from cdmisfa.cli.making import choice, flag, grouped, number, option, word
+from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     announce,
     print_result,
@@ -29,10 +28,9 @@ from cdmisfa.core.errors import LogDamagedError, UsageError, are_for
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.sources import Configuration
-    from recorder.cameras.options import LiveOptions
-    from replay.camera_logs.options import CameraOptions
+    from recorder.images.options import InputOptions
 
-OPENED = ("preset", "seed", "loop", "salvage", "episodes", "centre")
+OPENED = ("preset", "seed", "loop", "salvage", "episodes")
 """Options that say how a source is opened."""
 
 KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
@@ -65,26 +63,12 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
 @flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
 @flag("--episodes", "Take each log as an episode, one after the other.", group="Source")
-@choice(
-    "--centre",
-    "Learn from frames as they are over the run, or without the mean of their episode, a log or "
-    "what lies between two gaps: what differs between episodes alone is not learned then.",
-    ("run", "episode"),
-    group="Source",
-)
 @flag("--follow", "Wait for the frames of a recording being written.", group="Source")
 @number(
     "--follow-timeout",
     "With --follow, give up when no frame came for so long.",
     *(0.1, 1e6, "SECONDS"),
     default=60.0,
-    group="Source",
-)
-@number(
-    "--holdout",
-    "Keep the last part of a camera log from the progress learner, and say how slow what it "
-    "learned is there; by default 0.1, a tenth. 0 learns from all.",
-    *(0.0, 0.9, "SHARE"),
     group="Source",
 )
 @option(
@@ -96,8 +80,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
     group="Live streams",
 )
 @options.keyframes
-@options.log_options
-@options.live_options
+@options.input_options()
 @options.force
 @options.as_json
 @options.quiet
@@ -110,8 +93,7 @@ def learn_command(
     resume: bool,
     force: bool,
     as_json: bool,
-    live: LiveOptions,
-    cameras: CameraOptions,
+    inputs: InputOptions,
     **told: Any,
 ) -> None:
     """Learn slow feature modules from a scene, a recording, logs or cameras.
@@ -145,8 +127,8 @@ def learn_command(
 
     of_cameras = any(map(is_live, source))
     opened = opened_live if of_cameras else opened_logs
-    with opened(ctx.params, source, cameras, live) as (frames, configuration):
-        color = getattr(frames, "color", cameras.color)  # what auto chose stays
+    with opened(ctx.params, source, inputs) as (frames, configuration):
+        color = getattr(frames, "color", inputs.color)  # what auto chose stays
         with learning(frames.spec, told["max_iterations"]) as (stop, reporter):
             if hasattr(frames, "stop"):
                 frames.stop = stop  # waiting for frames ends with a signal, too
@@ -181,30 +163,28 @@ def learn_command(
 
 @contextlib.contextmanager
 def opened_logs(
-    told: Mapping[str, Any], source: tuple[str, ...], cameras: CameraOptions, live: LiveOptions
+    told: Mapping[str, Any], source: tuple[str, ...], inputs: InputOptions
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """A scene, a recording or logs, and what is said of them before and after.
 
     Args:
         told: the options of the command.
         source: its words.
-        cameras: how images of others become frames.
-        live: how live streams do; see `opened_live`.
+        inputs: how images of others become frames.
     """
     from cdmisfa.experiments.holdout import hold_out
     from cdmisfa.experiments.sources import OF_CAMERAS, is_scene, open_source
 
-    vain = [f"--{name}" for name in ("loop", "salvage", "holdout") if told[name]]
+    vain = [f"--{name}" for name in ("loop", "salvage") if told[name]]
     if vain and is_scene(source):
         raise UsageError(f"{source[0]} is a scene: {are_for(vain, 'logs')}")
-    options.refuse_live_options(live, source)
     if told["record_to"] is not None:
         raise UsageError("--record is for live streams: leave it out, or see cdmisfa record")
     with bar("opening", "logs") as shown:
         frames, configuration = open_source(
             source,
             settings=settings_of(told),
-            cameras=cameras,
+            inputs=inputs,
             follow=told["follow_timeout"] if told["follow"] else None,
             resumed=told["resume"],
             told=shown.update,
@@ -212,7 +192,8 @@ def opened_logs(
         )
     with contextlib.closing(frames):
         progress = configuration.learner.algorithm == OF_CAMERAS
-        hold_out(frames, told["holdout"], judged=progress)
+        share = None if configuration.inputs is None else configuration.inputs.holdout
+        hold_out(frames, share, judged=progress)
         say_about(frames)
         try:
             yield frames, configuration
@@ -222,18 +203,18 @@ def opened_logs(
 
 @contextlib.contextmanager
 def opened_live(
-    told: Mapping[str, Any], source: tuple[str, ...], cameras: CameraOptions, live: LiveOptions
+    told: Mapping[str, Any], source: tuple[str, ...], inputs: InputOptions
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """Live streams, recorded meanwhile where that is asked for; see `opened_logs`."""
     from cdmisfa.experiments.sources import open_cameras_now
     from recorder.live import RecordedWhileWatched
     from recorder.log.files import refuse_existing
 
-    refused = ("resume", "loop", "salvage", "episodes", "follow", "holdout")
-    if any(told[name] for name in refused) or told["centre"] == "episode":
+    refused = ("resume", "loop", "salvage", "episodes", "follow")
+    if any(told[name] for name in refused):
         raise UsageError(
-            "live streams cannot go back: leave out --resume, --loop, --salvage, --episodes, "
-            "--centre, --follow and --holdout, or learn from a recording of them"
+            "live streams cannot go back: leave out --resume, --loop, --salvage, --episodes and "
+            "--follow, or learn from a recording of them"
         )
     out, record_to, force = told["out"], told["record_to"], told["force"]
     for folder in (out, record_to):
@@ -241,10 +222,10 @@ def opened_live(
             refuse_existing(folder, force=force, goes_on=False)
     frames, configuration = open_cameras_now(
         source,
-        replace(live, seed=told["seed"]),
-        cameras=cameras,
+        inputs,
         preset=told["preset"],
         settings=settings_of(told),
+        seed=told["seed"],
         say=tell,
     )
     with contextlib.closing(frames):
@@ -284,4 +265,5 @@ def resume_as_started(ctx: click.Context, run: Path | None) -> None:
         for name, value in begun.items()
         if ctx.get_parameter_source(name) is not click.core.ParameterSource.COMMANDLINE
     }
+    kept["settings"] = (*begun.get("settings", ()), *ctx.params["settings"])
     ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,11 +24,9 @@ from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import LogDamagedError, UsageError
 
 if TYPE_CHECKING:
-    from recorder.cameras.options import LiveOptions
-    from recorder.images.options import ImageOptions
+    from recorder.images.options import InputOptions
     from recorder.log.manifest import RecordingStart
     from recorder.recording import ViewRecording
-    from replay.camera_logs.options import CameraOptions
 
 CONVERTED = "foreign"
 """What a recording names as its source where it was converted from camera logs."""
@@ -66,8 +63,7 @@ LIVE = ("cameras", "gym")
     "Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
     "--resume as first asked for.",
 )
-@options.image_options
-@options.live_options
+@options.input_options("fields", "size", "rate", "color")
 @options.force
 @options.as_json
 @options.quiet
@@ -81,8 +77,7 @@ def record_command(
     preset: str | None,
     settings: tuple[str, ...],
     as_json: bool,
-    images: ImageOptions,
-    live: LiveOptions,
+    inputs: InputOptions,
     **writing: Any,
 ) -> None:
     """Record what a scene or cameras show, one MCAP file per view.
@@ -106,16 +101,14 @@ def record_command(
                 "live streams cannot go back, and all of it is recorded: leave out --resume, "
                 "--view and --jobs"
             )
-        live = dataclasses.replace(live, seed=seed)
-        writing |= {"preset": preset, "settings": settings, "as_json": as_json}
-        record_streams(ctx, source, out, live, images, **writing)
+        writing |= {"preset": preset, "settings": settings, "seed": seed, "as_json": as_json}
+        record_streams(ctx, source, out, inputs, **writing)
         return
     refuse_logs(source)
     resumed = out if writing["resume"] else None
     start = RecordingStart() if resumed is None else _start(resumed)
     named = "".join(source) or start.scene
-    is_scene([named], images)  # which refuses options of cameras
-    options.refuse_live_options(live, [named])
+    is_scene([named], inputs)  # which refuses options of cameras
     given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
     asked = named or given_seed or writing["frames"] or writing["split"]
     if resumed is not None and not asked and (files := recorded(resumed)):
@@ -126,7 +119,7 @@ def record_command(
         where = "" if resumed is None else f"{resumed} does not say of what it is: "
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
     seed = seed if given_seed or start.seed is None else start.seed
-    configuration = configure(named, preset, of_scene(settings, images), seed)
+    configuration = configure(named, preset, of_scene(settings, inputs), seed)
     files = _record_scene(ctx, configuration, out, **writing)
     print_recording(out, files, as_json=as_json)
 
@@ -181,8 +174,7 @@ def _record_scene(
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out("Folder of the recording.", required=True)
-@options.log_options
-@options.live_options
+@options.input_options(keys=True)
 @options.salvage
 @flag("--resume", "Resume an attempt that was stopped.")
 @options.force
@@ -198,44 +190,37 @@ def convert_command(
     resume: bool,
     force: bool,
     as_json: bool,
-    live: LiveOptions,
-    cameras: CameraOptions,
+    inputs: InputOptions,
 ) -> None:
     """Write camera logs of others as a recording.
 
     SOURCE is MCAP files or their URLs, ROS bags, LeRobot datasets, tables of numbers (CSV,
     Parquet), or a video or a folder of pictures for each stream; several, or a pattern such as
-    'logs/*.mcap'. What was interrupted is resumed with --resume. Live streams are recorded, as by
-    cdmisfa record.
+    'logs/*.mcap'. What was interrupted is resumed with --resume.
     """
-    from cdmisfa.experiments.sources import convert
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
+    from recorder.recording import record
     from replay.inputs import locations, open_cameras, refuse_what_is_no_log
 
-    writing: dict[str, Any] = {"force": force}
-    if any(map(is_live, source)):
-        if resume or salvage:
-            raise UsageError("live streams cannot go back: leave out --resume and --salvage")
-        record_streams(ctx, source, out, live, cameras, as_json=as_json, **writing)
-        return
-    options.refuse_live_options(live, source)
+    if live := next(filter(is_live, source), None):
+        raise UsageError(f"{live} is a live stream: cdmisfa record {shlex.join(source)} -o REC")
     named = locations(source)
     for place in named:
         refuse_what_is_no_log(place)
     if not resume:
         refuse_existing(out, force=force)
-    opened = open_cameras(named, cameras, salvage=salvage, goal=("convert", str(out)))
+    opened = open_cameras(named, inputs, salvage=salvage, goal=("convert", str(out)))
     with contextlib.closing(opened) as frames:
         say_about(frames)
         with recording(ctx, out, resume=resume) as (report, stop):
-            files = convert(
+            files = record(
                 frames,
                 out,
                 resume=resume,
                 stop=stop,
                 progress=lambda done: report(done, frames.spec.length or 0),
-                **writing,
+                force=force,
             )
         say_changes(frames)
     print_recording(out, files, as_json=as_json)

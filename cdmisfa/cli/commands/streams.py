@@ -16,8 +16,7 @@ from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from recorder.cameras.options import LiveOptions
-    from recorder.images.options import ImageOptions
+    from recorder.images.options import InputOptions
     from recorder.recording import ViewRecording
 
 
@@ -25,8 +24,7 @@ def record_streams(
     ctx: click.Context,
     words: Sequence[str],
     out: Path,
-    live: LiveOptions,
-    images: ImageOptions,
+    inputs: InputOptions,
     *,
     as_json: bool,
     force: bool,
@@ -42,7 +40,7 @@ def record_streams(
     from recorder.recording import DEFAULT_FRAMES
 
     refuse_existing(out, force=force, goes_on=False)
-    source, configuration = open_cameras_now(words, live, cameras=images, say=tell, **how)
+    source, configuration = open_cameras_now(words, inputs, say=tell, **how)
     notice = "finishing the recording; again to stop at once\n"
     with contextlib.closing(source), stoppable(notice=notice) as stop:
         frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)

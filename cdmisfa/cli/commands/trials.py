@@ -44,7 +44,7 @@ MOST_SEEDS = 1_000_000
 @options.end_after("iterations", "End each trial after so many iterations.")
 @options.end_after("modules", "End each trial after so many modules.")
 @options.loop
-@options.log_options
+@options.input_options()
 @options.jobs
 @options.engine
 @flag("--keep-logs", "Keep the run of every trial, with its log.")

@@ -14,7 +14,7 @@ from cdmisfa.cli.making import flag, grouped, number, word
 from cdmisfa.cli.printing import say_about, tell
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
-from replay.camera_logs.options import CameraOptions
+from recorder.images.options import InputOptions
 
 
 @grouped("view", common=("save", "web", "screenshot", "at", "tab", "every"))
@@ -60,7 +60,7 @@ def view_command(
     port: int | None,
     memory_limit: str,
     force: bool,
-    cameras: CameraOptions,
+    inputs: InputOptions,
     **shown: Any,
 ) -> None:
     """Open a run or a recording in the Rerun viewer, or save, serve or draw it.
@@ -96,7 +96,7 @@ def view_command(
     shown["about"] = say_about
 
     if save is not None:
-        build_view(path, save, force=force, beside=beside, cameras=cameras, **shown)
+        build_view(path, save, force=force, beside=beside, inputs=inputs, **shown)
         tell(f"view {save}")
         return
     from replay.viewer.headless import WINDOW
@@ -104,10 +104,10 @@ def view_command(
     from replay.viewer.window import open_window, serve
 
     with contextlib.ExitStack() as until_seen:
-        if beside or cameras != CameraOptions():
+        if beside or inputs != InputOptions():
             folder = until_seen.enter_context(tempfile.TemporaryDirectory(prefix="cdmisfa-view-"))
             built = Path(folder) / f"{path.resolve().stem}.rrd"
-            build_view(path, built, beside=beside, cameras=cameras, **shown)
+            build_view(path, built, beside=beside, inputs=inputs, **shown)
             path, shown = built, {}
         if screenshot is not None:
             draw(path, screenshot, at=at, force=force, window=size or WINDOW, **shown)

@@ -27,11 +27,10 @@ from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
-from recorder.cameras.options import LiveOptions
-from recorder.cameras.words import is_live, live_options, open_live
+from recorder.cameras.words import is_live, open_live, refuse_stored
+from recorder.images.options import InputOptions
 from replay.arrays import TAKES, ArrayLog, are_arrays
 from replay.camera_logs.opening import ALL, log_format, only_foreign
-from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import UnequalError
 from replay.export.applied import Applied
 from replay.inputs import locations
@@ -95,8 +94,7 @@ class Application:
     def open(
         self,
         words: Sequence[str],
-        cameras: CameraOptions | None = None,
-        live: LiveOptions | None = None,
+        inputs: InputOptions | None = None,
         *,
         loop: bool = False,
         salvage: bool = False,
@@ -106,8 +104,7 @@ class Application:
 
         Args:
             words: what `cdmisfa learn` takes.
-            cameras: what of logs is taken; size, fit and colour are the recipe's.
-            live: how live streams are put on one clock.
+            inputs: what of logs is taken; size, fit and colour are the recipe's.
             loop: start again at the end.
             salvage: pass over what is damaged.
             say: told in a line when a camera's state changes.
@@ -116,14 +113,14 @@ class Application:
             UsageError: no such source, or one whose frames the modules cannot take.
             LogDamagedError: it is damaged.
         """
-        cameras, live = cameras or CameraOptions(), live or LiveOptions()
+        inputs = inputs or InputOptions()
         if any(map(is_live, words)):
-            made = replace(live_options(words, live, cameras), **self.made(cameras))
-            source = open_live(words, made, say=say)
-        elif is_scene(words, cameras):
-            source = configure(words[0], settings=of_scene((), cameras)).open_scene()
+            refuse_stored(words, inputs)
+            source = open_live(words, replace(inputs, **self.made(inputs)), say=say)
+        elif is_scene(words, inputs):
+            source = configure(words[0], settings=of_scene((), inputs)).open_scene()
         else:
-            source = self._log(words, cameras, loop=loop, salvage=salvage)
+            source = self._log(words, inputs, loop=loop, salvage=salvage)
         shape = self.recipe.shape
         if source.spec.frame_shape != shape:
             source.close()
@@ -133,18 +130,18 @@ class Application:
             )
         return centre_as(self.recipe.centre, source, words[0])
 
-    def made(self, options: Any) -> dict[str, Any]:
+    def made(self, options: InputOptions) -> dict[str, Any]:
         """The recipe, as options of images; what it leaves open is that of others."""
         recipe = self.recipe
         numbers: dict[str, Any] = {"fields": options.fields or recipe.fields}
         if recipe.size is not None:
             numbers = {"size": recipe.size, "fit": recipe.fit, "color": recipe.color}
-        return {**numbers, "depth": options.depth or recipe.range}
+        return {**numbers, "range": options.range or recipe.range}
 
-    def _log(self, words: Sequence[str], cameras: CameraOptions, **how: Any) -> FrameSource:
+    def _log(self, words: Sequence[str], inputs: InputOptions, **how: Any) -> FrameSource:
         places = locations(words)
         if are_arrays(places):
-            arrays = open_logs(words, cameras=cameras, **how)
+            arrays = open_logs(words, inputs=inputs, **how)
             if not isinstance(arrays, ArrayLog) or not arrays.spec.images or not self.recipe.size:
                 return arrays
             arrays.close()
@@ -153,28 +150,28 @@ class Application:
                     self.recipe.refuse_turned((array.shape[1], array.shape[2]))
             except UsageError as error:
                 raise UsageError(f"{words[0]}: {error}") from None
-            taken = {name: value for name, value in self.made(cameras).items() if name in TAKES}
-            return open_logs(words, cameras=replace(cameras, **taken), **how)
-        if cameras == CameraOptions() and not any(map(only_foreign, places)):
+            taken = {name: value for name, value in self.made(inputs).items() if name in TAKES}
+            return open_logs(words, inputs=replace(inputs, **taken), **how)
+        if not inputs.external and not any(map(only_foreign, places)):
             with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
                 recorded = RecordedSource(places, **how)
                 if recorded.spec.frame_shape == self.recipe.shape or not recorded.spec.images:
                     return recorded
                 recorded.close()
-        numbers = cameras.fields or any(log_format(place) == "table" for place in places)
+        numbers = inputs.fields or any(log_format(place) == "table" for place in places)
         if numbers and self.recipe.size is not None:
             height, width = self.recipe.size
             raise UsageError(
                 f"{words[0]} shows numbers, and the modules learned from pictures of "
                 f"{width}x{height}: choose pictures"
             )
-        cameras = replace(cameras, **self.made(cameras))
-        if not cameras.topics and not cameras.fields:
-            cameras = replace(cameras, topics=ALL)
+        inputs = replace(inputs, **self.made(inputs))
+        if not inputs.topics and not inputs.fields:
+            inputs = replace(inputs, topics=ALL)
         try:
-            return open_logs(words, cameras=cameras, **how)
+            return open_logs(words, inputs=inputs, **how)
         except UnequalError:
-            return open_logs(words, cameras=replace(cameras, align="time"), **how)
+            return open_logs(words, inputs=replace(inputs, align="time"), **how)
 
     def to(
         self,

@@ -28,6 +28,7 @@ from cdmisfa.experiments.store import (
     run_trials,
     trial_id,
 )
+from recorder.images.options import InputOptions
 from recorder.log.files import (
     found_path,
     held,
@@ -36,7 +37,6 @@ from recorder.log.files import (
     relative_path,
     to_disk,
 )
-from replay.camera_logs.options import CameraOptions
 from replay.corpus.finding import INDEX
 from replay.corpus.index import IndexedLog, index_logs, indexed_logs, is_index
 
@@ -115,7 +115,7 @@ def apply_to_logs(
     out: Path,
     *,
     form: str = "parquet",
-    cameras: CameraOptions | None = None,
+    inputs: InputOptions | None = None,
     frames: int | None = None,
     loop: bool = False,
     salvage: bool = False,
@@ -137,7 +137,7 @@ def apply_to_logs(
         words: folders, patterns, files and URLs of logs, or indices of them.
         out: the folder of the files; with workers on other machines a shared one.
         form: of the files: their ending.
-        cameras: see `Application.open`, as for `loop` and `salvage`.
+        inputs: see `Application.open`, as for `loop` and `salvage`.
         frames: end after so many of each stream.
         loop: start a log again at its end.
         salvage: pass over what is damaged.
@@ -155,9 +155,9 @@ def apply_to_logs(
         EngineError: no scheduler answers.
     """
     application, out = Application(run), Path(out).resolve()
-    cameras = cameras or CameraOptions()
-    options = {"cameras": cameras, "loop": loop, "salvage": salvage}
-    depends = plain(options | {"form": form, "frames": frames, "cameras": asdict(cameras)})
+    inputs = inputs or InputOptions()
+    options = {"inputs": inputs, "loop": loop, "salvage": salvage}
+    depends = plain(options | {"form": form, "frames": frames, "inputs": asdict(inputs)})
     folder = out / STORE
     if not folder.exists():
         refuse_existing(out, force=force, goes_on=False)
