@@ -44,7 +44,7 @@ from replay.viewer.program import missing_driver
 @pytest.fixture
 def sweep(tmp_path):
     for seed in range(3):
-        run = tmp_path / "sweep #1" / "trials" / f"trial{seed}"
+        run = tmp_path / "sweep #1" / f"trial{seed}"
         run.mkdir(parents=True)
         write_run(run / "run.mcap", VECTOR, 6, seed=seed)
     return tmp_path / "sweep #1"
@@ -58,14 +58,13 @@ def recording_of(file):
 
 def test_runs_are_found_in_a_sweep_and_beside_one_another(sweep):
     assert [run.name for run in runs_in(sweep)] == ["trial0", "trial1", "trial2"]
-    assert runs_in(sweep / "trials") == runs_in(sweep)
-    assert runs_in(sweep / "trials" / "trial0") == []
+    assert runs_in(sweep / "trial0") == []
     assert runs_in(sweep / "nothing") == []
 
 
 def test_rows_and_views_of_a_run_have_one_name_and_say_what_was_run(sweep, tmp_path):
-    ready_view(sweep / "trials" / "trial0")
-    shutil.copytree(sweep / "trials" / "trial0", sweep / "trials" / "copy of a #1")
+    ready_view(sweep / "trial0")
+    shutil.copytree(sweep / "trial0", sweep / "copy of a #1")
     names = set()
     rows = write_rows(runs_in(sweep), tmp_path)
     for run, row in zip(runs_in(sweep), rows, strict=True):
@@ -83,7 +82,7 @@ def test_rows_and_views_of_a_run_have_one_name_and_say_what_was_run(sweep, tmp_p
 
 
 def test_the_manifest_of_a_run_says_what_its_log_says(sweep):
-    run = sweep / "trials" / "trial1"
+    run = sweep / "trial1"
     outline = read_outline(run)
     streams, manifest = outline.names(), outline.header.manifest
     result = {
@@ -111,7 +110,7 @@ def test_only_what_is_missing_or_old_is_built(sweep):
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):
-    with pytest.raises(UsageError, match="--keep-logs"):
+    with pytest.raises(UsageError, match="holds no runs"):
         serve_catalogue(tmp_path)
 
 

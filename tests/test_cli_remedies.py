@@ -14,9 +14,7 @@ from conftest import Cdmisfa
 from waiting import python
 
 from cdmisfa.cli.commands.doctor import EXTRAS
-from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels import WIDE
-from replay.runs.folders import runs_in
 
 ROOT = Path(__file__).parents[1]
 LOGS = ROOT / "sample_logs" / "icub"
@@ -30,31 +28,6 @@ def test_export_makes_its_folders(
     out = tmp_path / "no" / "such" / name
     assert cdmisfa("export", oscillatory_run, "-o", out).code == 0
     assert out.stat().st_size > 0
-
-
-@pytest.mark.parametrize("words", [(), ("--web",), ("--save", "a.rrd")])
-def test_a_sweep_without_logs_says_how_to_keep_them(
-    cdmisfa: Cdmisfa, tmp_path: Path, words: tuple[str, ...]
-) -> None:
-    swept = ("sweep", "oscillatory", "-o", tmp_path, "--seeds", "0:1", "--max-iterations", 2)
-    assert cdmisfa(*swept).code == 0
-    done = cdmisfa("view", tmp_path, *words)
-    assert (done.code, done.err.count("\n")) == (2, 1)
-    assert "this sweep kept no logs: sweep again with --keep-logs" in done.err
-
-
-def test_the_runs_of_a_sweep_are_those_it_was_asked_for_last(
-    cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    swept = ("sweep", "oscillatory", "-o", tmp_path, "--keep-logs", "--max-iterations", 2)
-    assert cdmisfa(*swept, "--seeds", "0:2").code == 0
-    assert cdmisfa(*swept, "--seeds", "1:2", "--set", "learner.tau=10").code == 0
-    assert len(list((tmp_path / "trials").iterdir())) == 3
-    (run,) = runs_in(tmp_path)
-    assert json.loads((run / "run.json").read_text())["config"]["learner"]["tau"] == 10
-    (tmp_path / "sweep.json").write_text("{")
-    with pytest.raises(LogDamagedError, match=r"sweep\.json is damaged"):
-        runs_in(tmp_path)
 
 
 def test_a_stub_is_not_recovered_as_an_empty_log(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -1,19 +1,18 @@
-"""Reports of runs and sweeps: one HTML page each, with the results."""
+"""Reports of runs: one HTML page each, with the results."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.recompute import Recomputation
 from cdmisfa.experiments.resume import read_command
 from recorder.images.options import OPTIONS, InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
-from replay.runs.folders import REPORT_FILE, is_run, is_sweep, read_request, run_log, runs_in
-from replay.runs.log import read_header
+from replay.runs.folders import REPORT_FILE, is_run, run_log, runs_in
 
 if TYPE_CHECKING:
     from replay.report.trust import Proof
@@ -25,7 +24,7 @@ def write_report(
     *,
     force: bool = False,
 ) -> Path:
-    """Write the report of a run, of several runs or of a sweep.
+    """Write the report of a run, of several runs or of a folder of runs.
 
     Args:
         words: their paths.
@@ -59,8 +58,8 @@ def _page(paths: list[Path], runs: list[Path]) -> str:
 
     if len(paths) == 1 and runs:
         return report_of_run(paths[0], proof_of(paths[0]))
-    if len(paths) == 1 and (is_sweep(paths[0]) or runs_in(paths[0])):
-        return _of_sweep(paths[0])
+    if len(paths) == 1 and (found := runs_in(paths[0])):
+        return report_of_runs(found, f"{paths[0].resolve().name}: {len(found)} runs")
     if others := [path for path in paths if path not in runs]:
         raise UsageError(f"{others[0]} is no run: look at a log with cdmisfa info or cdmisfa view")
     return report_of_runs(paths, f"{len(paths)} runs compared")
@@ -71,46 +70,6 @@ def _is_run(path: Path) -> bool:
         return path.exists() and is_run(path)
     except CdmisfaError:
         return path.is_dir() and (path / "run.json").is_file()
-
-
-def _of_sweep(folder: Path) -> str:
-    """The page of a sweep, or of a folder of runs."""
-    from cdmisfa.experiments.results import as_table, results, varied
-    from replay.report.page import report_of_runs
-
-    runs, name = runs_in(folder), folder.resolve().name
-    if not is_sweep(folder):
-        return report_of_runs(runs, f"{name}: {len(runs)} runs")
-    points = results(folder)
-    differ = varied(points)
-    text = "; ".join(f"{key}: {', '.join(map(str, values))}" for key, values in differ.items())
-    text = f"What differs is {text}." if text else "Its trials differ in their seeds alone."
-    head, rows = as_table(points)
-    orders = [
-        (*map(str, point.point.values()), order or "nothing", count)
-        for point in points
-        for order, count in point.orders.items()
-    ]
-    keys = [*(points[0].point if points else ()), "learned, in order", "trials"]
-    tables = [
-        {"title": "What differs, and what came of it", "text": text, "head": head, "rows": rows},
-        {"title": "In which order streams were learned", "text": "", "head": keys, "rows": orders},
-    ]
-    title = f"{name}: a sweep of {len(points)} points"
-    asked = {number: (k, point) for k, (number, point) in enumerate(read_request(folder))}
-    runs.sort(key=lambda run: asked[_trial(run)][0])
-    names = [_named(run, asked[_trial(run)][1]) for run in runs]
-    return report_of_runs(runs, title, tables, names)
-
-
-def _trial(run: Path) -> str:
-    return run.name.partition(".")[0]
-
-
-def _named(run: Path, point: Mapping[str, Any]) -> str:
-    """A trial's name: what its point and its seed are."""
-    seed = read_header(run).manifest.get("seed")
-    return ", ".join([*(f"{key}={value}" for key, value in point.items()), f"seed {seed}"])
 
 
 def proof_of(run: Path) -> Proof:

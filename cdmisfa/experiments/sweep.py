@@ -44,7 +44,6 @@ from cdmisfa.experiments.store import (
 )
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
 from recorder.images.options import InputOptions
-from recorder.log.files import atomic_write
 from recorder.world.oscillatory import OscillatoryConfig
 
 REQUEST = "sweep.json"
@@ -84,7 +83,6 @@ def sweep(
     jobs: int = 1,
     engine: str = "local",
     scheduler: str | None = None,
-    keep_logs: bool = False,
     retry_failed: bool = False,
     progress: Callable[[int, int, int], None] = lambda finished, failed, total: None,
     **how: Any,
@@ -99,8 +97,6 @@ def sweep(
         jobs: local processes.
         engine: where to compute, see `processes.ENGINES`.
         scheduler: address of a dask scheduler.
-        keep_logs: keep each trial's run folder in folder/trials; with workers on other
-            machines it must be a shared one.
         retry_failed: compute trials again that failed before.
         progress: called with the trials finished, failed, and asked for.
         how: further arguments of `plan`, for all trials.
@@ -112,8 +108,7 @@ def sweep(
     folder = Path(folder).resolve()
     if log := next(folder.glob("*.mcap*"), None):
         raise UsageError(f"{folder} holds {log.name}, of a run or a recording: choose another -o")
-    logs = folder / "trials" if keep_logs else None
-    trials = plan(source, grid=grid or {}, seeds=seeds, logs=logs, **how)
+    trials = plan(source, grid=grid or {}, seeds=seeds, **how)
     request = as_text(_request(grid or {}, trials))
     if len(request) > MAX_LIST:
         raise UsageError(
@@ -143,7 +138,6 @@ def plan(
     inputs: InputOptions | None = None,
     max_iterations: int | None = None,
     max_modules: int | None = None,
-    logs: Path | None = None,
 ) -> list[SweepTrial]:
     """Every trial of a sweep, in the grid's order, seeds innermost; checks all settings.
 
@@ -157,7 +151,6 @@ def plan(
         inputs: how images of others become frames; see `open_source`.
         max_iterations: end each trial after so many.
         max_modules: end each trial after so many.
-        logs: folder in which each trial keeps its run.
 
     Raises:
         UsageError: an unknown key, a value that does not fit, or no such source.
@@ -197,7 +190,6 @@ def plan(
                 inputs=inputs,
                 max_iterations=max_iterations,
                 max_modules=max_modules,
-                log=logs / name if logs is not None else None,
                 code=code(),
             )
             trials.setdefault(trial.id, trial)
@@ -232,17 +224,16 @@ def _configured(
 def compute(trial: SweepTrial) -> Mapping[str, Any]:
     """Compute one trial: its result, or under "error" why there is none.
 
-    Oscillatory trials without a log run as a whole in C where the learner can;
-    all others as `learn` does.
+    Oscillatory trials run as a whole in C where the learner can; all others as `learn` does.
     """
     return answer(trial, code(), _compute)
 
 
 def _compute(trial: SweepTrial) -> dict[str, Any]:
-    live = trial.source == ("oscillatory",) and trial.log is None
+    live = trial.source == ("oscillatory",)
     if live and has_whole_trials(trial.configuration.learner):
         return _whole_trial(trial)
-    return _logged_trial(trial)
+    return _learned_trial(trial)
 
 
 def _whole_trial(trial: SweepTrial) -> dict[str, Any]:
@@ -266,20 +257,16 @@ def _whole_trial(trial: SweepTrial) -> dict[str, Any]:
     }
 
 
-def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
+def _learned_trial(trial: SweepTrial) -> dict[str, Any]:
     configuration = trial.configuration
     if is_scene(trial.source):
         source = configuration.open_scene()
     else:
         source = open_logs(trial.source, loop=trial.loop, inputs=trial.inputs)
-    with contextlib.closing(source), contextlib.ExitStack() as opened:
-        log = None
-        if trial.log is not None:
-            log = opened.enter_context(atomic_write(trial.log))
+    with contextlib.closing(source):
         result = run(
             source,
             configuration.learner,
-            log,
             seed=trial.seed,
             max_iterations=trial.max_iterations,
             max_modules=trial.max_modules,

@@ -48,22 +48,18 @@ def report_of_run(path: Path, proof: Proof | None = None) -> str:
 def report_of_runs(
     paths: Sequence[Path],
     title: str,
-    tables: Sequence[Mapping[str, Any]] = (),
-    names: Sequence[str] = (),
 ) -> str:
-    """The page that compares runs, as those of a sweep.
+    """Return the page that compares runs.
 
     Args:
         paths: of the runs, the first of which the others are compared with.
         title: of the page.
-        tables: of results: `title`, `text`, `head` and `rows`.
-        names: of the runs, by default those of their folders.
 
     Raises:
         UsageError: one is no run.
         LogDamagedError: one cannot be read.
     """
-    return rendered(runs_content(paths, title, tables, names))
+    return rendered(runs_content(paths, title))
 
 
 def rendered(content: Mapping[str, Any]) -> str:

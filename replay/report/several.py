@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,20 +36,15 @@ SHOWN = 24
 def runs_content(
     paths: Sequence[Path],
     title: str,
-    tables: Sequence[Mapping[str, Any]],
-    names: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What the page of several runs is made of; see runs.html."""
-    rows = side_by_side(paths) if paths else ()
-    if names:
-        rows = tuple(replace(row, name=name) for row, name in zip(rows, names, strict=True))
+    rows = side_by_side(paths)
     outcomes = {_outcome(row) for row in rows}
     same = sum(row.difference is None for row in rows)
     return {
         "kind": "runs",
         "title": title,
         "lead": _lead(rows, len(outcomes), same),
-        "tables": tables,
         "rows": [(place, colour_class(place), *row.cells()) for place, row in enumerate(rows)],
         "explained": [line for row in rows for line in row.explanation().splitlines()],
         "curves": [
@@ -73,8 +67,6 @@ def _outcome(row: Row) -> tuple[int, ...]:
 
 def _lead(rows: Sequence[Row], outcomes: int, same: int) -> str:
     n = len(rows)
-    if not n:
-        return "No run of it kept its log: here is what they came to."
     if same == n and n > 1:
         return f"All {n} runs are identical, bit for bit."
     what = f"came to {outcomes} different outcomes"

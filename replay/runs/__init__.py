@@ -5,7 +5,7 @@ from cdmisfa.core.exports import exports
 __getattr__, __dir__, __all__ = exports(
     __name__,
     {
-        "replay.runs.folders": "is_run is_sweep run_log runs_in",
+        "replay.runs.folders": "is_run run_log runs_in",
         "replay.runs.log": "Event RunHeader read_batches read_columns read_header",
         "replay.runs.run": "Outline Run read_outline",
         "replay.runs.writer": "RunWriter",

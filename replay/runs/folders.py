@@ -83,26 +83,11 @@ def read_run_json(folder: Path) -> Mapping[str, Any]:
 
 
 def runs_in(folder: Path) -> list[Path]:
-    """The folders of runs in a folder or in its `trials`; none where it is itself a run.
-
-    Of a sweep's trials they are those that it was asked for last.
-
-    Raises:
-        LogDamagedError: the sweep's request cannot be read.
-    """
+    """Return the folders of runs in a folder; none where it is itself a run."""
     folder = Path(folder)
     if not folder.is_dir() or is_run(folder):
         return []
-    trials = list((folder / "trials").glob("*"))
-    if is_sweep(folder):
-        wanted = {trial for trial, _ in read_request(folder)}
-        trials = [trial for trial in trials if trial.name.partition(".")[0] in wanted]
-    return sorted(p for p in (*folder.iterdir(), *trials) if p.is_dir() and is_run(p))
-
-
-def is_sweep(folder: Path) -> bool:
-    """Whether a folder is that of a sweep."""
-    return (Path(folder) / REQUEST).is_file()
+    return sorted(p for p in folder.iterdir() if p.is_dir() and is_run(p))
 
 
 def read_request(folder: Path) -> list[tuple[str, dict[str, Any]]]:

@@ -107,7 +107,7 @@ def served_table(folder: Path, port: int | None = None) -> Iterator[Table | None
     """
     runs = runs_in(folder)
     if not runs:
-        raise UsageError(f"{folder} holds no runs: sweep with --keep-logs")
+        raise UsageError(f"{folder} holds no runs")
     with (
         tempfile.TemporaryDirectory(prefix="cdmisfa-runs-") as place,
         _server(port) as (server, address),

@@ -25,7 +25,7 @@ def report_command(
 ) -> None:
     """Write what came of a run as one HTML page, to be read, printed or sent.
 
-    RUN is the folder of a run; several runs, which are compared; a sweep or another folder of
+    RUN is the folder of a run; several runs, which are compared; or a folder of
     runs. The page needs no network and no other file: what was
     learned, when, where the learner looked, why it ended, what each module tells apart, and whether
     that can be computed again. `learn` writes that of its run as report.html.

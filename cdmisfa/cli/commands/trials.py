@@ -47,7 +47,6 @@ MOST_SEEDS = 1_000_000
 @options.input_options()
 @options.jobs
 @options.engine
-@flag("--keep-logs", "Keep the run of every trial, with its log.")
 @options.retry_failed
 @options.as_json
 @options.quiet

@@ -13,7 +13,6 @@ from cdmisfa.cli import options
 from cdmisfa.cli.making import flag, grouped, number, word
 from cdmisfa.cli.printing import say_about, tell
 from cdmisfa.cli.progress import bar
-from cdmisfa.core.errors import UsageError
 from recorder.images.options import InputOptions
 
 
@@ -66,7 +65,7 @@ def view_command(
     """Open a run or a recording in the Rerun viewer, or save, serve or draw it.
 
     RUN is the folder of a run, or its run.mcap, a recording, an .rrd file, or one or several
-    camera logs; of a log behind a URL a copy is made. A sweep that kept its logs is served as a
+    camera logs; of a log behind a URL a copy is made. A folder of runs is served as a
     table, one row per run that it was asked for last, until interrupted.
     """
     if sum((save is not None, web, screenshot is not None)) > 1:
@@ -75,7 +74,7 @@ def view_command(
         raise click.UsageError("a file of Rerun has no place for a moment: --at without --save")
     if size is not None and (web or save is not None):
         raise click.UsageError("--size goes with a window or --screenshot")
-    from replay.runs.folders import is_sweep, runs_in
+    from replay.runs.folders import runs_in
     from replay.viewer.program import check_limit
 
     check_limit(memory_limit)
@@ -87,8 +86,6 @@ def view_command(
             raise click.UsageError(f"{path} holds many runs: --at is a moment of one")
         _view_sweep(path, screenshot, size, shown["tab"], web=web, port=port, force=force)
         return
-    if not beside and is_sweep(path):
-        raise UsageError(f"{path}: this sweep kept no logs: sweep again with --keep-logs")
     if port is not None and not web:
         raise click.UsageError("--port goes with --web, or with a sweep")
     from replay.view.build import build_view  # half a second, as are those below
