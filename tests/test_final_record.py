@@ -55,7 +55,7 @@ def copied_log(folder: Path, *, drop: int = -1, final: bool = True) -> None:
     with LogReader(source) as reader, LogFile(folder / "new.mcap") as log:
         for record in reader.metadata:
             if final or record.name != FINAL_METADATA:
-                log.add_metadata(record.name, record.values)
+                log.add_metadata(record.name, record.metadata)
         known = {}
         for number, channel in sorted(reader.channels.items()):
             schema = reader.schemas[channel.schema_id]

@@ -202,7 +202,7 @@ def test_more_views_than_files_may_be_open_are_recorded_learned_and_checked(
 def stated(folder: Path, view: str) -> dict[str, str]:
     with LogReader(folder / f"{view}.mcap") as reader:
         (record,) = (r for r in reader.metadata if r.name == RECORDING_METADATA)
-        return dict(record.values)
+        return dict(record.metadata)
 
 
 def test_each_of_many_views_names_only_its_own(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def test_every_variant_of_the_format_is_read(
             assert len(reader.channels) == bool(expected)
             attached = [(a.name, reader.attachment_data(a)) for a in reader.attachments]
             assert attached == [("myFile", b"\1\2\3")] * (kind == "attachment")
-            assert [m.values for m in reader.metadata] == [{"foo": "bar"}] * (kind == "metadata")
+            assert [m.metadata for m in reader.metadata] == [{"foo": "bar"}] * (kind == "metadata")
 
 
 def test_the_generator_makes_what_others_can_read() -> None:

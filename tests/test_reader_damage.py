@@ -188,12 +188,8 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
         files.record(files.SCHEMA, files.schema())
         + files.record(files.SCHEMA, files.schema(name="Other"))
     ),
-    "schema 0": lambda: files.record(files.SCHEMA, files.schema(0)),
     "not UTF-8": lambda: files.record(files.SCHEMA, b"\1\0\2\0\0\0\xff\xff\0\0\0\0\0\0\0\0"),
     "text of 4 GiB": lambda: files.record(files.SCHEMA, b"\1\0\xff\xff\xff\xff"),
-    "key twice": lambda: files.record(
-        files.METADATA, files.text("m") + struct.pack("<I", 20) + (files.text("k") * 4)
-    ),
     "attachment of 2**40 bytes": lambda: files.record(
         files.ATTACHMENT, bytes(16) + files.text("a") * 2 + struct.pack("<QI", 2**40, 0)
     ),

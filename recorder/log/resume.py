@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from mcap.records import Metadata
+
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.untrusted import opened_regular
 from recorder.config import Split
@@ -29,7 +31,7 @@ from recorder.log.files import (
 from recorder.log.manifest import RecordingSpec, RecordingStart, ViewMetadata, read_start
 from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import MAGIC, Metadata
+from recorder.mcap.records import MAGIC
 
 _LEAST = 64
 """Bytes that no log has less of once its header and metadata are written."""
@@ -277,9 +279,9 @@ def _refuse_other(path: Path, stated: ViewMetadata) -> None:
     if record is None or record.name != RECORDING_METADATA:
         raise UsageError(f"{path} does not say what it is a recording of: overwrite with --force")
     for key, value in stated.record().items():
-        if record.values.get(key) != value:
+        if record.metadata.get(key) != value:
             raise UsageError(
-                f"{path} cannot be continued: its {key} is {record.values.get(key)!r}, now it is "
+                f"{path} cannot be continued: its {key} is {record.metadata.get(key)!r}, now it is "
                 f"{value!r}; use the same command and versions, or overwrite with --force"
             )
 
@@ -299,7 +301,7 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
         record = _metadata(path)
         if path.suffix != ".mcap" or record is None or record.name != RECORDING_METADATA:
             return []
-        stated = ViewMetadata.parse(path, record.values)
+        stated = ViewMetadata.parse(path, record.metadata)
         there = frames_held(path, stated.view, gaps=stated.gaps)
         if there.stop_from(stops.get(stated.view, 0)) != there.end or not there.end:
             return []
@@ -328,10 +330,10 @@ def other_recordings(folder: Path, recording: RecordingSpec) -> list[Path]:
             continue
         if record.name != RECORDING_METADATA:
             raise UsageError(f"{path} is of no recording: choose another folder")
-        view = record.values.get("view", "")
+        view = record.metadata.get("view", "")
         stated = recording.metadata(view).record() if view in recording.spec.streams else {}
         mine = {k: v for k, v in stated.items() if k != "first_frame" and "version_" not in k}
-        if not mine or any(record.values.get(key) != value for key, value in mine.items()):
+        if not mine or any(record.metadata.get(key) != value for key, value in mine.items()):
             others.append(path)
     return others
 

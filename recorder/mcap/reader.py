@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
+from mcap.records import Channel, Schema
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.chunks import Chunks
@@ -18,11 +19,9 @@ from recorder.mcap.data_section import DataSection
 from recorder.mcap.records import (
     MAX_CHUNK,
     Attachment,
-    Channel,
     MalformedRecord,
     Message,
     Problem,
-    Schema,
     Segment,
 )
 from recorder.mcap.store import FileStore, OnePass, Store

@@ -6,13 +6,16 @@ Nothing here trusts a length, count or text of the file. Whoever reads a file tu
 
 from __future__ import annotations
 
+import io
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 
@@ -60,121 +63,37 @@ def no_log(path: Path) -> CdmisfaError:
     return UsageError(f"{path} is no log that is read: {KINDS}")
 
 
-@dataclass(frozen=True, slots=True)
-class Schema:
-    """How messages of a channel are to be decoded."""
-
-    id: int
-    name: str
-    encoding: str
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Channel:
-    """A stream of messages on a topic; `schema_id` 0 has no schema."""
-
-    id: int
-    schema_id: int
-    topic: str
-    encoding: str
-    metadata: dict[str, str] = field(hash=False)
-
-
-@dataclass(frozen=True, slots=True)
-class Statistics:
-    """How much the writer says the file holds."""
-
-    messages: int
-    attachments: int
-    metadata: int
-    chunks: int
-    per_channel: dict[int, int] = field(hash=False)
-
-
-class Fields:
-    """The fields of one record, taken one after the other within its bounds."""
+class Fields(ReadDataStream):
+    """The fields of one record, read one after the other within its bounds."""
 
     def __init__(self, data: bytes | memoryview, what: str) -> None:
-        self.data = memoryview(data)
-        self.what = what
-        self.at = 0
+        super().__init__(io.BytesIO(data))
+        self._size, self._what = len(data), what
 
-    def take(self, count: int) -> memoryview:
-        """Take the next `count` bytes.
+    def read(self, length: int) -> bytes:
+        """Return the next bytes.
 
         Raises:
             MalformedRecord: there are fewer left.
         """
-        if count > len(self.data) - self.at:
+        left = self._size - self.count
+        if length > left:
             raise MalformedRecord(
-                f"{self.what} is cut short or lies about a length ({count} bytes wanted, "
-                f"{len(self.data) - self.at} there)"
+                f"{self._what} is cut short or lies about a length ({length} bytes wanted, "
+                f"{left} there)"
             )
-        self.at += count
-        return self.data[self.at - count : self.at]
+        return bytes(super().read(length))
 
-    def integer(self, width: int) -> int:
-        """Take an unsigned little-endian number of `width` bytes."""
-        return int.from_bytes(self.take(width), "little")
-
-    def text(self) -> str:
-        """Take a text with its length in front.
+    def read_prefixed_string(self) -> str:
+        """Return a text with its length in front.
 
         Raises:
             MalformedRecord: it is not UTF-8.
         """
-        raw = self.take(self.integer(4))
         try:
-            return str(raw, "utf-8")
+            return str(super().read_prefixed_string())
         except UnicodeDecodeError:
-            raise MalformedRecord(f"{self.what} holds a text that is not UTF-8") from None
-
-    def texts(self) -> dict[str, str]:
-        """Take a map of texts, where no key may stand twice: readers would disagree.
-
-        Raises:
-            MalformedRecord: one does.
-        """
-        inner = Fields(self.take(self.integer(4)), self.what)
-        result: dict[str, str] = {}
-        while inner.at < len(inner.data):
-            key = inner.text()
-            if key in result:
-                raise MalformedRecord(f"{self.what} holds the key {key[:80]!r} twice")
-            result[key] = inner.text()
-        return result
-
-
-def schema(content: bytes | memoryview) -> Schema:
-    """A Schema record; raises MalformedRecord."""
-    fields = Fields(content, "a schema")
-    number = fields.integer(2)
-    if number == 0:
-        raise MalformedRecord("a schema has the id 0, which stands for none")
-    return Schema(number, fields.text(), fields.text(), bytes(fields.take(fields.integer(4))))
-
-
-def channel(content: bytes | memoryview) -> Channel:
-    """A Channel record; raises MalformedRecord."""
-    fields = Fields(content, "a channel")
-    return Channel(
-        fields.integer(2), fields.integer(2), fields.text(), fields.text(), fields.texts()
-    )
-
-
-def statistics(content: bytes | memoryview) -> Statistics:
-    """A Statistics record; raises MalformedRecord."""
-    fields = Fields(content, "the statistics")
-    messages = fields.integer(8)
-    fields.take(2 + 4)  # schemas and channels
-    attachments, metadata, chunks = fields.integer(4), fields.integer(4), fields.integer(4)
-    fields.take(8 + 8)  # first and last log time
-    raw = fields.take(fields.integer(4))
-    if len(raw) % 10:
-        raise MalformedRecord("the statistics hold a broken count per channel")
-    per_channel = dict(struct.iter_unpack("<HQ", raw))
-    return Statistics(messages, attachments, metadata, chunks, per_channel)
+            raise MalformedRecord(f"{self._what} holds a text that is not UTF-8") from None
 
 
 def crc32(data: bytes | memoryview, value: int = 0) -> int:
@@ -231,9 +150,9 @@ class Segment:
     def of_chunk(cls, offset: int, content: bytes | memoryview) -> Segment:
         """Parse the header of a chunk at a place in the file."""
         fields = Fields(content, "a chunk")
-        start, end, size = fields.integer(8), fields.integer(8), fields.integer(8)
-        crc, compression, stored = fields.integer(4), fields.text(), fields.integer(8)
-        data = offset + RECORD_HEADER.size + fields.at
+        start, end, size = fields.read8(), fields.read8(), fields.read8()
+        crc, compression, stored = fields.read4(), fields.read_prefixed_string(), fields.read8()
+        data = offset + RECORD_HEADER.size + fields.count
         return cls(offset, data, stored, size, compression, crc, start, end, chunked=True)
 
     def head(self, crc: int) -> bytes:
@@ -274,14 +193,6 @@ class Segment:
         for part in self.indexes:
             counts[part.channel] = counts.get(part.channel, 0) + part.count
         return counts
-
-
-@dataclass(frozen=True, slots=True)
-class Metadata:
-    """A named map of texts."""
-
-    name: str
-    values: dict[str, str] = field(hash=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +250,8 @@ class Definitions:
         if self._bytes > MAX_DEFINITION:
             raise MalformedRecord(f"schemas and channels take more than {MAX_DEFINITION} bytes")
         is_schema = opcode == Opcode.SCHEMA
-        new = schema(content) if is_schema else channel(content)
+        fields = Fields(content, "a schema" if is_schema else "a channel")
+        new = Schema.read(fields) if is_schema else Channel.read(fields)
         known: dict[int, Any] = self.schemas if is_schema else self.channels
         if known.setdefault(new.id, new) != new:
             kind = "schema" if is_schema else "channel"

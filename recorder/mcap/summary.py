@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from mcap.opcode import Opcode
+from mcap.records import Statistics
 
 from recorder.mcap.records import (
     CHUNK_HEADER,
@@ -27,9 +28,7 @@ from recorder.mcap.records import (
     MalformedRecord,
     Refuse,
     Segment,
-    Statistics,
     crc32,
-    statistics,
 )
 from recorder.mcap.store import Store
 
@@ -89,10 +88,10 @@ class Summary:
             raise MalformedRecord("its chunk index names chunks that overlap")
         counts = [segment.channel_counts() or {} for segment in found]
         accounted = (
-            len(found) == len(all_of) == stated.chunks
-            and len(self.indexes[Opcode.METADATA_INDEX]) == stated.metadata
-            and len(self.indexes[Opcode.ATTACHMENT_INDEX]) == stated.attachments
-            and sum(sum(c.values()) for c in counts) == stated.messages
+            len(found) == len(all_of) == stated.chunk_count
+            and len(self.indexes[Opcode.METADATA_INDEX]) == stated.metadata_count
+            and len(self.indexes[Opcode.ATTACHMENT_INDEX]) == stated.attachment_count
+            and sum(sum(c.values()) for c in counts) == stated.message_count
             and all(c.keys() <= known for c in counts)
         )
         return found if accounted else None
@@ -106,7 +105,7 @@ class Summary:
         found = []
         for content in self.indexes[opcode]:
             fields = Fields(content, "an index")
-            start, size = fields.integer(8), fields.integer(8)
+            start, size = fields.read8(), fields.read8()
             if size < RECORD_HEADER.size or start + size > self.begin:
                 raise MalformedRecord("an index points outside the data")
             found.append((start, start + size))
@@ -165,7 +164,7 @@ def _take_records(data: bytes, summary: Summary, definitions: Definitions) -> No
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             definitions.add(opcode, content, "summary")
         elif opcode == Opcode.STATISTICS:
-            summary.statistics = statistics(content)
+            summary.statistics = Statistics.read(Fields(content, "the statistics"))
         elif opcode <= Opcode.DATA_END and opcode != Opcode.SUMMARY_OFFSET:
             raise MalformedRecord(f"a {Opcode(opcode).name} record among the summary")
         at += RECORD_HEADER.size + length

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from mcap.opcode import Opcode
+from mcap.records import Header, Metadata
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.chunks import check_size
@@ -25,7 +26,6 @@ from recorder.mcap.records import (
     Fields,
     IndexPart,
     MalformedRecord,
-    Metadata,
     Refuse,
     Segment,
     no_log,
@@ -257,11 +257,11 @@ class LogStructure:
         elif opcode == Opcode.HEADER:
             if self._at != len(MAGIC):
                 raise MalformedRecord("a second header, as of two files in one")
-            fields = Fields(self._definition(content, length), "the header")
-            self.profile, self.library = fields.text(), fields.text()
+            header = Header.read(Fields(self._definition(content, length), "the header"))
+            self.profile, self.library = header.profile, header.library
         elif opcode == Opcode.DATA_END:
             self.data_end = self._at
-            crc = Fields(self._file.peek(content, min(length, 4)), "the data end").integer(4)
+            crc = Fields(self._file.peek(content, min(length, 4)), "the data end").read4()
             if self._resync and self._limit is None and length != 4:
                 raise MalformedRecord("a data end of another length than its own")
             if self._limit is not None and content + length != self._limit:
@@ -339,16 +339,17 @@ class LogStructure:
         if self._metadata_bytes > MAX_DEFINITION:
             raise MalformedRecord(f"metadata takes more than {MAX_DEFINITION} bytes")
         fields = Fields(content, "metadata")
-        self.metadata.append(Metadata(fields.text(), fields.texts()))
-        self._inside = self._at + RECORD_HEADER.size + fields.at
+        self.metadata.append(Metadata.read(fields))
+        self._inside = self._at + RECORD_HEADER.size + fields.count
 
     def _attachment(self, content: int, length: int) -> None:
         fields = Fields(self._file.read(content, min(length, _BEFORE_DATA)), "an attachment")
-        log_time, create_time = fields.integer(8), fields.integer(8)
-        name, media_type, size = fields.text(), fields.text(), fields.integer(8)
-        if fields.at + size + 4 > length:
+        log_time, create_time = fields.read8(), fields.read8()
+        name, media_type = fields.read_prefixed_string(), fields.read_prefixed_string()
+        size = fields.read8()
+        if fields.count + size + 4 > length:
             raise MalformedRecord("an attachment lies about its length")
-        data = content + fields.at
+        data = content + fields.count
         self._inside = data + size + 4
         crc = int.from_bytes(self._file.read(data + size, 4), "little")
         found = Attachment(name, media_type, log_time, create_time, data, size, crc)
@@ -411,14 +412,14 @@ class LogStructure:
         if stated is None:
             return
         found = {
-            "chunks": (stated.chunks, len(chunks)),
-            "attachments": (stated.attachments, len(self.attachments)),
-            "metadata records": (stated.metadata, len(self.metadata)),
+            "chunks": (stated.chunk_count, len(chunks)),
+            "attachments": (stated.attachment_count, len(self.attachments)),
+            "metadata records": (stated.metadata_count, len(self.metadata)),
         }
         counts = [s.channel_counts() for s in self.segments]
         if all(c is not None for c in counts):
             total = sum(sum(c.values()) for c in counts if c is not None)
-            found["messages"] = (stated.messages, total)
+            found["messages"] = (stated.message_count, total)
         for what, (said, there) in found.items():
             if said != there:
                 self._refuse("statistics of the summary", f"{said} {what} stated, {there} there")

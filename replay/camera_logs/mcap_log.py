@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from mcap.records import Channel
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
@@ -15,7 +16,7 @@ from recorder.images.decoding import MessageKind, decoder_of
 from recorder.images.messages import Decoder
 from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import Channel, MalformedRecord, Segment
+from recorder.mcap.records import MalformedRecord, Segment
 from recorder.mcap.tables import MessageTable
 from replay.camera_logs.stream import (
     MessageImages,
@@ -181,5 +182,5 @@ def _refuse_nothing(reader: LogReader) -> None:
 def _kind(reader: LogReader, channel: Channel) -> MessageKind:
     schema = reader.schemas.get(channel.schema_id)
     if schema is None:
-        return MessageKind("no schema", channel.encoding)
-    return MessageKind(schema.name, channel.encoding, schema.data, schema.encoding)
+        return MessageKind("no schema", channel.message_encoding)
+    return MessageKind(schema.name, channel.message_encoding, schema.data, schema.encoding)

@@ -9,12 +9,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from mcap.records import Channel
+
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import Channel, Problem, Segment
+from recorder.mcap.records import Problem, Segment
 from replay.arrays import are_arrays
 from replay.camera_logs.opening import channels_of, log_format, only_foreign
 from replay.camera_logs.pictures import FolderImages
@@ -310,13 +312,13 @@ def describe_reader(
     counts, channels = count_messages(reader, decode=decode, told=told), []
     name = reader.path.name
     for number, found in sorted(counts.items()):
-        undefined = Channel(number, 0, f"(channel {number}, never defined)", "", {})
+        undefined = Channel(number, f"(channel {number}, never defined)", "", {}, 0)
         channel = reader.channels.get(number, undefined)
         schema = reader.schemas.get(channel.schema_id)
         kind, times = schema.name if schema else "", (found.start, found.end)
-        entry = (channel.topic, channel.encoding, kind, found.messages, *times, name)
+        entry = (channel.topic, channel.message_encoding, kind, found.messages, *times, name)
         channels.append(ChannelInfo(*entry))
-    metadata = {m.name: m.values for m in reader.metadata}
+    metadata = {m.name: m.metadata for m in reader.metadata}
     state = state_of(reader)
     if state == "whole" and not (decode and _all_checked(reader)):
         state = "unchecked"

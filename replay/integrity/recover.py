@@ -165,7 +165,7 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[str, dict[int, ChannelCount]
         proves.
     """
     for record in reader.metadata:
-        log.add_metadata(record.name, record.values)
+        log.add_metadata(record.name, record.metadata)
     for attachment in reader.attachments:
         log.add_attachment(
             attachment.name,
@@ -185,7 +185,7 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[str, dict[int, ChannelCount]
             written[number] = log.add_channel(
                 channel.topic,
                 log.add_schema(schema.name, schema.encoding, schema.data) if schema else 0,
-                encoding=channel.encoding,
+                encoding=channel.message_encoding,
                 metadata=channel.metadata,
             )
 
@@ -208,7 +208,7 @@ def _lost_messages(reader: LogReader, kept: dict[int, ChannelCount]) -> dict[int
     """How many messages are gone: by the writer's statistics, else by the index of each chunk."""
     stated = reader.statistics
     if stated is not None:
-        return {n: max(stated.per_channel.get(n, 0) - kept[n].messages, 0) for n in kept}
+        return {n: max(stated.channel_message_counts.get(n, 0) - kept[n].messages, 0) for n in kept}
     counts = [s.channel_counts() for s in reader.segments if reader.table(s) is None]
     if not reader.data_complete or None in counts:
         return dict.fromkeys(kept)

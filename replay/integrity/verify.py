@@ -56,7 +56,7 @@ class RunPass:
 
     def __init__(self, log: Path, reader: LogReader, *, beside: bool) -> None:
         self._log, self._reader, self._beside = log, reader, beside
-        self._final = next((r.values for r in reader.metadata if r.name == FINAL_METADATA), None)
+        self._final = next((r.metadata for r in reader.metadata if r.name == FINAL_METADATA), None)
         self._document = read_run_json(log.parent) if beside else {}
         self._stated = self._stated_signals()
         self._hash, self._expected = SignalsHash(), 0
@@ -371,7 +371,7 @@ def _checked(path: Path, reader: LogReader, *, beside: bool) -> Checked:
         for number in counts.keys() - reader.channels.keys()
     ]
     there = sum(channel.messages for channel in counts.values())
-    stated = reader.statistics.messages if reader.statistics else there
+    stated = reader.statistics.message_count if reader.statistics else there
     if stated != there and not reader.problems:
         wrong.append(f"its summary states {stated} messages, there are {there}")
     problems = [Problem(str(path), what) for what in wrong]

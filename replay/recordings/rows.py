@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from mcap.records import Channel
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
@@ -16,7 +17,7 @@ from cdmisfa.kernels.frames import gather
 from cdmisfa.kernels.frames import layout as kernel_layout
 from recorder.log.manifest import ViewMetadata
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import Channel, MalformedRecord, Segment
+from recorder.mcap.records import MalformedRecord, Segment
 from recorder.mcap.tables import MessageTable
 
 

@@ -44,7 +44,7 @@ def head_poses(path: Path) -> dict[str, HeadPose]:
     found: dict[str, HeadPose] = {}
     for file in log_files(path):
         with LogReader(file) as reader:
-            facts = next((r.values for r in reader.metadata if r.name == RECORDING_METADATA), {})
+            facts = next((r.metadata for r in reader.metadata if r.name == RECORDING_METADATA), {})
             pose = first_pose(reader)
         if pose is not None and "view" in facts:
             found[facts["view"]] = pose

@@ -81,7 +81,7 @@ class ViewFile:
                 f"({len(records)} {RECORDING_METADATA} records); "
                 "cdmisfa learn and convert take logs of others, by their --topic"
             )
-        self.facts = facts = ViewMetadata.parse(self.path, records[0].values)
+        self.facts = facts = ViewMetadata.parse(self.path, records[0].metadata)
         self.reader.expect(self.reader.segments)
         schema = IMAGE_SCHEMA if facts.spec.images else VECTOR_SCHEMA
         self._channels = [self._channel(view_topic(facts.view), schema)]
@@ -181,7 +181,7 @@ class ViewFile:
                 f"{self.path}: {len(channels)} channels on {topic}, a recording has one"
             )
         known = self.reader.schemas.get(channels[0].schema_id)
-        if known is None or known.name != schema or channels[0].encoding != "protobuf":
+        if known is None or known.name != schema or channels[0].message_encoding != "protobuf":
             raise LogDamagedError(f"{self.path}: {topic} does not hold {schema} in protobuf")
         return ChannelRows(self.reader, channels[0], self.facts)
 

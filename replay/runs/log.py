@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
+from mcap.records import Channel
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
@@ -20,7 +21,6 @@ from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.core.untrusted import MAX_LIST, parse_json
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import Channel
 from recorder.mcap.store import PARTIAL
 from recorder.mcap.tables import MessageTable
 from replay.runs.codec import (
@@ -125,7 +125,7 @@ def read_header(path: Path) -> RunHeader:
 def header_in(reader: LogReader) -> RunHeader:
     """Return the header of a run's log that is open; raises as `read_header`."""
     log = reader.path
-    found = next((r.values for r in reader.metadata if r.name == RUN_METADATA), None)
+    found = next((r.metadata for r in reader.metadata if r.name == RUN_METADATA), None)
     if found is None:
         raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
     text = found.get("schema", "")
