@@ -62,7 +62,7 @@ def copied_log(folder: Path, *, drop: int = -1, final: bool = True) -> None:
             known[number] = log.add_channel(
                 channel.topic, log.add_schema(schema.name, schema.encoding, schema.data)
             )
-        for entry in reader.messages(None, ordered=False):
+        for entry in reader.messages():
             if entry.sequence != drop:
                 log.write(known[entry.channel.id], entry.log_time, entry.data, entry.sequence)
     (folder / "new.mcap").rename(source)

@@ -25,7 +25,7 @@ from recorder.mcap.records import (
     Segment,
 )
 from recorder.mcap.store import FileStore, OnePass, Store
-from recorder.mcap.tables import MessageTable, Pairs, in_order
+from recorder.mcap.tables import MessageTable, Pairs
 from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]
@@ -179,26 +179,16 @@ class LogReader:
 
     # Messages
 
-    def messages(
-        self,
-        topics: Collection[str] | None = None,
-        *,
-        start: int | None = None,
-        stop: int | None = None,
-        ordered: bool = True,
-    ) -> Iterator[Message]:
-        """Give the messages by log time, ties in file order.
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
+        """Yield the messages in file order.
 
         Args:
             topics: only these; None for all.
-            start: only with log times in [start, stop), in nanoseconds; None for all.
-            stop: see start.
-            ordered: by log time; otherwise in file order.
 
         Raises:
             LogDamagedError: at the first damage, without `salvage`.
         """
-        for segment, table in self.tables(start=start, stop=stop, ordered=ordered, topics=topics):
+        for segment, table in self.tables(topics=topics):
             known = {c: self._channel(c, segment) for c in np.unique(table.channel).tolist()}
             own = {c: k for c, k in known.items() if k and (topics is None or k.topic in topics)}
             if len(own) < len(known):
@@ -207,30 +197,25 @@ class LogReader:
                 yield Message(own[number], sequence, log_time, published, data)
 
     def tables(
-        self,
-        *,
-        start: int | None = None,
-        stop: int | None = None,
-        ordered: bool = True,
-        topics: Collection[str] | None = None,
+        self, *, start: int = 0, topics: Collection[str] | None = None
     ) -> Iterator[tuple[Segment, MessageTable]]:
-        """Give the messages chunk by chunk as columns, in the order of `messages`.
+        """Yield the messages chunk by chunk as columns, in file order.
 
-        Chunks whose times overlap come in pieces. Of a log that was opened by its index, chunks
-        without any of `topics` are left out.
+        Chunks that end before log time `start` are left out, and of a log that was opened by its
+        index those without any of `topics`.
 
         Raises:
             LogDamagedError: at the first damage, without `salvage`.
         """
-        low, high = start or 0, 2**64 if stop is None else stop
-        chosen = [s for s in self.segments if s.end >= low and s.start < high]
+        chosen = [s for s in self.segments if s.end >= start]
         if self.by_index:
             numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
             chosen = [s for s in chosen if numbers & (s.channel_counts() or {}).keys()]
         self.expect(chosen)
-        in_file = ((s, t) for s in chosen if (t := self.table(s)) is not None)
-        for segment, table in in_order(chosen, self.table) if ordered else in_file:
-            yield segment, table.within(low, high)
+        for segment in chosen:
+            table = self.table(segment)
+            if table is not None:
+                yield segment, table.select(table.log_time >= np.uint64(start)) if start else table
 
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
         """Give every chunk in file order, None for one that is damaged and left out.

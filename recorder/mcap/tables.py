@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,6 @@ from recorder.mcap.records import (
     MESSAGE_HEADER,
     RECORD_HEADER,
     MalformedRecord,
-    Segment,
 )
 
 Pairs = list[tuple[int, NDArray[np.uint64]]]
@@ -71,23 +69,6 @@ class MessageTable:
         data = self.data.data
         for log_time, published, at, size, sequence, channel, _ in self.records.tolist():
             yield channel, sequence, log_time, published, bytes(data[at : at + size])
-
-    def by_time(self) -> MessageTable:
-        """The messages by log time, ties as they are."""
-        times = self.log_time
-        if (times[1:] >= times[:-1]).all():
-            return self
-        return self.select(np.argsort(times, kind="stable"))
-
-    def within(self, start: int, stop: int) -> MessageTable:
-        """The messages with log times in [start, stop)."""
-        times = self.log_time
-        if not len(times) or (start <= int(times.min()) and int(times.max()) < stop):
-            return self
-        keep = times >= np.uint64(min(max(start, 0), 2**64 - 1))
-        if stop < 2**64:
-            keep &= times < np.uint64(max(stop, 0))
-        return self.select(keep)
 
     def payload(self, row: int) -> bytes:
         """A copy of a payload."""
@@ -160,45 +141,3 @@ def _no_record(data: ByteArray, at: int) -> str:
     if over > 0:
         return f"a record at {at} runs {over} bytes over its end"
     return "a message is shorter than its own header"
-
-
-def in_order(
-    segments: Sequence[Segment], table_of: Callable[[Segment], MessageTable | None]
-) -> Iterator[tuple[Segment, MessageTable]]:
-    """The messages of chunks by log time, ties in file order; overlapping chunks come in pieces.
-
-    Args:
-        segments: chunks in file order.
-        table_of: decodes a chunk; None where it is left out. Few are asked for at once.
-    """
-    for group in overlapping(segments):
-        times = [_times(table_of(segment)) for segment in group]
-        order = np.argsort(np.concatenate(times), kind="stable")
-        counts = [len(each) for each in times]
-        chunk_of = np.repeat(np.arange(len(group)), counts)[order]
-        row_of = np.concatenate([np.arange(count) for count in counts])[order]
-        edges = [0, *(np.flatnonzero(np.diff(chunk_of)) + 1).tolist(), len(order)]
-        for low, high in itertools.pairwise(edges if len(order) else ()):
-            segment = group[int(chunk_of[low])]
-            table = table_of(segment)
-            if table is not None:
-                yield segment, table.select(row_of[low:high])
-
-
-def _times(table: MessageTable | None) -> NDArray[np.uint64]:
-    return np.empty(0, np.uint64) if table is None else table.log_time
-
-
-def overlapping(segments: Sequence[Segment]) -> Iterator[list[Segment]]:
-    """Group chunks so that sorting the messages within each group sorts all."""
-    ordered = sorted(enumerate(segments), key=lambda pair: (pair[1].start, pair[0]))
-    group: dict[int, Segment] = {}
-    end, last = -1, -1
-    for number, segment in ordered:
-        if group and (segment.start > end or (segment.start == end and number > last)):
-            yield [group[place] for place in sorted(group)]
-            group, end, last = {}, -1, -1
-        group[number] = segment
-        end, last = max(end, segment.end), max(last, number)
-    if group:
-        yield [group[place] for place in sorted(group)]

@@ -126,7 +126,7 @@ class McapImages(MessageImages):
 
     def _by_pass(self) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
         """The chunks with messages of the topic, and their log times, read and checked."""
-        for segment, table in self.reader.tables(ordered=False):
+        for segment, table in self.reader.tables():
             own = self._rows_of(table)
             if len(own):
                 yield segment, table.log_time[own]

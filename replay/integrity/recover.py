@@ -191,7 +191,7 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[str, dict[int, ChannelCount]
 
     add_channels()
     digest, unverified = hashlib.sha256(), 0
-    for segment, table in reader.tables(ordered=False):
+    for segment, table in reader.tables():
         add_channels()  # the summary may lack channels that are defined in a chunk
         unverified += len(table) if segment.cut and segment.crc else 0
         for number, sequence, log_time, published, data in table.rows():
@@ -219,7 +219,7 @@ def _compare(path: Path, metadata: int, digest: str) -> None:
     """Read the new log with every checksum and compare it with what was written."""
     found = hashlib.sha256()
     with LogReader(path) as reader:
-        for _, table in reader.tables(ordered=False):
+        for _, table in reader.tables():
             for number, sequence, log_time, published, data in table.rows():
                 found.update(_HASHED.pack(number, sequence, log_time, published))
                 found.update(data)

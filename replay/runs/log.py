@@ -206,8 +206,8 @@ def read_batches(
     header = header or read_header(log)
     with LogReader(log) as reader:
         batches = BatchReader(log, header, reader.channels, every=every, topics=topics)
-        since = header.spec.time_ns(start) if start else None
-        for _, table in reader.tables(ordered=False, start=since):
+        since = header.spec.time_ns(start) if start else 0
+        for _, table in reader.tables(start=since):
             yield from batches.take(table)
         yield batches.rest()
         if not reader.complete and not log.name.endswith(PARTIAL):

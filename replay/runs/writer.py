@@ -191,7 +191,7 @@ class RunWriter(Sink):
         """
         where, taken = f"{log} {SIGNALS_TOPIC}", list[bytes]()
         with LogReader(log) as reader:
-            for entry in reader.messages(self._channels, ordered=False):
+            for entry in reader.messages(self._channels):
                 topic = entry.channel.topic
                 if topic == SIGNALS_TOPIC:
                     if iteration_of(entry.data, where) >= iterations:
