@@ -23,7 +23,7 @@ from cdmisfa.experiments.holdout import hold_out, judged
 from cdmisfa.experiments.session import Session
 from cdmisfa.experiments.sources import configure_for, log_settings
 from cdmisfa.features.following import batch_outputs, following_slowness
-from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
+from cdmisfa.features.sfa import batch_sfa, slowness
 from cdmisfa.modules import Module
 from replay.camera_logs.source import ForeignSource
 from replay.runs.modules import load_modules
@@ -225,7 +225,7 @@ def test_the_leading_components_of_many_directions_are_those_of_frames_in_memory
     strong = np.stack([np.sin(t / period) for period in (90, 31, 12, 5)], axis=1) * (4, 5, 6, 7)
     x = strong @ rng.normal(0, 1, (4, 200)) + rng.normal(0, 1, (3000, 200))
     centred = x - x.mean(axis=0)
-    within = leading_directions(centred, 4)
+    within = np.linalg.svd(centred, full_matrices=False)[2][:4].T
     exact = slowness(centred @ within @ batch_sfa(centred @ within, 2).T)
     phi, mean, _ = batch_outputs(in_pieces(x, 256), len(x), components=4, outputs=2)
     (found,) = following_slowness(in_pieces(x, 256), [(phi, mean)])

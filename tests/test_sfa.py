@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
+from cdmisfa.features.sfa import batch_sfa, slowness
 from recorder.world.oscillatory import one_period
 
 
@@ -30,11 +30,3 @@ def test_more_features_than_directions_are_refused():
     frames = np.outer(np.sin(np.arange(100.0)), [1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match="vary in 1 directions"):
         batch_sfa(frames, 2)
-
-
-def test_leading_directions_are_those_of_an_exact_decomposition():
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((300, 40)) * np.linspace(5, 0.1, 40)
-    exact = np.linalg.svd(x, full_matrices=False)[2][:4].T
-    found = leading_directions(x, 4)
-    np.testing.assert_allclose(np.abs(np.sum(exact * found, axis=0)), 1.0, atol=1e-6)

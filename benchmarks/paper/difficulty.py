@@ -13,8 +13,9 @@ from benchmarks.paper import Table, study
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.experiments.results import correlation
+from cdmisfa.features.following import batch_outputs
 from cdmisfa.features.incsfa import IncrementalFeature
-from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
+from cdmisfa.features.sfa import slowness
 from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_of, paper_config
 from cdmisfa.studies.paper.oscillatory import STREAMS
 from recorder.world.oscillatory import one_period
@@ -71,9 +72,7 @@ def run(settings: Settings) -> dict[str, Any]:
 
 def slowest_weights(frames: FloatArray, components: int) -> FloatArray:
     """Return weights of batch SFA's slowest feature within the leading principal components."""
-    x = frames - frames.mean(axis=0)
-    leading = leading_directions(x, components)
-    return np.asarray(leading @ batch_sfa(x @ leading, 1)[0])
+    return batch_outputs([(frames, False)], len(frames), components, outputs=1).phi[0]
 
 
 def tables(trials: Sequence[Trial]) -> list[Table]:

@@ -43,8 +43,8 @@ class BatchOutputs(NamedTuple):
 def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) -> BatchOutputs:
     """The slowest outputs of frames that all count the same, in their leading components.
 
-    That is what `batch_sfa` finds of frames in memory within their `leading_directions`, up to how
-    far the directions that are kept meanwhile, `KEPT` times as many, hold the leading ones.
+    That is what `batch_sfa` finds of frames in memory within their leading principal components, up
+    to how far the directions that are kept meanwhile, `KEPT` times as many, hold these.
 
     Args:
         pieces: at least one, uint8 pixels, which count 1/255 each, or float64 values.

@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, as_frames
 
-EXTRA, ROUNDS = 8, 20
-"""Directions beyond those wanted, and rounds, of the subspace iteration."""
-
 
 def batch_sfa(frames: NDArray[Any], outputs: int, *, tolerance: float = 1e-10) -> FloatArray:
     """Slowest linear features of unit variance, slowest first.
@@ -44,27 +41,6 @@ def batch_sfa(frames: NDArray[Any], outputs: int, *, tolerance: float = 1e-10) -
     change = np.diff(x @ whitening.T, axis=0)
     _, rotation = np.linalg.eigh(change.T @ change / len(change))
     return np.asarray(rotation[:, :outputs].T @ whitening)
-
-
-def leading_directions(x: FloatArray, components: int) -> FloatArray:
-    """Orthonormal basis of the leading principal components, by subspace iteration.
-
-    Args:
-        x: (n, I) centred frames.
-        components: K, how many.
-
-    Returns:
-        (I, K), the largest variance first; the identity where K is I or more.
-    """
-    size = x.shape[1]
-    if size <= components:
-        return np.eye(size)
-    rng = np.random.default_rng(0)
-    basis = rng.standard_normal((size, min(size, components + EXTRA)))
-    for _ in range(ROUNDS):
-        basis, _ = np.linalg.qr(x.T @ (x @ basis))
-    _, rotation = np.linalg.eigh((x @ basis).T @ (x @ basis))
-    return np.asarray(basis @ rotation[:, ::-1][:, :components])
 
 
 def slowness(y: FloatArray) -> FloatArray:
