@@ -2,7 +2,9 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/.installed
-KERNELS := $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/kernels/b*.py)
+TESTED := .venv/.with-test
+SOURCES := pyproject.toml setup.py $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/kernels/b*.py) \
+    $(if $(wildcard cdmisfa/kernels/*.so),,FORCE)
 
 SANITIZED := build/sanitized
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
@@ -16,37 +18,37 @@ demo: $(INSTALLED)
 test: lint suite
 
 # Of three processes one waits as a rule: for cameras, viewers and what it has killed.
-suite: $(INSTALLED)
+suite: $(TESTED)
 	$(BIN)/pytest -n 3 --dist loadgroup
 
-lint: $(INSTALLED)
+lint: $(TESTED)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-bench: $(INSTALLED)
+bench: .venv/.with-bench
 	$(BIN)/python -m benchmarks
 
 # The site, in build/site: its tutorials are executed, and nothing is fetched.
-docs: $(INSTALLED)
+docs: .venv/.with-docs
 	$(BIN)/sphinx-build -W -b html docs build/site
 
-pictures: $(INSTALLED)
+pictures: .venv/.with-docs
 	$(BIN)/python docs/images/draw.py
 
-fuzz: $(INSTALLED)
+fuzz: $(TESTED)
 	$(BIN)/python -m tools.fuzz.guided --seconds $(or $(SECONDS),60)
 	$(BIN)/python -m tools.fuzz.logs --jobs 2
 
-torture: $(INSTALLED)
+torture: $(TESTED)
 	$(BIN)/python -m tools.torture --seed $(or $(SEED),0) --minutes $(or $(MINUTES),30)
 
 # The tests of tools/, with some cases of each kind of attack, and of the benchmarks.
-attacks: $(INSTALLED)
+attacks: $(TESTED)
 	$(BIN)/pytest -n 3 --dist loadgroup tools
 
 # The tests of the kernels, which then end where they leave an array or the range of a number.
-sanitized: $(INSTALLED)
+sanitized: $(TESTED)
 	CFLAGS="$(SANITIZERS)" LDFLAGS="$(SANITIZERS)" $(BIN)/python setup.py -q \
 	    build --build-base $(SANITIZED) --build-lib $(SANITIZED)/lib
 	LD_PRELOAD="$$(gcc -print-file-name=libasan.so)" ASAN_OPTIONS=detect_leaks=0 \
@@ -54,7 +56,7 @@ sanitized: $(INSTALLED)
 	    tests/test_incsfa.py tests/test_recursive_sfa.py tests/test_chunks.py
 
 # Wheel and source archive of the commit, in dist/.
-release: $(INSTALLED)
+release: .venv/.with-release
 	rm -rf dist build/release
 	git clone --quiet . build/release
 	$(BIN)/python -m build --outdir dist build/release
@@ -62,11 +64,20 @@ release: $(INSTALLED)
 
 install: $(INSTALLED)
 
-$(INSTALLED): pyproject.toml setup.py $(KERNELS)
-	@echo "installing cdmisfa and what it needs into .venv, once (a minute or two)"
+# What the product needs; .with-EXTRA is the product with an extra of pyproject.toml.
+$(INSTALLED): $(SOURCES)
+	@echo "installing cdmisfa and what it needs into .venv, once (about a minute)"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
 	touch $@
+
+.venv/.with-%: $(SOURCES)
+	@echo "installing cdmisfa with its extra $* into .venv, once (about a minute)"
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$*]'
+	touch $(INSTALLED) $@
+
+FORCE:
 
 clean:
 	rm -rf .venv build dist cdmisfa/kernels/*.so *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -11,10 +11,10 @@ import shutil
 import signal
 import socket
 import subprocess
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -87,14 +87,9 @@ def test_a_folder_of_logs_becomes_one_table(
         expected = module.transform(np.stack(list(pictures(90, [0, 1, 2, 2][seed]))))
         np.testing.assert_array_equal(y(table, NAMES[seed]), expected)
         assert pq.read_table(said[name]["out"]).num_rows == said[name]["frames"] == 90
-    found = duckdb.sql(
-        f"SELECT log, stream, count(*) FROM '{out}/*.parquet' GROUP BY ALL ORDER BY ALL"
-    ).fetchall()
-    assert found == [
-        *((name, "cam", 90) for name in NAMES),
-        ("rec", "cam", 50),
-        ("rec", "other", 50),
-    ]
+    rows = zip(table["log"].to_pylist(), table["stream"].to_pylist(), strict=True)
+    recorded = {("rec", "cam"): 50, ("rec", "other"): 50}
+    assert Counter(rows) == {(name, "cam"): 90 for name in NAMES} | recorded
     told = cdmisfa("apply", run, logs, "-o", out)
     assert told.code == 3
     assert "7 logs: 0 tried now, 7 before; of these 2 failed, or ended early" in told.out

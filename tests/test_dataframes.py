@@ -47,7 +47,7 @@ def test_tables_of_each_library_are_the_same_frames(kind: str) -> None:
     for _ in range(2):  # a result of DuckDB is not used up
         frames = ArrayLog({"car": given}).take(0, ROWS).frames
         np.testing.assert_array_equal(frames, expected)
-    recording = cdmisfa.Recording({"car": given, "again": table("polars")})
+    recording = cdmisfa.Recording({"car": given, "again": table("pandas")})
     assert recording.spec.streams == ("car", "again")
 
 

@@ -70,6 +70,14 @@ def test_quick_runs_reproduce_the_claim_and_write_everything(
     assert document["trials"] == len((folder / "rows.jsonl").read_text().splitlines())
 
 
+def test_it_needs_matplotlib_before_it_computes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdmisfa.studies.paper.reproduce.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'cdmisfa\[paper\]'"):
+        stability(tmp_path)
+
+
 def test_a_change_is_followed_early_and_not_late(tmp_path: Path) -> None:
     document = reproduce("nonstationary", tmp_path, trials=2, quick=True)
     assert document["claims"][1]["holds"]

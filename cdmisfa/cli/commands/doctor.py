@@ -19,7 +19,7 @@ from cdmisfa.core.errors import CdmisfaError
 NAMES = ("recorder", "replay")
 """Packages of ours beside `cdmisfa`, whose names others may have, too."""
 
-PACKAGES = ("numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplotlib")
+PACKAGES = ("numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow")
 """Packages that no command can do without for long."""
 
 EXTRAS = {
@@ -28,6 +28,7 @@ EXTRAS = {
     "rl": (("gymnasium", "stable_baselines3"), "examples/ppo.py"),
     "foxglove": (("websockets",), "foxglove:// streams of robots"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
+    "paper": (("matplotlib",), "reproduce"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "sklearn": (("sklearn",), "RecursiveSFA and IncSFA, estimators of scikit-learn"),
     "river": (("river",), "OnlineSFA, a transformer of river"),

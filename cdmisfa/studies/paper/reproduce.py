@@ -11,6 +11,7 @@ import base64
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +70,13 @@ def reproduce(
         where: engine and scheduler, see `run_trials`.
 
     Raises:
-        UsageError: no such experiment or engine.
+        UsageError: no such experiment or engine, or matplotlib is missing.
         CdmisfaError: a trial failed; the others are kept.
     """
     if name not in EXPERIMENTS:
         raise UsageError(f"no experiment {name!r}: {did_you_mean(name, (*EXPERIMENTS, 'all'))}")
+    if find_spec("matplotlib") is None:
+        raise UsageError("reproduce draws figures: pip install 'cdmisfa[paper]'")
     experiment, version = EXPERIMENTS[name], code()
     if experiment.sees and recording is None:
         recording = make_recording(folder.parent / "icub-recording", FIRST_SEED, jobs)
