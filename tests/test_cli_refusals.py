@@ -64,7 +64,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "sweep oscillatory -o x --seeds 1,4,0:2": ("--seeds 1,4,0:2: 1 stands there twice",),
     "learn oscillatory --set learner.beta=foo": ("'foo': it must be a number, or auto",),
     "learn oscillatory --seed abc": ("'--seed': 'abc' is no whole number",),
-    "learn oscillatory --follow-timeout abc": ("'abc' is no number",),
+    "record oscillatory -o x --rate abc": ("'abc' is no number",),
     "learn oscillatory --resume -o RUN --algorithm progress": (
         "was made with learner.algorithm = 2.0, not progress",
     ),

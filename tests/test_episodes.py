@@ -215,7 +215,6 @@ def test_a_log_that_changes_meanwhile_is_left_out(tmp_path: Path) -> None:
         (("av:lavfi:testsrc", "--set", "input.centre=episode"), "input.centre is for logs"),
         (("CORPUS", "--color", "auto"), "--color auto looks at one log"),
         (("CORPUS", "--topic", "/no"), "no topic /no"),
-        (("CORPUS", "--follow", "--episodes"), "--follow takes the folder of one recording"),
         (("CORPUS/../broken",), "corpus.parquet is damaged"),
         (("CORPUS", "--set", "input.holdout=0.5", "--loop"), "input.holdout is for camera logs"),
         (

@@ -30,7 +30,6 @@ from recorder.live import COUNTS, RecordedWhileWatched, record_watched
 from replay.export.forms import export
 from replay.integrity.info import describe
 from replay.integrity.verify import check_log
-from replay.recordings.followed import FollowedSource
 from replay.recordings.source import RecordedSource
 
 FPS = 30.0
@@ -214,51 +213,6 @@ def test_what_is_learned_live_is_learned_again_from_the_recording(
     assert [int(last[name]["missing"]) for name in sorted(last)] == [
         counts[name]["missing"] for name in sorted(counts)
     ]
-
-
-def test_a_recording_of_cameras_is_learned_from_while_it_is_written(tmp_path: Path) -> None:
-    config = CONFIGS[1]
-    folder, followed = tmp_path / "rec", []
-    recorded = RecordedWhileWatched(opened(rough(), 3), folder)
-
-    def follow() -> None:
-        with FollowedSource(folder, timeout=30) as source:
-            grows.set()
-            followed.append((learned(source, config), source.finished))
-
-    grows, thread = threading.Event(), threading.Thread(target=follow)
-
-    def progress(done: float) -> None:
-        if done == 200:
-            thread.start()
-            assert grows.wait(30)  # frames come while it learns
-        elif done > 200:
-            time.sleep(2e-4)
-
-    record_watched(recorded, progress=progress)
-    thread.join()
-    with RecordedSource(folder) as source:
-        again = learned(source, config)
-    assert followed[0][0].signals_sha256 == again.signals_sha256
-    assert again.iterations > 20
-
-
-def test_a_gap_of_a_followed_recording_is_known_once_a_later_frame_came(tmp_path: Path) -> None:
-    source = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
-    record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
-    with FollowedSource(tmp_path / "rec") as followed:
-        whole = RecordedSource(tmp_path / "rec")
-        for n in (20, 40, 30):
-            for one, two in zip(followed.take_all(n), whole.take_all(n), strict=True):
-                same(one, two)
-        followed.seek(20)
-        assert followed.take(0, 20).t == 60
-        followed.seek(0)
-        finished = tmp_path / "rec" / "left.mcap"
-        finished.rename(f"{finished}.partial")
-        followed._timeout = 0.2
-        with pytest.raises(LogExhaustedError, match="did not come within"):
-            followed.take_all(91)
 
 
 def test_a_live_run_that_ends_within_a_block_is_checked_by_its_recording(

@@ -150,23 +150,6 @@ def test_what_is_no_log_is_refused(tmp_path: Path, raw: bytes) -> None:
         LogReader(path)
 
 
-def test_a_growing_file_is_followed(tmp_path: Path) -> None:
-    raw = written(list(range(100)))
-    path = tmp_path / "log.mcap.partial"
-    path.write_bytes(raw[:1000])
-    seen = 0
-    with LogReader(path) as reader:
-        for end in range(1000, len(raw) + 700, 700):
-            with path.open("ab") as file:
-                file.write(raw[path.stat().st_size : end])
-            reader.refresh()
-            count = sum(1 for _ in reader.messages())
-            assert count >= seen
-            seen = count
-        assert reader.complete
-        assert seen == 100
-
-
 def test_a_long_file_is_read_in_little_memory(tmp_path: Path) -> None:
     path = tmp_path / "long.mcap"
     messages = enumerate([bytes(500_000)] * 400)

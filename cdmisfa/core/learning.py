@@ -43,15 +43,12 @@ class Keyframe:
         t: the source's next frame.
         state: of the learner.
         versions: of the packages that computed it.
-        taken: the SHA-256 of the frames before it, of a source that says so; see
-            `FollowedSource`.
     """
 
     iteration: int
     t: int
     state: LearnerState
     versions: Mapping[str, str]
-    taken: str | None = None
 
 
 @runtime_checkable

@@ -174,10 +174,10 @@ class Keyframes(Sink):
         self._log.sync()
 
     def _keyframe(self) -> Keyframe:
-        learner, taken = self._learner, getattr(self._source, "taken", None)
+        learner = self._learner
         # A camera's own t may lie behind the last block, where it ended within the next one.
         t = self._source.t if self._t is None else self._t
-        return Keyframe(learner.iteration, t, learner.state, self._versions, taken)
+        return Keyframe(learner.iteration, t, learner.state, self._versions)
 
 
 class BetweenEpisodes(Sink):

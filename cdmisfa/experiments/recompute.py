@@ -24,7 +24,6 @@ from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.resume import (
     config_history,
-    read_command,
     reconfigured,
     restore,
     source_of,
@@ -220,10 +219,9 @@ class Recomputation:
     def other_files(self) -> list[str]:
         """Names of the source's files that are not those it learned from.
 
-        None are named of a source of other words, of one that was not needed, and of a recording
-        that was still written.
+        None are named of a source of other words, and of one that was not needed.
         """
-        if self._source is None or self._words or read_command(self.log.parent)[1].get("follow"):
+        if self._source is None or self._words:
             return []
         return other_files(stated_source(self.log), description(self._source, at_once=True))
 

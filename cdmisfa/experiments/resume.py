@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +25,7 @@ from recorder.world.scenes import SCENES, open_scene
 from replay.runs.compare import differences
 from replay.runs.folders import RUN_FILE
 from replay.runs.keyframes import read_keyframe
-from replay.runs.log import RunHeader, read_columns, read_header
+from replay.runs.log import RunHeader, read_header
 from replay.runs.run import known_to_both, stated_source
 
 COMMAND = "command"
@@ -37,7 +36,7 @@ OPTIONS = (
     "preset",
     "settings",
     "algorithm",
-    *("loop", "salvage", "episodes", "follow"),
+    *("loop", "salvage", "episodes"),
     *INPUTS,
     "max_iterations",
     "max_modules",
@@ -204,7 +203,6 @@ def restore_from(
 
     Raises:
         UsageError: a fork was cut before the iteration where it begins.
-        LogDamagedError: the source does not show any more what was learned from.
     """
     keyframe = read_keyframe(log)
     if forked_at is not None and (keyframe is None or keyframe.iteration < forked_at):
@@ -212,16 +210,6 @@ def restore_from(
     if keyframe is None:
         return None
     restore(learner, keyframe, source.spec)
-    if keyframe.taken is not None:
-        records = (signals for columns in read_columns(log) for signals in columns.records())
-        for signals in itertools.islice(records, keyframe.iteration):
-            source.seek(signals.t)
-            source.take(signals.stream, learner.tau)
-        if source.taken != keyframe.taken:
-            raise LogDamagedError(
-                f"{log.parent}: what it learned from is not there any more: begin anew with "
-                "--force, or choose another folder"
-            )
     source.seek(keyframe.t)
     return keyframe
 

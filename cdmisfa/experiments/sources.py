@@ -246,7 +246,7 @@ def open_source(
     Raises:
         CdmisfaError: there is no such scene, log or setting, or a log is damaged.
     """
-    if how.get("follow") is None and is_scene(words, inputs):
+    if is_scene(words, inputs):
         if how.get("episodes"):
             raise UsageError(f"{words[0]} is a scene: episodes are of logs, as of recordings of it")
         scene = configure(str(words[0]), preset, of_scene(settings, inputs), seed)
@@ -301,7 +301,6 @@ def open_logs(
     loop: bool = False,
     salvage: bool = False,
     inputs: InputOptions | None = None,
-    follow: float | None = None,
     episodes: bool = False,
     told: Told = lambda done, total: None,
     goal: tuple[str, str] = ("learn", "RUN"),
@@ -313,7 +312,6 @@ def open_logs(
         loop: start again at the end.
         salvage: pass over damaged parts.
         inputs: how images of others become frames; given, paths are taken as such logs.
-        follow: wait so many seconds for more frames of a recording being written.
         episodes: each path is an episode of its own; those of an index always are.
         told: how many of the episodes were opened.
         goal: see `open_log`.
@@ -323,12 +321,6 @@ def open_logs(
         LogDamagedError: the log is damaged.
     """
     inputs = inputs or InputOptions()
-    if follow is not None and (
-        len(words) > 1
-        or words[0] in SCENES
-        or any((loop, salvage, episodes, inputs != InputOptions()))
-    ):
-        raise UsageError("--follow takes the folder of one recording, and neither loops nor skips")
     if scene := next((word for word in words if word in SCENES and not Path(word).exists()), None):
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
     from replay.corpus.finding import may_be_corpus
@@ -341,23 +333,19 @@ def open_logs(
             f"record {shlex.join(live)} -o REC"
         )
     for path in (paths := locations(words)):
-        if not path.exists() and follow is None:
+        if not path.exists():
             _, colon, address = str(path).partition(":")
             kinds = [f"{kind}:{address}" for kind in CAMERAS if colon]
             raise no_such(path, [*SCENES, *kinds], f"the scenes are {', '.join(SCENES)}")
-    if follow is None:
-        how: Any = {"loop": loop, "salvage": salvage}
-        source: StoredSource | None = None
-        if episodes or may_be_corpus(words):
-            from replay.corpus.episodes import open_episodes
+    how: Any = {"loop": loop, "salvage": salvage}
+    source: StoredSource | None = None
+    if episodes or may_be_corpus(words):
+        from replay.corpus.episodes import open_episodes
 
-            source = open_episodes(words, episodes and paths, inputs, told=told, **how)
-        source = source or open_log(paths, inputs, goal=goal, **how)
-        source.centre_by(inputs.centre)
-        return source
-    from replay.recordings.followed import FollowedSource
-
-    return FollowedSource(paths[0], timeout=follow)
+        source = open_episodes(words, episodes and paths, inputs, told=told, **how)
+    source = source or open_log(paths, inputs, goal=goal, **how)
+    source.centre_by(inputs.centre)
+    return source
 
 
 def open_cameras_now(

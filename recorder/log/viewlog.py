@@ -178,9 +178,9 @@ class ViewLog:
         return self._file.size >= (self._split.size or 0)
 
     def _begin_next_part(self) -> None:
-        """Begin a part before the one before is finished, so that some file is always open.
+        """Begin a part before the one before is finished.
 
-        Whoever follows the recording sees that it continues.
+        So a recording that was killed always has an unfinished file, by which it is known.
         """
         full = self._file
         full.flush()

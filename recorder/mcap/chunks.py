@@ -127,15 +127,10 @@ class Chunks:
                 found.append((part.channel, pairs.reshape(-1, 2)))
         return found
 
-    def forget(self, but: Collection[int] = ()) -> None:
-        """Drop the decoded chunks, except those at some places of the file."""
-        for key in self._cache.keys() - set(but):
-            self._drop(key)
-        self._ahead = None
-
     def close(self) -> None:
-        """Drop all, and end the thread; harmless when called twice."""
-        self.forget()
+        """Drop the decoded chunks, and end the thread; harmless when called twice."""
+        self._cache.clear()
+        self._cached, self._ahead = 0, None
         if self._thread is not None:
             self._thread.shutdown()
 

@@ -82,7 +82,7 @@ class LogReader:
         self.salvage = salvage
         self.problems: list[Problem] = []
         self._failed: set[int] = set()
-        self._defined, self._searched = 0, False
+        self._defined = self._searched = False
         self._file = log if isinstance(log, Store) else FileStore(Path(log))
         if check == "pass":
             self._file = OnePass(self._file)
@@ -168,10 +168,6 @@ class LogReader:
                 f"above the limit of {MAX_CHUNK}"
             )
         return self._file.read(attachment.offset, attachment.size)
-
-    def digest(self) -> str:
-        """SHA-256 of the file, checked as it is read."""
-        return self.data.sha256()
 
     def crc_absent(self) -> int:
         """Count the segments that no CRC protects; see `DataSection.unprotected`."""
@@ -268,37 +264,6 @@ class LogReader:
         """Read a chunk's message indexes; see `Chunks.index`."""
         return self._chunks.index(segment, channels)
 
-    def is_at(self, path: Path) -> bool:
-        """Whether a path leads to the very file that was opened."""
-        return self._file.is_at(path)
-
-    def moved(self, path: Path) -> None:
-        """Note that the file that was opened was renamed."""
-        self.path = self._file.path = path
-
-    def refresh(self) -> bool:
-        """Read what a recorder wrote since; return whether the file grew.
-
-        What was read before is not read again, but for one pass over a file that got its end,
-        whose checksum says whether all of it is as it was.
-
-        Raises:
-            LogDamagedError: what was written is damaged.
-        """
-        if self.complete or not self._file.grow():
-            return False
-        try:
-            kept = self._structure.resume()
-        except MalformedRecord as error:
-            raise LogDamagedError(f"{self.path}: {error}") from None
-        same = {segment.offset for segment in self._structure.segments[:kept]}
-        self._chunks.forget(same)
-        self._failed &= same
-        self._defined, self._searched = min(self._defined, kept), False
-        self._settle()
-        self.data.check()
-        return True
-
     def close(self) -> None:
         """Close the file; harmless when called twice."""
         self._chunks.close()
@@ -361,15 +326,15 @@ class LogReader:
         """Decode chunks until every channel that has messages is known."""
         definitions, segments = self._structure.definitions, self.segments
         known, counted = definitions.channels, set[int]()
-        if self._defined == len(segments):
+        if self._defined:
             return
         # A summary that is believed defines every channel of which it counts messages.
-        for segment in () if self.by_index else segments[self._defined :]:
+        for segment in () if self.by_index else segments:
             counts = segment.channel_counts()
             if counts is None or not counts.keys() <= known.keys():
                 self.table(segment)
             counted.update(counts or ())
-        self._defined = len(segments)
+        self._defined = True
         schemas = {0, *definitions.schemas}
         if not (counted <= known.keys() and {c.schema_id for c in known.values()} <= schemas):
             self._search()

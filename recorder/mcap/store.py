@@ -58,22 +58,6 @@ class Store(ABC):
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:  # noqa: B027 - a hint
         """Announce the ranges [start, stop) that will be read, one after the other."""
 
-    def forget(self) -> None:
-        """Drop what was read, so that it is read again."""
-        self._window = b""
-
-    def grow(self) -> bool:
-        """Update the size; return whether it grew.
-
-        Raises:
-            LogDamagedError: it is smaller.
-        """
-        return False
-
-    def is_at(self, path: Path) -> bool:
-        """Whether a path leads to the very file that was opened."""
-        return False
-
     def changed(self) -> bool:
         """Whether it was written to since it was opened, other than by its recorder."""
         return False
@@ -181,15 +165,6 @@ class FileStore(Store):
                     begin = start
                 end = stop
 
-    def is_at(self, path: Path) -> bool:
-        try:
-            now = os.stat(path)
-            if not os.path.samestat(now, self._seen):
-                return False
-            return self in _OPEN or self._unchanged(now) or self._is_grown(_Descriptor(path))
-        except OSError:
-            return False
-
     def changed(self) -> bool:
         with _LOCK:
             file = _OPEN.get(self)
@@ -199,14 +174,6 @@ class FileStore(Store):
             raise LogDamagedError(f"{self.path}: {error.strerror}") from None
         same = os.path.samestat(now, self._seen) and self._unchanged(now)
         return not same and self.path.suffix != PARTIAL
-
-    def grow(self) -> bool:
-        now = os.fstat(self._open().number)
-        if now.st_size < self.size:
-            raise self._was_cut()
-        self._seen, before, self.size = now, self.size, now.st_size
-        self.forget()
-        return self.size > before
 
     def close(self) -> None:
         self._closed = True

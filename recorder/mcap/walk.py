@@ -120,20 +120,6 @@ class LogStructure:
             yield segment
         self._walk_data()
 
-    def resume(self) -> int:
-        """Walk over what was appended; how many of the segments before are as they were."""
-        if self._last_chunk is not None:
-            # Its message indexes need not all have been there.
-            self._at = self.segments.pop().offset
-            self._last_chunk = None
-        if self.data_crc is not None:
-            self._at, self.data_crc = self.data_end, None
-        kept = len(self.segments)
-        self.tail, self.missing = None, ""
-        self._read_end()
-        self._walk_data()
-        return kept
-
     def _refuse(self, where: str, what: str) -> None:
         if self.first_damage is None:
             self.first_damage = self._at

@@ -89,30 +89,24 @@ class ChannelRows:
         self._may_lack = reader.salvage or facts.gaps
         self._segments: list[Segment] = []
         self._starts = [0]
-        self._seen: list[Segment] = []
         self._unconfirmed: set[int] = set()
 
     def extend(self) -> None:
-        """Number the messages that are there now.
+        """Number the messages of the whole file.
 
         Raises:
             LogDamagedError: a log time that is no frame's, a frame twice or out of order, and
                 without `salvage` a frame that is missing, unless the file says that it has gaps.
         """
-        segments, seen = self._reader.segments, self._seen
-        if seen and seen[-1] is not segments[len(seen) - 1]:
-            self._forget(seen.pop())
-        new = segments[len(seen) :]
         if self._reader.by_index and not self._may_lack:
             # The log times of each chunk are compared with the summary's count when it is read.
-            known = len(self._segments)
-            for segment in new:
+            for segment in self._reader.segments:
                 self._take(segment)
-            self._unconfirmed.update(range(known, len(self._segments)))
+            self._unconfirmed.update(range(len(self._segments)))
             first, count = self._facts.first_frame, self._starts[-1]
             self.row_ranges = [RowRange(first, first + count, 0)] if count else []
             return
-        for segment in new:
+        for segment in self._reader.segments:
             self.add(segment)
 
     def add(self, segment: Segment) -> None:
@@ -189,7 +183,6 @@ class ChannelRows:
 
     def _take(self, segment: Segment) -> bool:
         """Count the channel's messages in the next chunk of the file; whether it has any."""
-        self._seen.append(segment)
         counts = segment.channel_counts()
         if counts is None:
             table = self._reader.table(segment)
@@ -200,15 +193,6 @@ class ChannelRows:
             self._segments.append(segment)
             self._starts.append(self._starts[-1] + count)
         return count > 0
-
-    def _forget(self, segment: Segment) -> None:
-        """Forget the last chunk, to which its recorder has added."""
-        if self._segments and self._segments[-1] is segment:
-            self._segments.pop()
-            self._starts.pop()
-            stop = self._starts[-1]
-            kept = [one for one in self.row_ranges if one.row < stop]
-            self.row_ranges = [r._replace(stop=min(r.stop, r.start + stop - r.row)) for r in kept]
 
     def _number(self, times: NDArray[np.uint64], row: int, found: list[RowRange]) -> None:
         """Add the frames of messages from `row` on to the ranges found."""

@@ -117,7 +117,6 @@ class RecordedSource(LoggedSource):
             LogDamagedError: a file is damaged, or the files of a folder contradict each other.
         """
         self._loop = loop
-        self._paths = paths
         self._files = [path for path in log_files(paths) if not _only_begun(path)]
         known = {view.path: view for view in opened}
         views: list[ViewFile] = []
@@ -132,43 +131,6 @@ class RecordedSource(LoggedSource):
                 view.close()
             raise
         self._t = self._first
-
-    def refresh(self) -> bool:
-        """Read what a recorder wrote since: more frames, and further parts of a view.
-
-        What is there already is not read again.
-
-        Returns:
-            False, and nothing was read, where a file was removed or replaced.
-
-        Raises:
-            UsageError: no such recording any more.
-            LogDamagedError: what was written is damaged.
-        """
-        before = {view.path.name.removesuffix(PARTIAL): view for view in self._all()}
-        files = log_files(self._paths)
-        there = {path.name.removesuffix(PARTIAL): path for path in files}
-        if not all(n in there and v.reader.is_at(there[n]) for n, v in before.items()):
-            return False
-        opened: list[ViewFile] = []
-        added: list[ViewFile] = []
-        try:
-            for path in files:
-                view = before.get(path.name.removesuffix(PARTIAL))
-                if view is not None:
-                    view.refresh(path)
-                    opened.append(view)
-                elif not _only_begun(path):
-                    added.append(ViewFile(path))
-            views = _arrange(opened + added, salvage=False)
-        except BaseException:
-            for view in added:
-                view.close()
-            raise
-        self._files, self._views = [v.path for v in opened + added], views
-        self._identities = None
-        self._set_clock()
-        return True
 
     def coverage(self) -> dict[str, list[tuple[int, int]]]:
         """The frames that are there of each view, as ranges [start, stop)."""
@@ -187,13 +149,6 @@ class RecordedSource(LoggedSource):
             "loop": self._loop,
             "views": self._views_with(logs),
         }
-
-    def describe_files(self) -> list[dict[str, Any]]:
-        """The views' files as far as they are known, with the SHA-256 of these bytes."""
-        readers = [view.reader for view in self._all()]
-        return self._views_with(
-            [{"file": r.path.name, "bytes": r.size, "sha256": r.digest()} for r in readers]
-        )
 
     def scene(self) -> Mapping[str, str]:
         """What was recorded: the scene, its seed and the checksum of its configuration."""

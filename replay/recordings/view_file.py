@@ -89,21 +89,11 @@ class ViewFile:
             self._channels.append(self._channel(TRUTH_TOPIC, TRUTH_SCHEMA))
         self.ranges: list[tuple[int, int]] = []
         if not self._by_chunk:
-            self._number()
-
-    def refresh(self, path: Path) -> None:
-        """Read the frames that a recorder wrote since; it may have renamed the file."""
-        self.path = path
-        self.reader.moved(path)
-        if self.reader.refresh():
-            self._number()
-
-    def _number(self) -> None:
-        for rows in self._channels:
-            rows.extend()
-        self._find_ranges()
-        if self.ranges:
-            self._find_layouts()
+            for rows in self._channels:
+                rows.extend()
+            self._find_ranges()
+            if self.ranges:
+                self._find_layouts()
 
     def _find_ranges(self) -> None:
         self.ranges = functools.reduce(intersection, (rows.ranges for rows in self._channels))

@@ -108,7 +108,6 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     facts = {
         "version": KEYFRAME_VERSION,
         "versions": keyframe.versions,
-        "taken": keyframe.taken,
         "policy_rng": state.policy_rng,
         "arrays": contents(arrays),
     }
@@ -144,8 +143,7 @@ def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
         of_modules = [name for name in arrays if name.startswith(_MODULES)]
         columns = {name.removeprefix(_MODULES): arrays.pop(name) for name in of_modules}
         state = LearnerState(arrays, _modules(columns), dict(facts["policy_rng"]))
-        taken = facts["taken"] if isinstance(facts["taken"], str) else None
-        return Keyframe(decoded.iteration, decoded.t, state, dict(facts["versions"]), taken)
+        return Keyframe(decoded.iteration, decoded.t, state, dict(facts["versions"]))
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise LogDamagedError(f"{where}: not a keyframe ({one_line(error)})") from error
 

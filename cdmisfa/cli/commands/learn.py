@@ -12,7 +12,7 @@ import click
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
-from cdmisfa.cli.making import flag, grouped, number, option, word
+from cdmisfa.cli.making import flag, grouped, option, word
 from cdmisfa.cli.printing import (
     announce,
     print_result,
@@ -63,14 +63,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
 @flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
 @flag("--episodes", "Take each log as an episode, one after the other.", group="Source")
-@flag("--follow", "Wait for the frames of a recording being written.", group="Source")
-@number(
-    "--follow-timeout",
-    "With --follow, give up when no frame came for so long.",
-    *(0.1, 1e6, "SECONDS"),
-    default=60.0,
-    group="Source",
-)
 @option(
     "--record",
     "record_to",
@@ -185,7 +177,6 @@ def opened_logs(
             source,
             settings=settings_of(told),
             inputs=inputs,
-            follow=told["follow_timeout"] if told["follow"] else None,
             resumed=told["resume"],
             told=shown.update,
             **{name: told[name] for name in OPENED},
@@ -210,11 +201,11 @@ def opened_live(
     from recorder.live import RecordedWhileWatched
     from recorder.log.files import refuse_existing
 
-    refused = ("resume", "loop", "salvage", "episodes", "follow")
+    refused = ("resume", "loop", "salvage", "episodes")
     if any(told[name] for name in refused):
         raise UsageError(
-            "live streams cannot go back: leave out --resume, --loop, --salvage, --episodes and "
-            "--follow, or learn from a recording of them"
+            "live streams cannot go back: leave out --resume, --loop, --salvage and --episodes, "
+            "or learn from a recording of them"
         )
     out, record_to, force = told["out"], told["record_to"], told["force"]
     for folder in (out, record_to):
