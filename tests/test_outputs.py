@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,8 @@ def test_outputs_are_those_on_every_logged_frame_of_the_stream(tmp_path: Path, s
 
 def test_weights_of_an_expansion_are_no_picture(tmp_path: Path) -> None:
     write_run(tmp_path / "run.mcap", VECTOR, 6)
-    own, *_ = heard(tmp_path / "run.mcap", module_of(1, 3, np.ones((1, 5))), VECTOR)
+    module = replace(module_of(1, 3, np.ones((1, 5))), expansion="quadratic")
+    own, *_ = heard(tmp_path / "run.mcap", module, VECTOR)
     assert own.saliency() is None
 
 

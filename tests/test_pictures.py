@@ -59,4 +59,4 @@ def test_every_tab_of_a_recording_and_of_a_comparison_is_drawn(
 
 def test_what_is_drawn_is_there(code: dict[str, Any]) -> None:
     names = {path.stem for path in IMAGES.glob("*.png")}
-    assert names == {*code["VIEWS"], *code["FIGURES"], *code["REPORTS"], "scene"}
+    assert names == {*code["VIEWS"], *code["REPORTS"], "scene"}
