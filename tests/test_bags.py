@@ -106,8 +106,11 @@ def test_a_message_that_is_no_bytes_is_damage(tmp_path: Path, value: object) -> 
     path = ros2_database(tmp_path)
     with contextlib.closing(sqlite3.connect(path)) as database, database:
         database.execute("UPDATE messages SET data = ?", (value,))
-    with pytest.raises(LogDamagedError, match=re.escape(f"{path}: a message on /cam_left has")):
-        open_images(path, "/cam_left")
+    with (
+        contextlib.closing(open_images(path, "/cam_left")) as images,
+        pytest.raises(LogDamagedError, match=re.escape(f"{path}: /cam_left at ") + ".* no bytes"),
+    ):
+        images.image(0)
 
 
 def test_without_rosbags_the_extra_is_named(
@@ -137,9 +140,7 @@ def test_a_bag_is_described_without_its_messages(
 
 
 @pytest.mark.parametrize("kind", ["FILE", "MESSAGE", "BZ2", "LZ4"])
-def test_a_packed_bag_is_the_same_and_unpacks_to_no_more_than_the_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_a_packed_bag_is_the_same(tmp_path: Path, kind: str) -> None:
     ros1 = kind in ("BZ2", "LZ4")
     whole, packed = (ros1_bag if ros1 else ros2_bag)(tmp_path), tmp_path / "packed.bag"
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
@@ -157,7 +158,3 @@ def test_a_packed_bag_is_the_same_and_unpacks_to_no_more_than_the_limit(
         np.testing.assert_array_equal(images.times, expected.times)
         for row in (*range(COUNT), 1, 3):
             np.testing.assert_array_equal(images.image(row), expected.image(row))
-    if ros1:
-        monkeypatch.setattr("replay.camera_logs.bag.MAX_CHUNK", 28_000)
-        with pytest.raises(LogDamagedError, match="unpacks to more than 28000 bytes"):
-            open_images(packed, TOPICS[0])

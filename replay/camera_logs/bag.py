@@ -1,22 +1,15 @@
-"""ROS bags: the images, or numbers, of a rosbag2 (.db3) or of a ROS 1 .bag, through rosbags.
-
-What is packed is unpacked here, within limits that rosbags does not know.
-"""
+"""ROS bags: the images, or numbers, of a rosbag2 (.db3) or of a ROS 1 .bag, through rosbags."""
 
 from __future__ import annotations
 
-import bz2
 import contextlib
-import io
 import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path, PurePath
 from typing import Any, Final, NamedTuple, TypeVar
 
-import lz4.frame
 import numpy as np
 import zstandard
 
@@ -35,10 +28,7 @@ from replay.camera_logs.stream import (
 
 Found = TypeVar("Found")
 
-_HEADS: Final = {".bag": b"#ROSBAG V", ".db3": b"SQLite format 3\0"}
-"""What each kind begins with."""
-
-BAGS: Final = tuple(_HEADS)
+BAGS: Final = (".bag", ".db3")
 
 METADATA: Final = "metadata.yaml"
 MAX_METADATA: Final = 1024 * 1024
@@ -51,16 +41,15 @@ Images of anything but one colour are packed to more than that.
 
 
 class _Bag(NamedTuple):
-    """An opened bag: its reader, its format, and whether each message is packed."""
+    """An opened bag: readers of rosbags for its parts, one after the other, and its format."""
 
-    reader: Any
+    readers: Sequence[Any]
     ros1: bool
-    packed: bool
 
     def kinds(self) -> dict[str, MessageKind]:
-        """The kind of each topic's messages; of ROS 1 each publisher is a connection."""
+        """Return the kind of each topic's messages; in ROS 1 each publisher is a connection."""
         found = {}
-        for connection in self.reader.connections:
+        for connection in (c for reader in self.readers for c in reader.connections):
             definition = str(connection.msgdef.data).encode()
             name, idl = str(connection.msgtype), connection.msgdef.format.name == "IDL"
             kind = MessageKind(name, "cdr", definition, "ros2idl" if idl else "ros2msg")
@@ -69,28 +58,28 @@ class _Bag(NamedTuple):
             found[str(connection.topic)] = kind
         return found
 
-    def connections(self, topics: Sequence[str]) -> list[Any]:
-        return [c for c in self.reader.connections if c.topic in topics]
+    def messages(
+        self, topics: Sequence[str], start: int | None = None
+    ) -> Iterator[tuple[str, int, Any]]:
+        """Yield topic, time and data of each message on some topics, from a time on."""
+        for reader in self.readers:
+            if chosen := [c for c in reader.connections if c.topic in topics]:
+                for connection, stamp, data in reader.messages(chosen, start):
+                    yield str(connection.topic), stamp, data
 
-    def messages(self, topics: Sequence[str], *, whole: bool) -> Iterator[tuple[str, int, bool]]:
-        """The topic and the time of each message on some, and whether it holds bytes.
-
-        Args:
-            topics: the topics.
-            whole: read the data of a rosbag2, too, beside which these stand together.
-        """
-        if whole or self.ros1:
-            for connection, stamp, data in self.reader.messages(self.connections(topics)):
-                yield str(connection.topic), stamp, isinstance(data, bytes)
+    def stamps(self, topics: Sequence[str]) -> Iterator[tuple[str, int]]:
+        """Yield topic and time of each message on some topics, of a rosbag2 without its data."""
+        if self.ros1:
+            yield from ((topic, stamp) for topic, stamp, _ in self.messages(topics))
             return
         query = (
-            "SELECT topics.name, messages.timestamp, typeof(messages.data) FROM messages "
+            "SELECT topics.name, messages.timestamp FROM messages "
             "JOIN topics ON messages.topic_id = topics.id "
             f"WHERE topics.name IN ({','.join('?' * len(topics))}) ORDER BY messages.timestamp"
         )
-        for storage in getattr(self.reader.storage, "storages", [self.reader.storage]):
-            for name, stamp, kind in storage.dbconn.execute(query, tuple(topics)):
-                yield name, stamp, kind == "blob"  # SQLite keeps anything in any column
+        for reader in self.readers:
+            for storage in getattr(reader.storage, "storages", [reader.storage]):
+                yield from storage.dbconn.execute(query, tuple(topics))
 
 
 class BagImages(MessageImages):
@@ -106,7 +95,7 @@ class BagImages(MessageImages):
         self.path, self.color = path, reading.color
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
-        self._messages: Iterator[tuple[Any, int, bytes]] = iter(())
+        self._messages: Iterator[tuple[str, int, Any]] = iter(())
         self._next = -1
         with contextlib.ExitStack() as opened:
             self._bag = bag = opened.enter_context(_opened(path))
@@ -114,33 +103,28 @@ class BagImages(MessageImages):
             channels = [(name, kind, name) for name, kind in kinds.items()]
             (self.topic, *_), self.decode = choose_images(path, topic, channels, reading)
             self.kind = kinds[self.topic]
-            stamps: list[int] = []
             with explained(path, "rosbags"):
-                for _, stamp, has_bytes in bag.messages([self.topic], whole=False):
-                    if stamps and stamp < stamps[-1]:
-                        raise LogDamagedError(
-                            f"{path}: its messages are not in the order of time; convert it to MCAP"
-                        )
-                    if not has_bytes:
-                        raise LogDamagedError(f"{path}: a message on {self.topic} has no bytes")
-                    stamps.append(stamp)
+                stamps = [stamp for _, stamp in bag.stamps([self.topic])]
+            if stamps != sorted(stamps):
+                raise LogDamagedError(
+                    f"{path}: its messages are not in the order of time; convert it to MCAP"
+                )
             if not stamps:
                 raise UsageError(f"{path}: there is no message on {self.topic}")
             self.times = sorted_times(f"{path}: {self.topic}", stamps)
             self._opened = opened.pop_all()
         self.remarks = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
 
-    def taken(self, row: int, take: Callable[[bytes], Found]) -> Found:
+    def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
         with explained(self.path, "rosbags"):
             if row != self._next:
-                connections = self._bag.connections([self.topic])
-                self._messages = self._bag.reader.messages(connections, int(self.times[row]))
+                self._messages = self._bag.messages([self.topic], int(self.times[row]))
                 self._next = int(np.searchsorted(self.times, self.times[row]))
             while self._next <= row:
-                _, _, data = next(self._messages, (None, 0, b""))
+                _, _, data = next(self._messages, ("", 0, b""))
                 self._next += 1
-            if self._bag.packed:
-                data = _unpacked_message(data)
+        if not isinstance(data, bytes):  # SQLite keeps anything in any column
+            raise LogDamagedError(f"{self.where(row)}: the message has no bytes")
         return take(data)
 
     def close(self) -> None:
@@ -164,11 +148,13 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
         stamps: dict[str, list[int]] = {name: [] for name in kinds}
         with explained(path, "rosbags"):
             if bag.ros1 and not whole:
-                for connection in bag.reader.connections:
-                    entries = bag.reader.indexes.get(connection.id, ())
-                    stamps[str(connection.topic)] += [entry.time for entry in entries]
+                for reader in bag.readers:
+                    for connection in reader.connections:
+                        entries = reader.indexes.get(connection.id, ())
+                        stamps[str(connection.topic)] += [entry.time for entry in entries]
             else:
-                for name, stamp, _ in bag.messages(list(kinds), whole=whole):
+                messages = bag.messages if whole else bag.stamps
+                for name, stamp, *_ in messages(list(kinds)):
                     stamps[name].append(stamp)
     found = []
     for name, kind in kinds.items():
@@ -196,57 +182,20 @@ def _opened(path: Path) -> Iterator[_Bag]:
             f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
         ) from None
     ros1 = path.suffix == ".bag" and path.is_file()
-    with _unpacked_bag(path) as (plain, packed), contextlib.ExitStack() as opened:
+    with _parts(path) as parts, contextlib.ExitStack() as opened:
         with explained(path, "rosbags"):
-            reader: Any = Rosbag1(plain) if ros1 else Rosbag2(plain)
-            reader.open()
-            opened.callback(reader.close)
-            if ros1:
-                reader.chunks = {place: _bounded(chunk) for place, chunk in reader.chunks.items()}
-            elif packed:  # rosbags would unpack it without a limit
-                storage = reader.storage
-                storage.metadata = storage.metadata._replace(compression_mode=None)
-        yield _Bag(reader, ros1, packed)
-
-
-def _bounded(chunk: Any) -> Any:
-    """A chunk of a ROS 1 bag with a limit on what it unpacks to."""
-    from rosbags.rosbag1.reader import decompressors
-
-    if chunk.datasize > MAX_CHUNK:
-        raise ValueError(f"a chunk of {chunk.datasize} bytes, above the limit of {MAX_CHUNK}")
-    bounded = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
-    for name, kind in bounded.items():
-        if chunk.decompressor is decompressors[name]:
-            return chunk._replace(decompressor=partial(_unpacked_chunk, kind))
-    return chunk
-
-
-def _unpacked_chunk(kind: Callable[[], Any], data: bytes) -> bytes:
-    unpacking = kind()
-    found = bytes(unpacking.decompress(data, max_length=MAX_CHUNK))
-    if not unpacking.eof:
-        raise ValueError(f"a chunk is cut short, or unpacks to more than {MAX_CHUNK} bytes")
-    return found
-
-
-def _zstd(source: Any) -> Any:
-    """A stream of what zstd packed."""
-    unpacking = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2)
-    return unpacking.stream_reader(source, read_across_frames=True)
-
-
-def _unpacked_message(data: bytes) -> bytes:
-    with _zstd(io.BytesIO(data)) as reader:
-        found = bytes(reader.read(MAX_CHUNK + 1))
-    if len(found) > MAX_CHUNK:
-        raise ValueError(f"a message unpacks to more than {MAX_CHUNK} bytes, the limit")
-    return found
+            readers: list[Any] = [Rosbag1(part) if ros1 else Rosbag2(part) for part in parts]
+            for reader in readers:
+                reader.open()
+                opened.callback(reader.close)
+        yield _Bag(readers, ros1)
 
 
 @contextlib.contextmanager
-def _unpacked_bag(path: Path) -> Iterator[tuple[Path, bool]]:
-    """A bag with plain files, the same or a copy, and whether each of its messages is packed.
+def _parts(path: Path) -> Iterator[Sequence[Path]]:
+    """Yield what rosbags opens: the bag, or its packed files, unpacked into a temporary folder.
+
+    rosbags unpacks files without a limit; chunks and messages take memory alone, of the budget.
 
     Args:
         path: a file, or the folder of a rosbag2.
@@ -256,53 +205,47 @@ def _unpacked_bag(path: Path) -> Iterator[tuple[Path, bool]]:
         LogDamagedError: it is no bag, or unpacks to far more than it is.
     """
     if not path.is_dir():
-        if not begun(path).startswith(_HEADS[path.suffix]):
-            raise LogDamagedError(f"{path}: it is no ROS bag, by its first bytes")
-        yield path, False
+        begun(path)
+        yield [path]
         return
     from ruamel.yaml import YAML
 
     with explained(path / METADATA, "YAML"):
-        whole = YAML(typ="safe").load(read_regular(path / METADATA, MAX_METADATA).decode("utf-8"))
-        said = whole["rosbag2_bagfile_information"]
-        names = [PurePath(str(name)).name for name in said["relative_file_paths"]]
-        packed = str(said.get("compression_mode") or "").lower()
-        kept_as = str(said["storage_identifier"])
+        text = read_regular(path / METADATA, MAX_METADATA).decode("utf-8")
+        said = YAML(typ="safe").load(text)["rosbag2_bagfile_information"]
+        files = [path / PurePath(str(name)).name for name in said["relative_file_paths"]]
+        packed, kept_as = said.get("compression_mode"), str(said["storage_identifier"])
     if kept_as != "sqlite3":
         raise LogDamagedError(
             f"{path}: files of {kept_as[:40]} are read if they are MCAP and called .mcap: "
             "unpack them with zstd -d"
         )
-    for name in names:
-        check_regular(path / name)
-    if packed != "file":
-        yield path, packed == "message"
+    for file in files:
+        check_regular(file)
+    if str(packed).lower() != "file":
+        yield [path]
         return
-    with tempfile.TemporaryDirectory() as temporary:
-        copy = Path(temporary)
-        for name in names:
-            _unpack(path / name, copy / PurePath(name).stem)
-        said["relative_file_paths"] = [PurePath(name).stem for name in names]
-        said["compression_mode"] = said["compression_format"] = ""
-        with (copy / METADATA).open("w", encoding="utf-8") as file:
-            YAML(typ="safe").dump(whole, file)
-        yield copy, False
+    with tempfile.TemporaryDirectory() as folder:
+        yield [_unpacked(file, Path(folder)) for file in files]
 
 
-def _unpack(packed: Path, target: Path) -> None:
-    """Unpack a file into another, unless it becomes far too large or leaves no room on the disk.
+def _unpacked(packed: Path, folder: Path) -> Path:
+    """Unpack a file into a folder, unless it becomes far too large or leaves no room on the disk.
 
     Raises:
         LogDamagedError: it would, or it is not packed by zstd.
     """
+    target = folder / packed.stem
     with explained(packed, "zstd"), opened_regular(packed) as source, target.open("xb") as out:
         most = max(os.fstat(source.fileno()).st_size * MOST_TIMES, MAX_CHUNK)
-        most = min(most, shutil.disk_usage(target.parent).free // 2)
-        with _zstd(source) as reader:
-            while part := reader.read(1 << 20):
-                out.write(part)
-                if out.tell() > most:
-                    raise LogDamagedError(
-                        f"{packed} unpacks to more than {most} bytes, the limit: unpack it with "
-                        f"zstd -d, and take compression_mode out of {METADATA}"
-                    )
+        most = min(most, shutil.disk_usage(folder).free // 2)
+        unpacking = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2)
+        reader = unpacking.stream_reader(source, read_across_frames=True)
+        while part := reader.read(1 << 20):
+            out.write(part)
+            if out.tell() > most:
+                raise LogDamagedError(
+                    f"{packed} unpacks to more than {most} bytes, the limit: unpack it with "
+                    f"zstd -d, and take compression_mode out of {METADATA}"
+                )
+    return target
