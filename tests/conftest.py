@@ -136,3 +136,12 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]
         for process in started:
             process.kill()
             process.wait()
+
+
+@pytest.fixture
+def keyframes_every(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Let runs keep the learner's state every so many iterations, whatever room that takes."""
+    from cdmisfa.experiments.session import Session
+
+    defaults: Any = Session.learn.__kwdefaults__
+    return lambda every: monkeypatch.setitem(defaults, "keyframes", every)

@@ -37,7 +37,7 @@ SHOWN: Mapping[str, tuple[object, ...]] = {
     "compare": ("run", "run"),
     "at": ("run", 2),
     "check": ("run",),
-    "fork": ("run", "--at", 2, *SHORT, "-o", "fork"),
+    "fork": ("run", "--iteration", 2, *SHORT, "-o", "fork"),
     "apply": ("run", "rec", "-o", "applied.csv"),
     "report": ("run",),
     "signals": (),

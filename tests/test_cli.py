@@ -226,7 +226,7 @@ class TestRuns:
         assert (result["ended"], result["iterations"]) == ("log_exhausted", blocks)
         assert result["undecided"] == ["x1", "x2", "x3"]
         assert cdmisfa("check", run).code == cdmisfa("at", run, blocks).code == 0
-        forked = cdmisfa("fork", run, "--at", 5, "-o", fork, "--no-rerun", "--json")
+        forked = cdmisfa("fork", run, "--iteration", 5, "-o", fork, "--no-rerun", "--json")
         assert (forked.code, forked.json["ended"]) == (0, "log_exhausted")
         info = cdmisfa("info", run)
         assert "whole" in info.out

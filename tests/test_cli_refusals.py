@@ -150,12 +150,14 @@ CASES: dict[str, tuple[str, ...]] = {
         "record it first, with cdmisfa record gym:Pendulum-v1 -o REC",
     ),
     # a fork that cannot be
-    "fork RUN --at 3 -o x --set learner.tau=20": ("learner.tau is 100 and stays",),
-    "fork RUN --at 3 -o x --set learner.expansion=none": ("expansion is quadratic and stays",),
-    "fork RUN --at 3 -o x --set learner.components=3": ("does not fit",),
-    "fork RUN --at 3 -o x --set scene.seed=3": ("changes learner.* alone",),
-    "fork RUN --at 3 -o x --set learner.nuu=3": ("unknown key learner.nuu",),
-    "fork RUN --at 16 -o x": ("holds 15 iterations",),
+    "fork RUN --iteration 3 -o x --set learner.tau=20": ("learner.tau is 100 and stays",),
+    "fork RUN --iteration 3 -o x --set learner.expansion=none": (
+        "expansion is quadratic and stays",
+    ),
+    "fork RUN --iteration 3 -o x --set learner.components=3": ("does not fit",),
+    "fork RUN --iteration 3 -o x --set scene.seed=3": ("changes learner.* alone",),
+    "fork RUN --iteration 3 -o x --set learner.nuu=3": ("unknown key learner.nuu",),
+    "fork RUN --iteration 16 -o x": ("holds 15 iterations",),
     # experiments that there are not, or not so
     "reproduce stabillity -o x": ("no experiment 'stabillity': did you mean stability?",),
     # what is read from no URL, and what is the URL of no log
@@ -172,7 +174,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "record oscillatory -o file": (FOLDER,),
     "record oscillatory --resume -o file/below": (FOLDER,),
     "sweep oscillatory --seeds 0 -o file": (FOLDER,),
-    "fork RUN --at 3 --force -o file": (FOLDER,),
+    "fork RUN --iteration 3 --force -o file": (FOLDER,),
     "sweep oscillatory -o RUN --seeds 0:1": ("run.mcap",),
     "export RUN -o - --to csv": ("name another",),
     "view RUN --screenshot x.jpg": ("the picture is a PNG, name it x.png",),
@@ -180,14 +182,14 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn oscillatory -o EMPTY": ("is empty: name a",),
     "record oscillatory --frames 20 -o EMPTY": ("is empty: name a",),
     "view RUN --save EMPTY": ("is empty: name a",),
-    "fork EMPTY --at 3 -o fork": ("is empty: name a",),
+    "fork EMPTY --iteration 3 -o fork": ("is empty: name a",),
     **{f"{command} EMPTY": ("is empty: name a",) for command in ("learn", "view", "info")},
     # a conversion needs a folder
     "convert LOGS/left.mcap": ("-o",),
     # resuming is advised only where it can be
     "learn oscillatory -o taken": (TAKEN, "go on with --resume"),
     "record oscillatory -o taken": (TAKEN, "go on with --resume"),
-    "fork RUN --at 3 -o taken": (TAKEN,),
+    "fork RUN --iteration 3 -o taken": (TAKEN,),
     "learn gym:Pendulum-v1 -o taken": (TAKEN,),
     "record gym:Pendulum-v1 -o taken": (TAKEN,),
 }

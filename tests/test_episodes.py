@@ -263,7 +263,7 @@ def test_killed_in_the_middle_of_many_episodes_it_is_resumed_with_the_same_signa
         np.save(folder / f"ep{i}.npy", x.T)
     assert cdmisfa("index", folder).code == 0
     words = (folder, *QUICK, "--set", "learner.watch=9999", "--set", "input.centre=episode")
-    words = (*words, "--keyframes", 20, "--set", "input.holdout=0")
+    words = (*words, "--set", "input.holdout=0")
     whole = cdmisfa("learn", *words, "--json").json
     assert whole["iterations"] == 300
     run = tmp_path / "run"
@@ -275,7 +275,8 @@ def test_killed_in_the_middle_of_many_episodes_it_is_resumed_with_the_same_signa
 
     slowed = "import sys, time; from cdmisfa.cli import run; from cdmisfa.agents.progress import "
     slowed += "learner as own; step = own.ProgressLearner.step; own.ProgressLearner.step = "
-    slowed += "lambda *a: (time.sleep(.002), step(*a))[1]; sys.exit(run(sys.argv[1:]))"
+    slowed += "lambda *a: (time.sleep(.002), step(*a))[1]; from cdmisfa.experiments.session import "
+    slowed += "Session; Session.learn.__kwdefaults__['keyframes'] = 20; sys.exit(run(sys.argv[1:]))"
     with running("-c", slowed, "learn", *map(str, words), "-o", str(run)) as process:
         wait_for(far, 60, process)
         os.kill(process.pid, signal.SIGKILL)

@@ -144,7 +144,7 @@ def test_going_on_keeps_to_what_the_run_learns_from(
     assert cdmisfa("learn", "--resume", "-o", resumed, *more).json["held_out"] == whole["held_out"]
     assert cdmisfa("check", once).code == 0
     endless = ("--set", "learner.watch=1000", "--json", "--no-rerun")
-    forked = cdmisfa("fork", once, "--at", "20", "-o", fork, *endless).json
+    forked = cdmisfa("fork", once, "--iteration", "20", "-o", fork, *endless).json
     assert forked["frames"] == forked["held_out"]["frames"][0] == 5400
 
 

@@ -292,7 +292,9 @@ def test_what_is_no_file_is_refused_by_every_command(
         assert (done.code, done.err.count("\n"), name in done.err) == (2, 1, True), (way, done.err)
 
 
-@pytest.mark.parametrize("words", ["check {}", "at {} 3", "fork {} --at 3 -o x", "compare {} {}"])
+@pytest.mark.parametrize(
+    "words", ["check {}", "at {} 3", "fork {} --iteration 3 -o x", "compare {} {}"]
+)
 def test_what_stands_where_a_run_would_be_is_said(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:

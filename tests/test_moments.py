@@ -79,6 +79,8 @@ def lying(folder: Path, old: bytes, new: bytes) -> None:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Runs of both learners: live, recorded in a loop, and stopped and resumed many times."""
     folder = tmp_path_factory.mktemp("moments")
+    defaults = Session.learn.__kwdefaults__
+    defaults["keyframes"] = 20
     must("record", "oscillatory", "-o", folder / "log", "--frames", 1500)
     for algorithm in OF:
         for name, source in (("live", "oscillatory"), ("loop", folder / "log")):
@@ -86,8 +88,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for out, stops in ((name, (ENDS,)), (f"{name}-resumed", (17, 23, 64, ENDS))):
                 for stop in stops:
                     resume = () if stop == stops[0] else ("--resume",)
-                    where = ("-o", folder / f"{algorithm}-{out}", "--keyframes", 20, *resume)
+                    where = ("-o", folder / f"{algorithm}-{out}", *resume)
                     must("learn", source, *told, *where, "--max-iterations", stop)
+    defaults["keyframes"] = None
     return folder
 
 
@@ -203,6 +206,7 @@ def the_dice(state: LearnerState) -> LearnerState:
 def test_a_keyframe_that_lies_is_found_out(
     tmp_path: Path,
     cdmisfa: Cdmisfa,
+    keyframes_every: Callable[[int], None],
     monkeypatch: pytest.MonkeyPatch,
     lie: Callable[[LearnerState], LearnerState],
     where: str,
@@ -212,13 +216,14 @@ def test_a_keyframe_that_lies_is_found_out(
         return encode_keyframe(dataclasses.replace(keyframe, state=state))
 
     monkeypatch.setattr("replay.runs.writer.encode_keyframe", kept)
-    told = (*words("2.0"), *LEARN, "--keyframes", 10, "--max-iterations", 30)
+    keyframes_every(10)
+    told = (*words("2.0"), *LEARN, "--max-iterations", 30)
     assert cdmisfa("learn", "oscillatory", *told, "-o", tmp_path / "run").code == 0
     checked = cdmisfa("check", tmp_path / "run")
     assert checked.code == 4
     assert checked.out.startswith(f"iteration 19: {where}")
-    assert cdmisfa("check", tmp_path / "run", "--to", 15).code == 0
-    assert cdmisfa("check", tmp_path / "run", "--from", 10, "--json").code == 4
+    assert cdmisfa("check", tmp_path / "run", "--iterations", ":15").code == 0
+    assert cdmisfa("check", tmp_path / "run", "--iterations", "10:", "--json").code == 4
 
 
 @pytest.mark.parametrize(
@@ -238,10 +243,13 @@ def test_a_moment_that_is_not_there_is_refused(
         asked(place / "2.0-live")
 
 
-def test_without_its_source_a_run_has_its_keyframes(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+def test_without_its_source_a_run_has_its_keyframes(
+    tmp_path: Path, cdmisfa: Cdmisfa, keyframes_every: Callable[[int], None]
+) -> None:
+    keyframes_every(10)
     log, run = tmp_path / "log", tmp_path / "run"
     cdmisfa("record", "oscillatory", "-o", log, "--frames", 2000)
-    told = (*words("2.0"), *LEARN, "--keyframes", 10, "--max-iterations", 25)
+    told = (*words("2.0"), *LEARN, "--max-iterations", 25)
     assert cdmisfa("learn", log, *told, "-o", run).code == 0
     log.rename(tmp_path / "moved")
     assert cdmisfa("at", run, 20, "--json").json["t"] == 800
@@ -276,7 +284,9 @@ def test_at_prints_all_of_the_memory(place: Path, cdmisfa: Cdmisfa) -> None:
 
 def test_a_fork_goes_on_as_told(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
     parent, fork = place / "2.0-loop", tmp_path / "fork"
-    done = cdmisfa("fork", parent, "--at", 30, "--set", "learner.nu=0.02", "-o", fork, "--json")
+    done = cdmisfa(
+        "fork", parent, "--iteration", 30, "--set", "learner.nu=0.02", "-o", fork, "--json"
+    )
     assert done.code == 0, done.err
     assert done.json["iterations"] == ENDS
     found = first_difference(parent, fork)
@@ -311,13 +321,20 @@ def test_a_fork_that_changes_nothing_is_its_parent(place: Path, tmp_path: Path) 
     ],
 )
 def test_forks_of_forks_are_resumed_and_checked(
-    place: Path, tmp_path: Path, cdmisfa: Cdmisfa, parent: str, key: str, at: int
+    place: Path,
+    tmp_path: Path,
+    cdmisfa: Cdmisfa,
+    keyframes_every: Callable[[int], None],
+    parent: str,
+    key: str,
+    at: int,
 ) -> None:
+    keyframes_every(15)
     one, two, straight = (tmp_path / n for n in ("one", "two", "straight"))
-    told = ("--no-rerun", "--keyframes", 15)
-    fork = ("fork", place / parent, "--at", at, "--set", key, *told, "-o", one)
+    told = ("--no-rerun",)
+    fork = ("fork", place / parent, "--iteration", at, "--set", key, *told, "-o", one)
     assert cdmisfa(*fork, "--max-iterations", 60).code == 0
-    again = ("fork", one, "--at", 52, "--seed", 9, *told)
+    again = ("fork", one, "--iteration", 52, "--seed", 9, *told)
     assert cdmisfa(*again, "-o", two, "--max-iterations", 70).code == 0
     assert cdmisfa(*again, "-o", straight, "--max-iterations", 110).code == 0
     resumed = cdmisfa("learn", "--resume", "-o", two, "--max-iterations", 110, "--no-rerun")

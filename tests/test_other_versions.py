@@ -53,7 +53,7 @@ def test_a_run_of_another_arithmetic_is_not_computed_again(
     for words in (
         ("check", run),
         ("at", run, 2),
-        ("fork", run, "--at", 0, "-o", tmp_path / "fork"),
+        ("fork", run, "--iteration", 0, "-o", tmp_path / "fork"),
     ):
         done = cdmisfa(*words)
         assert (done.code, done.err.count("\n")) == (2, 1), (words, done.err)

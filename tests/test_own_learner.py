@@ -42,7 +42,7 @@ def test_it_learns_is_checked_and_resumed(cdmisfa: Cdmisfa, tmp_path: Path) -> N
     whole = cdmisfa(*words, "-o", tmp_path / "whole").json
     assert (whole["iterations"], whole["frames"], whole["ended"]) == (9, 270, "nothing_left")
     assert cdmisfa("check", tmp_path / "whole", "--json").json["identical"]
-    cdmisfa(*words, "-o", tmp_path / "parts", "--max-iterations", 4, "--keyframes", 2)
+    cdmisfa(*words, "-o", tmp_path / "parts", "--max-iterations", 4)
     resumed = cdmisfa("learn", "--resume", "-o", tmp_path / "parts", "--max-iterations", 9).code
     assert resumed == 0
     result = json.loads((tmp_path / "parts" / "run.json").read_text())["result"]

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +41,10 @@ def learned(cdmisfa: Cdmisfa, out: Path, *words: object) -> Path:
 
 
 @pytest.fixture
-def run(cdmisfa: Cdmisfa, tmp_path: Path) -> Path:
+def run(cdmisfa: Cdmisfa, keyframes_every: Callable[[int], None], tmp_path: Path) -> Path:
     """A run of 2.0 with some modules, and its report."""
-    return learned(cdmisfa, tmp_path / "run", "--max-modules", 3, "--keyframes", 10)
+    keyframes_every(10)
+    return learned(cdmisfa, tmp_path / "run", "--max-modules", 3)
 
 
 def test_a_module_is_saved_where_all_rules_hold_and_nowhere_else(run: Path) -> None:
@@ -64,7 +66,7 @@ def test_a_fork_is_judged_by_its_parents_rules_until_it_parts(
 ) -> None:
     first = read_told(run, frames=1).outline.saved[0].iteration
     fork, at = tmp_path / "fork", first + 5
-    words = ("--at", at, "--set", "learner.delta=1e-9", "-o", fork, "--no-rerun")
+    words = ("--iteration", at, "--set", "learner.delta=1e-9", "-o", fork, "--no-rerun")
     assert cdmisfa("fork", run, *words, "--max-iterations", at + 40).code == 0
     told = read_told(fork, frames=1)
     rules = deciding(conditions_of(told.outline, told.signals))

@@ -156,12 +156,6 @@ preset = word(
     "Preset (icub, icub-real, oscillatory, cameras) or a .toml file; by default the source's.",
     group="Learner",
 )
-keyframes = number(
-    "--keyframes",
-    "Keep the learner's state every N iterations; by default every 100, or less often so that they "
-    "stay a small part of the log.",
-    *(1, None, "N"),
-)
 engine = together(
     choice(
         "--engine",

@@ -334,9 +334,7 @@ def check_run(
         LogDamagedError: the log cannot be read.
     """
     if stop is not None and 0 < start >= stop:
-        raise UsageError(
-            f"from {start} to {stop} there is nothing to check: --from comes before --to"
-        )
+        raise UsageError(f"from {start} to {stop} there is nothing to check: write FIRST:END")
     with Recomputation(run, start, source) as again:
         first = again.learner.iteration
         at, found = again.compare(stop, read_keyframes(again.log, first))

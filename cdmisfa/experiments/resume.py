@@ -40,7 +40,6 @@ OPTIONS = (
     *INPUTS,
     "max_iterations",
     "max_modules",
-    "keyframes",
 )
 """Options of a command that are kept with its run."""
 

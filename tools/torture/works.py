@@ -113,7 +113,15 @@ WORKS: Mapping[str, Work] = {
         _learn("@png/left", "@png/right", *PICTURES, "--loop"), RESUME, _run, ITERATIONS
     ),
     "fork": Work(
-        lambda place, shared: ("fork", shared / "run", "--at", 150, "--no-rerun", "-o", place),
+        lambda place, shared: (
+            "fork",
+            shared / "run",
+            "--iteration",
+            150,
+            "--no-rerun",
+            "-o",
+            place,
+        ),
         ("learn", "--resume", "--no-rerun", "-o"),
         *(_run, ITERATIONS // 2),
     ),

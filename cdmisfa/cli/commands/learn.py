@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 OPENED = ("preset", "seed", "loop", "salvage", "episodes")
 """Options that say how a source is opened."""
 
-KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
+KEPT = ("seed", "max_iterations", "max_modules")
 """Options that are handed on to the run as they are."""
 
 
@@ -71,7 +71,6 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes")
     help="Record what every live stream shows while learning, to learn the same from it again.",
     group="Live streams",
 )
-@options.keyframes
 @options.input_options()
 @options.force
 @options.as_json

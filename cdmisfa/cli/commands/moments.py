@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
-from cdmisfa.cli.making import WholeRange, number, option, word
+from cdmisfa.cli.making import option, word
 from cdmisfa.cli.printing import (
     outcome_line,
     print_document,
@@ -77,15 +78,22 @@ def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: boo
     print_line(f"memory: {len(state.arrays)} arrays, {size:.1f} kB; --json prints all of it")
 
 
+def _part(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int | None]:
+    """Parse a range of iterations."""
+    found = re.fullmatch(r"(\d{0,18}):(\d{0,18})", value or ":", re.ASCII)
+    if found is None:
+        raise click.BadParameter(f"{value!r} is no range: write FIRST:END, as 100:200")
+    first, end = found.groups()
+    return int(first or 0), int(end) if end else None
+
+
 @click.command("check")
 @options.path_argument("run")
-@option("--from", "start", type=WholeRange(0), default=0, metavar="K", help="First iteration.")
 @option(
-    "--to",
-    "stop",
-    type=WholeRange(1),
-    metavar="L",
-    help="End before this one; else at the end.",
+    "--iterations",
+    metavar="FIRST:END",
+    callback=_part,
+    help="Check these iterations alone, without END; by default all.",
 )
 @source
 @options.as_json
@@ -93,8 +101,7 @@ def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: boo
 def check_command(
     ctx: click.Context,
     run: Path,
-    start: int,
-    stop: int | None,
+    iterations: tuple[int, int | None],
     source: tuple[str, ...],
     as_json: bool,
 ) -> None:
@@ -106,7 +113,7 @@ def check_command(
     """
     from cdmisfa.experiments.session import Session
 
-    checked = Session.check(run, source, start, stop)
+    checked = Session.check(run, source, *iterations)
     if as_json:
         print_document(run=str(run), **checked.as_json())
     else:
@@ -117,7 +124,14 @@ def check_command(
 
 @click.command("fork")
 @options.path_argument("run")
-@number("--at", "Go on after so many iterations of the run.", 0, unit="K", required=True)
+@option(
+    "--iteration",
+    "at",
+    type=click.IntRange(0),
+    required=True,
+    metavar="K",
+    help="Continue after K iterations of the run.",
+)
 @options.out("Folder of the fork.", required=True)
 @options.settings("What the learner is told from there on; may be repeated.", "learner.KEY=VALUE")
 @options.seed("Seed of the random choices from there on; the world stays.", default=None)
@@ -125,7 +139,6 @@ def check_command(
 @options.end_after("modules", "End after so many modules in all; by default as the run.")
 @source
 @options.no_rerun
-@options.keyframes
 @options.force
 @options.as_json
 @options.quiet
@@ -138,7 +151,6 @@ def fork_command(
     max_iterations: int | None,
     max_modules: int | None,
     no_rerun: bool,
-    keyframes: int | None,
     as_json: bool,
     **told: Any,
 ) -> None:
@@ -158,7 +170,6 @@ def fork_command(
         result = session.learn(
             sinks=(reporter,),
             stop=stop,
-            keyframes=keyframes,
             rerun=not no_rerun,
             hashing=reporter.hashing,
         )

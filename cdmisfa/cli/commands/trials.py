@@ -201,7 +201,6 @@ def reproduce_command(
 @click.command("demo")
 @options.out("Folder of the recordings and runs; by default the one you are in.")
 @options.seed()
-@options.preset
 @number("--frames", "Frames a view.", 400, default=8000)
 @options.jobs
 @options.as_json
