@@ -307,19 +307,6 @@ def test_what_stands_where_a_run_would_be_is_said(
         assert (done.code, done.err) == (2, said)
 
 
-@pytest.mark.parametrize("size", [99, 1 << 40])
-@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.bag", "a.db3"])
-def test_a_file_that_was_never_written_is_said_to_be(
-    cdmisfa: Cdmisfa, tmp_path: Path, name: str, size: int
-) -> None:
-    with (tmp_path / name).open("xb") as file:
-        file.truncate(size)
-    for command in ("info", "verify", "learn"):
-        done = cdmisfa(command, tmp_path / name)
-        assert done.code == 3
-        assert "it begins with zeros, as a file that was never written" in done.err + done.out
-
-
 @pytest.mark.parametrize("ending", ["flv", "ts", "gif", "webp", "tiff", "bmp"])
 def test_of_what_is_no_log_it_is_said_which_kinds_are(
     cdmisfa: Cdmisfa, tmp_path: Path, ending: str

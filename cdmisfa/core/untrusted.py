@@ -34,14 +34,6 @@ _STATM: Final = Path("/proc/self/statm")
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE") if sys.platform == "linux" else 0
 _DATA: Final = 5
 """Column of `_STATM`: the pages that `RLIMIT_DATA` limits."""
-_BLOCK: Final = 512
-"""Bytes of a block of `st_blocks`, whatever the disk's own."""
-_SPARSE: Final = 4 * 1024**3
-_EMPTY: Final = 1000
-"""Files above `_SPARSE` bytes of which so small a part is on the disk are holes: what reads them to
-their end would never come there. A file system that compresses makes nothing so small."""
-_HEAD: Final = 16
-"""Bytes that `begun` gives, which no format has as zeros."""
 _LOCK: Final = threading.Lock()
 _THREAD: Final = threading.local()
 _threads = 0
@@ -143,7 +135,7 @@ def _free() -> None:
 
 
 def check_regular(path: Path, limit: int | None = None) -> None:
-    """Refuse a path that is no regular file, or a file that is too large, or all holes, unopened.
+    """Refuse a path that is no regular file, or a file that is too large, unopened.
 
     Raises:
         UsageError: so it is; or it may not be read.
@@ -178,24 +170,6 @@ def opened_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
             yield file
     except OSError as error:
         raise LogDamagedError(f"{path} cannot be read: {error.strerror or error}") from error
-
-
-def begun(path: Path) -> bytes:
-    """The first bytes of a file; raises as `read_regular` does, and where it was never written.
-
-    Raises:
-        LogDamagedError: it is empty, or begins with zeros, as no format does.
-    """
-    with opened_regular(path) as file:
-        head = file.read(_HEAD)
-    if not head:
-        raise LogDamagedError(f"{path}: it is empty")
-    if not any(head):
-        raise LogDamagedError(
-            f"{path}: it begins with zeros, as a file that was never written: copy it again from "
-            "where it was recorded"
-        )
-    return head
 
 
 def open_regular(path: Path, limit: int | None = None) -> int:
@@ -249,9 +223,3 @@ def _check(path: Path, found: os.stat_result, limit: int | None) -> None:
         raise UsageError(f"{path}: no regular file but {kind}, remove it or name another")
     if limit is not None and found.st_size > limit:
         raise UsageError(f"{path}: {found.st_size} bytes, above the limit of {limit}")
-    on_disk = getattr(found, "st_blocks", 0) * _BLOCK  # 0 where a file system does not tell
-    if found.st_size > _SPARSE and 0 < on_disk < found.st_size // _EMPTY:
-        raise UsageError(
-            f"{path}: {found.st_size} bytes, of which {on_disk} were ever written: copy it again "
-            "from where it was recorded"
-        )

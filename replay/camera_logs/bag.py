@@ -14,7 +14,7 @@ import numpy as np
 import zstandard
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.untrusted import begun, check_regular, opened_regular, read_regular
+from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
 from recorder.images.decoding import MessageKind, decoder_of
 from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
 from recorder.mcap.records import MAX_CHUNK
@@ -205,7 +205,7 @@ def _parts(path: Path) -> Iterator[Sequence[Path]]:
         LogDamagedError: it is no bag, or unpacks to far more than it is.
     """
     if not path.is_dir():
-        begun(path)
+        check_regular(path)
         yield [path]
         return
     from ruamel.yaml import YAML

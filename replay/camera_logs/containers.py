@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-from cdmisfa.core.untrusted import begun, opened_regular
+from cdmisfa.core.untrusted import opened_regular
 
 
 class Extent(NamedTuple):
@@ -32,11 +32,10 @@ def extent_of(path: Path) -> Extent:
 
     Raises:
         UsageError: it is no regular file, or may not be read.
-        LogDamagedError: it was never written, or the disk does not give it.
+        LogDamagedError: the disk does not give it.
     """
-    head = begun(path)
     with opened_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
+        size, head = os.fstat(file.fileno()).st_size, file.read(len(_ASF))
         if head[4:8] in _FIRST_BOXES:
             kinds, extent = _boxes(file, size)
             if kinds & {b"moov", b"moof"}:

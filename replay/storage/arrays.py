@@ -6,7 +6,6 @@ import math
 import os
 import re
 import struct
-import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -52,14 +51,10 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 if len(members) != _stated_members(stored.zip):
                     raise ValueError("its directory is cut")
                 arrays = {name: stored[name] for name in stored.files}
-        except _IMPOSSIBLE as error:
-            raise ValueError("an impossible array") from error
-        except _DAMAGED as error:
+        except (*_IMPOSSIBLE, *_DAMAGED) as error:
             raise ValueError(one_line(error)) from error
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise ValueError("not all of it are arrays")
-    for array in arrays.values():
-        _check_text(array)
     return arrays
 
 
@@ -115,24 +110,13 @@ def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
             size = dtype.itemsize * math.prod(shape)
             if min(shape, default=0) < 0 or at + size > len(data):
                 raise ValueError(f"{str(name)[:40]!r} is no array of it")
-            arrays[str(name)] = array = np.ndarray(shape, dtype, data, at).copy()
-            _check_text(array)
+            arrays[str(name)] = np.ndarray(shape, dtype, data, at).copy()
             at += size
     except (*_IMPOSSIBLE, TypeError, LookupError) as error:
         raise ValueError("an impossible array") from error
     if at != len(data):
         raise ValueError(f"its arrays have {at} bytes, and it has {len(data)}")
     return arrays
-
-
-def _check_text(array: NDArray[Any]) -> None:
-    """Refuse text with code points that are no characters: Python cannot hold them."""
-    for name in array.dtype.names or ("",):
-        texts = np.ascontiguousarray(array[name] if name else array)
-        if texts.dtype.kind == "U" and texts.nbytes:
-            codes = texts.view(np.dtype(np.uint32).newbyteorder(texts.dtype.byteorder))
-            if codes.max() > sys.maxunicode:
-                raise ValueError("its text holds what is no character")
 
 
 def _plain_type(kind: Any) -> np.dtype[Any]:
