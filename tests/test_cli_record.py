@@ -21,8 +21,6 @@ from recorder.recording import RecordingStoppedError, record, record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.camera_logs.source import ForeignSource
 
-PNG = b"\x89PNG"
-
 
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]

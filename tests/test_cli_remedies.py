@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
-import shutil
 import tomllib
 from pathlib import Path
 
@@ -17,17 +16,6 @@ from cdmisfa.cli.commands.doctor import EXTRAS
 from cdmisfa.kernels import WIDE
 
 ROOT = Path(__file__).parents[1]
-LOGS = ROOT / "sample_logs" / "icub"
-SHORT = ("--set", "learner.tau=10", "--no-rerun")
-
-
-@pytest.mark.parametrize("name", ["y.csv", "y.parquet"])
-def test_export_makes_its_folders(
-    cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, name: str
-) -> None:
-    out = tmp_path / "no" / "such" / name
-    assert cdmisfa("export", oscillatory_run, "-o", out).code == 0
-    assert out.stat().st_size > 0
 
 
 def test_a_stub_is_not_recovered_as_an_empty_log(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
@@ -107,15 +95,6 @@ def test_demo_without_the_simulator_records_oscillatory_streams(
     assert Path(done.json["report"]).parent == tmp_path / "runs" / "demo-oscillatory"
 
 
-def test_a_scheduler_without_an_address_is_one_line_to_the_end_of_the_process(
-    tmp_path: Path,
-) -> None:
-    words = ("sweep", "oscillatory", "-o", tmp_path, "--engine", "dask", "--scheduler", "nope")
-    ended = python("-m", "cdmisfa", *words)
-    said = "cdmisfa: no dask scheduler answers at nope: missing port number in address 'nope'\n"
-    assert (ended.returncode, ended.stderr) == (1, said)
-
-
 def test_another_package_of_the_name_of_ours_is_named(tmp_path: Path) -> None:
     other = tmp_path / "replay" / "__init__.py"
     other.parent.mkdir()
@@ -124,27 +103,6 @@ def test_another_package_of_the_name_of_ours_is_named(tmp_path: Path) -> None:
     done = python("-c", code, cwd=tmp_path)
     said = f"replay is not cdmisfa's: {other}; give cdmisfa an environment of its own"
     assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
-
-
-def test_another_package_that_was_installed_over_ours_is_named(tmp_path: Path) -> None:
-    for package in ("cdmisfa", "recorder", "replay"):
-        shutil.copytree(ROOT / package, tmp_path / package)
-    ours = tmp_path / "replay" / "__init__.py"
-    ours.write_text("from setuptools import find_packages\n")
-    done = python("-m", "cdmisfa", "doctor", cwd=tmp_path)
-    said = f"replay is not cdmisfa's: {ours}; give cdmisfa an environment of its own"
-    assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
-
-
-def test_doctor_names_whose_package_has_the_name_of_ours(
-    cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    owners = {"replay": ["cdmisfa", "other"], "recorder": ["cdmisfa"]}
-    monkeypatch.setattr("importlib.metadata.packages_distributions", lambda: owners)
-    done = cdmisfa("doctor", "--json")
-    assert done.code == 1
-    (check,) = (c for c in json.loads(done.out)["checks"] if c["what"].startswith("name "))
-    assert (check["what"], "also of other" in check["detail"]) == ("name replay", True)
 
 
 def test_the_citation_names_this_version() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from conftest import Cdmisfa
 
-from cdmisfa.cli.app import COMMANDS, GROUPS
+from cdmisfa.cli.app import COMMANDS
 from cdmisfa.cli.commands.learn import learn_command
 
 
@@ -37,22 +37,6 @@ def test_a_shell_completes_commands_options_choices_and_files(
     assert of("sweep x --engine ") == ["local", "dask"]
     for command in ("learn", "convert", "view", "info", "check", "apply"):
         assert of(f"{command} x") == [None]
-
-
-def test_a_name_is_fetched_when_its_command_runs_and_not_when_a_shell_completes(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("replay.storage.location._copied", lambda url: pytest.fail("fetched"))
-    found = completed(monkeypatch, capsys, "cdmisfa view https://a.b/run.mcap --scr")
-    assert found == ["--screenshot"]
-
-
-def test_the_programs_help_has_every_command_below_a_heading(cdmisfa: Cdmisfa) -> None:
-    lines = cdmisfa("--help").out.splitlines()
-    at = lines.index("Record:")
-    headings = [line[:-1] for line in lines[at:] if line and not line.startswith(" ")]
-    listed = [line.split()[0] for line in lines[at:] if line[:3].strip() and line.startswith("  ")]
-    assert (headings, listed) == (list(GROUPS), list(COMMANDS))
 
 
 LEARN = ("learn", "oscillatory", "--max-iterations", "500", "--max-modules", "1")

@@ -92,17 +92,3 @@ def test_a_copy_among_parts_is_named_as_the_cause(
     assert (done.code, done.err.count("\n")) == (2, 1)
     said = f"{copy}: /cam shows the same as /cam of {parts[1]}, as a copy does: leave one out"
     assert done.err == f"cdmisfa: {said}\n"
-
-
-@pytest.mark.parametrize("place", ["x1-again.mcap", "other/x1.mcap"])
-def test_a_copy_of_a_view_is_named(
-    cdmisfa: Cdmisfa, tmp_path: Path, oscillatory_recording: Path, place: str
-) -> None:
-    rec = tmp_path / "rec"
-    shutil.copytree(oscillatory_recording, rec)
-    copy = tmp_path / "rec" / place
-    copy.parent.mkdir(exist_ok=True)
-    shutil.copy(rec / "x1.mcap", copy)
-    done = cdmisfa("learn", rec / "x1.mcap", rec / "x2.mcap", copy, *LEARN)
-    assert (done.code, done.err.count("\n")) == (2, 1)
-    assert f"{copy} is a copy of {rec / 'x1.mcap'}: leave one out" in done.err

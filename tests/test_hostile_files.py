@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
 import socket
 import zipfile
 from collections.abc import Callable
@@ -16,61 +14,25 @@ import numpy as np
 import pytest
 from camera_files import write_pictures
 from conftest import Cdmisfa
-from test_modules import learned, with_width
+from test_modules import with_width
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.learning import Keyframe
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.results import results
-from cdmisfa.experiments.store import DONE, ROWS, read_rows
+from cdmisfa.experiments.store import ROWS, read_rows
 from cdmisfa.modules import Module
 from recorder.config import RecordConfig
 from recorder.log.logfile import LogFile
 from recorder.log.resume import frames_held
 from recorder.mcap.records import KINDS
 from recorder.recording import record_scene
-from replay.arrays import ENDINGS
 from replay.camera_logs import pictures
-from replay.camera_logs.opening import WHOLE_FILES, open_images
+from replay.camera_logs.opening import open_images
 from replay.integrity.info import describe
 from replay.runs.folders import REQUEST, RUN_METADATA, read_run_json
-from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.log import read_header
 from replay.runs.modules import load_modules, save_modules
 from replay.storage.arrays import stored_arrays
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda path: path.symlink_to("/dev/zero"),
-        os.mkfifo,
-        lambda path: path.mkdir(),
-        lambda path: path.symlink_to("nothing"),
-    ],
-    ids=["device", "fifo", "folder", "broken link"],
-)
-def test_only_regular_files_are_pictures(tmp_path: Path, make: Callable[[Path], None]) -> None:
-    write_pictures(tmp_path / "pictures", 3)
-    make(tmp_path / "pictures" / "1a.png")
-    with pytest.raises(UsageError, match=r"1a\.png: no regular file"):
-        open_images(tmp_path / "pictures", None)
-
-
-def test_a_link_to_a_picture_is_a_picture(tmp_path: Path) -> None:
-    values = write_pictures(tmp_path / "pictures", 3)
-    (tmp_path / "pictures" / "3.png").symlink_to("1.png")
-    images = open_images(tmp_path / "pictures", None)
-    assert images.image(3)[0, 0] == values[1]
-
-
-def test_a_picture_that_became_something_else_is_not_waited_for(tmp_path: Path) -> None:
-    write_pictures(tmp_path / "pictures", 3)
-    images = open_images(tmp_path / "pictures", None)
-    (tmp_path / "pictures" / "1.png").unlink()
-    os.mkfifo(tmp_path / "pictures" / "1.png")
-    with pytest.raises(LogDamagedError, match=r"1\.png: no regular file"):
-        images.image(1)
 
 
 def test_a_huge_picture_is_refused_unread(tmp_path: Path) -> None:
@@ -118,20 +80,6 @@ def test_an_array_that_says_it_is_larger_than_its_file_is_refused(
         load_modules(tmp_path)
 
 
-def test_a_field_that_is_nothing_of_a_module_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "modules.npz"
-    save_modules(path, [with_width(2)])
-    with np.load(path) as stored:
-        arrays = dict(stored)
-    np.savez(path, **arrays, module1_later=np.zeros(3))
-    with pytest.raises(LogDamagedError, match="later"):
-        load_modules(path)
-    counts = arrays.pop("module1_counts")
-    np.savez(path, **arrays, module1_countt=counts)
-    with pytest.raises(LogDamagedError, match="count"):
-        load_modules(path)
-
-
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
     """A file that is cut, or of which something was flipped, zeroed, doubled or left out."""
     at, n = sorted(rng.integers(0, len(whole) + 1, 2))
@@ -172,21 +120,6 @@ def test_damaged_modules_are_the_same_or_an_error(tmp_path: Path) -> None:
         loaded += 1
         assert [stated(module) for module in found] == first, number
     assert loaded < 750
-
-
-def test_no_flipped_bit_of_a_keyframe_is_unexpected() -> None:
-    learner, _ = learned("uint8", "none")
-    whole = encode_keyframe(Keyframe(learner.iteration, 0, learner.state, {"python": "3"}))
-    text = whole.index(b"{"), whole.rindex(b"}") + 1
-    refused = 0
-    for place in range(text[0] * 8, text[1] * 8, 3):
-        damaged = bytearray(whole)
-        damaged[place // 8] ^= 1 << place % 8
-        try:
-            decode_keyframe(bytes(damaged))
-        except LogDamagedError:
-            refused += 1
-    assert refused > 1000
 
 
 @pytest.mark.parametrize(
@@ -231,18 +164,6 @@ def test_deep_json_is_damage(tmp_path: Path) -> None:
     (tmp_path / ROWS).write_text(DEEP + "\n")
     with pytest.raises(LogDamagedError, match=ROWS):
         list(read_rows(tmp_path))
-
-
-@pytest.mark.parametrize(
-    "result", [{"iterations": 1}, {"iterations": "x", "modules": []}, {"modules": 3}, [], None]
-)
-def test_a_row_that_is_no_result_is_damage(tmp_path: Path, result: object) -> None:
-    request = {"trials": [{"id": "a", "point": {}}]}
-    (tmp_path / REQUEST).write_text(json.dumps(request))
-    row = {"id": "a", "status": DONE, "point": {}, "result": result}
-    (tmp_path / ROWS).write_text(json.dumps(row) + "\n")
-    with pytest.raises(LogDamagedError, match=ROWS):
-        results(tmp_path)
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
@@ -292,21 +213,6 @@ def test_what_is_no_file_is_refused_by_every_command(
         assert (done.code, done.err.count("\n"), name in done.err) == (2, 1, True), (way, done.err)
 
 
-@pytest.mark.parametrize(
-    "words", ["check {}", "at {} 3", "fork {} --iteration 3 -o x", "compare {} {}"]
-)
-def test_what_stands_where_a_run_would_be_is_said(
-    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("run").mkdir()
-    for name, named in (("a.mcap", "a.mcap"), ("run/run.mcap", "run")):
-        os.mkfifo(name)
-        done = cdmisfa(*words.replace("{}", named).split())
-        said = f"cdmisfa: {name}: no regular file but a pipe, remove it or name another\n"
-        assert (done.code, done.err) == (2, said)
-
-
 @pytest.mark.parametrize("ending", ["flv", "ts", "gif", "webp", "tiff", "bmp"])
 def test_of_what_is_no_log_it_is_said_which_kinds_are(
     cdmisfa: Cdmisfa, tmp_path: Path, ending: str
@@ -321,36 +227,3 @@ def test_of_what_is_no_log_it_is_said_which_kinds_are(
             assert f"{path}" in done.err
             assert what in done.err
             assert KINDS in done.err
-
-
-@pytest.mark.parametrize("ending", sorted({*WHOLE_FILES, *ENDINGS, ".mcap"}))
-def test_every_kind_that_is_read_is_named(ending: str) -> None:
-    assert re.search(rf"{re.escape(ending.replace('.jpeg', '.jpg'))}\b", KINDS)
-
-
-@pytest.mark.parametrize("kind", ["fifo", "socket"])
-@pytest.mark.parametrize(
-    "words",
-    [
-        "record oscillatory --frames 20 -o out",
-        "learn oscillatory --max-iterations 1 -o out",
-        "export RUN --to csv -o out.csv",
-        "reproduce stability --trials 1 -o out",
-    ],
-)
-def test_what_is_no_file_is_not_replaced(
-    cdmisfa: Cdmisfa,
-    oscillatory_run: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    words: str,
-    kind: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    out = Path(words.split()[-1])
-    NO_FILES[kind](out)
-    before = out.stat()
-    force = () if words.startswith("reproduce") else ("--force",)
-    done = cdmisfa(*words.replace("RUN", str(oscillatory_run)).split(), *force)
-    assert (done.code, f"{out} is no file but" in done.err) == (2, True), done.err
-    assert os.path.samestat(out.stat(), before)

@@ -123,44 +123,6 @@ def test_one_broken_log_does_not_hide_the_others(cdmisfa: Cdmisfa, tmp_path: Pat
     assert document["problems"] == [{"where": str(logs[1]), "what": "empty, nothing was written"}]
 
 
-NO_LOGS = ("missing.mcap", "no-*.mcap", "a.flv", "a.ts", "a.gif", "empty")
-
-
-@pytest.mark.parametrize("bad", [False, True])
-@pytest.mark.parametrize("command", ["info", "verify"])
-@pytest.mark.parametrize("word", NO_LOGS)
-def test_what_is_no_log_does_not_hide_the_others(
-    cdmisfa: Cdmisfa, tmp_path: Path, command: str, word: str, bad: bool
-) -> None:
-    one, broken, two = broken_among_whole(tmp_path)
-    (tmp_path / "empty").mkdir()
-    for name in NO_LOGS[2:5]:
-        (tmp_path / name).write_bytes(b"FLV" * 9)
-    logs = (one, tmp_path / word, *((broken,) if bad else ()), two)
-    done = cdmisfa(command, *logs)
-    assert (done.code, done.err, str(tmp_path / word) in done.out) == (3 if bad else 2, "", True)
-    document = cdmisfa(command, *logs, "--json").json
-    states = [file["state"] for file in document["files"]]
-    as_seen = "unchecked" if command == "info" else "whole"
-    expected = {as_seen: 2, "not read": 1, "damaged": int(bad)}
-    assert {state: states.count(state) for state in expected} == expected
-    assert document["state"] == ("damaged" if bad else "not read")
-    assert len(document["problems"]) == 1 + bad
-
-
-def test_info_says_of_each_of_several_logs_in_which_state_it_is(
-    cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    one, bad, two = broken_among_whole(tmp_path)
-    lines = cdmisfa("info", one, bad, two, tmp_path / "none").out.splitlines()
-    assert lines[:4] == [
-        f"{one}: foreign, contents unchecked, checksums ok",
-        f"{bad}: foreign, damaged, checksums bad",
-        f"{two}: foreign, contents unchecked, checksums ok",
-        f"{tmp_path / 'none'}: not read",
-    ]
-
-
 @pytest.mark.parametrize("topics", [(), ("/one", "/bad", "/two")])
 @pytest.mark.parametrize("use", ["learn", "convert"])
 def test_what_cannot_be_read_is_left_out_of_what_is_salvaged(

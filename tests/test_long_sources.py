@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 from folders import flip
-from message_files import write_mcap
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SeekableSource, description
@@ -24,16 +23,11 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
-from recorder.images.decoding import MessageKind
-from recorder.mcap.reader import LogReader
-from replay.camera_logs.opening import identity_of
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import told_otherwise
 from replay.runs.log import read_header
-from replay.runs.run import stated_source
 from replay.storage import identity
-from replay.storage.identity import LogIdentity
 from replay.view.build import build_view
 
 CONFIG = LearnerConfig(tau=20)
@@ -153,27 +147,6 @@ def test_every_kind_of_log_is_known_by_a_sample_and_in_the_end_by_all_of_it(
     source.close()
 
 
-@pytest.mark.parametrize("size", [0, 1, 4095, 4096, 4097, 65_536, 10**10])
-def test_a_sample_reaches_from_the_first_bytes_to_the_last(size: int) -> None:
-    places = identity.sampled(size)
-    assert places == sorted(places)
-    assert (places[0], min(places[-1] + identity.PIECE, size)) == (0, size)
-
-
-def test_a_log_without_checksums_is_told_from_one_with_the_same_index(tmp_path: Path) -> None:
-    from mcap.writer import CompressionType
-
-    known = []
-    for value in range(2):
-        data = np.random.default_rng(value).integers(0, 256, 3000, np.uint8).tobytes()
-        how = {"compression": CompressionType.NONE, "enable_data_crcs": False}
-        path, kind = tmp_path / f"{value}.mcap", MessageKind("", "raw")
-        with LogReader(write_mcap(path, kind, {"t": [(0, data)]}, **how)) as reader:
-            known.append(LogIdentity(reader).sample())
-    assert known[0]["bytes"] == known[1]["bytes"]
-    assert known[0]["sample_sha256"] != known[1]["sample_sha256"]
-
-
 def test_a_killed_run_goes_on_with_its_file_alone(recording: Path, tmp_path: Path) -> None:
     whole = learn(recording, tmp_path / "whole")
     with pytest.raises(KilledError):
@@ -185,49 +158,6 @@ def test_a_killed_run_goes_on_with_its_file_alone(recording: Path, tmp_path: Pat
     result = learn(recording, tmp_path / "run", resume=True)
     assert result.as_json() | {"run": ""} == whole.as_json() | {"run": ""}
     assert told_otherwise(tmp_path / "run", tmp_path / "whole") == ()
-
-
-def test_a_finished_run_goes_on_with_all_of_its_file_compared(tmp_path: Path) -> None:
-    """A byte that no sample has is another."""
-    path = table(tmp_path / "t.csv", 3)
-
-    def learn_table(out: Path, *sinks: Sink, **how: Any) -> RunResult:
-        source = ForeignSource(path, rate=10)
-        try:
-            return run(source, CONFIG, out, sinks=sinks, rerun=False, **how)
-        finally:
-            source.close()
-
-    with pytest.raises(KilledError):
-        learn_table(tmp_path / "killed", Then(killed, 7))
-    done = learn_table(tmp_path / "run", max_iterations=5)
-    assert told_otherwise(tmp_path / "run", tmp_path / "killed") == ()
-    more = learn_table(tmp_path / "run", max_iterations=8, resume=True)
-    assert more.source == done.source
-    stated = read_header(tmp_path / "run").manifest["source"]["files"]
-    assert stated == [{"file": "t.csv", "sha256": done.source["files"][0]["sha256"]}]
-    assert stated_source(tmp_path / "killed" / "run.mcap.partial")["files"][0].keys() == {
-        "file",
-        "bytes",
-        "sample_sha256",
-    }
-    at = identity.sampled(path.stat().st_size)[3] + identity.PIECE + 100
-    raw = bytearray(path.read_bytes())
-    raw[at] = ord("1") if raw[at] != ord("1") else ord("2")
-    path.write_bytes(raw)
-    with pytest.raises(UsageError, match=r"source\.files.*sha256"):
-        learn_table(tmp_path / "run", max_iterations=9, resume=True)
-    assert (tmp_path / "run" / "run.mcap").is_file()
-
-
-def test_a_run_of_before_is_resumed(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(identity, "AT_ONCE", 2**40)
-    with pytest.raises(KilledError):
-        learn(recording, tmp_path / "run", Then(killed, 7), keyframes=4)
-    monkeypatch.setattr(identity, "AT_ONCE", 0)
-    assert learn(recording, tmp_path / "run", resume=True).iterations == ITERATIONS
 
 
 def test_what_changes_meanwhile_is_damage_and_the_run_is_kept(
@@ -244,32 +174,6 @@ def test_what_changes_meanwhile_is_damage_and_the_run_is_kept(
     with pytest.raises(LogDamagedError, match=r"x3\.mcap"):
         learn(recording, out, Then(overwrite))
     assert sorted(file.name for file in out.iterdir()) == ["run.mcap.partial"]
-
-
-@pytest.mark.parametrize("kind", ["folder", "picture", "table"])
-def test_files_are_hashed_as_they_were_opened_or_called_changed(tmp_path: Path, kind: str) -> None:
-    folder = pictures(tmp_path / "p", 1)
-    path = {"folder": folder, "picture": folder / "0.png"}.get(kind)
-    path = path or table(tmp_path / "t.csv", 4)
-    file = folder / "0.png" if kind == "folder" else path
-    log, changed = (identity_of(path, []) for _ in range(2))
-    known = log.whole(lambda count: None)
-    (folder / "new.png").write_bytes(b"c")  # what comes into a folder does not count
-    os.utime(file, ns=(1, 1))
-    assert log.whole(lambda count: None) == known
-    with pytest.raises(LogDamagedError, match="it was changed while it was read; begin again"):
-        changed.whole(lambda count: None)  # perhaps before it was learned from
-    with file.open("r+b") as opened:
-        opened.write(b"c")
-    with pytest.raises(LogDamagedError, match="it was changed while it was read; begin again"):
-        log.whole(lambda count: None)
-    assert known["file"] == path.name
-    listed = "".join(
-        f"{one.name}\0{hashlib.sha256(one.read_bytes()).hexdigest()}\n"
-        for one in sorted(pictures(tmp_path / "again", 1).iterdir())
-    )
-    if kind == "folder":
-        assert known["sha256"] == hashlib.sha256(listed.encode()).hexdigest()
 
 
 def test_a_checksum_of_the_data_that_does_not_match_is_told_at_the_end(
@@ -300,18 +204,3 @@ def test_a_stopped_run_does_nothing_that_takes_as_long_as_its_log_and_is_resumed
     whole = learn(recording, tmp_path / "whole")
     resumed = learn(recording, out, resume=True)
     assert resumed.as_json() | {"run": ""} == whole.as_json() | {"run": ""}
-
-
-def test_a_log_that_was_changed_before_a_stop_is_damage(recording: Path, tmp_path: Path) -> None:
-    touch, stops = Then(lambda: os.utime(recording / "x1.mcap", ns=(1, 1))), iter([False])
-    with pytest.raises(LogDamagedError, match=r"x1\.mcap: it was changed while it was read"):
-        learn(recording, tmp_path / "run", touch, stop=lambda: next(stops, True))
-
-
-def test_a_view_of_a_killed_run_takes_its_recording_alone(recording: Path, tmp_path: Path) -> None:
-    with pytest.raises(KilledError):
-        learn(recording, tmp_path / "run", Then(killed, 7))
-    build_view(tmp_path / "run", tmp_path / "v.rrd", all_views=recording)
-    flip(recording / "x1.mcap", 10)
-    with pytest.raises(UsageError, match="not the recording"):
-        build_view(tmp_path / "run", tmp_path / "w.rrd", all_views=recording)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import functools
 import os
 import resource
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,9 +16,9 @@ from folders import contents
 from waiting import python
 
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
-from cdmisfa.core.errors import LogDamagedError, LogWriteError
+from cdmisfa.core.errors import LogDamagedError
 from recorder.config import Split
-from recorder.log import logfile, manifest
+from recorder.log import logfile
 from recorder.log.files import held
 from recorder.log.logfile import AppendOnlyFile, LogFile
 from recorder.log.manifest import MOST_NAMED
@@ -80,16 +77,6 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return files
 
 
-def test_a_file_that_is_being_written_is_known_again_by_what_it_held(files: list[Path]) -> None:
-    files[0] = files[0].rename(f"{files[0]}.partial")
-    one, two = map(FileStore, files)
-    assert len(store._OPEN) == 1
-    with files[0].open("ab") as file:
-        file.write(b", and more")
-    assert two.read(0, 1) == b"b"  # which closes the other
-    assert one.read(0, 16) == b"a.mcap"
-
-
 def test_another_file_in_place_of_one_that_is_being_written_is_refused(files: list[Path]) -> None:
     files[0] = files[0].rename(f"{files[0]}.partial")
     one, two = map(FileStore, files)
@@ -131,17 +118,6 @@ def test_a_file_that_became_shorter_is_damage_to_whoever_reads_it(
     os.truncate(files[0], left)
     with pytest.raises(LogDamagedError, match=r"a\.mcap: it was cut while it was read$"):
         read(one)
-
-
-@pytest.mark.parametrize("left", [0, 100])
-def test_a_log_that_became_shorter_is_damage(tmp_path: Path, parts: Path, left: int) -> None:
-    path = Path(shutil.copy(min(parts.glob("*.mcap")), tmp_path))
-    with LogReader(path) as reader:
-        assert reader.by_index
-        os.truncate(path, left)
-        for look in (lambda: list(reader.tables()), reader.data.sha256):
-            with pytest.raises(LogDamagedError, match=r"it was cut while it was read$"):
-                look()
 
 
 # Files that are written
@@ -237,20 +213,6 @@ def test_many_views_are_resumed(tmp_path: Path) -> None:
     assert contents(tmp_path / "rec") == contents(tmp_path / "whole")
 
 
-def test_a_recording_that_names_many_views_in_each_file_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As they were before, whatever their number."""
-    monkeypatch.setattr(manifest, "MOST_NAMED", 1000)
-    record(ManyViews(MOST_NAMED + 3), tmp_path, frames=5)
-    monkeypatch.undo()
-    assert check_log(tmp_path).ok
-    assert len(recorded(tmp_path)) == MOST_NAMED + 3
-    (tmp_path / "v0007.mcap").unlink()
-    (problem,) = check_log(tmp_path).problems
-    assert problem.what == "the view 'v0007' of the recording has no file"
-
-
 @pytest.fixture
 def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[AppendOnlyFile]:
     """A file that is not open between two writes, as another one is."""
@@ -262,30 +224,6 @@ def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[AppendO
     yield file
     file.close()
     other.close()
-
-
-@pytest.mark.parametrize("change", ["longer", "another", "gone", "held"])
-def test_what_others_did_to_a_closed_file_is_an_error_once_and_for_all(
-    tmp_path: Path, written: AppendOnlyFile, change: str
-) -> None:
-    path = tmp_path / "a"
-    with contextlib.ExitStack() as stack:
-        if change == "longer":
-            path.write_bytes(b"firstly")
-        elif change == "another":
-            path.rename(tmp_path / "c")
-            path.write_bytes(b"first")
-        elif change == "gone":
-            path.unlink()
-        else:
-            fcntl.flock(stack.enter_context(path.open("rb")), fcntl.LOCK_EX)
-        with pytest.raises(LogWriteError, match=r"another process|No such file") as first:
-            written.write(b"second")
-    for attempt in (written.flush, lambda: written.write(b"third")):
-        with pytest.raises(LogWriteError) as again:
-            attempt()
-        assert str(again.value) == str(first.value)
-    assert not path.exists() or path.read_bytes() in (b"first", b"firstly")
 
 
 def test_nobody_overwrites_what_a_recorder_has_closed(tmp_path: Path) -> None:

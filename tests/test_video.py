@@ -20,7 +20,6 @@ from replay.camera_logs.source import ForeignSource
 av = pytest.importorskip("av")
 
 SIZE = (HEIGHT, WIDTH)
-QUICK = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
 
 
 @pytest.fixture(scope="module")
