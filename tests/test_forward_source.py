@@ -14,15 +14,12 @@ from folders import contents
 from live_cameras import SHAPE, bar
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
-from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
-from cdmisfa.experiments.session import run
 from recorder.config import Split
 from recorder.recording import RecordingStoppedError, record
 from replay.recordings.source import RecordedSource
 
 FRAMES = 700
-CONFIG = LearnerConfig(tau=20, components=3, expansion="none", warm_up=3)
 
 
 class Webcams:
@@ -89,13 +86,6 @@ def test_what_was_recorded_is_what_the_cameras_showed(cdmisfa: Cdmisfa, recordin
         same(one, two)
 
 
-def test_the_signals_are_the_same_live_and_from_the_recording(recording: Path) -> None:
-    live = run(Webcams(), CONFIG, seed=3, max_iterations=30)
-    recorded = run(RecordedSource(recording), CONFIG, seed=3, max_iterations=30)
-    assert live.iterations == 30
-    assert live.signals_sha256 == recorded.signals_sha256
-
-
 @pytest.mark.parametrize("split", [None, Split(seconds=3), Split(size=12_000)])
 def test_a_resumed_recording_is_the_same_bytes(split: Split | None, tmp_path: Path) -> None:
     """A source that has not come to the missing frames yet passes over those that are there."""
@@ -135,33 +125,6 @@ def test_a_source_that_ends_is_recorded_to_its_end(tmp_path: Path) -> None:
     assert [file.frames for file in files] == [70, 70]
     with pytest.raises(UsageError, match=r"--frames is 71: .*no more than the 70"):
         record(Webcams(length=70), tmp_path / "other", frames=71)
-
-
-def test_a_dot_in_a_name_is_no_part(tmp_path: Path) -> None:
-    for frames in (60, 100):
-        files = record(
-            Webcams(("a.b", "c")),
-            tmp_path / "rec",
-            frames=frames,
-            split=Split(seconds=1),
-            resume=True,
-        )
-    assert [f.file.name for f in files][:2] == ["a.b-000.mcap", "a.b-001.mcap"]
-
-
-def test_a_source_that_does_not_say_what_it_is_is_refused(tmp_path: Path) -> None:
-    class Nameless(Webcams):
-        def describe(self) -> Mapping[str, Any]:
-            return {}
-
-    for do in (
-        lambda: record(Nameless(), tmp_path / "out", frames=9),
-        lambda: run(Nameless(), CONFIG, tmp_path / "out", max_iterations=1),
-        lambda: run(Nameless(), CONFIG, tmp_path / "out", resume=True),
-    ):
-        with pytest.raises(UsageError, match=r"Nameless .*give its describe\(\) a kind"):
-            do()
-    assert not (tmp_path / "out").exists()
 
 
 IMAGES = SourceSpec(("a", "b"), (4, 6, 3), "uint8")

@@ -27,7 +27,6 @@ from recorder.cameras.readers import CameraFrames, Readers
 from recorder.cameras.video import Steady
 from recorder.config import Split
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
-from replay.export.forms import export
 from replay.integrity.info import describe
 from replay.integrity.verify import check_log
 from replay.recordings.source import RecordedSource
@@ -328,15 +327,6 @@ def test_images_of_all_cameras_become_frames_of_the_first_ones_size() -> None:
         CameraFrames(["left"], (48, 64), "crop").frame(0, half[:24, :32])
 
 
-def test_images_before_the_size_is_known_are_passed_over() -> None:
-    hand, taken = Hand("left"), list[Any]()
-    hand.give(flat(0), flat(2), None)
-    readers = Readers([hand], lambda camera, image: image if image.any() else None)
-    wait_for(lambda: taken.append(readers.take(0)) or taken[-1], seconds=20)
-    readers.close()
-    np.testing.assert_array_equal(taken[-1].image, flat(2))
-
-
 def test_a_full_queue_is_emptied_and_says_so() -> None:
     cameras = Cameras(1, queue_bytes=10 * flat(0).nbytes)
     source = cameras.source()
@@ -368,14 +358,10 @@ def test_recording_goes_on_until_it_is_stopped(tmp_path: Path) -> None:
     assert not list((tmp_path / "rec").glob("*.partial"))
 
 
-def test_a_recording_with_gaps_is_shown_and_exported_with_its_gaps(tmp_path: Path) -> None:
+def test_a_recording_with_gaps_is_shown_with_its_gaps(tmp_path: Path) -> None:
     source = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
     record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
     assert check_log(tmp_path / "rec").ok
-    assert export(tmp_path / "rec", tmp_path / "png", "images") == 90 - 29 + 90
-    names = sorted(path.name for path in (tmp_path / "png" / "left").iterdir())
-    assert (names[30], names[31]) == ("00000030.png", "00000060.png")
-    assert export(tmp_path / "rec", tmp_path / "robot", "lerobot") == 90 - 29
     with RecordedSource(tmp_path / "rec", loop=True) as looped:
         looped.seek(85)
         block = looped.take(0, 10)

@@ -8,15 +8,12 @@ import http.server
 import json
 import re
 import signal
-import socket
-import struct
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import av
 import foxglove
 import numpy as np
 import pytest
@@ -25,20 +22,17 @@ from conftest import Cdmisfa
 from contracts.sources import ForwardContract
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage as FoxgloveRaw
 from live_cameras import Robot
-from waiting import Clock, python, started, wait_for
-from websockets.sync.server import ServerConnection, serve
+from waiting import Clock, started, wait_for
 
 from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import UsageError
 from recorder.cameras.video import VideoCamera
 from recorder.cameras.words import is_live, live_names, open_live
 from recorder.images.options import InputOptions
 from replay.recordings.source import RecordedSource
 
-RAW = "foxglove.RawImage"
 TEST = "av:lavfi:testsrc=size=160x120:rate=30"
 
 
@@ -108,30 +102,14 @@ def test_a_task_shows_its_observations_and_actions_as_truth() -> None:
     assert np.abs(block.truth[begins][1:, :4]).max() <= 0.05
 
 
-def test_a_policy_is_given_the_observation() -> None:
-    seen: list[Any] = []
-
-    def policy(observation: Any) -> Any:
-        seen.append(observation)
-        return 0
-
-    with GymSource(["CartPole-v1"], policy=policy, hold=4) as source:
-        source.take(0, 8)
-    assert len(seen) == 3  # for frame 8, which is the last, too
-
-
 def test_arrays_that_do_not_fit_are_refused() -> None:
     with pytest.raises(UsageError, match="a shows uint8 of shape"):
         ArraySource({"a": np.zeros((5, 2, 2, 3), np.uint8)})
     with pytest.raises(UsageError, match="no stream given"):
         ArraySource({})
     frames: Any = np.zeros((5, 2, 2), np.uint8)
-    for given in (frames, [frames], None, {"a": 5}, {1: frames}):
-        with pytest.raises(UsageError, match=r'given.*: name each, as \{"left": frames\}, with'):
-            ArraySource(given)
-    for tasks in ("CartPole-v1", [], None):
-        with pytest.raises(UsageError, match=r'give a list, as \["CartPole-v1"\]'):
-            GymSource(tasks)
+    with pytest.raises(UsageError, match=r'given.*: name each, as \{"left": frames\}, with'):
+        ArraySource(frames)
     source = ArraySource({"a": np.zeros((5, 4), float), "b": np.zeros((5, 3), float)})
     with pytest.raises(UsageError, match="b shows float64"):
         source.take(0, 2)
@@ -219,15 +197,9 @@ def test_frames_keep_the_ratio_of_the_sides(word: str, shape: tuple[int, int]) -
 
 
 class Motion(http.server.BaseHTTPRequestHandler):
-    """A web camera: MJPEG without end, but each connection breaks after 20 pictures.
-
-    It shows 25 a second, at `/slow.mjpg` 10.
-    """
+    """A web camera: MJPEG without end, but each connection breaks after 20 images."""
 
     def do_GET(self) -> None:
-        if self.path == "/gone.mjpg":
-            self.send_error(404)
-            return
         self.send_response(200)
         self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
         self.end_headers()
@@ -236,7 +208,7 @@ class Motion(http.server.BaseHTTPRequestHandler):
                 data = encoded(gray(5 * k), "JPEG")
                 head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
                 self.wfile.write(head.encode() + b"\r\n" + data + b"\r\n")
-                time.sleep(0.1 if self.path == "/slow.mjpg" else 0.04)
+                time.sleep(0.04)
 
     def log_message(self, *args: Any) -> None:
         pass
@@ -260,63 +232,6 @@ def test_a_web_camera_that_breaks_is_connected_to_anew(web_camera: str) -> None:
     assert said[0] == "stream is gone: Input/output error: connecting to it anew"
     assert len(blocks) >= 2
     assert source.alignment["stream"]["missing"] > 0  # type: ignore[attr-defined]
-
-
-def test_a_web_camera_that_is_not_there_is_one_line(web_camera: str) -> None:
-    word = web_camera.replace("stream", "gone")
-    with pytest.raises(UsageError) as refused:
-        open_live([word], InputOptions())
-    assert str(refused.value) == f"{word} cannot be opened: Server returned 404 Not Found"
-
-
-def test_a_web_camera_that_does_not_answer_is_not_waited_for_long(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("recorder.cameras.words._TIMEOUT", 0.3)
-    with socket.create_server(("127.0.0.1", 0)) as server:  # it accepts, and says nothing
-        word = f"http://127.0.0.1:{server.getsockname()[1]}/stream.mjpg"
-        with pytest.raises(UsageError, match="cannot be opened: it did not answer in time"):
-            open_live([word], InputOptions())
-
-
-def test_pictures_of_a_web_camera_were_taken_when_they_come(web_camera: str) -> None:
-    # MJPEG tells no times, and those that FFmpeg makes up are those of 25 pictures a second.
-    word = web_camera.replace("stream", "slow")
-    with open_live([word], InputOptions(size=(48, 64))) as source:
-        assert 5 < source.spec.fps < 11
-        source.take(0, 12)
-        counts = source.alignment["slow"]  # type: ignore[attr-defined]
-    assert (counts["missing"], counts["late"], counts["disordered"]) == (0, 0, 0)
-
-
-def test_a_stream_over_tcp_ends_where_that_is_asked_for(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-
-        def send() -> None:
-            connection, _ = server.accept()
-            buffer = connection.makefile("wb")
-            with av.open(buffer, "w", format="matroska") as container:
-                video = container.add_stream("mjpeg", rate=25)
-                video.width, video.height, video.pix_fmt = 64, 48, "yuvj420p"
-                for k in range(40):
-                    gray = np.full((72, 64), 128, np.uint8)
-                    gray[:48] = 5 * k
-                    frame = av.VideoFrame.from_ndarray(gray, format="yuvj420p")
-                    container.mux(video.encode(frame))
-                    time.sleep(0.02)
-                container.mux(video.encode(None))
-            buffer.close()
-            connection.close()
-
-        thread = threading.Thread(target=send)
-        thread.start()
-        options = InputOptions(size=(48, 64), lost="end")
-        with open_live([f"tcp://127.0.0.1:{port}"], options) as source:
-            assert source.take(0, 10).frames.shape == (10, 48, 64)
-            with pytest.raises(LogExhaustedError, match=rf"127\.0\.0\.1_{port}"):
-                source.take(0, 10**4)
-        thread.join()
 
 
 def gray(k: int) -> np.ndarray[Any, Any]:
@@ -369,13 +284,6 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
             open_live(words, InputOptions())
 
 
-def test_a_range_for_images_of_a_running_robot_without_distances_is_refused(robot: Robot) -> None:
-    words = [f"{robot.address}/cam/left", f"{robot.address}/cam/right"]
-    for shown in (words[:1], words[1:], words):
-        with pytest.raises(UsageError, match=r"shows no distances \(16UC1, 32FC1\): input.range"):
-            open_live(shown, InputOptions(range=(1, 3)))
-
-
 def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
     cdmisfa: Cdmisfa, tmp_path: Path, robot: Robot
 ) -> None:
@@ -421,73 +329,16 @@ def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
         assert source.take(0, 2).frames.shape == (2, 48, 64)
 
 
-def test_a_topic_that_the_server_does_not_know_yet_is_subscribed_to_again() -> None:
-    told: list[dict[str, Any]] = []
-    data = FoxgloveRaw(width=5, height=4, encoding="mono8", step=5, data=bytes(20))
-    channel = {"id": 1, "topic": "/cam", "encoding": "protobuf", "schema": "", "schemaName": RAW}
-    refused = {"op": "status", "level": 2, "message": "Unknown channel ID: 1"}
-
-    def talk(connection: ServerConnection) -> None:
-        connection.send(json.dumps({"op": "advertise", "channels": [channel]}))
-        for message in connection:
-            told.append(json.loads(message))
-            if len(told) < 3:
-                connection.send(json.dumps(refused))
-                continue
-            for k in range(20):
-                head = struct.pack("<BIQ", 1, 1, 10**18 + k * 10**7)
-                connection.send(head + data.SerializeToString())
-
-    with serve(talk, "127.0.0.1", 0, subprotocols=["foxglove.websocket.v1"]) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        word = f"foxglove://127.0.0.1:{server.socket.getsockname()[1]}/cam"
-        with open_live([word], InputOptions(rate=100)) as source:
-            assert source.take(0, 1).frames.shape == (1, 4, 5)
-        server.shutdown()
-        thread.join()
-    assert [message["op"] for message in told[:3]] == ["subscribe"] * 3
-
-
-def test_a_server_whose_headers_never_end_is_told_of_once() -> None:
-    script = (
-        "import sys\n"
-        "from cdmisfa.core.errors import CdmisfaError\n"
-        "from recorder.cameras.foxglove import FoxgloveCamera\n"
-        "try: next(FoxgloveCamera(sys.argv[1], 'cam', timeout=0.3).pictures())\n"
-        "except CdmisfaError as error: print(error)\n"
-    )
-
-    def answer(listener: socket.socket) -> None:
-        connection, _ = listener.accept()
-        with contextlib.suppress(OSError), connection:
-            while True:
-                connection.sendall(b"HTTP/1.1 200 OK\r\n" + b"x: " + b"y" * (1 << 16))
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        threading.Thread(target=answer, args=(listener,), daemon=True).start()
-        word = f"foxglove://127.0.0.1:{listener.getsockname()[1]}/cam"
-        done = python("-c", script, word)
-    assert "does not answer" in done.stdout
-    assert done.stderr == ""
-
-
 REFUSED = {
     "learn av:nothing.mkv": "av:nothing.mkv cannot be opened",
     "record rtsp://me:secret@127.0.0.1:9/x -o x": "rtsp://127.0.0.1:9/x cannot",
     "record foxglove://127.0.0.1:9/x -o x": "does not answer",
     "record camera:/dev/video99 -o x": "/dev/video99: there is no such device",
     f"learn {TEST} --set input.range=0.3,5": "shows no distances: input.range is for those of",
-    f"learn {TEST} icub": "icub is no live stream, as the others are",
-    f"learn {TEST} gym:CartPole-v1": "record each apart",
     f"learn {TEST} --loop": "live streams cannot go back",
     f"learn {TEST} --resume -o run": "learn from a recording of them",
-    f"learn {TEST} --topic /x": "is a live stream: --topic is for logs",
-    "learn oscillatory --record x": "--record is for live streams",
     f"record {TEST} -o x --resume": "leave out --resume",
     f"convert {TEST} -o x": "is a live stream: cdmisfa record",
-    "record icub oscillatory -o x": "record one scene at a time",
-    "record icub --set input.fit=pad -o x": "icub is a scene: input.fit is for logs and cameras",
     "record icub --size 32x24 -o x": "icub is a scene: --size is for cameras",
 }
 

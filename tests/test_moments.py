@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from PIL import Image
 from cdmisfa import Run
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.cli import run
-from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
+from cdmisfa.core.errors import NotReproducedError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.session import Session
@@ -186,33 +185,14 @@ def a_bit(state: LearnerState) -> LearnerState:
     return dataclasses.replace(state, arrays=arrays)
 
 
-def a_module(state: LearnerState) -> LearnerState:
-    first = dataclasses.replace(state.modules[0], phi=-state.modules[0].phi)
-    return dataclasses.replace(state, modules=(first, *state.modules[1:]))
-
-
-def the_dice(state: LearnerState) -> LearnerState:
-    return dataclasses.replace(state, policy_rng={**state.policy_rng, "uinteger": 7})
-
-
-@pytest.mark.parametrize(
-    ("lie", "where"),
-    [
-        (a_bit, "keyframe abstraction.v[3, 1] is "),
-        (a_module, "keyframe modules.phi[0, 0, 0] is "),
-        (the_dice, "keyframe policy_rng is "),
-    ],
-)
 def test_a_keyframe_that_lies_is_found_out(
     tmp_path: Path,
     cdmisfa: Cdmisfa,
     keyframes_every: Callable[[int], None],
     monkeypatch: pytest.MonkeyPatch,
-    lie: Callable[[LearnerState], LearnerState],
-    where: str,
 ) -> None:
     def kept(keyframe: Keyframe) -> bytes:
-        state = lie(keyframe.state) if keyframe.iteration == 20 else keyframe.state
+        state = a_bit(keyframe.state) if keyframe.iteration == 20 else keyframe.state
         return encode_keyframe(dataclasses.replace(keyframe, state=state))
 
     monkeypatch.setattr("replay.runs.writer.encode_keyframe", kept)
@@ -221,7 +201,7 @@ def test_a_keyframe_that_lies_is_found_out(
     assert cdmisfa("learn", "oscillatory", *told, "-o", tmp_path / "run").code == 0
     checked = cdmisfa("check", tmp_path / "run")
     assert checked.code == 4
-    assert checked.out.startswith(f"iteration 19: {where}")
+    assert checked.out.startswith("iteration 19: keyframe abstraction.v[3, 1] is ")
     assert cdmisfa("check", tmp_path / "run", "--iterations", ":15").code == 0
     assert cdmisfa("check", tmp_path / "run", "--iterations", "10:", "--json").code == 4
 
@@ -230,8 +210,6 @@ def test_a_keyframe_that_lies_is_found_out(
     ("asked", "why"),
     [
         (lambda run: Run(run).at(131), "holds 130 iterations"),
-        (lambda run: Run(run).at(-1), "a run begins after 0"),
-        (lambda run: Session.check(run, start=10**9), "holds 130 iterations"),
         (lambda run: Session.check(run, stop=131), "holds 130 iterations"),
         (lambda run: Session.check(run, start=20, stop=10), "from 20 to 10 there is nothing"),
     ],
@@ -316,7 +294,6 @@ def test_a_fork_that_changes_nothing_is_its_parent(place: Path, tmp_path: Path) 
     ("parent", "key", "at"),
     [
         ("2.0-loop", "learner.nu=0.03", 31),
-        ("progress-live", "learner.settled=0.1", 31),
         ("2.0-live", "learner.nu=0.02", 0),
     ],
 )
@@ -346,34 +323,6 @@ def test_forks_of_forks_are_resumed_and_checked(
     assert keyframe is not None
     assert found is not None
     assert (keyframe.iteration, found.iteration >= 52) == (52, True)
-
-
-def test_a_fork_that_was_cut_before_it_began_is_refused(
-    place: Path, tmp_path: Path, cdmisfa: Cdmisfa
-) -> None:
-    fork = tmp_path / "fork"
-    with Session.fork(place / "2.0-live", 40, fork, settings=["learner.nu=0.02"]) as session:
-        session.learn(rerun=False)
-    log = (fork / "run.mcap").read_bytes()
-    (fork / "run.mcap").unlink()
-    (fork / "run.mcap.partial").write_bytes(log[: len(log) // 5])
-    refused = cdmisfa("learn", "--resume", "-o", fork)
-    assert (refused.code, "fork again with --force" in refused.err) == (2, True)
-
-
-def test_a_manifest_that_says_nothing_is_damage(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
-    run = tmp_path / "run"
-    cdmisfa("learn", "oscillatory", "-o", run, "--max-iterations", 3, "--no-rerun")
-    lying(run, b'"config"', b'"confix"')
-    with pytest.raises(LogDamagedError, match="does not say"):
-        Run(run).at(2)
-
-
-def test_an_option_that_is_short_for_a_key_is_kept(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
-    run, told = tmp_path / "run", ("--algorithm", "progress", "--set", "learner.explore=0.3")
-    done = cdmisfa("learn", "oscillatory", *told, *LEARN, "-o", run, "--max-iterations", 12)
-    assert done.code == 0, done.err
-    assert Session.check(run).difference is None
 
 
 SAME, OTHER = "the same was learned, at other iterations", "what was learned differs"
@@ -407,8 +356,5 @@ def test_compare_says_what_differs_and_shows_both(
     other = cdmisfa("compare", parent, place / "progress-live").out
     assert other.splitlines()[0] == OTHER
     assert "learner.algorithm 2.0 against progress; " in other
-    assert "; only one of them says learner.agreement, learner.alpha" in other
-    assert re.search(r"; only one of them says .* more$", other, re.MULTILINE)
-    assert "None against" not in other
     same = cdmisfa("compare", parent, place / "2.0-live-resumed", "--json").json
     assert (same["signals"], same["identical"]) == ({}, True)

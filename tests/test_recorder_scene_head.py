@@ -12,7 +12,6 @@ import pytest
 from cdmisfa.core.config import LearnerConfig, section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.session import Session, run
-from cdmisfa.watching import WatchEnv
 from recorder.config import RecordConfig
 from recorder.log.scenery import scenery_of, turned, turns_of
 from recorder.recording import record_scene
@@ -131,15 +130,6 @@ def test_a_log_that_ends_within_a_turn_ends_the_run(scene, tmp_path):
         ended = run(source, LEARNER, None, max_iterations=25)
     assert ended.ended == "log_exhausted"
     assert 2 < ended.iterations < 8
-
-
-def test_an_environment_of_gymnasium_loses_them_too(scene):
-    scene.seek(0)
-    env = WatchEnv(scene, tau=8)
-    _, info = env.reset(seed=0)
-    for action, t in ((info["stream"], 8), (1 - info["stream"], 26), (1 - info["stream"], 34)):
-        env.step(action)
-        assert scene.t == t
 
 
 def test_a_roaming_view_shows_what_the_others_do_while_it_dwells_there():

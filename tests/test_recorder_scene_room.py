@@ -16,7 +16,6 @@ from recorder.config import RecordConfig
 from recorder.world.icub.config import EyesConfig, IcubConfig
 from recorder.world.icub.lens import SAMPLES, Lens, light
 from recorder.world.icub.meshes import ball_mesh, box_mesh, can_mesh
-from recorder.world.icub.room import room_of
 from recorder.world.icub.textures import SIDE, TEXTURES, texture
 
 pytest.importorskip("pybullet")
@@ -152,13 +151,6 @@ def test_physics_moves_objects_after_the_paper_s_motions_upright_on_the_table():
     assert source.spec.truth == (*TRUTH, *HEIGHTS)
     np.testing.assert_array_equal(block.truth[:, :6], poses[5:8, :, :2].reshape(3, 6))
     np.testing.assert_array_equal(block.truth[:, 6:], poses[5:8, :, 2])
-
-
-def test_a_ball_that_rolls_has_no_stripes():
-    """How they lie depends on its whole way, and is as slow as where it is."""
-    scenes = (dataclasses.replace(REAL, physics=physics) for physics in (False, True))
-    striped, rolling = (room_of(scene).objects[2].paint.std(axis=(0, 1)).max() for scene in scenes)
-    assert rolling < striped / 4
 
 
 def rays_of(level: int, frames: int) -> np.ndarray:

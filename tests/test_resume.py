@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from conftest import Cdmisfa
@@ -265,44 +263,6 @@ def test_a_run_that_is_still_going_is_left_alone(tmp_path: Path) -> None:
     result = go(OscillatorySource(), out, 2, sinks=[Told(meddle)])
     assert len(refused) == 4
     assert result.signals_sha256 == go(OscillatorySource(), None, 2).signals_sha256
-
-
-@pytest.mark.parametrize("removed", range(3))
-def test_a_kill_while_a_run_is_replaced_leaves_none_or_says_how_to_go_on(
-    whole: Path, tmp_path: Path, cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch, removed: int
-) -> None:
-    run = Path(shutil.copytree(whole, tmp_path / "run"))
-    words = ("learn", "oscillatory", "--max-iterations", 3, "--no-rerun", "-o", run, "--force")
-    unlink, left = Path.unlink, [removed]
-
-    def killed(path: Path, *words: Any, **options: Any) -> None:
-        if path.exists() and path.parent == run:
-            if not left[0]:
-                raise SystemExit(9)
-            left[0] -= 1
-        unlink(path, *words, **options)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "unlink", killed)
-        cdmisfa(*words)
-    verified = cdmisfa("verify", run)
-    if removed:
-        assert (verified.code, "record or learn first, or name each" in verified.err) == (2, True)
-        resumed = cdmisfa("learn", "--resume", "-o", run)
-        assert (resumed.code, "begin one there with --force" in resumed.err) == (2, True)
-    else:
-        assert verified.code == 0
-    assert cdmisfa(*words).code == 0
-    assert cdmisfa("verify", run).code == 0
-
-
-@pytest.mark.parametrize(("last", "expected"), [(19, None), (20, 20), (59, 40), (10**6, 60)])
-def test_the_keyframe_at_or_before_an_iteration(
-    tmp_path: Path, last: int, expected: int | None
-) -> None:
-    go(OscillatorySource(), tmp_path / "run", 60)
-    found = read_keyframe(tmp_path / "run", last)
-    assert (None if found is None else found.iteration) == expected
 
 
 class RoomyLog:
