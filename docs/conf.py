@@ -23,8 +23,7 @@ import cdmisfa
 from cdmisfa.cli import interrupts
 from cdmisfa.core import errors
 from cdmisfa.experiments.documents import markdown
-from replay.viewer.program import free_port, running
-from replay.viewer.web import HOST, POLICY, page_server
+from replay.viewer import HOST, Program, free_port
 
 project = "cdmisfa"
 author = copyright = "the maintainers of cdmisfa"
@@ -56,6 +55,19 @@ _folder = tempfile.TemporaryDirectory()
 os.environ["CDMISFA_TUTORIALS"] = _folder.name
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
+# Rerun's page asks other hosts for fonts, examples and newer versions, and reports to its makers.
+POLICY = "; ".join(
+    (
+        "default-src 'self'",
+        "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:",
+        "style-src 'self' 'unsafe-inline'",
+        "img-src 'self' data: blob:",
+        "worker-src 'self' blob:",
+        "connect-src 'self' data: blob:",
+        "base-uri 'none'",
+        "form-action 'none'",
+    )
+)
 VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 
 
@@ -121,11 +133,10 @@ def add_the_viewer(app: Any, failure: Exception | None) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     port = free_port()
-    with running(page_server(port)):
+    page = f"http://{HOST}:{port}/"
+    with Program("--serve-web", "--web-viewer-port", str(port), page):
         for file in VIEWER:
-            (folder / file).write_bytes(
-                _fetched(f"http://{HOST}:{port}/{file.replace('index.html', '')}")
-            )
+            (folder / file).write_bytes(_fetched(page + file.replace("index.html", "")))
     page = (folder / "index.html").read_text("utf-8")
     opened = (
         'location.search || history.replaceState(null, "", "?url=" + '

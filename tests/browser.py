@@ -1,16 +1,14 @@
-"""Chromium without a screen: what it draws of a view, and whom it asks."""
+"""Chromium without a screen, and what it draws of a view."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-import json
 import shutil
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -81,39 +79,12 @@ def shown(pixels: Any) -> dict[str, int]:
     }
 
 
-def drawn(driver: Any, lanes: Collection[str] = tuple(LANES)) -> set[str]:
-    """Wait until lanes of a run are drawn; the hosts asked, but for what a policy refused."""
-    events: list[Any] = []
+def drawn(driver: Any, lanes: Collection[str] = tuple(LANES)) -> None:
+    """Wait until lanes of a run are drawn."""
     end = time.monotonic() + SECONDS
-
-    def heard(word: str) -> bool:
-        """Whether the page has asked for it; asks the driver, not the busy page."""
-        for entry in driver.get_log("performance"):
-            events.append(json.loads(entry["message"])["message"])
-        return any(word in str(event["params"].get("request")) for event in events)
-
-    def painted() -> bool:
-        pixels = shown(picture(driver))
-        return min(pixels[lane] for lane in lanes) > 1000
-
-    for ready in (lambda: heard("/run.rrd"), painted):
-        while not ready():
-            assert time.monotonic() < end, "the page does not show the run"
-            time.sleep(3)
-    heard("")
-
-    asked, refused = {}, set()
-    for event in events:
-        facts = event["params"]
-        if event["method"] == "Network.requestWillBeSent":
-            asked[facts["requestId"]] = facts["request"]["url"]
-        if event["method"] == "Network.loadingFailed" and facts.get("blockedReason") == "csp":
-            refused.add(facts["requestId"])
-    return {
-        str(urlsplit(url).hostname)
-        for key, url in asked.items()
-        if key not in refused and url.startswith(("http", "ws"))
-    }
+    while min(shown(picture(driver))[lane] for lane in lanes) <= 1000:
+        assert time.monotonic() < end, "the page does not show the run"
+        time.sleep(3)
 
 
 def errors(driver: Any) -> list[str]:

@@ -71,7 +71,7 @@ CASES: dict[str, tuple[str, ...]] = {
     # what is written has the name of its kind
     "view RUN --save x.mp4": ("x.mp4: the view is a file of Rerun, name it x.rrd",),
     "view REC --save x.mcap": ("x.mcap: the view is a file of Rerun, name it x.rrd",),
-    "view RUN --screenshot x.rrd": ("x.rrd: the picture is a PNG, name it x.png",),
+    "view RUN --screenshot x.rrd": ("x.rrd: the screenshot is a PNG, name it x.png",),
     "compare RUN RUN --save x.png": ("x.png: the view is a file of Rerun, name it x.rrd",),
     "export RUN --to parquet -o z.csv": ("z.csv: parquet is written, name it z.parquet",),
     "export REC --to images -o z.csv": ("z.csv: a folder is written, name it without .csv",),
@@ -82,7 +82,7 @@ CASES: dict[str, tuple[str, ...]] = {
         f"{words} -o x.mcap": ("x.mcap: a folder is written, name it without .mcap",)
         for words in ("record oscillatory", "learn oscillatory", "convert LOGS", "sweep REC")
     },
-    "view x --at 3 --save x.rrd": ("--at without --save",),
+    "view x --at 3 --save x.rrd": ("--at goes with a window",),
     # a scene is one, and has no options of cameras
     "learn oscillatory icub": (ONE,),
     "learn here oscillatory": (ONE,),
@@ -177,7 +177,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "fork RUN --iteration 3 --force -o file": (FOLDER,),
     "sweep oscillatory -o RUN --seeds 0:1": ("run.mcap",),
     "export RUN -o - --to csv": ("name another",),
-    "view RUN --screenshot x.jpg": ("the picture is a PNG, name it x.png",),
+    "view RUN --screenshot x.jpg": ("the screenshot is a PNG, name it x.png",),
     # no name is not the folder one is in
     "learn oscillatory -o EMPTY": ("is empty: name a",),
     "record oscillatory --frames 20 -o EMPTY": ("is empty: name a",),

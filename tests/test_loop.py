@@ -78,7 +78,7 @@ class TestKeyframes(SinkContract):
 
 class TestLiveView(SinkContract):
     def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
-        from replay.viewer.live import LiveView
+        from replay.view.live import LiveView
 
         return LiveView(source.spec, {}, learner.tau, len(learner.phi))
 

@@ -52,15 +52,14 @@ FORBIDDEN = {
     "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),
     "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),
     "replay.camera_logs": ("replay.recordings.source", "replay.view.columns", "rerun"),
-    "replay.corpus": ("replay.viewer.program", "cdmisfa.experiments.session", "rerun"),
+    "replay.corpus": ("replay.viewer", "cdmisfa.experiments.session", "rerun"),
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
-    "replay.integrity": ("replay.export.frames", "replay.viewer.program", "rerun"),
+    "replay.integrity": ("replay.export.frames", "replay.viewer", "rerun"),
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),
     "replay.report": ("replay.view.columns", "replay.export.frames", "rerun"),
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
-    "replay.view": ("replay.viewer.program", "replay.export.frames", "pybullet"),
-    "replay.viewer": ("cdmisfa.experiments.session", "recorder.world.icub.world"),
+    "replay.view": ("replay.viewer", "replay.export.frames", "pybullet"),
 }
 """Imports that each room must not have, of which the rules must catch every single one."""
 

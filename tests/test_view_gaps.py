@@ -19,7 +19,6 @@ from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view
 from replay.view.columns import Column, Target
-from replay.viewer.moments import frame_at
 
 ITERATIONS, TAU, EVERY = 15, 40, 20
 GAP_AFTER, GAP = 4, 95
@@ -123,7 +122,6 @@ def test_axes_reach_to_the_end_of_the_run(shown):
     assert rows["/attends"]["frame"][-1] == end
     axes = {time["end"] for _, _, time, *_ in View(folder / "run.rrd").views("TimeSeries")}
     assert max(axes) >= end
-    assert frame_at(folder, str(end - 1)) == end - 1
 
 
 @pytest.mark.parametrize("entity", ["/world/truth", "/signals/y", "/learned/1/followed"])

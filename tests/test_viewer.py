@@ -1,44 +1,33 @@
-"""The viewer shows a view in a window and without one, and ends when it should."""
+"""The viewer shows a view in a window, in a browser and without a screen, and ends with it."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
+import re
+import signal
 import socket
 import sys
-import time
 from pathlib import Path
-from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
+from browser import chromium, drawn
 from conftest import Cdmisfa
+from headless import Headless, needs_driver, shown
 from PIL import Image
 from run_data import IMAGE, PROGRESS, VECTOR, read_signals, run_of, write_run
 from view_data import views_of
-from waiting import running, wait_for
+from waiting import started, wait_for
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from replay import viewer
 from replay.view import panels
-from replay.view.bindings import viewer_program
 from replay.view.build import build_view, view_of
-from replay.viewer import headless, program, window
-from replay.viewer.catalogue import served_moment
-from replay.viewer.moments import frame_at
-from replay.viewer.program import (
-    check_limit,
-    environment,
-    free_port,
-    private_host,
-    run_program,
-)
-from replay.viewer.steered import Steered, is_painted
+from replay.viewer import Program, frame_at
 
 ITERATIONS = 24
-
-
-needs_driver = pytest.mark.skipif(bool(program.missing_driver()), reason=program.missing_driver())
 
 
 @needs_driver
@@ -47,15 +36,14 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
     write_run(tmp_path / "run.mcap", IMAGE, ITERATIONS)
     build_view(tmp_path, tmp_path / "run.rrd", tab="Abstraction")
     blocks = [block for _, block in run_of(IMAGE, ITERATIONS)]
-    with headless.headless_viewer() as opened:
-        opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
-        views = {view.name: view for view in opened.ask(all_views)}
+    with shown(tmp_path / "run.rrd") as ask:
+        views = {view.name: view for view in ask(all_views)}
         assert [view.reports for view in views.values()] == [[]] * len(views)
         for block in (blocks[3], next(b for b in blocks if b.stream != blocks[3].stream)):
-            opened.go_to(block.t)
+            ask(lambda client, t=block.t: client.set_time("frame", sequence=t) or True)
             grey = int(block.frames[0].min())
             view = views["Input x"].view_id
-            opened.ask(lambda client, v=view, g=grey: shows(client, v, g))
+            ask(lambda client, v=view, g=grey: shows(client, v, g))
 
 
 NAMED = {
@@ -87,20 +75,19 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(
 
     def side_by_side(*views, **_):
         tabs.extend(views)
-        shown = [view for tab in views for view in views_of(tab)]  # none behind another page
-        return rrb.Blueprint(rrb.Grid(*shown), auto_views=False, auto_layout=False)
+        every = [view for tab in views for view in views_of(tab)]  # none behind another page
+        return rrb.Blueprint(rrb.Grid(*every), auto_views=False, auto_layout=False)
 
     monkeypatch.setattr(panels, "blueprint", side_by_side)
     build_view(tmp_path, tmp_path / "run.rrd")
     assert len(tabs) == n_tabs
-    with headless.headless_viewer("2400x1600") as opened:
-        opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
-        views = opened.ask(all_views)
+    with shown(tmp_path / "run.rrd", "2400x1600") as ask:
+        views = ask(all_views)
         assert len(views) > n_views
         for name in some:
             (view,) = [v for v in views if v.name == name]
-            opened.ask(lambda client, v=view: client.take_screenshot(v.view_id))
-        state = opened.ask(lambda client: client.get_state())
+            ask(lambda client, v=view: client.take_screenshot(v.view_id))
+        state = ask(lambda client: client.get_state())
         assert [(v.name, v.reports) for v in state.views if v.reports] == []
 
 
@@ -117,76 +104,82 @@ def shows(client, view, grey):
 
 
 @needs_driver
-def test_a_screenshot_is_a_picture(tmp_path, monkeypatch):
-    monkeypatch.setattr(headless, "SETTLE", 0.5)
-    write_run(tmp_path / "run.mcap", VECTOR, 6)
-    headless.screenshot(tmp_path, tmp_path / "s.png", at=80, window="800x500")
+def test_a_screenshot_shows_a_tab_at_a_moment(tmp_path, monkeypatch, cdmisfa: Cdmisfa):
+    monkeypatch.setattr(viewer, "SETTLE", 0.5)
+    monkeypatch.setattr(viewer, "WINDOW", "800x500")
+    records, seen, painted = write_run(tmp_path / "run.mcap", VECTOR, 12), [], viewer.is_painted
+
+    def look(client):
+        seen.append((client.get_state(), client.get_blueprint().blueprint))
+        return painted(client)
+
+    monkeypatch.setattr(viewer, "is_painted", look)
+    words = ("view", tmp_path, "--screenshot", tmp_path / "s.png")
+    assert cdmisfa(*words, "--at", "iteration 5", "--tab", "gate").code == 0
     with Image.open(tmp_path / "s.png") as picture:
         assert picture.size in ((800, 500), (1600, 1000))
         assert len(np.unique(np.asarray(picture.convert("L")))) > 20
-    with pytest.raises(UsageError, match="--force"):
-        headless.screenshot(tmp_path, tmp_path / "s.png")
-
-
-@needs_driver
-def test_a_screenshot_of_a_tab_at_an_event(tmp_path, monkeypatch):
-    """The cursor stands where module 2 was saved, in the tab that was asked for."""
-    records = write_run(tmp_path / "run.mcap", VECTOR, 12, saves=True)
-    seen = []
-
-    def look(viewer, out):
-        state = viewer.ask(lambda client: client.get_state())
-        opened = viewer.ask(lambda client: client.get_blueprint()).blueprint
-        seen.append((state.recordings[0].current_time, opened))
-
-    monkeypatch.setattr(headless.Steered, "draw", look)
-    monkeypatch.setattr(headless, "SETTLE", 0.5)
-    headless.screenshot(tmp_path, tmp_path / "s.png", at="iteration 5", tab="gate")
-    ((time_then, blueprint),) = seen
+    state, blueprint = seen[-1]
     kinds = [
         part["ContainerBlueprint"] for part in blueprint.values() if "ContainerBlueprint" in part
     ]
     tabs = max(kinds, key=lambda part: len(part["contents"]) * (part["container_kind"] == "Tabs"))
     opened = blueprint[f"/{tabs['active_tab']}"]["ContainerBlueprint"]["display_name"]
-    assert (time_then, opened) == (records[5].t, "Gate")
+    assert (state.recordings[0].current_time, opened) == (records[5].t, "Gate")
+    assert "--force" in cdmisfa(*words).err
 
 
 @needs_driver
 def test_a_window_opens_at_a_moment(tmp_path, monkeypatch):
-    """A window without a screen; it ends once it has said where its cursor stands."""
-    records = write_run(tmp_path / "run.mcap", VECTOR, 12)
-    run, go_to, seen = window.run_program, window._go_to, []
+    """The viewer runs without a screen here, and is ended when its cursor stands."""
+    records, seen = write_run(tmp_path / "run.mcap", VECTOR, 12), []
 
-    def without_a_screen(words, *more):
-        run(["--headless", *words], *more)
+    class Window(Headless):
+        def shown(self, port, frame):
+            client = super().shown(port, frame)
+            seen.append(self.ask(client.get_state))
+            self.terminate()
 
-    def look(frame, viewer, place):
-        go_to(frame, viewer, place)
-        seen.append(Steered(viewer, place).ask(lambda client: client.get_state()))
-        viewer.terminate()
-
-    monkeypatch.setattr(window, "has_display", lambda: True)
-    monkeypatch.setattr(window, "run_program", without_a_screen)
-    monkeypatch.setattr(window, "_go_to", look)
-    with pytest.raises(CdmisfaError, match="ended with code -15"):
-        window.open_window(tmp_path, at="iteration 5")
+    monkeypatch.setattr(viewer, "has_display", lambda: True)
+    monkeypatch.setattr(viewer, "Program", Window)
+    with view_of(tmp_path) as view, pytest.raises(CdmisfaError, match="ended with code -15"):
+        viewer.open_window(view, frame_at(tmp_path, "iteration 5"))
     assert seen[0].recordings[0].current_time == records[5].t
 
 
-@needs_driver
-def test_a_page_opens_at_a_moment(tmp_path):
-    """Its link, in a viewer without a browser, with the tabs of the view."""
-    records = write_run(tmp_path / "run.mcap", VECTOR, 12)
-    with (
-        view_of(tmp_path, 10, None, "Gate") as view,
-        served_moment(view, records[5].t) as (_, page),
-        headless.headless_viewer() as viewer,
-    ):
-        (link,) = parse_qs(urlsplit(page).query)["url"]
-        viewer.ask(lambda client: client.open(link))
-        shown = viewer.ask(lambda client: is_painted(client.get_state()) and client.get_state())
-        assert shown.recordings[0].current_time == records[5].t
-        assert "Verdict on each block: the last 50 blocks" in {one.name for one in shown.views}
+@pytest.fixture
+def page(tmp_path):
+    """`cdmisfa view RUN --web`, interrupted at the end, and the address that it prints."""
+    write_run(tmp_path / "run.mcap", VECTOR, 24)
+    with started("view", tmp_path, "--web", "--tab", "Overview") as process:
+        line = process.stderr.readline()
+        yield process, line.strip()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 130
+
+
+def test_a_browser_draws_the_page(page, tmp_path):
+    with chromium(tmp_path) as browser:
+        browser.get(page[1])
+        drawn(browser)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
+def test_the_page_and_its_data_are_on_this_machine_only(page):
+    found = re.fullmatch(
+        r"http://127\.0\.0\.1:(\d+)/\?url=\S*127\.0\.0\.1%3A(\d+)%2Fproxy", page[1]
+    )
+    assert found is not None, page
+    wait_for(lambda: len(addresses(found.groups())) == 2, 60, page[0])
+    assert addresses(found.groups()) == {f"0100007F:{int(port):04X}" for port in found.groups()}
+
+
+def addresses(ports):
+    """The addresses of this machine, in hexadecimal, at which something listens at these ports."""
+    lines = [Path(f"/proc/net/{name}").read_text().splitlines()[1:] for name in ("tcp", "tcp6")]
+    rows = [line.split() for line in (*lines[0], *lines[1])]
+    wanted = {f"{int(port):04X}" for port in ports}
+    return {row[1] for row in rows if row[3] == "0A" and row[1].split(":")[1] in wanted}
 
 
 def test_a_moment_is_a_frame_an_iteration_or_an_event(cdmisfa: Cdmisfa, tmp_path):
@@ -196,19 +189,14 @@ def test_a_moment_is_a_frame_an_iteration_or_an_event(cdmisfa: Cdmisfa, tmp_path
     assert frame_at(tmp_path, "123") == 123
     assert frame_at(tmp_path, "iteration 7") == 7 * 40
     assert (frame_at(tmp_path, "module 1"), frame_at(tmp_path, "Module 2")) == (first, second)
-    for wrong, said in (
-        ("999999", "the last of"),
-        ("iteration 999999", "the last of"),
-        ("module 7", "; events: stream x"),
-        ("odule 1", "no frame, iteration or event"),
-    ):
-        with pytest.raises(UsageError, match=said):
+    for wrong in ("iteration 999999", "module 7", "odule 1"):
+        with pytest.raises(UsageError, match="no frame, iteration or event"):
             frame_at(tmp_path, wrong)
     with pytest.raises(UsageError, match="only a run"):
         frame_at(tmp_path / "v.rrd", "module 1")
 
 
-def test_tabs_and_sizes_that_are_not_there_are_refused(tmp_path):
+def test_a_tab_that_is_not_there_is_refused(tmp_path):
     write_run(tmp_path / "run.mcap", VECTOR, 3)
     with pytest.raises(
         UsageError, match="no tab 'Bridge': there are Overview, Abstraction, Gate, Decision"
@@ -217,105 +205,55 @@ def test_tabs_and_sizes_that_are_not_there_are_refused(tmp_path):
     build_view(tmp_path, tmp_path / "run.rrd", tab="MODULES")
     with (
         pytest.raises(UsageError, match="is built already"),
-        view_of(tmp_path / "run.rrd", 10, None, "Gate"),
+        view_of(tmp_path / "run.rrd", tab="Gate"),
     ):
         pass
-    for size in ("big", "10x10", "1600", "1600x-2"):
-        with pytest.raises(UsageError, match="say 1600x1000"):
-            headless.screenshot(tmp_path, tmp_path / "s.png", window=size)
 
 
-def test_a_port_that_is_taken_is_refused_in_one_line(tmp_path):
+def test_a_port_that_is_taken_is_refused_in_one_line(tmp_path, cdmisfa: Cdmisfa):
     write_run(tmp_path / "run.mcap", VECTOR, 2)
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        with pytest.raises(CdmisfaError, match=r"--port \d+: .*choose another"):
-            window.serve(tmp_path, port=taken.getsockname()[1])
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        done = cdmisfa("view", tmp_path, "--web", "--port", taken.getsockname()[1])
+    assert (done.code, "choose another" in done.err) == (1, True)
 
 
-def test_without_a_driver_the_remedy_is_said(tmp_path, monkeypatch):
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is a driver")
+@pytest.mark.parametrize("name", ["VK_DRIVER_FILES", "VK_ICD_FILENAMES"])
+def test_without_a_driver_the_remedy_is_printed_once_the_input_is_right(
+    tmp_path, monkeypatch, cdmisfa: Cdmisfa, name
+):
     write_run(tmp_path / "run.mcap", VECTOR, 2)
-    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
-    monkeypatch.setattr(sys, "platform", "linux")
-    with pytest.raises(CdmisfaError, match="mesa-vulkan-drivers"):
-        headless.screenshot(tmp_path, tmp_path / "s.png")
+    (tmp_path / "other.rrd").write_text("nothing of Rerun's")
+    for variable in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv(name, str(tmp_path / "none.json"))
+    for path, words in ((tmp_path, "mesa-vulkan-drivers"), (tmp_path / "other.rrd", "no file of")):
+        done = cdmisfa("view", path, "--screenshot", tmp_path / "s.png")
+        assert (done.code, words in done.err) == (2, True), done
 
 
-def test_telemetry_is_off():
-    assert environment()["CI"] == "1"
-    assert viewer_program().is_file()
-
-
-def test_what_cannot_be_shown_is_refused_at_once(tmp_path, monkeypatch):
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is a display")
+def test_without_a_display_other_ways_are_named(tmp_path, monkeypatch, cdmisfa: Cdmisfa):
     write_run(tmp_path / "run.mcap", VECTOR, 2)
-    monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(CdmisfaError, match=r"no display .* --web"):
-        window.open_window(tmp_path)
-    for limit in ("banana", "4", "GB", "-1GB"):
-        with pytest.raises(UsageError, match="4GB or 75%"):
-            window.open_window(tmp_path, memory_limit=limit)
-    assert [check_limit(limit) for limit in ("4GB", "75%", "512MiB")]
-    last = max(s.t + len(s.y) - 1 for s in read_signals(tmp_path))
-    with pytest.raises(UsageError, match=f"the last of .* is {last}$"):
-        headless.screenshot(tmp_path, tmp_path / "s.png", at=last + 1)
+    done = cdmisfa("view", tmp_path)
+    assert (done.code, "no display" in done.err, "--web" in done.err) == (1, True, True)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells a child")
-def test_the_program_ends_with_a_parent_that_is_killed(tmp_path):
-    told = tmp_path / "pid"
-    program = tmp_path / "program"
-    program.write_text(f"#!/bin/sh\necho $$ > {told}.part\nmv {told}.part {told}\nexec sleep 60\n")
-    program.chmod(0o755)
-    code = (
-        "import sys, pathlib, replay.viewer.program as v\n"
-        f"v.viewer_program = lambda: pathlib.Path({str(program)!r})\n"
-        "v.run_program([])\n"
-    )
-    with running("-c", code) as parent:
-        wait_for(told.exists, 60, parent)
-    child = Path("/proc") / told.read_text().strip() / "cmdline"
-    for _ in range(100):
-        if not child.exists() or not child.read_bytes():
-            return
-        time.sleep(0.05)
-    pytest.fail("it runs on")
+def test_a_folder_of_runs_is_refused(tmp_path, cdmisfa: Cdmisfa):
+    (tmp_path / "a").mkdir()
+    write_run(tmp_path / "a" / "run.mcap", VECTOR, 2)
+    done = cdmisfa("view", tmp_path, "--web")
+    assert (done.code, "holds many runs: name one" in done.err) == (2, True)
 
 
-def test_a_program_that_fails_is_quoted(tmp_path, monkeypatch, capfd):
-    script = tmp_path / "program"
-    script.write_text("#!/bin/sh\necho chatter >&2\necho 'no luck' >&2\nexit 3\n")
-    script.chmod(0o755)
-    monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: script)
-    with pytest.raises(CdmisfaError, match="code 3: no luck"):
-        run_program([])
-    assert capfd.readouterr().err == ""
+def test_a_program_that_fails_is_quoted():
+    with pytest.raises(CdmisfaError, match="with code 2: "), Program("--no-such") as program:
+        program.until_end()
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux has a whole network")
-def test_a_view_is_opened_where_no_page_finds_it_and_leaves_nothing_behind(tmp_path, monkeypatch):
-    """It has no name by then, and the port asks nobody, but is at an address by chance."""
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
-    write_run(tmp_path / "run.mcap", VECTOR, 2)
-    given = []
-
-    def program(arguments, view=None):
-        assert list((tmp_path / "temporary").iterdir()) == []
-        given.append((arguments, view and view.read(4)))
-
-    monkeypatch.setattr(window, "run_program", program)
-    monkeypatch.setattr(window, "has_display", lambda: True)
-    window.open_window(tmp_path)
-    window.open_window(tmp_path)
-    window.serve(tmp_path)
-    heads = [("-" in arguments, head) for arguments, head in given]
-    assert heads == [(True, b"RRF2")] * 2 + [(False, None)]  # the last serves it itself
-    places = {arguments[arguments.index("--bind") + 1] for arguments, _ in given[:2]}
-    assert len(places) == 2
-    hosts = places | {private_host() for _ in range(20)}
-    assert len(hosts) == 22
-    assert all(host.startswith("127.") and host != "127.0.0.1" for host in hosts)
-    assert all(map(free_port, hosts))
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's /proc")
+def test_its_telemetry_is_off():
+    with Program("--serve-grpc", "--port", str(viewer.free_port())) as program:
+        assert b"CI=1" in Path(f"/proc/{program.pid}/environ").read_bytes().split(b"\0")

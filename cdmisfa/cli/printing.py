@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.run_folder import RunResult
     from replay.integrity.learned import ModuleInfo
-    from replay.viewer.broadcast import Broadcast
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
@@ -182,15 +181,6 @@ def say_changes(source: FrameSource) -> None:
     changes = getattr(source, "changes", {}).values()  # only logs of others have these
     for line in (*changes, *getattr(source, "salvaged", list)()):
         warn(line)
-
-
-def announce(broadcast: Broadcast) -> None:
-    """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.program import has_display
-
-    tell(f"live view {broadcast.address}    look at it in a browser of this machine")
-    if has_display():
-        broadcast.open_window()
 
 
 def outcome_line(outcome: Mapping[str, Any]) -> str:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, description
@@ -47,9 +48,6 @@ from recorder.log.files import folder_here
 from replay.runs.folders import run_log
 from replay.runs.run import stated_source, states_whole
 from replay.runs.writer import RunWriter
-
-if TYPE_CHECKING:
-    from replay.viewer.broadcast import Broadcast
 
 Hashing = Callable[[int, int], None]
 """Told of bytes of the source that were hashed and of how many, while that is waited for."""
@@ -241,8 +239,7 @@ class Session:
         stop: Callable[[], bool] = lambda: False,
         keyframes: int | None = None,
         rerun: bool = True,
-        live: bool = False,
-        announce: Callable[[Broadcast], None] = lambda broadcast: None,
+        live: Callable[[str], AbstractContextManager[None]] | None = None,
         hashing: Hashing = _not_told,
     ) -> RunResult:
         """Learn until nothing is left to learn, and log every signal.
@@ -254,8 +251,8 @@ class Session:
                 long source is known by a sample.
             keyframes: iterations between keyframes, see `Keyframes`.
             rerun: also build the Rerun view.
-            live: also show the run in Rerun while it learns, to viewers on this machine.
-            announce: called with what viewers of the live view are served.
+            live: also serve the run to Rerun's viewers while it learns; called with the address,
+                and entered while the run is served.
             hashing: told of bytes of the source that were hashed, and of how many, while the run
                 waits for what it states of its source at its end.
 
@@ -280,16 +277,16 @@ class Session:
                 )
                 told.append(OpenLog(log, self.learner))
                 told.append(Keyframes(log, self.source, self.learner, self._versions, keyframes))
-            if live:
-                from replay.viewer.live import LiveView
+            if live is not None:
+                from replay.view.live import LiveView
 
                 tau, outputs = self.learner.tau, len(self.learner.phi)
                 view = LiveView(self.source.spec, self.manifest, tau, outputs, run=self.folder)
                 told.append(opened.enter_context(view))
-                announce(view.broadcast)
+                opened.enter_context(live(view.address))
             if log is not None and self.before is not None:
                 self._copy_log(log, digest)
-                if live:
+                if live is not None:
                     view.earlier(log.path.parent)
             told += [BestEffort(sink, told) for sink in sinks]
             ended = learn_blocks(self.source, self.learner, told, stop=stop, **self._limits)

@@ -140,7 +140,7 @@ class Recording(Shown):
         """
         if not self.words:
             raise UsageError("recordings and logs are shown: of arrays, view the run")
-        view(self, [Path(word) for word in self.words], save, tab=tab, inputs=self.inputs)
+        view([Path(word) for word in self.words], save, tab=tab, inputs=self.inputs)
 
     def _facts(self) -> Mapping[str, Any]:
         return {"recording": ", ".join(self.words) or "arrays", **self.spec.facts()}

@@ -209,7 +209,7 @@ class Run(Shown, RecomputedRun):
         Raises:
             CdmisfaError: there is no display, or the file cannot be written.
         """
-        view(self, [self.path], save, tab=tab)
+        view([self.path], save, tab=tab)
 
     def _facts(self) -> Mapping[str, Any]:
         learned = (f"{m.index}: {m.stream}, η {m.eta[0]:.3g}" for m in self.modules)

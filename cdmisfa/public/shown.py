@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import html
+import atexit
+import contextlib
 import sys
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.shown import ROW, WIDTH, Shown, png
+from cdmisfa.core.shown import ROW, WIDTH
 from recorder.images.options import InputOptions
 from replay.palette import colour
 
@@ -40,67 +40,37 @@ def watched(streams: NDArray[Any], count: int) -> NDArray[np.uint8]:
 
 
 def view(
-    held: Shown,
     paths: Sequence[Path],
     save: str | Path | None,
     *,
     tab: str | None = None,
     inputs: InputOptions | None = None,
 ) -> None:
-    """Show a run or a recording: in the notebook, else in a window, or write its view to a file.
+    """Show a run or a recording: below a notebook's cell, else in a window; or write its view.
 
     Args:
-        held: what is shown; a notebook shows it where the viewer's frame cannot be.
         paths: the run's folder, or the files of the recording.
-        save: the file.
+        save: the file of the view.
         tab: the name of the tab that is open.
         inputs: which streams of logs, and how they become frames.
     """
-    from replay.view.build import build_view
+    from replay.view.build import build_view, view_of
 
-    def build(out: Path) -> None:
-        build_view(paths[0], out, beside=paths[1:], tab=tab, inputs=inputs)
-
+    how: dict[str, Any] = {"beside": paths[1:], "tab": tab, "inputs": inputs}
     if save is not None:
-        build(Path(save))
+        build_view(paths[0], Path(save), **how)
         return
-    from replay.viewer.window import open_window, refuse_without_display, serve_frame
+    from replay.viewer import open_window, served
 
-    display = _notebook()
-    if display is None:
-        refuse_without_display()
-    with tempfile.TemporaryDirectory(prefix="cdmisfa-", ignore_cleanup_errors=True) as folder:
-        file = Path(folder) / f"{paths[0].resolve().stem}.rrd"
-        build(file)
-        if display is None:
-            open_window(file)
-        else:
-            display(framed(held, serve_frame(file)), raw=True)
-
-
-def framed(held: Shown, address: str) -> dict[str, str]:
-    """The viewer's page in a frame, by MIME types; the object itself where that cannot be shown.
-
-    Args:
-        held: what the page shows.
-        address: of the page, on this machine.
-    """
-    place = address.partition("?")[0]
-    instead = (
-        f"<p>Here is the viewer as long as the notebook runs on this machine, at {place}: run the "
-        "cell again, or write the view to a file, view('run.rrd').</p>"
-    )
-    bundle = {
-        "text/plain": repr(held),
-        "text/html": f'<object type="text/html" data="{html.escape(address)}" '
-        f'style="width:100%;height:{HEIGHT}px">{held._repr_html_()}{instead}</object>',
-    }
-    picture = held._picture()
-    return bundle if picture is None else {**bundle, "image/png": png(picture)}
-
-
-def _notebook() -> Callable[..., None] | None:
-    """What shows things in the notebook that this is; None elsewhere."""
     ipython: Any = sys.modules.get("IPython")
-    shell = None if ipython is None else ipython.get_ipython()
-    return ipython.display.display if hasattr(shell, "kernel") else None
+    if ipython is None or not hasattr(ipython.get_ipython(), "kernel"):
+        with view_of(paths[0], **how) as file:
+            open_window(file)
+        return
+    file = _until_exit.enter_context(view_of(paths[0], **how))
+    _, address = _until_exit.enter_context(served(file))
+    ipython.display.display(ipython.display.IFrame(address, "100%", HEIGHT))
+
+
+_until_exit = contextlib.ExitStack()
+atexit.register(_until_exit.close)

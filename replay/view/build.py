@@ -6,6 +6,7 @@ The view can always be built again: the logs are the archive.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,11 +15,10 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from rerun.chunk import Chunk
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError, are_for
-from cdmisfa.core.untrusted import check_regular
+from cdmisfa.core.untrusted import opened_regular
 from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.inputs import About, Logged, holds_run, open_to_look
@@ -33,11 +33,13 @@ from replay.view.labels import label, part
 from replay.view.layouts import blueprint, lines, time_axis
 from replay.view.modules import ModulesView
 from replay.view.panels import run_layout
-from replay.view.properties import APPLICATION, properties_of, property_chunks, recording_id
 from replay.view.run import RunView
 from replay.view.scene import SceneView, gaze_view, scene_view, write_gaze, write_heads
 from replay.view.summary import summary_text
 from replay.view.world import WorldView, world_of_recording, write_learned
+
+APPLICATION = "cdmisfa"
+"""Rerun's application id: the viewer remembers one layout for it."""
 
 FLUSH_SECONDS = 60.0
 
@@ -55,7 +57,6 @@ def build_view(
     tab: str | None = None,
     beside: Sequence[Path] = (),
     inputs: InputOptions | None = None,
-    body: bool = True,
     about: About = lambda source: None,
 ) -> None:
     """Write the view of a run, a recording or camera logs as an .rrd file, whole or not at all.
@@ -69,7 +70,6 @@ def build_view(
         tab: name of the tab that is open; by default the first.
         beside: more camera logs, or files of the recording.
         inputs: which streams of camera logs; by default all of images.
-        body: show the robot's body in a run's view.
         about: given a recording or camera logs before they are shown, to say what they are.
 
     Raises:
@@ -89,7 +89,7 @@ def build_view(
             raise UsageError(f"{path}: one run is shown at a time; compare --save shows several")
         log = run_log(path)
         with recording_to(out, _name(log), log, force=force) as recording:
-            _write_run(recording, log, every, all_views, tab, body=body)
+            _write_run(recording, log, every, all_views, tab)
     elif all_views is not None:
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
@@ -98,29 +98,28 @@ def build_view(
 
 
 @contextlib.contextmanager
-def view_of(
-    path: Path,
-    every: int,
-    all_views: Path | None,
-    tab: str | None = None,
-    about: About = lambda source: None,
-) -> Iterator[Path]:
-    """The view of a run, a recording or an .rrd file, there for as long as it is looked at.
+def view_of(path: Path, *, tab: str | None = None, **how: Any) -> Iterator[Path]:
+    """Yield the view of a run, a recording or logs as an .rrd file, which is temporary.
+
+    Args:
+        path: as for `build_view`, or an .rrd file, which is yielded as it is.
+        tab: name of the tab that is open.
+        how: see `build_view`.
 
     Raises:
         UsageError: there is no such file, or an .rrd file cannot have the tab.
     """
     if path.suffix == ".rrd":
-        if not path.is_file():
-            raise UsageError(f"{path} does not exist: name a run, a recording or an .rrd file")
-        check_regular(path)
+        with opened_regular(path) as file:
+            if file.read(4) != b"RRF2":  # for anything else the viewer shows nothing, without end
+                raise UsageError(f"{path} is no file of Rerun: name a run or a recording")
         if tab is not None:
             raise UsageError(f"--tab {tab}: {path} is built already, name its run or recording")
         yield path
         return
-    with tempfile.TemporaryDirectory(prefix="cdmisfa-view-") as folder:
+    with tempfile.TemporaryDirectory(prefix="cdmisfa-view-", ignore_cleanup_errors=True) as folder:
         view = Path(folder) / f"{path.resolve().stem}.rrd"
-        build_view(path, view, every=every, all_views=all_views, tab=tab, about=about)
+        build_view(path, view, tab=tab, **how)
         yield view
 
 
@@ -144,7 +143,9 @@ def recording_to(
     refuse_taken(out, force=force)
     if not out.parent.is_dir():
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
-    recording = rr.RecordingStream(APPLICATION, recording_id=recording_id(name, source))
+    # Rerun merges recordings of the same name and id.
+    place = hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:12]
+    recording = rr.RecordingStream(APPLICATION, recording_id=f"{name}-{place}")
     recording.set_log_time_enabled(False)
     with atomic_write(out) as partial:
         try:
@@ -166,8 +167,6 @@ def _write_run(
     every: int,
     all_views: Path | None,
     tab: str | None,
-    *,
-    body: bool,
 ) -> None:
     header, folder = read_header(log), log.parent
     streams = list(range(len(header.spec.streams)))
@@ -176,7 +175,7 @@ def _write_run(
     tally, view = Tally(header), RunView(recording, header, streams, every)
     known = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
     modules = ModulesView(Target(recording, header.spec), known)
-    world = WorldView(recording, header, folder, streams, every, all_views, body=body)
+    world = WorldView(recording, header, folder, streams, every, all_views)
     truth: list[Frames] = []
     for note in world.notes:
         view.event(0, 0, note, "WARN")
@@ -194,8 +193,6 @@ def _write_run(
     modules.finish(outline)
     for note in modules.notes:
         view.event(outline.end, outline.iterations, note, "WARN")
-    # Not as `AnyValues`, which lose a value of another type than the process's first of its name.
-    recording.send_chunks([Chunk(c) for c in property_chunks(properties_of(outline, folder))])
     text = label(summary_text(outline, _name(log), events))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, all_views, log, outline, every)

@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
+import rerun as rr
+
 from cdmisfa.core.signals import Signal
-from replay.view.bindings import escape_entity_path_part
 
 _DRAWN = (
     (0x20, 0x7E),  # ASCII
@@ -34,7 +35,7 @@ def label(text: str) -> str:
 
 def part(names: Sequence[str], index: int) -> str:
     """A stream's part of an entity's path: its number from 1, so that order holds, and its name."""
-    return str(escape_entity_path_part(f"{index + 1}_{label(names[index])}"))
+    return str(rr.escape_entity_path_part(f"{index + 1}_{label(names[index])}"))
 
 
 def _is_drawn(code: int) -> bool:

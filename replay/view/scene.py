@@ -58,13 +58,12 @@ class SceneView:
         target: where it goes.
         scenery: what stands where.
         every: show where things are at every so many frames.
-        body: show the robot's, too.
 
     Attributes:
         notes: why the robot's body is not shown.
     """
 
-    def __init__(self, target: Target, scenery: Scenery, every: int, *, body: bool = True) -> None:
+    def __init__(self, target: Target, scenery: Scenery, every: int) -> None:
         self._target, self._every, spec = target, every, target.spec
         self.notes: list[str] = []
         self._watched, self._scenery = -1, scenery
@@ -85,7 +84,7 @@ class SceneView:
             if gaze is not None:
                 _write_pyramid(target, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
         try:
-            self._body = write_body(target.recording, SCENE, scenery.robot) if body else None
+            self._body = write_body(target.recording, SCENE, scenery.robot)
         except CdmisfaError as error:
             self.notes.append(str(error))
 

@@ -245,13 +245,6 @@ def _table(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def world_tab(header: RunHeader, scenery: Scenery | None, streams: Sequence[int]) -> WorldTab:
-    """The world on the first tab of a run with this scenery, or with none that is known."""
-    if scenery is not None or not header.spec.images:
-        return WorldTab(scene=scenery is not None)
-    return WorldTab(wall=bounds(len(streams), *header.spec.frame_shape))
-
-
 class WorldView:
     """Writes the world of a run.
 
@@ -262,7 +255,6 @@ class WorldView:
         streams: those that are shown.
         every: where things are is shown at every so many frames, as pictures are.
         learned_from: the recording that the run learned from, where that is known.
-        body: of the robot, too.
 
     Attributes:
         notes: what a person should know of it.
@@ -276,18 +268,17 @@ class WorldView:
         streams: Sequence[int],
         every: int,
         learned_from: Path | None = None,
-        *,
-        body: bool = True,
     ) -> None:
         target = Target(recording, header.spec)
         scenery, unsure = world_of_run(header, run, learned_from)
-        self._tab = world_tab(header, scenery, streams)
+        self._tab = WorldTab(scene=scenery is not None)
         self._view: SceneView | WallView | None = None
         self.notes: list[str] = [] if unsure is None else [unsure]
         if scenery is not None:
-            self._view = SceneView(target, scenery, every, body=body)
+            self._view = SceneView(target, scenery, every)
             self.notes += self._view.notes
         elif header.spec.images:
+            self._tab = WorldTab(wall=bounds(len(streams), *header.spec.frame_shape))
             self._view = WallView(target, streams, by_progress=header.by_progress)
 
     def take(self, batch: Batch) -> None:

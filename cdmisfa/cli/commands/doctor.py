@@ -119,9 +119,9 @@ def _kernels() -> Iterator[Check]:
 
 
 def _vulkan() -> Iterator[Check]:
-    from replay.viewer.program import vulkan_drivers
+    from replay.viewer import vulkan_drivers
 
-    drivers = sorted(vulkan_drivers())
+    drivers = vulkan_drivers()
     detail = ", ".join(d.stem for d in drivers) or "apt-get install mesa-vulkan-drivers"
     yield Check("vulkan driver", bool(drivers), detail, "view --screenshot without a screen")
 

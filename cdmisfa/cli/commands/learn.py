@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,6 @@ from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
 from cdmisfa.cli.making import flag, grouped, option, word
 from cdmisfa.cli.printing import (
-    announce,
     print_result,
     quoted,
     say_about,
@@ -132,8 +132,7 @@ def learn_command(
                 force=force,
                 resume=resume,
                 rerun=not told["no_rerun"],
-                live=told["live_view"],
-                announce=announce,
+                live=_watched() if told["live_view"] else None,
                 sinks=(reporter,),
                 stop=stop,
                 hashing=reporter.hashing,
@@ -150,6 +149,12 @@ def learn_command(
         ctx.exit(stop.exit_code)
     if getattr(frames, "left_out", ()):
         ctx.exit(LogDamagedError.exit_code)
+
+
+def _watched() -> Callable[[str], contextlib.AbstractContextManager[None]]:
+    from replay.viewer import watched
+
+    return partial(watched, say=tell)
 
 
 @contextlib.contextmanager

@@ -1,11 +1,12 @@
 """A run in the viewer while it learns.
 
-What the learner thinks is kept in memory and handed over in large pieces, so that the
-learner hardly waits for it. Only who was given the address can connect, from this machine.
+Signals are kept in memory and handed over in large pieces, so that the learner hardly waits.
 """
 
 from __future__ import annotations
 
+import os
+import socket
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,12 +24,12 @@ from cdmisfa.core.signals import NO_STATE, SIGNALS, BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
 from replay.runs.log import Batch, Frames, RunHeader, read_batches
 from replay.runs.run import LINES, Outline
+from replay.view.build import APPLICATION
 from replay.view.columns import MOST_STREAMS, Target
 from replay.view.modules import ModulesView
 from replay.view.panels import MOST_MODULES, run_layout
 from replay.view.run import RunView
 from replay.view.world import WorldView
-from replay.viewer.broadcast import Broadcast
 
 EVERY_SECONDS = 1.5
 """Time between two pieces."""
@@ -54,13 +55,9 @@ class LiveView(Sink):
         tau: frames of a block.
         outputs: outputs of an abstraction.
         run: its folder, where it has one.
-        port: to listen at; by default a free one.
 
     Attributes:
-        broadcast: what viewers are served.
-
-    Raises:
-        CdmisfaError: the port is taken, or Rerun is switched off.
+        address: where Rerun's viewers connect, on this machine.
     """
 
     def __init__(
@@ -71,11 +68,15 @@ class LiveView(Sink):
         outputs: int,
         *,
         run: Path | None = None,
-        port: int | None = None,
     ) -> None:
         outline = _nothing_yet(RunHeader(spec, manifest), tau, outputs)
-        self.broadcast = Broadcast("live", port)
-        self._recording = self.broadcast.recording
+        self._recording = rr.RecordingStream(APPLICATION, recording_id=f"live-{os.getpid()}")
+        self._recording.set_log_time_enabled(False)
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        sink = rr.GrpcServerSink("127.0.0.1", port)
+        self._recording.set_sinks(sink)
+        self.address = str(sink.uri)
         self._recording.send_recording_name("live")
         self._recording.log("summary", rr.TextDocument(SUMMARY), static=True)
         streams = outline.streams(MOST_STREAMS)
@@ -90,7 +91,6 @@ class LiveView(Sink):
             self._view.event(0, 0, note, "WARN")
         self._images = spec.images
         self._next = time.monotonic() + EVERY_SECONDS
-        self.broadcast.hand_over()
         self._forget()
 
     def _forget(self) -> None:
@@ -159,12 +159,12 @@ class LiveView(Sink):
         self._modules.flush()
         self._view.flush()
         self._world.flush()
-        self.broadcast.hand_over()
 
     def close(self) -> None:
         """Hand over the rest and stop serving; a viewer keeps what it has."""
         self.flush()
-        self.broadcast.close()
+        self._recording.flush()
+        self._recording.disconnect()
 
     def __enter__(self) -> Self:
         return self

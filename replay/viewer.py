@@ -1,0 +1,286 @@
+"""Rerun's own programs: the window of a view, its page in a browser, and its screenshot.
+
+All of them listen at 127.0.0.1 alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import rerun_cli
+
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from recorder.log.files import atomic_write
+from replay.inputs import holds_run
+from replay.runs.log import EVENT_TOPIC, read_batches, read_columns
+
+HOST = "127.0.0.1"
+
+WINDOW = "1600x1000"
+"""Size of a screenshot, in points."""
+
+SETTLE = 6.0
+"""Seconds after which the viewer's notices are gone from a screenshot."""
+
+SECONDS = 120.0
+"""Longest wait for an answer of the viewer, which is slow without a graphics card."""
+
+INSTALL = "apt-get install mesa-vulkan-drivers libvulkan1"
+"""Installs a Vulkan driver that needs no graphics card."""
+
+ITERATION = re.compile(r"iteration\s*(\d+)", re.IGNORECASE)
+
+
+class Program(subprocess.Popen[bytes]):
+    """Rerun's viewer or server, which ends with the `with` block that runs it.
+
+    It has a session of its own, so that an interrupt reaches it through us alone. Its output goes
+    to a file: it hangs where it cannot write to a pipe.
+
+    Args:
+        arguments: of the program.
+    """
+
+    def __init__(self, *arguments: str) -> None:
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the program)
+        # The `rerun` on the path is a wrapper that does not end its child when it is ended.
+        path = Path(rerun_cli.__file__).with_name("rerun.exe" if os.name == "nt" else "rerun")
+        super().__init__(
+            [str(path), "--bind", HOST, *arguments],
+            env={**os.environ, "CI": "1", "RUST_LOG": "warn"},  # CI switches the telemetry off
+            stdout=self._output,
+            stderr=self._output,
+            start_new_session=True,
+        )
+
+    def __exit__(self, *error: Any) -> None:
+        self.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.wait(timeout=5)
+        self.kill()
+        super().__exit__(*error)
+        self._output.close()
+
+    def until_end(self) -> None:
+        """Wait until it ends.
+
+        Raises:
+            CdmisfaError: it ends with an error.
+        """
+        if self.wait():
+            raise self._failure()
+
+    def _failure(self) -> CdmisfaError:
+        self._output.seek(0)
+        lines = self._output.read().decode("utf-8", "replace").split("\n")
+        last = next((line for line in reversed(lines) if line.strip()), "it does not say why")
+        why = next((line for line in lines if "panicked" in line), last)
+        return CdmisfaError(f"the viewer ended with code {self.returncode}: {why.strip()}")
+
+    def ask(self, question: Callable[[], Any]) -> Any:
+        """Repeat a question until its answer is true; Rerun's client raises until it has one.
+
+        Raises:
+            CdmisfaError: the program ended, or there is no answer in time.
+        """
+        end = time.monotonic() + SECONDS
+        while time.monotonic() < end:
+            if self.poll() is not None:
+                raise self._failure()
+            with contextlib.suppress(OSError, RuntimeError, ValueError):
+                if answer := question():
+                    return answer
+            time.sleep(0.05)
+        raise CdmisfaError(f"the viewer does not answer within {SECONDS:.0f} s")
+
+    def shown(self, port: str, frame: int | None) -> Any:
+        """Return Rerun's client of the viewer once that shows its view, at a frame.
+
+        Args:
+            port: where the viewer listens.
+            frame: where the time cursor is put; None leaves it at the end.
+        """
+        from rerun.experimental import ViewerClient
+
+        from replay.view.columns import FRAME
+
+        client = self.ask(lambda: ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy"))
+        self.ask(lambda: is_painted(client))
+        if frame is not None:
+            client.set_time(FRAME, sequence=frame, play_state="paused")
+        return client
+
+
+def is_painted(client: Any) -> bool:
+    """Return whether a viewer shows everything that it was given."""
+    state = client.get_state()
+    return bool(state.recordings) and bool(state.views) and not state.loading
+
+
+def open_window(view: Path, frame: int | None = None) -> None:
+    """Show an .rrd file in a window, at a frame, until the window is closed.
+
+    Raises:
+        CdmisfaError: there is no display, or the viewer ends with an error.
+    """
+    if not has_display():
+        raise CdmisfaError(
+            "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
+            "--screenshot"
+        )
+    port = str(free_port())
+    with Program("--port", port, str(view)) as viewer:
+        if frame is not None:
+            viewer.shown(port, frame)
+        viewer.until_end()
+
+
+@contextlib.contextmanager
+def served(view: Path, port: int = 0) -> Iterator[tuple[Program, str]]:
+    """Serve an .rrd file to browsers on this machine.
+
+    Args:
+        view: the file.
+        port: of the page; by default a free one.
+
+    Yields:
+        The server, and the address of the page.
+
+    Raises:
+        CdmisfaError: the port is taken.
+    """
+    data = free_port()
+    with _page(port, f"rerun+http://{HOST}:{data}/proxy", "--port", str(data), str(view)) as page:
+        yield page
+
+
+@contextlib.contextmanager
+def watched(data: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Show a live view in a window, or where there is no display at a page.
+
+    The window stays open afterwards, and keeps what it shows.
+
+    Args:
+        data: address of the live view.
+        say: called with a line that names the address.
+    """
+    if has_display():
+        say(f"live view {data}")
+        Program("--port", str(free_port()), "--connect", data)
+        yield
+        return
+    with _page(0, data, data) as (_, address):
+        say(f"live view {address}    look at it in a browser of this machine")
+        yield
+
+
+@contextlib.contextmanager
+def _page(port: int, data: str, *words: str) -> Iterator[tuple[Program, str]]:
+    """Serve the viewer's page, which shows what is at an address."""
+    port = free_port(port)
+
+    def answers() -> bool:
+        with socket.create_connection((HOST, port)):
+            return True
+
+    with Program("--serve-web", "--web-viewer-port", str(port), *words) as server:
+        server.ask(answers)
+        yield server, f"http://{HOST}:{port}/?url={quote(data, safe='')}"
+
+
+def screenshot(view: Path, out: Path, frame: int | None = None) -> None:
+    """Draw an .rrd file as a PNG without a screen.
+
+    Args:
+        view: the file.
+        out: the PNG file, which is replaced.
+        frame: where the time cursor stands; by default at the end.
+
+    Raises:
+        CdmisfaError: there is no driver, or the viewer fails.
+    """
+    if sys.platform.startswith("linux") and not vulkan_drivers():
+        raise UsageError(f"{out} cannot be drawn, no Vulkan driver is installed: {INSTALL}")
+    port = str(free_port())
+    words = ("--headless", "--hide-welcome-screen", "--window-size", WINDOW)
+    with Program(*words, "--port", port, str(view)) as viewer:
+        client = viewer.shown(port, frame)
+        time.sleep(SETTLE)
+        viewer.ask(lambda: is_painted(client))
+        png = bytes(viewer.ask(client.take_screenshot))
+    with atomic_write(out) as partial:
+        partial.write_bytes(png)
+
+
+def frame_at(path: Path, at: str) -> int:
+    """Return the frame of a moment.
+
+    Args:
+        path: a run or recording, or an .rrd file.
+        at: a frame, as "20000"; of a run also an iteration, as "iteration 500", or words of an
+            event, as "module 2": the first one that has them.
+
+    Raises:
+        UsageError: there is no such iteration or event.
+        LogDamagedError: the log cannot be read.
+    """
+    if at.isdecimal():
+        return int(at)
+    if path.suffix == ".rrd" or not holds_run(path):
+        raise UsageError(f"--at {at}: only a run has iterations and events, name a frame")
+    if found := ITERATION.fullmatch(at.strip()):
+        for columns in read_columns(path):
+            for frame in columns.frames[columns.iterations == int(found[1])]:
+                return int(frame)
+    else:
+        words = re.compile(rf"\b{re.escape(at.strip())}\b", re.IGNORECASE)
+        for batch in read_batches(path, topics=(EVENT_TOPIC,)):
+            for event in batch.events:
+                if words.search(event.text):
+                    return int(event.t)
+    raise UsageError(f"--at {at!r} is no frame, iteration or event of {path}")
+
+
+def free_port(port: int = 0) -> int:
+    """Return a port of this machine at which nothing listens.
+
+    Args:
+        port: the one that is wanted; 0 for any.
+
+    Raises:
+        CdmisfaError: it is taken, or not for this user.
+    """
+    with socket.socket() as probe:
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise CdmisfaError(f"--port {port}: {error.strerror}, choose another one") from error
+        return int(probe.getsockname()[1])
+
+
+def has_display() -> bool:
+    """Return whether a window can be opened."""
+    return not sys.platform.startswith("linux") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
+
+
+def vulkan_drivers() -> list[Path]:
+    """Return the manifests of the Vulkan drivers that a loader would find."""
+    chosen = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    if chosen:
+        return [p for p in map(Path, chosen.split(os.pathsep)) if p.exists()]
+    shared = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
+    folders = (Path(f, "vulkan", "icd.d") for f in ("/etc", *shared.split(os.pathsep)))
+    return sorted(file for folder in folders for file in folder.glob("*.json"))

@@ -1,1 +1,0 @@
-"""The program that shows a view: its window, its page, its pictures."""
