@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import threading
-from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -21,9 +19,6 @@ PARTIAL: Final = ".partial"
 OPEN_FILES = 24
 """Files of recordings that are open at once; a recording in parts has thousands."""
 
-_MARK: Final = 4096
-"""Bytes at both ends of a growing file by which it is recognised."""
-
 _PEEK: Final = 4096
 _PEEK_FAR: Final = 256
 """Bytes read ahead at a place that is far from the last."""
@@ -33,33 +28,30 @@ _BLOCK: Final = 1024 * 1024
 """Bytes that a pass over a file reads at once."""
 
 
-class Store(ABC):
+class Store:
     """`size` bytes of a file, read at any place, short pieces through one small window."""
 
-    size: int
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, size: int) -> None:
+        self.path, self.size = path, size
         self._window = b""
         self._window_at = 0
 
-    @abstractmethod
     def read_at(self, offset: int, count: int) -> bytes:
-        """Up to `count` bytes from `offset` on; none where the file ends by now.
+        """Return up to `count` bytes from `offset` on; none where the file ends by now.
 
         Raises:
             LogDamagedError: they cannot be read.
         """
+        raise NotImplementedError
 
-    @abstractmethod
     def close(self) -> None:
         """Close it; harmless when called twice."""
 
-    def expect(self, spans: Sequence[tuple[int, int]]) -> None:  # noqa: B027 - a hint
+    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
         """Announce the ranges [start, stop) that will be read, one after the other."""
 
     def changed(self) -> bool:
-        """Whether it was written to since it was opened, other than by its recorder."""
+        """Return whether it was written to since it was opened, other than by its recorder."""
         return False
 
     def peek(self, offset: int, count: int) -> bytes:
@@ -123,16 +115,14 @@ class FileStore(Store):
         Raises:
             UsageError: it cannot be opened.
         """
-        super().__init__(path)
         self._closed = False
-        self._mark = b""
         try:
             file = _Descriptor(path)
             self._seen = os.fstat(file.number)
-            self._keep(file)
         except OSError as error:
             raise UsageError(f"{path}: {error.strerror}") from None
-        self.size = self._seen.st_size
+        super().__init__(path, self._seen.st_size)
+        self._keep(file)
 
     def read_at(self, offset: int, count: int) -> bytes:
         file = self._open()
@@ -169,11 +159,10 @@ class FileStore(Store):
         with _LOCK:
             file = _OPEN.get(self)
         try:
-            now = os.stat(str(self.path)) if file is None else os.fstat(file.number)
+            now = os.stat(self.path) if file is None else os.fstat(file.number)
         except OSError as error:
             raise LogDamagedError(f"{self.path}: {error.strerror}") from None
-        same = os.path.samestat(now, self._seen) and self._unchanged(now)
-        return not same and self.path.suffix != PARTIAL
+        return not self._is(now)
 
     def close(self) -> None:
         self._closed = True
@@ -193,41 +182,29 @@ class FileStore(Store):
     def _opened_again(self) -> _Descriptor:
         """Open the very file that was opened before."""
         try:
-            path = Path(str(self.path))
-            if os.path.samestat(os.stat(path), self._seen):  # else it may be no file any more
-                file = _Descriptor(path)
-                now = os.fstat(file.number)
-                known = self._unchanged(now) or self._is_grown(file)
-                if known and os.path.samestat(now, self._seen):
+            if self._is(os.stat(self.path)):  # else it may be no file any more
+                file = _Descriptor(self.path)
+                if self._is(os.fstat(file.number)):
                     self._keep(file)
                     return file
         except OSError as error:
             raise LogDamagedError(f"{self.path}: {error.strerror} while it was read") from None
         raise LogDamagedError(f"{self.path}: it was replaced while it was read")
 
-    def _unchanged(self, now: os.stat_result) -> bool:
-        return (now.st_size, now.st_mtime_ns) == (self.size, self._seen.st_mtime_ns)
-
-    def _is_grown(self, file: _Descriptor) -> bool:
-        """Whether a file is this one, which was still written when it was closed, and is longer."""
-        longer = os.fstat(file.number).st_size >= self.size
-        return self._mark != b"" and longer and self._marks(file) == self._mark
-
-    def _marks(self, file: _Descriptor) -> bytes:
-        """The first and the last bytes of what is known of a file."""
-        count = min(_MARK, self.size)
-        return os.pread(file.number, count, 0) + os.pread(file.number, count, self.size - count)
+    def _is(self, now: os.stat_result) -> bool:
+        """Return whether a file is the one that was opened; one being recorded may be longer."""
+        if self.path.suffix == PARTIAL:
+            same = now.st_size >= self.size
+        else:
+            same = (now.st_size, now.st_mtime_ns) == (self.size, self._seen.st_mtime_ns)
+        return same and os.path.samestat(now, self._seen)
 
     def _keep(self, file: _Descriptor) -> None:
-        """Hold a file open, and close others; of those that still grow a mark is kept."""
+        """Hold a file open, and close others."""
         with _LOCK:
             _OPEN[self] = file
-            if (above := len(_OPEN) - OPEN_FILES) > 0:
-                for one in [f for f in _OPEN if f is not self][:above]:
-                    closed = _OPEN.pop(one)
-                    if one.path.suffix == PARTIAL:
-                        with contextlib.suppress(OSError):  # then it is not opened again
-                            one._mark = one._marks(closed)
+            for one in [f for f in _OPEN if f is not self][: max(len(_OPEN) - OPEN_FILES, 0)]:
+                _OPEN.pop(one)
 
 
 class _Descriptor:
@@ -255,9 +232,8 @@ class OnePass(Store):
     """
 
     def __init__(self, store: Store) -> None:
-        super().__init__(store.path)
-        self.size = self._end = store.size
-        self._store = store
+        super().__init__(store.path, store.size)
+        self._store, self._end = store, store.size
         self._passed_crc = 0
         self._window_at = -1
         if self.size <= _BLOCK:

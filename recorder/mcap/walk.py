@@ -181,8 +181,8 @@ class LogStructure:
         if self.data_crc is not None and self._limit is None and not self.missing:
             self.missing = "cut short: its summary is not all there, every message is"
         self.complete = self._limit is not None and self.data_crc is not None
-        if self.complete:
-            self._compare_with_summary()
+        if self.complete and self.summary:
+            self._compare_with(self.summary)
 
     # The outer records
 
@@ -389,23 +389,12 @@ class LogStructure:
         lies = self._resync and self.summary is not None and self.summary.broken
         self._limit = self.summary.begin if self.summary and not lies else None
 
-    def _compare_with_summary(self) -> None:
-        assert self.summary is not None
-        stated, named = self.summary.statistics, self.summary.named
-        chunks = [s for s in self.segments if s.chunked]
-        if named and [c.offset for c in chunks] != named:
+    def _compare_with(self, summary: Summary) -> None:
+        """Refuse a summary that tells of other chunks, or of another number of messages."""
+        if summary.named and [s.offset for s in self.segments if s.chunked] != summary.named:
             self._refuse("summary", "its chunk index does not name the chunks that are there")
-        if stated is None:
-            return
-        found = {
-            "chunks": (stated.chunk_count, len(chunks)),
-            "attachments": (stated.attachment_count, len(self.attachments)),
-            "metadata records": (stated.metadata_count, len(self.metadata)),
-        }
         counts = [s.channel_counts() for s in self.segments]
-        if all(c is not None for c in counts):
-            total = sum(sum(c.values()) for c in counts if c is not None)
-            found["messages"] = (stated.message_count, total)
-        for what, (said, there) in found.items():
-            if said != there:
-                self._refuse("statistics of the summary", f"{said} {what} stated, {there} there")
+        there = sum(sum(count.values()) for count in counts if count)
+        stated = summary.statistics.message_count if summary.statistics else there
+        if stated != there and None not in counts:
+            self._refuse("summary", f"it states {stated} messages, there are {there}")

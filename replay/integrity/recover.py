@@ -16,13 +16,13 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.files import make_folder, refuse_unless
 from recorder.log.logfile import LogFile
 from recorder.mcap.chunks import UNUSED
-from recorder.mcap.mending import mended
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem
 from recorder.mcap.store import PARTIAL, FileStore
 from replay.camera_logs.opening import only_foreign
 from replay.integrity.counting import ChannelCount
 from replay.integrity.info import SCHEMA, problems_of
+from replay.integrity.mending import mended
 from replay.storage.location import location
 from replay.storage.opening import log_files
 

@@ -144,7 +144,8 @@ def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
         columns = {name.removeprefix(_MODULES): arrays.pop(name) for name in of_modules}
         state = LearnerState(arrays, _modules(columns), dict(facts["policy_rng"]))
         return Keyframe(decoded.iteration, decoded.t, state, dict(facts["versions"]))
-    except (LookupError, TypeError, ValueError, OverflowError) as error:
+    # SystemError is NumPy's for text with code points that are no characters.
+    except (LookupError, TypeError, ValueError, OverflowError, SystemError) as error:
         raise LogDamagedError(f"{where}: not a keyframe ({one_line(error)})") from error
 
 

@@ -65,7 +65,7 @@ def load_modules(path: Path) -> tuple[Module, ...]:
         return tuple(_module(stored, index) for index in _indices(stored))
     except FileNotFoundError as error:
         raise UsageError(f"{path} does not exist: name a run's folder") from error
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, SystemError) as error:
         raise LogDamagedError(f"{path} holds no modules ({one_line(error)})") from error
 
 

@@ -35,8 +35,7 @@ class MendedStore(Store):
     """A log with some bytes replaced; `mended` lists what was wrong."""
 
     def __init__(self, store: Store) -> None:
-        super().__init__(store.path)
-        self.size = store.size
+        super().__init__(store.path, store.size)
         self.mended: list[Problem] = []
         self._store = store
         self._places: list[int] = []
