@@ -63,8 +63,8 @@ CASES: dict[str, tuple[str, ...]] = {
     "view RUN --topic /a --save v.rrd": ("is a run: --topic is for logs",),
     "sweep oscillatory -o x --seeds 1,4,0:2": ("--seeds 1,4,0:2: 1 stands there twice",),
     "learn oscillatory --set learner.beta=foo": ("'foo': it must be a number, or auto",),
-    "learn oscillatory --seed abc": ("'--seed': 'abc' is no whole number",),
-    "record oscillatory -o x --rate abc": ("'abc' is no number",),
+    "learn oscillatory --seed abc": ("'--seed': 'abc' is not a valid integer",),
+    "record oscillatory -o x --rate abc": ("'abc' is not a valid float",),
     "learn oscillatory --resume -o RUN --algorithm progress": (
         "was made with learner.algorithm = 2.0, not progress",
     ),

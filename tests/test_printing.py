@@ -28,7 +28,7 @@ def test_a_table_on_a_terminal_fits_and_loses_nothing(
     print_table(("name", "about"), rows)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 24
-    said = "".join(itertools.chain.from_iterable(line[6:].split() for line in lines[2:]))
+    said = "".join(itertools.chain.from_iterable(line[6:].split() for line in lines[1:]))
     assert said == "".join(about.replace(" ", "") for _, about in rows)
 
 

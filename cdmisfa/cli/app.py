@@ -1,7 +1,7 @@
 """The group of commands, and how every way out of them becomes an exit code.
 
-A command's module is imported only when that command runs, so that `--help` and
-completion never wait for numpy, PyBullet or Rerun.
+A command's module is imported only when that command runs, and imports the library inside the
+command, so that `--help` never waits for numpy, PyBullet or Rerun.
 """
 
 from __future__ import annotations
@@ -27,73 +27,25 @@ from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.untrusted import printable
 from replay.storage.location import with_urls
 
-GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
-    "Record": {
-        "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
-        "convert": ("record", "Write camera logs of others as a recording."),
-    },
-    "Learn": {
-        "learn": (
-            "learn",
-            "Learn slow feature modules from a scene, a recording, logs or cameras.",
-        ),
-        "fork": (
-            "moments",
-            "Go on from some iteration of a run with other settings, as a run of its own.",
-        ),
-        "sweep": ("trials", "Learn from a source many times, over a grid of settings and seeds."),
-        "apply": ("apply", "Apply the modules of a run to other logs."),
-    },
+GROUPS: Mapping[str, Mapping[str, str]] = {
+    "Record": {"record": "record", "convert": "record"},
+    "Learn": {"learn": "learn", "fork": "moments", "sweep": "trials", "apply": "apply"},
     "Look": {
-        "view": (
-            "view",
-            "Open a run or a recording in the Rerun viewer, or save, serve or draw it.",
-        ),
-        "report": (
-            "report",
-            "Write what came of a run as one HTML page, to be read, printed or sent.",
-        ),
-        "info": ("info", "Say what is in a recording, a run, any MCAP file, or a camera log."),
-        "results": (
-            "trials",
-            "Print mean and standard deviation over seeds at each point of a sweep.",
-        ),
-        "signals": ("logs", "List every signal that a run records."),
+        "view": "view",
+        "report": "report",
+        "info": "info",
+        "results": "trials",
+        "signals": "logs",
     },
-    "Compare and check": {
-        "compare": ("logs", "Check that runs' signals are the same bits, and show their curves."),
-        "check": (
-            "moments",
-            "Learn a run again from its source, and compare every signal bit for bit.",
-        ),
-        "at": ("moments", "Say what a learner was after K iterations of a run, exactly."),
-    },
-    "Keep": {
-        "verify": ("logs", "Check that a log is whole: structure, checksums, nothing lost."),
-        "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
-        "export": (
-            "logs",
-            "Write a run's signals as a table or arrays, a recording as images, videos or a "
-            "dataset.",
-        ),
-    },
-    "Many logs": {
-        "index": ("corpus", "Index what is in many logs: streams, times, damage, doubles."),
-    },
-    "Studies": {
-        "reproduce": (
-            "trials",
-            "Reproduce an experiment of the paper: numbers, tables and figures.",
-        ),
-        "demo": ("trials", "Record, learn, check and show: the whole story in minutes."),
-    },
-    "This machine": {
-        "doctor": ("doctor", "Say what this machine has and what it lacks."),
-    },
+    "Compare and check": {"compare": "logs", "check": "moments", "at": "moments"},
+    "Keep": {"verify": "logs", "recover": "logs", "export": "logs"},
+    "Many logs": {"index": "corpus"},
+    "Studies": {"reproduce": "trials", "demo": "trials"},
+    "This machine": {"doctor": "doctor"},
 }
-"""Each command by its heading of --help, with its module in this package and its line of help."""
+"""Each command by its heading of --help, with its module in this package."""
 
-COMMANDS = {name: told for group in GROUPS.values() for name, told in group.items()}
+COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
 """The same without headings."""
 
 LONGEST_NAME = 255
@@ -115,7 +67,7 @@ class LazyGroup(click.Group):
         """Import the command."""
         if cmd_name not in COMMANDS:
             return None
-        module = importlib.import_module(f"cdmisfa.cli.commands.{COMMANDS[cmd_name][0]}")
+        module = importlib.import_module(f"cdmisfa.cli.commands.{COMMANDS[cmd_name]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 
@@ -128,12 +80,18 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands without importing them."""
+        """List the commands below their headings."""
         width = max(map(len, COMMANDS))  # one for all groups
-        for heading, commands in GROUPS.items():
+        for heading, names in GROUPS.items():
+            commands = {name: self.get_command(ctx, name) for name in names}
             with formatter.section(heading):
-                rows = [(name.ljust(width), text) for name, (_, text) in commands.items()]
-                formatter.write_dl(rows)
+                formatter.write_dl(
+                    [
+                        (name.ljust(width), (command.help or "").partition("\n")[0])
+                        for name, command in commands.items()
+                        if command is not None
+                    ]
+                )
 
 
 @click.group(

@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli.making import (
-    WRITTEN,
-    Command,
-    choice,
-    flag,
-    number,
-    option,
-    together,
-    word,
-)
 from cdmisfa.cli.printing import Stderr
 from cdmisfa.core.errors import TooSmallError, UsageError
 from cdmisfa.core.options import parse_settings
@@ -26,6 +17,8 @@ from replay.storage.location import location
 
 if TYPE_CHECKING:
     from recorder.images.options import InputOptions
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class LocalPath(click.Path):
@@ -47,47 +40,88 @@ WORD = click.Path(readable=False)
 """A path, URL or other word of a source; a shell completes it as a file."""
 
 
-INPUTS: Mapping[str, Callable[[Command], Command]] = {
-    "topics": option(
+class Size(click.ParamType[Any]):
+    """A size, WIDTHxHEIGHT, as (height, width)."""
+
+    name = "size"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """See `click.ParamType`."""
+        if not isinstance(value, str):
+            return value
+        found = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", value, re.ASCII)
+        if found is None:
+            self.fail(f"{value!r} is no size: write WIDTHxHEIGHT, as 128x48", param, ctx)
+        return int(found[2]), int(found[1])
+
+
+class Time(click.ParamType[Any]):
+    """A time, [[HOURS:]MINUTES:]SECONDS, as seconds."""
+
+    name = "time"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """See `click.ParamType`."""
+        if not isinstance(value, str):
+            return value
+        pattern = r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d{1,9})?)"
+        found = re.fullmatch(pattern, value, re.ASCII)
+        if found is None:
+            words = "write seconds, or MINUTES:SECONDS, as 1:30"
+            self.fail(f"{value!r} is no time: {words}", param, ctx)
+        hours, minutes, seconds = (float(part or 0) for part in found.groups())
+        return hours * 3600 + minutes * 60 + seconds
+
+
+INPUTS: Mapping[str, Decorator] = {
+    "topics": click.option(
         "--topic",
         "topics",
+        multiple=True,
         metavar="TOPIC",
         help="A topic of a log, a stream each, or a pattern of them, as '/cam*'; repeatable.",
-        multiple=True,
     ),
-    "fields": option(
+    "fields": click.option(
         "--field",
         "fields",
+        multiple=True,
         metavar="FIELD",
         help="Take numbers instead of images: a field of a topic's messages, as pose.position.x or "
         "ranges[0:100], or a column of a table; several are one vector.",
-        multiple=True,
     ),
-    "size": word(
+    "size": click.option(
         "--size",
-        "WxH",
-        "Shrink images to this size; by default to what has their ratio of the sides and no more "
-        "pixels than 128x48.",
-        type=WRITTEN["WxH"],
+        type=Size(),
+        metavar="WxH",
+        help="Shrink images to this size; by default to one of their ratio of the sides with no "
+        "more pixels than 128x48.",
     ),
-    "rate": number("--rate", "Frames a second; by default the first stream's.", *(1e-3, 1e6, "HZ")),
-    "start": word(
+    "rate": click.option(
+        "--rate",
+        type=click.FloatRange(1e-3, 1e6),
+        metavar="HZ",
+        help="Frames a second; by default the first stream's.",
+    ),
+    "start": click.option(
         "--start",
-        "TIME",
-        "Leave out what a log has before this time, in seconds or as MINUTES:SECONDS.",
-        type=WRITTEN["TIME"],
+        type=Time(),
+        metavar="TIME",
         default="0",
+        help="Leave out what a log has before this time, in seconds or as MINUTES:SECONDS.",
     ),
-    "end": word(
-        "--end", "TIME", "Leave out what a log has from this time on.", type=WRITTEN["TIME"]
+    "end": click.option(
+        "--end",
+        type=Time(),
+        metavar="TIME",
+        help="Leave out what a log has from this time on.",
     ),
-    "align": option(
+    "align": click.option(
         "--align",
         type=click.Choice(["index", "time"]),
         help="Put streams that differ on one clock: the i-th image of each, or the last image at "
         "each time. By default they are refused.",
     ),
-    "color": option(
+    "color": click.option(
         "--color",
         type=click.Choice(["on", "off", "auto"]),
         is_flag=False,
@@ -100,7 +134,7 @@ INPUTS: Mapping[str, Callable[[Command], Command]] = {
 """Options of commands that read external logs, by the names of `InputOptions`."""
 
 
-def input_options(*names: str, keys: bool = False) -> Callable[[Command], Command]:
+def input_options(*names: str, keys: bool = False) -> Decorator:
     """Options of `INPUTS`, all or those named; the command gets them as `inputs`.
 
     Args:
@@ -109,7 +143,7 @@ def input_options(*names: str, keys: bool = False) -> Callable[[Command], Comman
     """
     chosen = names or tuple(INPUTS)
 
-    def wrapped(command: Command) -> Command:
+    def wrapped(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
         def with_inputs(*args: Any, **values: Any) -> Any:
             from recorder.images.options import InputOptions
@@ -126,10 +160,12 @@ def input_options(*names: str, keys: bool = False) -> Callable[[Command], Comman
                 remedy = ", or a smaller --size" if "size" in given else ""
                 raise UsageError(f"{error}{remedy}") from None
 
-        each = [INPUTS[name] for name in chosen]
+        decorated: Callable[..., Any] = with_inputs
         if keys:
-            each.append(settings("Set a key input.*, as input.fit=pad; repeatable.", "KEY=VALUE"))
-        return together(*each)(cast(Command, with_inputs))
+            decorated = settings("Set a key input.*, as input.fit=pad; repeatable.")(decorated)
+        for name in reversed(chosen):
+            decorated = INPUTS[name](decorated)
+        return decorated
 
     return wrapped
 
@@ -141,29 +177,44 @@ def _with_keys(inputs: InputOptions, settings: Sequence[str]) -> InputOptions:
     return inputs.configured(words.get("input", {}))
 
 
-loop = flag("--loop", "Start a recording or log again at its end.", group="Source")
-salvage = flag("--salvage", "Pass over damaged parts and images of a log.", group="Source")
-force = flag("--force", "Overwrite what is already there.")
-no_rerun = flag("--no-rerun", "Do not build the Rerun view run.rrd.")
-retry_failed = flag("--retry-failed", "Compute trials again that failed before.")
-as_json = option(
+look_options = input_options("topics", "fields", "rate", keys=True)
+"""Which streams of external logs are shown or exported."""
+
+loop = click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
+salvage = click.option(
+    "--salvage", is_flag=True, help="Pass over damaged parts and images of a log."
+)
+force = click.option("--force", is_flag=True, help="Overwrite what is already there.")
+no_rerun = click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+retry_failed = click.option(
+    "--retry-failed", is_flag=True, help="Compute trials again that failed before."
+)
+as_json = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
 )
-jobs = number("--jobs", "Parallel processes.", 1, 1024, default=1)
-preset = word(
+jobs = click.option(
+    "--jobs", type=click.IntRange(1, 1024), default=1, show_default=True, help="Parallel processes."
+)
+preset = click.option(
     "--preset",
-    "NAME",
-    "Preset (icub, icub-real, oscillatory, cameras) or a .toml file; by default the source's.",
-    group="Learner",
+    metavar="NAME",
+    help="Preset (icub, icub-real, oscillatory, cameras) or a .toml file; by default the source's.",
 )
-engine = together(
-    choice(
+
+
+def engine(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--engine` and `--scheduler`."""
+    scheduler = click.option(
+        "--scheduler", metavar="ADDRESS", help="Address of a dask scheduler that runs."
+    )
+    where = click.option(
         "--engine",
-        "Where to compute: in processes of this machine, or in workers of dask.",
-        ("local", "dask"),
-    ),
-    word("--scheduler", "ADDRESS", "Address of a dask scheduler that runs."),
-)
+        type=click.Choice(["local", "dask"]),
+        default="local",
+        show_default=True,
+        help="Where to compute: in processes of this machine, or in workers of dask.",
+    )
+    return where(scheduler(command))
 
 
 def _be_quiet(ctx: click.Context, param: click.Parameter, given: bool) -> None:
@@ -181,53 +232,38 @@ quiet = click.option(
 """`-q`, of the program and of commands that show how far they are."""
 
 
-def seed(
-    about: str = "Seed of every random choice.", default: int | None = 0
-) -> Callable[[Command], Command]:
-    """`--seed`."""
-    return number("--seed", about, 0, 2**63 - 1, default=default, group="Learner")
-
-
-def seeds(about: str, default: str) -> Callable[[Command], Command]:
-    """`--seeds`, which `parse_seeds` reads."""
-    about += ": a range without its end, or numbers with commas, as 1,5,9."
-    return word("--seeds", "FIRST:END", about, default=default, show_default=True)
-
-
-def settings(
-    about: str = "Set a configuration key, as learner.nu=0.02; may be repeated.",
-    unit: str = "KEY=VALUE",
-) -> Callable[[Command], Command]:
+def settings(help: str = "Set a configuration key, as learner.nu=0.02; repeatable.") -> Decorator:
     """`--set`."""
-    how: dict[str, Any] = {"metavar": unit, "help": about, "group": "Learner"}
-    return option("--set", "settings", multiple=True, **how)
+    return click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help=help)
 
 
-def end_after(what: str, about: str) -> Callable[[Command], Command]:
+def seed(help: str = "Seed of every random choice.", default: int | None = 0) -> Decorator:
+    """`--seed`."""
+    kind = click.IntRange(0, 2**63 - 1)
+    return click.option("--seed", type=kind, default=default, show_default=True, help=help)
+
+
+def end_after(what: str, help: str) -> Decorator:
     """`--max-iterations` or `--max-modules`."""
-    return number(f"--max-{what}", about, 1, group="Learner")
+    return click.option(f"--max-{what}", type=click.IntRange(1), help=help)
 
 
-def path(
-    name: str, about: str, unit: str | None = None, **how: Any
-) -> Callable[[Command], Command]:
-    """An option that is a path of this machine."""
-    return option(name, type=OUT, metavar=unit, help=about, **how)
-
-
-def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]:
+def out(help: str, *, required: bool = False) -> Decorator:
     """`-o`: where the result goes."""
-    return option("-o", "--out", type=OUT, required=required, help=meaning)
+    return click.option("-o", "--out", type=OUT, required=required, help=help)
 
 
-def path_argument(name: str) -> Callable[[Command], Command]:
+def path(name: str, metavar: str, help: str) -> Decorator:
+    """An option that is a path of this machine."""
+    return click.option(name, type=OUT, metavar=metavar, help=help)
+
+
+def path_argument(name: str) -> Decorator:
     """A path of this machine; whether it exists is for the library to say, in its own words."""
     return click.argument(name, type=OUT)
 
 
-def log_argument(
-    name: str, *, nargs: int = 1, required: bool = True
-) -> Callable[[Command], Command]:
+def log_argument(name: str, *, nargs: int = 1, required: bool = True) -> Decorator:
     """A log's path or URL, or several, of which patterns are replaced by what matches them."""
 
     def opened(
@@ -241,9 +277,4 @@ def log_argument(
             return tuple(locations(value))
         return location(value)
 
-    how: dict[str, Any] = {"callback": opened, "type": WORD}
-    return click.argument(name, nargs=nargs, required=required, **how)
-
-
-look_options = input_options("topics", "fields", "rate", keys=True)
-"""Which streams of external logs are shown or exported."""
+    return click.argument(name, nargs=nargs, required=required, callback=opened, type=WORD)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import shlex
-import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,10 +22,6 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
-
-
-NARROWEST = 8
-"""Letters of a column in which words are broken, or fewer where it needs no more."""
 
 
 def quoted(path: str | Path) -> str:
@@ -59,63 +53,35 @@ def print_document(**each: Any) -> None:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Rows of cells in aligned columns under a ruled head, on stdout; it fits into a terminal.
+    """Print rows of cells in columns below a head, on stdout.
 
-    Where it does not, its widest cells go on in the next lines. What no terminal shows has a line
-    a row, for other programs.
+    A terminal gets a table that fits, with long cells broken; other programs get a line a row.
     """
-    from rich.cells import cell_len
-
     cells = [[printable(with_urls(str(cell))) for cell in row] for row in (head, *rows)]
-    columns = list(zip(*cells, strict=True))
-    widths = [max(map(cell_len, column)) for column in columns]
     if sys.stdout.isatty():
-        words = [
-            max(cell_len(word) for cell in column for word in cell.split(" ")) for column in columns
-        ]
-        room = shutil.get_terminal_size().columns
-        widths = fitting(fitting(widths, words, room), [NARROWEST] * len(widths), room)
+        from rich.console import Console  # takes a tenth of a second
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="")
+        for name in cells[0]:
+            table.add_column(Text(name), overflow="fold")
+        for row in cells[1:]:
+            table.add_row(*map(Text, row))
+        Console().print(table)
+        return
+    from rich.cells import cell_len  # wide letters take two places, accents none
+
+    widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
     cells.insert(1, ["-" * width for width in widths])
     for row in cells:
-        parts = [_wrapped(c, w) for c, w in zip(row, widths, strict=True)]
-        for line in itertools.zip_longest(*parts, fillvalue=""):
-            filled = (c + " " * (w - cell_len(c)) for c, w in zip(line, widths, strict=True))
-            print_line("  ".join(filled).rstrip())
-
-
-def _wrapped(text: str, width: int) -> list[str]:
-    """Lines of a text, of so many places of a terminal: wide letters take two, accents none."""
-    from rich.cells import cell_len
-
-    if cell_len(text) <= width:
-        return [text]
-    from rich.console import Console
-    from rich.text import Text
-
-    lines = Text(text).wrap(Console(width=width), width)
-    return [line.plain.rstrip() for line in lines]
+        filled = (c + " " * (w - cell_len(c)) for c, w in zip(row, widths, strict=True))
+        print_line("  ".join(filled).rstrip())
 
 
 def print_columns(columns: Mapping[str, Sequence[Any]]) -> None:
     """Columns below their names, as `print_table` does."""
     print_table(list(columns), list(zip(*columns.values(), strict=True)))
-
-
-def fitting(widths: Sequence[int], least: Sequence[int], room: int) -> list[int]:
-    """Widths of columns, two spaces apart, of which the widest are narrowed until all fit.
-
-    Args:
-        widths: that they would like to have.
-        least: that they keep, even where they do not fit.
-        room: for all of them.
-    """
-    fit = list(widths)
-    while sum(fit) + 2 * (len(fit) - 1) > room:
-        spare = [width if width > keeps else 0 for width, keeps in zip(fit, least, strict=True)]
-        if not any(spare):
-            break
-        fit[spare.index(max(spare))] -= 1
-    return fit
 
 
 def say_failed(rows: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:

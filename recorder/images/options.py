@@ -142,9 +142,10 @@ class InputOptions(InputConfig):
         Raises:
             UsageError: a value that does not fit; it names the option or the key.
         """
-        for name, hint in _HINTS.items():
-            if name != "color":
-                value = convert_value(getattr(self, name), hint, option_name(name))
+        for field in fields(self):
+            value, name = getattr(self, field.name), field.name
+            if name != "color" and not (value is None and field.default is None):
+                value = convert_value(value, _HINTS[name], option_name(name))
                 object.__setattr__(self, name, value)
         if self.color not in (False, True, "auto"):
             raise UsageError(f"--color is {self.color}: give on, off or auto")
@@ -256,4 +257,8 @@ class Reading:
 IMAGES = Reading()
 """Images, and no numbers."""
 
-_HINTS: Final = typing.get_type_hints(InputOptions)
+_HINTS: Final = {
+    name: next((a for a in typing.get_args(hint) if type(None) in typing.get_args(hint)), hint)
+    for name, hint in typing.get_type_hints(InputOptions).items()
+}
+"""The types of settings, without None."""

@@ -12,7 +12,6 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.interrupts import Stop, stoppable
-from cdmisfa.cli.making import grouped, number, option
 from cdmisfa.cli.printing import (
     print_document,
     print_line,
@@ -40,19 +39,19 @@ FILE_FORMS = ("parquet", "csv", "mcap", "rrd")
 STDOUT = "stdout"
 
 
-@grouped("apply", common=("out", "to", "frames", "loop", "jobs"))
+@click.command("apply")
 @options.path_argument("run")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out(
     "The file of one log, .parquet, .csv, .mcap or .rrd (a view); or a folder, of a file a log."
 )
-@option(
+@click.option(
     "--to",
     type=click.Choice([*FILE_FORMS, STDOUT]),
     help=f"Format of the files in a folder, by default {FILE_FORMS[0]}; or {STDOUT}: print each "
     "block as a JSON line as soon as it is complete.",
 )
-@number("--frames", "End after so many frames of each stream.", 1)
+@click.option("--frames", type=click.IntRange(1), help="End after so many frames of each stream.")
 @options.loop
 @options.salvage
 @options.input_options("topics", "fields", "rate", "start", "end", "align", keys=True)

@@ -11,7 +11,6 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.info import in_bytes
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.making import flag, number
 from cdmisfa.cli.printing import (
     print_document,
     print_line,
@@ -28,14 +27,26 @@ if TYPE_CHECKING:
 MOST_GONE = 5
 """Logs that are gone, of which so many are named."""
 
-JOBS = number("--jobs", "Parallel processes; by default as many as there are processors.", 1, 1024)
+JOBS = click.option(
+    "--jobs",
+    type=click.IntRange(1, 1024),
+    help="Parallel processes; by default as many as there are processors.",
+)
 
 
 @click.command("index")
 @click.argument("corpus", nargs=-1, required=True, type=options.WORD)
 @options.out("The index, a .parquet file; by default corpus.parquet in the folder.")
-@flag("--deep", "Decode every log: checksums, gaps, shapes, and what is twice in other files.")
-@flag("--full", "Read every byte: what changed shows by SHA-256, not by size and time.")
+@click.option(
+    "--deep",
+    is_flag=True,
+    help="Decode every log: checksums, gaps, shapes, and what is twice in other files.",
+)
+@click.option(
+    "--full",
+    is_flag=True,
+    help="Read every byte: what changed shows by SHA-256, not by size and time.",
+)
 @JOBS
 @options.as_json
 @options.quiet

@@ -13,7 +13,6 @@ import click
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
-from cdmisfa.cli.making import flag, grouped, option, word
 from cdmisfa.cli.printing import (
     print_result,
     quoted,
@@ -37,19 +36,18 @@ KEPT = ("seed", "max_iterations", "max_modules")
 """Options that are handed on to the run as they are."""
 
 
-@grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
+@click.command("learn")
 @click.argument("source", nargs=-1, type=options.WORD)
 @options.out("Folder of the run; without it nothing is written.")
 @options.seed()
 @options.preset
 @options.settings()
-@word(
+@click.option(
     "--algorithm",
-    "NAME",
-    f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a "
+    metavar="NAME",
+    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a "
     "class of your own, package.module:Class. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
-    group="Learner",
 )
 @options.end_after("iterations", "End after so many iterations.")
 @options.end_after(
@@ -58,18 +56,17 @@ KEPT = ("seed", "max_iterations", "max_modules")
     "streams.",
 )
 @options.loop
-@flag("--resume", "Resume the run in -o where it was stopped.")
+@click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
 @options.salvage
-@flag("--live-view", "Show the run in Rerun while it learns.")
+@click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
 @options.no_rerun
-@flag("--episodes", "Take each log as an episode, one after the other.", group="Source")
-@option(
+@click.option("--episodes", is_flag=True, help="Take each log as an episode, one after the other.")
+@click.option(
     "--record",
     "record_to",
     type=options.OUT,
     metavar="DIR",
     help="Record what every live stream shows while learning, to learn the same from it again.",
-    group="Live streams",
 )
 @options.input_options()
 @options.force

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.making import flag, option, word
 from cdmisfa.cli.printing import (
     print_document,
     print_json,
@@ -86,7 +85,7 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
 
 @click.command("compare")
 @options.log_argument("runs", nargs=-1)
-@options.path("--save", "Also write their curves, one over the other, as a view.", "F.rrd")
+@options.path("--save", "F.rrd", "Also write their curves, one over the other, as a view.")
 @options.force
 @options.as_json
 @click.pass_context
@@ -158,7 +157,7 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
 
 @click.command("export")
 @options.log_argument("path", nargs=-1)
-@option(
+@click.option(
     "--to",
     "form",
     metavar="FORM",
@@ -166,8 +165,10 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
     "file's name ends in.",
 )
 @options.out("The file to write, for a recording the folder.", required=True)
-@flag("--lossless", "Keep every value of images in a video.")
-@word("--task", "TEXT", "What is done in a LeRobot dataset; by default what a log says.")
+@click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
+@click.option(
+    "--task", metavar="TEXT", help="What is done in a LeRobot dataset; by default what a log says."
+)
 @options.look_options
 @options.force
 @options.as_json
@@ -211,7 +212,7 @@ def _is_film(out: Path) -> bool:
 
 
 @click.command("signals")
-@flag("--markdown", "Print the page docs/reference/signals.md.")
+@click.option("--markdown", is_flag=True, help="Print the page docs/reference/signals.md.")
 @options.as_json
 def signals_command(markdown: bool, as_json: bool) -> None:
     """List every signal that a run records.

@@ -10,7 +10,6 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
-from cdmisfa.cli.making import option, word
 from cdmisfa.cli.printing import (
     outcome_line,
     print_document,
@@ -23,12 +22,12 @@ from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.names import counted
 
-source = word(
+source = click.option(
     "--source",
-    "SOURCE",
-    "What it learned from, where that is no longer what the run says, as its recording; "
-    "repeatable.",
+    metavar="SOURCE",
     multiple=True,
+    help="What it learned from, where that is no longer what the run says, as its recording; "
+    "repeatable.",
 )
 
 
@@ -89,7 +88,7 @@ def _part(ctx: click.Context, param: click.Parameter, value: str | None) -> tupl
 
 @click.command("check")
 @options.path_argument("run")
-@option(
+@click.option(
     "--iterations",
     metavar="FIRST:END",
     callback=_part,
@@ -124,7 +123,7 @@ def check_command(
 
 @click.command("fork")
 @options.path_argument("run")
-@option(
+@click.option(
     "--iteration",
     "at",
     type=click.IntRange(0),
@@ -133,7 +132,7 @@ def check_command(
     help="Continue after K iterations of the run.",
 )
 @options.out("Folder of the fork.", required=True)
-@options.settings("What the learner is told from there on; may be repeated.", "learner.KEY=VALUE")
+@options.settings("Set a key learner.* from there on; repeatable.")
 @options.seed("Seed of the random choices from there on; the world stays.", default=None)
 @options.end_after("iterations", "End after so many iterations in all; by default as the run.")
 @options.end_after("modules", "End after so many modules in all; by default as the run.")

@@ -14,7 +14,6 @@ from click.core import ParameterSource
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.streams import print_recording, record_streams, refuse_logs
 from cdmisfa.cli.interrupts import Stop, stoppable
-from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     say_about,
     say_changes,
@@ -35,32 +34,25 @@ LIVE = ("cameras", "gym")
 """What it names where it is of live streams."""
 
 
-@grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
+@click.command("record")
 @click.argument("source", nargs=-1, type=options.WORD)
 @options.out("Folder of the recording.", required=True)
-@number(
+@click.option(
     "--frames",
-    "Frames of each view; by default 1000, with --resume as many as first asked for, of cameras "
-    "until Ctrl-C.",
-    1,
+    type=click.IntRange(1),
+    help="Frames of each view; by default 1000, with --resume as many as first asked for, and of "
+    "cameras all until Ctrl-C.",
 )
 @options.seed()
-@option(
-    "--view",
-    "views",
-    multiple=True,
-    metavar="NAME",
-    help="Only this view; repeatable.",
-    group="Source",
-)
+@click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view; repeatable.")
 @options.jobs
 @options.preset
 @options.settings()
-@flag("--resume", "Resume an interrupted recording.")
-@word(
+@click.option("--resume", is_flag=True, help="Resume an interrupted recording.")
+@click.option(
     "--split",
-    "LIMIT",
-    "Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
+    metavar="LIMIT",
+    help="Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
     "--resume as first asked for.",
 )
 @options.input_options("fields", "size", "rate", "color")
@@ -171,12 +163,12 @@ def _record_scene(
         )
 
 
-@grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
+@click.command("convert")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out("Folder of the recording.", required=True)
 @options.input_options(keys=True)
 @options.salvage
-@flag("--resume", "Resume an attempt that was stopped.")
+@click.option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
 @options.force
 @options.as_json
 @options.quiet

@@ -13,7 +13,6 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.making import flag, grouped, number, word
 from cdmisfa.cli.printing import (
     print_document,
     print_json,
@@ -29,16 +28,22 @@ from cdmisfa.cli.progress import Bar, bar
 MOST_SEEDS = 1_000_000
 
 
-@grouped("sweep", common=("out", "grid", "seeds", "settings", "max_iterations", "jobs"))
+@click.command("sweep")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out("Folder of the sweep; what is finished in it is not computed again.", required=True)
-@word(
+@click.option(
     "--grid",
-    "KEY=V1,V2,...",
-    "Values to try for a configuration key; several grids multiply.",
+    metavar="KEY=V1,V2,...",
     multiple=True,
+    help="Values to try for a configuration key; several grids multiply.",
 )
-@options.seeds("Seeds of every point", "0:20")
+@click.option(
+    "--seeds",
+    metavar="FIRST:END",
+    default="0:20",
+    show_default=True,
+    help="Seeds of every point: a range without its end, or numbers with commas, as 1,5,9.",
+)
 @options.preset
 @options.settings()
 @options.end_after("iterations", "End each trial after so many iterations.")
@@ -134,7 +139,7 @@ def parse_seeds(text: str) -> list[int]:
 
 @click.command("results")
 @options.path_argument("folder")
-@flag("--csv", "Print comma-separated values.")
+@click.option("--csv", is_flag=True, help="Print comma-separated values.")
 @options.as_json
 def results_command(folder: Path, csv: bool, as_json: bool) -> None:
     """Print mean and standard deviation over seeds at each point of a sweep.
@@ -159,11 +164,13 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
 @click.command("reproduce")
 @click.argument("name")
 @options.out("Folder of the results [default: reproduction].")
-@number("--trials", "Trials per condition, instead of the paper's number.", 1)
+@click.option(
+    "--trials", type=click.IntRange(1), help="Trials per condition, instead of the paper's number."
+)
 @options.jobs
 @options.engine
-@options.path("--recording", "Recording of the iCub scene.")
-@flag("--quick", "Few trials, enough to test the claim.")
+@options.path("--recording", "DIR", "Recording of the iCub scene.")
+@click.option("--quick", is_flag=True, help="Few trials, enough to test the claim.")
 @options.as_json
 @options.quiet
 def reproduce_command(
@@ -201,7 +208,9 @@ def reproduce_command(
 @click.command("demo")
 @options.out("Folder of the recordings and runs; by default the one you are in.")
 @options.seed()
-@number("--frames", "Frames a view.", 400, default=8000)
+@click.option(
+    "--frames", type=click.IntRange(400), show_default=True, default=8000, help="Frames a view."
+)
 @options.jobs
 @options.as_json
 @options.quiet

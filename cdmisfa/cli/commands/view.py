@@ -8,34 +8,39 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.making import flag, grouped, number, word
 from cdmisfa.cli.printing import say_about, tell
 from cdmisfa.core.errors import UsageError
 from recorder.log.files import refuse_taken, refuse_unless
 
 
-@grouped("view", common=("save", "web", "screenshot", "at", "tab"))
+@click.command("view")
 @options.log_argument("run", nargs=-1)
-@options.path("--save", "Write the view to a file.", "F.rrd")
-@flag("--web", "Serve the view to a browser on this machine only.")
-@options.path("--screenshot", "Draw the view into a file, without a screen.", "F.png")
-@word(
+@options.path("--save", "F.rrd", "Write the view to a file.")
+@click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
+@options.path("--screenshot", "F.png", "Draw the view into a file, without a screen.")
+@click.option(
     "--at",
-    "WHEN",
-    'Moment to open it at: a frame, "iteration 500", or words of an event, as "module 2".',
+    metavar="WHEN",
+    help='Moment to open it at: a frame, "iteration 500", or words of an event, as "module 2".',
 )
-@word("--tab", "NAME", "Name of the open tab; by default the first.")
-@number("--port", "Port of the page of --web; by default a free one.", 1, 65535)
-@number(
+@click.option("--tab", metavar="NAME", help="Name of the open tab; by default the first.")
+@click.option(
+    "--port",
+    type=click.IntRange(1, 65535),
+    help="Port of the page of --web; by default a free one.",
+)
+@click.option(
     "--every",
-    "Show the images of every Nth frame; numbers are all shown.",
-    *(1, None, "N"),
+    type=click.IntRange(1),
+    metavar="N",
+    show_default=True,
     default=10,
+    help="Show the images of every Nth frame; numbers are all shown.",
 )
 @options.path(
     "--all-views",
-    "Also show what was not watched, from the recording that the run learned from.",
     "RECORDING",
+    "Also show what was not watched, from the recording that the run learned from.",
 )
 @options.look_options
 @options.force
