@@ -1,12 +1,13 @@
 """Reading any MCAP file, strictly: whole or cut, with or without an index.
 
-It gives every message that is there, in the order of log time (ties in file
-order), and never one whose checksum does not match. Memory holds a few chunks.
+It gives every message that is there, in file order, and never one whose checksum does not
+match. Memory holds a few chunks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
@@ -15,14 +16,16 @@ from mcap.records import Channel, Schema
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.chunks import Chunks
-from recorder.mcap.data_section import DataSection
 from recorder.mcap.records import (
+    CHUNK_PEEK,
     MAX_CHUNK,
+    RECORD_HEADER,
     Attachment,
     MalformedRecord,
     Message,
     Problem,
     Segment,
+    crc32,
 )
 from recorder.mcap.store import FileStore, OnePass, Store
 from recorder.mcap.tables import MessageTable, Pairs
@@ -40,8 +43,8 @@ class LogReader:
     `salvage` the damaged chunk is left out and noted in `problems` instead, and the
     unverifiable part of a chunk in which the file ends is read too. Where its summary accounts
     for every message, only what is asked for is read: each chunk is checked when it is, and the
-    checksum over all data where all of it is read (`check`, `digest`) or a chunk has none of its
-    own. A URL that lacks its end is damaged, as nothing tells whether the server sent all of it.
+    checksum over all data where all of it is read (`check`, `sha256`) or a chunk has none of its
+    own.
 
     Attributes:
         path: the file.
@@ -55,7 +58,7 @@ class LogReader:
         data_complete: every message is there, if not the summary behind them.
         metadata: the metadata records.
         statistics: what the summary says the file holds, or None.
-        data: all of its bytes.
+        file: its bytes.
     """
 
     def __init__(
@@ -82,25 +85,23 @@ class LogReader:
         self.salvage = salvage
         self.problems: list[Problem] = []
         self._failed: set[int] = set()
-        self._defined = self._searched = False
-        self._file = log if isinstance(log, Store) else FileStore(Path(log))
+        self._defined = self._searched = self._checked = False
+        self.file = log if isinstance(log, Store) else FileStore(Path(log))
         if check == "pass":
-            self._file = OnePass(self._file)
-        self.path = self._file.path
+            self.file = OnePass(self.file)
+        self.path = self.file.path
         try:
             check = check or ("data" if salvage else "chunks")
             by_index = check == "chunks" or (check == "pass" and not salvage)
-            found = LogStructure(self._file, self._refuse, by_index=by_index, resync=salvage)
+            found = LogStructure(self.file, self._refuse, by_index=by_index, resync=salvage)
             self._structure = found
-            self.data = DataSection(self._file, found, self._refuse_data)
-            known, unproven = found.definitions, self.data.check_unproven
             note = None if check == "chunks" else self._note
-            self._chunks = Chunks(self._file, known, note, unproven)
+            self._chunks = Chunks(self.file, found.definitions, note, self._check_unproven)
             self._settle()
             if not self.by_index and check != "pass":
-                self.data.check()
+                self._check_data()
         except BaseException as error:
-            self._file.close()
+            self.file.close()
             if isinstance(error, MalformedRecord):
                 raise LogDamagedError(f"{self.path}: {error}") from None
             raise
@@ -110,7 +111,7 @@ class LogReader:
     @property
     def size(self) -> int:
         """Bytes of the file."""
-        return self._file.size
+        return self.file.size
 
     @property
     def missing(self) -> str:
@@ -167,11 +168,42 @@ class LogReader:
                 f"{self.path}: attachment {attachment.name[:80]!r} has {attachment.size} bytes, "
                 f"above the limit of {MAX_CHUNK}"
             )
-        return self._file.read(attachment.offset, attachment.size)
+        return self.file.read(attachment.offset, attachment.size)
 
     def crc_absent(self) -> int:
-        """Count the segments that no CRC protects; see `DataSection.unprotected`."""
-        return self.data.unprotected(self.segments)
+        """Count the segments that no checksum protects.
+
+        Of a file opened by its index, which states none of all data, the first chunk stands for
+        all.
+        """
+        if self._structure.data_crc:
+            return 0
+        segments = self.segments
+        if self.by_index:
+            places = [s.offset + RECORD_HEADER.size for s in segments[:1]]
+            segments = [Segment.of_chunk(p, self.file.peek(p, CHUNK_PEEK)) for p in places]
+        return sum(1 for s in segments if s.crc == 0 and s.size)
+
+    def sha256(self, counted: Callable[[int], None] = lambda count: None) -> str:
+        """Return the SHA-256 of the file, and check the checksum over all data on the way.
+
+        Args:
+            counted: called with the number of each further bytes that were hashed.
+        """
+        sha256, crc, at = hashlib.sha256(), 0, 0
+        end = self._structure.data_end if self._structure.data_crc else 0
+        for block in self.file.blocks(0, self.file.size):
+            sha256.update(block)
+            crc = crc32(block[: max(end - at, 0)], crc)
+            at += len(block)
+            counted(len(block))
+        self._check_data(crc)
+        return sha256.hexdigest()
+
+    def tail(self) -> Iterator[bytes]:
+        """Yield the bytes from the data end record on, where the file was opened by its index."""
+        if self.by_index:
+            yield from self.file.blocks(self._structure.data_end, self.file.size)
 
     # Messages
 
@@ -222,7 +254,7 @@ class LogReader:
         Raises:
             LogDamagedError: at the first damage, without `salvage`.
         """
-        file = self._file
+        file = self.file
         assert isinstance(file, OnePass)
         if self.by_index:
             for segment in self._structure.walk(file):
@@ -233,13 +265,13 @@ class LogReader:
             for segment in self.segments:
                 file.pass_to(segment.offset)
                 yield segment, self.table(segment)
-        self.data.check(file.crc_to(self._structure.data_end))
+        self._check_data(file.crc_to(self._structure.data_end))
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
         """Say which chunks, or only `indexes` of them, will be read one after the other."""
         self._chunks.expect(() if indexes else segments)
         spans = ((s.data_end if indexes else s.offset, s.stop) for s in segments)
-        self._file.expect(list(spans))
+        self.file.expect(list(spans))
 
     def table(self, segment: Segment) -> MessageTable | None:
         """Decode a chunk and check it; the last few are kept.
@@ -267,7 +299,7 @@ class LogReader:
     def close(self) -> None:
         """Close the file; harmless when called twice."""
         self._chunks.close()
-        self._file.close()
+        self.file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -303,10 +335,25 @@ class LogReader:
             if table is not None and len(table):
                 tail.start, tail.end = int(table.log_time.min()), int(table.log_time.max())
 
-    def _refuse_data(self) -> None:
-        if not self.salvage:
-            self._search()  # an error that names the chunk says more
-        self._refuse("data section", "its CRC does not match: damaged")
+    def _check_data(self, crc: int | None = None) -> None:
+        """Compare the checksum over all data that the log states with theirs, once.
+
+        Args:
+            crc: of the data, where they were read; by default they are read now.
+        """
+        stated, end = self._structure.data_crc, self._structure.data_end
+        if not stated or self._checked:
+            return
+        self._checked = True
+        if (self.file.crc(0, end) if crc is None else crc) != stated:
+            if not self.salvage:
+                self._search()  # an error that names the chunk says more
+            self._refuse("data section", "its CRC does not match: damaged")
+
+    def _check_unproven(self) -> None:
+        """Check the data for a chunk that has no checksum of its own."""
+        if self._structure.by_index:
+            self._check_data()
 
     def _channel(self, number: int, segment: Segment) -> Channel | None:
         known = self._structure.definitions

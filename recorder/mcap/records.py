@@ -38,6 +38,8 @@ INDEX_HEADER: Final = struct.Struct("<BQHI")
 """Opcode, length, channel, bytes of the pairs, which follow: log time and place in the chunk."""
 CHUNK_HEADER: Final = struct.Struct("<BQQQQI")
 """Opcode, length, first and last log time, size and CRC; compression and records follow."""
+CHUNK_PEEK: Final = 256
+"""Bytes that hold all of a chunk before its records: the name of its compression is short."""
 
 
 class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with a record, not where

@@ -9,14 +9,20 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
-from recorder.mcap.records import CHUNK_HEADER, MAX_CHUNK, RECORD_HEADER, MalformedRecord, Segment
+from recorder.mcap.records import (
+    CHUNK_HEADER,
+    CHUNK_PEEK,
+    MAX_CHUNK,
+    RECORD_HEADER,
+    MalformedRecord,
+    Segment,
+)
 from recorder.mcap.store import Store
 
 _CHUNK: Final = re.compile(
     rb"(?=\x06[\s\S]{4}\0{4}[\s\S]{20}\0{4}[\s\S]{4}(\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)[\s\S]{4}\0{4})"
     # Opcode, length, times and the low half of the size, its high half, CRC, compression, bytes.
 )
-_HEAD: Final = 256
 _BLOCK: Final = 1 << 20
 _OVERLAP: Final = 64
 
@@ -36,7 +42,7 @@ def own_end(file: Store, opcode: int, content: int) -> int | None:
         return content + 6 + int.from_bytes(file.peek(content + 2, 4), "little")
     if opcode == Opcode.CHUNK:
         with contextlib.suppress(MalformedRecord):
-            chunk = Segment.of_chunk(content - RECORD_HEADER.size, file.peek(content, _HEAD))
+            chunk = Segment.of_chunk(content - RECORD_HEADER.size, file.peek(content, CHUNK_PEEK))
             return chunk.data_offset + chunk.stored
     return None
 

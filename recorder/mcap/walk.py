@@ -17,6 +17,7 @@ from mcap.records import Header, Metadata
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.chunks import check_size
 from recorder.mcap.records import (
+    CHUNK_PEEK,
     MAGIC,
     MAX_CHUNK,
     MAX_DEFINITION,
@@ -36,7 +37,6 @@ from recorder.mcap.summary import Summary, read_summary
 
 LOOSE_BYTES: Final = 1024 * 1024
 """Messages outside chunks are read about this many bytes at once."""
-_CHUNK_HEADER: Final = 256
 _LOOSE: Final = struct.Struct("<HIQ")
 _INDEX: Final = struct.Struct("<HI")
 DATA_END_BYTES: Final = RECORD_HEADER.size + 4
@@ -265,12 +265,12 @@ class LogStructure:
         return self._file.read(content, length)
 
     def _chunk(self, content: int, length: int) -> Segment:
-        head = self._file.peek(content, min(length, _CHUNK_HEADER))
+        head = self._file.peek(content, min(length, CHUNK_PEEK))
         return fitting(Segment.of_chunk(self._at, head), content + length)
 
     def _cut_chunk(self, content: int, length: int, limit: int) -> None:
         try:
-            head = self._file.peek(content, min(limit - content, _CHUNK_HEADER))
+            head = self._file.peek(content, min(limit - content, CHUNK_PEEK))
             tail = Segment.of_chunk(self._at, head)
             check_size(tail.compression, 0)
         except MalformedRecord:

@@ -61,44 +61,7 @@ class Identity(ABC):
         """
 
 
-class _ByteIdentity(Identity):
-    """Identity of a log on this machine: SHA-256 of its bytes."""
-
-    _sha256: str | None = None
-
-    @abstractmethod
-    def sample_sha256(self) -> str:
-        """SHA-256 of a few of its bytes; raises as `sample`."""
-
-    @abstractmethod
-    def sha256(self, counted: Counted) -> str:
-        """SHA-256 of all of its bytes, read now; raises as `whole`."""
-
-    @abstractmethod
-    def changed(self) -> bool:
-        """Whether it may hold something else than when it was opened."""
-
-    def sample(self) -> dict[str, Any]:
-        found = self.sample_sha256()
-        if self.changed():
-            raise self._was_changed()
-        return {"file": self.path.name, "bytes": self.size, "sample_sha256": found}
-
-    def whole(self, counted: Counted) -> dict[str, Any]:
-        if self._sha256 is None:
-            found = self.sha256(counted)
-            if self.changed():
-                raise self._was_changed()
-            self._sha256 = found
-        elif self.changed() and self.sha256(counted) != self._sha256:
-            raise self._was_changed()
-        return {"file": self.path.name, "sha256": self._sha256}
-
-    def _was_changed(self) -> LogDamagedError:
-        return LogDamagedError(f"{self.path}: it was changed while it was read; begin again")
-
-
-class FilesIdentity(_ByteIdentity):
+class FilesIdentity(Identity):
     """Identity of a file, or of files of a folder with their names.
 
     Args:
@@ -109,8 +72,10 @@ class FilesIdentity(_ByteIdentity):
         CdmisfaError: they cannot be read.
     """
 
+    _sha256: str | None = None
+
     def __init__(self, path: Path, files: Iterable[Path] | None = None) -> None:
-        self.path: Path = path
+        self.path = path
         self._files = [path] if files is None else sorted(files)
         self._names = [] if files is None else [str(f.relative_to(path)) for f in self._files]
         for file in self._files:
@@ -118,7 +83,27 @@ class FilesIdentity(_ByteIdentity):
         self._then = self._now()
         self.size = sum(size for size, _ in self._then)
 
-    def sample_sha256(self) -> str:
+    def sample(self) -> dict[str, Any]:
+        found = self._sample()
+        if self._changed():
+            raise self._was_changed()
+        return {"file": self.path.name, "bytes": self.size, "sample_sha256": found}
+
+    def whole(self, counted: Counted) -> dict[str, Any]:
+        if self._sha256 is None:
+            found = self.sha256(counted)
+            if self._changed():
+                raise self._was_changed()
+            self._sha256 = found
+        elif self._changed() and self.sha256(counted) != self._sha256:
+            raise self._was_changed()
+        return {"file": self.path.name, "sha256": self._sha256}
+
+    def _was_changed(self) -> LogDamagedError:
+        return LogDamagedError(f"{self.path}: it was changed while it was read; begin again")
+
+    def _sample(self) -> str:
+        """Return the SHA-256 of a few of the bytes."""
         found = hashlib.sha256()
         sizes = [size for size, _ in self._then]
         for name, size in zip(self._names, sizes, strict=False):
@@ -130,6 +115,7 @@ class FilesIdentity(_ByteIdentity):
         return found.hexdigest()
 
     def sha256(self, counted: Counted) -> str:
+        """Return the SHA-256 of all bytes, read now; raises as `whole`."""
         each = []
         for file in self._files:
             found = hashlib.sha256()
@@ -142,7 +128,8 @@ class FilesIdentity(_ByteIdentity):
         listed = "".join(f"{name}\0{one}\n" for name, one in zip(self._names, each, strict=True))
         return hashlib.sha256(_encoded(listed)).hexdigest()
 
-    def changed(self) -> bool:
+    def _changed(self) -> bool:
+        """Return whether it may hold something else than when it was opened."""
         return self._now() != self._then
 
     def _now(self) -> list[tuple[int, int]]:
@@ -157,26 +144,26 @@ class FilesIdentity(_ByteIdentity):
         return found
 
 
-class LogIdentity(_ByteIdentity):
+class LogIdentity(FilesIdentity):
     """A log in a file, whose sample holds all from its data end record on."""
 
     def __init__(self, reader: LogReader) -> None:
         self.path, self.size = reader.path, reader.size
-        self._data = reader.data
+        self._reader = reader
 
-    def sample_sha256(self) -> str:
+    def _sample(self) -> str:
         found = hashlib.sha256()
         for place in sampled(self.size):
-            found.update(self._data.read(place, PIECE))
-        for block in self._data.tail():
+            found.update(self._reader.file.read(place, PIECE))
+        for block in self._reader.tail():
             found.update(block)
         return found.hexdigest()
 
     def sha256(self, counted: Counted) -> str:
-        return self._data.sha256(counted)
+        return self._reader.sha256(counted)
 
-    def changed(self) -> bool:
-        return self._data.changed()
+    def _changed(self) -> bool:
+        return self._reader.file.changed()
 
 
 class LoggedSource(StoredSource):
