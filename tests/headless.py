@@ -11,7 +11,12 @@ import pytest
 
 from replay import viewer
 
-needs_driver = pytest.mark.skipif(not viewer.vulkan_drivers(), reason=viewer.INSTALL)
+
+def needs_driver(test: Callable[..., Any]) -> Callable[..., Any]:
+    """Mark a test that draws with Vulkan, and skip it where there is no driver."""
+    skipped = pytest.mark.skipif(not viewer.vulkan_drivers(), reason=viewer.INSTALL)
+    marked: Callable[..., Any] = pytest.mark.system(skipped(test))
+    return marked
 
 
 class Headless(viewer.Program):

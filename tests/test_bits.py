@@ -63,7 +63,10 @@ def assert_same_bits(
     ("compiler", "flags", "runner"),
     [
         (("gcc",), ("-O0",), ()),
-        (("aarch64-linux-gnu-gcc",), ("-O0", "-static"), ("qemu-aarch64",)),
+        pytest.param(
+            *(("aarch64-linux-gnu-gcc",), ("-O0", "-static"), ("qemu-aarch64",)),
+            marks=pytest.mark.system,
+        ),
     ],
     ids=" ".join,
 )

@@ -20,6 +20,8 @@ from report_data import HOSTILE, Page, pictured_run
 import cdmisfa as library
 from cdmisfa.experiments.reports import write_report
 
+pytestmark = pytest.mark.system  # a browser
+
 DISPLAYED = (
     "return [...document.querySelectorAll(arguments[0])].map(e => getComputedStyle(e).display)"
 )

@@ -92,6 +92,7 @@ def test_the_number_of_threads_does_not_show(threads: str) -> None:
     assert elsewhere(**dict.fromkeys(THREADS, threads))[1] == SIGNALS
 
 
+@pytest.mark.system
 @pytest.mark.skipif(shutil.which("qemu-x86_64") is None, reason="qemu-x86_64 is not installed")
 def test_a_processor_without_avx_gives_the_same_signals() -> None:
     assert elsewhere("qemu-x86_64", "-cpu", "Nehalem", **NO_FMA) == (False, SIGNALS)

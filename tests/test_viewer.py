@@ -158,6 +158,7 @@ def page(tmp_path):
         assert process.wait(timeout=30) == 130
 
 
+@pytest.mark.system
 def test_a_browser_draws_the_page(page, tmp_path):
     with chromium(tmp_path) as browser:
         browser.get(page[1])

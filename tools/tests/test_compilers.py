@@ -9,6 +9,8 @@ import pytest
 
 from tests.test_bits import NEHALEM, assert_same_bits
 
+pytestmark = pytest.mark.system  # clang, and emulated processors
+
 WIDE = ("-O3", "-mavx2", "-mfma")
 SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
