@@ -32,28 +32,18 @@ BOTH = ("--topic", "/cam_left", "--topic", "/cam_right")
 NO_IMAGES = "holds no images; numbers are taken with --field"
 REFUSED = {
     "learn oscillatory --topic /left": "is a scene: --topic is for cameras",
-    "learn oscillatory --set input.range=0.3,5 --start 1": ("a scene: --start is for cameras"),
-    "learn oscillatory --size 12": "128x48",
     "learn pictures": "--rate",
     "learn a.mcap --topic /cam_* --rate 25": "50 images a second, not 25",
     "learn a.mcap --topic /cam_* --start 12 --end 5": "--start 12 is no earlier than --end 5",
-    "learn a.mcap --topic /cam_* --set input.range=0.3,5": (
-        "a.mcap: it holds no distances (16UC1, 32FC1): input.range is for these"
-    ),
     "learn uneven.mcap --topic /cam_* --set input.gaps=hold --start 0.2 --end 1": (
         "--start 0.2 --end 1 --set input.gaps=hold --align time --rate 50"
     ),
     "view t.csv uneven.mcap --set input.time=s --save v": "these show a number and images",
-    "learn t.csv b.mcap --set input.time=s --field a": (
-        "there is no a, it has data; --field is of every stream, images are no numbers"
-    ),
     "view apart.mcap --save v.rrd": (
         "apart.mcap: /early ends before /late begins, they have no time in common: "
         "take each by itself, with --topic"
     ),
     "learn joints.mcap": NO_IMAGES,
-    "convert joints.mcap -o rec": NO_IMAGES,
-    "learn joints.mcap --topic /j*": NO_IMAGES,
     "view joints.mcap --save v.rrd": "it holds no images",
 }
 
@@ -65,8 +55,6 @@ def test_what_cannot_be_taken_is_refused_in_one_line(
     monkeypatch.chdir(logs)
     write_pictures(logs / "pictures", 5)
     (logs / "t.csv").write_text("s,a\n0,1\n1,2\n2,3\n")
-    empty = [(10**12 + i, b'{"data": ""}') for i in range(9)]
-    write_mcap(logs / "b.mcap", MessageKind("foxglove.CompressedImage", "json"), {"/cam": empty})
     write_mcap(logs / "joints.mcap", MessageKind("j", "json"), {"/joints": [(1, b"{}")]})
     image = np.zeros((16, 16), np.uint8)
     apart = {"/late": [(20_000 + 100 * i, image) for i in range(20)]}
@@ -116,49 +104,3 @@ def test_a_run_on_cameras_says_of_what_its_streams_are(cdmisfa: Cdmisfa, logs: P
     for run in (logs / "run", logs / "again"):
         config = json.loads((run / "run.json").read_text())["config"]
         assert config["scene"] == {"kind": "foreign"}
-
-
-def test_recordings_named_together_are_refused_with_what_would_work(
-    cdmisfa: Cdmisfa, logs: Path
-) -> None:
-    both = (logs / "one", logs / "two")
-    for folder, count in zip(both, (60, 50), strict=True):
-        log = folder.with_suffix(".mcap")
-        write_cameras(log, {"/image": (count, 20)})
-        assert cdmisfa("convert", log, "-o", folder).code == 0
-    refused = cdmisfa("learn", *both)
-    assert (refused.code, refused.err.count("\n")) == (2, 1)
-    assert f"{both[0]} and {both[1]} are recordings of their own" in refused.err
-    assert "--align index" in refused.err
-    done = cdmisfa("learn", *both, "--align", "index", *QUICK)
-    assert "two_image: 50 images" in done.err
-    assert done.code == 0, done.err
-    twice = cdmisfa("learn", both[0], both[0])
-    assert (twice.code, "is named twice" in twice.err) == (2, True)
-    assert cdmisfa("view", *both, "--save", logs / "both.rrd").code == 0
-    assert len(cdmisfa("info", *both, "--json").json["metadata"]) == 2
-
-
-def test_streams_with_gaps_are_not_put_together_by_number(cdmisfa: Cdmisfa, logs: Path) -> None:
-    """By number, images on both sides of a gap would be neighbours."""
-    for name, late in (("one", 0), ("two", 60)):
-        times = [late + i / 50 + (2 if i > 30 else 0) for i in range(60)]
-        rows = "\n".join(f"{time},{i}" for i, time in enumerate(times))
-        (logs / f"{name}.csv").write_text(f"stamp,{name}\n{rows}\n")
-    files = (logs / "one.csv", logs / "two.csv")
-    refused = cdmisfa("learn", *files, "--set", "input.time=stamp")
-    assert refused.code == 2
-    assert "no time in common, and gaps" in refused.err
-    assert "take each by itself" in refused.err
-    part = cdmisfa(
-        "learn", *files, "--set", "input.time=stamp", "--align", "index", "--max-iterations", 1
-    )
-    assert part.code == 0
-
-
-def test_what_is_in_several_files_is_told_apart(cdmisfa: Cdmisfa, logs: Path) -> None:
-    both = cdmisfa("info", logs / "a.mcap", logs / "uneven.mcap").out.splitlines()
-    assert [line.split()[-1] for line in both[4:]] == [
-        *("file", "-----------", "a.mcap", "a.mcap", "uneven.mcap", "uneven.mcap"),
-    ]
-    assert cdmisfa("info", logs / "a.mcap").out.splitlines()[3].split()[-1] == "schema"

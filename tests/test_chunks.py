@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import struct
-import zlib
 from pathlib import Path
 
 import lz4.frame
@@ -13,15 +12,12 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import CompressionType
-from message_files import write_mcap
 from reference import frames as reference
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels import frames as kernels
 from recorder.config import RecordConfig
-from recorder.images.decoding import MessageKind
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from recorder.mcap.chunks import decompressed
@@ -133,29 +129,6 @@ def test_a_chunk_that_is_not_as_the_summary_says_is_refused(
                 fast(view, 99, 2)
 
 
-@pytest.mark.parametrize("which", [0, 1])
-def test_a_time_that_is_not_its_frames_is_refused_where_its_chunk_is_read(
-    pictures: dict[str, Path], tmp_path: Path, which: int
-) -> None:
-    """Even if its index and all checksums that are read agree."""
-    chunk, raw = parts_of(pictures["none"], 2)
-    pair = chunk.indexes[which].offset + 16 * 7
-    time, place = struct.unpack_from("<QQ", raw, pair)
-    later = struct.pack("<Q", time + 1)
-    message = chunk.data_offset + place + 15
-    assert raw[message : message + 8] == raw[pair : pair + 8]
-    raw[message : message + 8] = raw[pair : pair + 8] = later
-    data = raw[chunk.data_offset :][: chunk.stored]
-    raw[chunk.offset + 33 : chunk.offset + 37] = struct.pack("<I", zlib.crc32(data))
-    path = tmp_path / "left.mcap"
-    path.write_bytes(raw)
-    with contextlib.closing(ViewFile(path)) as view:
-        assert fast(view, 0, 100)[0].any()
-        for _ in range(2):
-            with pytest.raises(LogDamagedError, match=f"after frame 106 comes log time {time + 1}"):
-                fast(view, 99, 2)
-
-
 @settings(deadline=None)
 @given(st.data())
 def test_values_are_copied_from_within_the_payloads_only(data: st.DataObject) -> None:
@@ -177,26 +150,6 @@ def test_values_are_copied_from_within_the_payloads_only(data: st.DataObject) ->
     true = reference.gather(raw, own[start:stop], *laid_out)
     assert found == (None if true is None else len(own))
     assert true is None or out.tobytes() == true
-
-
-@pytest.mark.parametrize("compression", list(CompressionType))
-def test_chunks_that_are_held_stay_as_they_are_while_others_are_decoded(
-    tmp_path: Path, compression: CompressionType
-) -> None:
-    path = tmp_path / "log.mcap"
-    random = np.random.default_rng(1)
-    payloads = [random.integers(0, 9, 3000, np.uint8).tobytes() for _ in range(60)]
-    kind, how = MessageKind("", "b"), {"chunk_size": 8192, "compression": compression}
-    write_mcap(path, kind, {"a": enumerate(payloads)}, **how)
-    with LogReader(path) as reader:
-        held = [table for _, table in reader.tables()]
-        assert len(held) == 20
-        found = [table.payload(row) for table in held for row in range(len(table))]
-        assert found == payloads
-        for number in (7, 3, 4, 5, 6, 19, 0, 1, 2):
-            table = reader.table(reader.segments[number])
-            assert table is not None
-            assert [table.payload(row) for row in range(3)] == payloads[3 * number : 3 * number + 3]
 
 
 @pytest.mark.parametrize("size", [1, 65_535, 65_536, 200_000])

@@ -11,12 +11,8 @@ from conftest import Cdmisfa
 from message_files import STEP, every, learned_alike, write_mcap
 from PIL import Image
 
-from cdmisfa import GymSource
-from cdmisfa.core.errors import UsageError
-from recorder.cameras.words import CAMERAS, CameraKind, open_live
 from recorder.images.framing import Framing
 from recorder.images.messages import image_decoder
-from recorder.images.options import InputOptions
 from recorder.images.videos import frame_colors
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
@@ -105,31 +101,6 @@ def test_colours_are_learned_from_recorded_and_replayed_alike(
     assert gray["signals_sha256"] != run["signals_sha256"]
     with RecordedSource(tmp_path / "rec") as source:
         assert (source.take(0, COUNT).frames == beside(colors())).all()
-
-
-def test_live_streams_are_recorded_in_colours(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    pytest.importorskip("av")
-    rec = tmp_path / "rec"
-    words = ["av:lavfi:color=c=red:size=32x24:rate=50", "--color", "--size", "16x12"]
-    done = cdmisfa("record", *words, "--frames", "5", "-o", rec)
-    assert done.code == 0, done.err
-    with RecordedSource(rec) as source:
-        red, green, blue = np.split(source.take(0, 2).frames[1], 3, axis=1)
-        assert red.shape == (12, 16)
-        assert red.min() >= 250
-        assert max(green.max(), blue.max()) <= 5
-    with GymSource(["CartPole-v1"], size=(20, 30), color=True) as task:
-        assert task.spec.frame_shape == (20, 90)
-        assert task.take(0, 2).frames.shape == (2, 20, 90)
-
-
-def test_what_has_no_colours_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "t.csv").write_text("a\n1\n2\n")
-    with pytest.raises(UsageError, match=r"as they are: --color is for images"):
-        ForeignSource(tmp_path / "t.csv", rate=5, color=True)
-    monkeypatch.setitem(CAMERAS, "plain", CameraKind(lambda word, name: None))
-    with pytest.raises(UsageError, match="plain:1 shows gray images: leave out --color"):
-        open_live(["plain:1"], InputOptions(color=True))
 
 
 def test_a_scene_is_recorded_and_learned_in_colours(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

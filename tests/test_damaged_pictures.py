@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -103,11 +102,6 @@ def test_no_jpeg_without_its_end_is_read(kind: str, damage: Damage) -> None:
     assert accepted(JPEG[kind], damage) == 0
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "JPEG in gray", "JPEG of few colours", "JPEG in CMYK"])
-def test_few_jpegs_with_a_part_of_zeros_are_read(kind: str) -> None:
-    assert accepted(JPEG[kind], part_of_zeros) <= 3
-
-
 @pytest.mark.parametrize("behind", [b"", bytes(2000), b"\xff\xd8\xff\xd9"])
 @pytest.mark.parametrize("filled", [b"", b"\xff" * 7, bytes(32)])
 @pytest.mark.parametrize("kind", JPEG)
@@ -188,27 +182,3 @@ def test_info_and_verify_judge_a_folder_alike(
     assert verify.json["files"][0]["crc"] == crc
     if state != "unchecked":
         assert info.code == verify.code
-
-
-@pytest.mark.parametrize("written", [in_folder, in_log])
-def test_info_calls_nothing_whole_that_only_verify_reads(
-    tmp_path: Path, cdmisfa: Cdmisfa, written: Any
-) -> None:
-    random = np.random.default_rng(5)
-    kind = "png" if written is in_log else "jpg"
-    pictures = [packed(scene(random), format="PNG" if kind == "png" else "JPEG")] * 6
-    pictures[3] = end_of_zeros(pictures[3], random)
-    path, _ = written(tmp_path, pictures, kind)
-    assert ", contents unchecked, " in cdmisfa("info", path).out
-    assert cdmisfa("verify", path).code == 3
-
-
-def test_verify_says_that_nothing_vouches_for_a_jpeg(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
-    random = np.random.default_rng(3)
-    for ending, said in (("png", []), ("jpg", ["a JPEG has no checksums"])):
-        (tmp_path / ending).mkdir()
-        kind = {"png": "PNG", "jpg": "JPEG"}[ending]
-        path, _ = in_folder(tmp_path / ending, [packed(scene(random), format=kind)], ending)
-        notes = json.loads(cdmisfa("verify", path, "--json").out)["notes"]
-        assert [any(part in note for note in notes) for part in said] == [True] * len(said)
-        assert len(notes) == len(said)

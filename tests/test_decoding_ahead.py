@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import threading
-import warnings
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -157,34 +155,6 @@ def test_whatever_is_asked_for_next_frames_and_errors_are_the_same(
         assert max(held) <= 2 * cores
 
 
-@pytest.mark.parametrize("together", [False, True])
-def test_between_blocks_the_next_pictures_are_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, together: bool
-) -> None:
-    monkeypatch.setattr(ahead, "CORES", 2)
-    before = threading.active_count()
-    with contextlib.closing(
-        ForeignSource(two(tmp_path / "log.mcap"), ["/a", "/b"], rate=25)
-    ) as source:
-        take = source.take_all if together else functools.partial(source.take, 1)
-        for _ in range(3):
-            take(7)
-            following = [(int(not together), source.t + i) for i in range(4)]
-            assert list(source._ahead._begun) == following
-        begun = list(source._ahead._begun.values())
-        take(7)
-        assert all(one is not None and one.done() for one in begun)
-        assert threading.active_count() > before
-        source.seek(source.end - 2)
-        take(2)
-        assert not source._ahead._begun
-        source.seek(0)
-        take(1)
-        assert source._ahead._begun
-    assert not source._ahead._begun
-    assert threading.active_count() == before
-
-
 def test_an_interrupt_leaves_no_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ahead, "CORES", 2)
     before, log = threading.active_count(), write(tmp_path / "log.mcap")
@@ -213,11 +183,3 @@ def test_large_pictures_are_left_to_one_thread(
     monkeypatch.setattr(stream, "AT_ONCE", 20)
     assert all(map(np.array_equal, shown(log)[0], frames))
     assert len(limits) > COUNT
-
-
-def test_warnings_are_as_before_once_no_thread_decodes() -> None:
-    good = [encoded(image, "JPEG") for image in pictures(8)]
-    before = list(warnings.filters)
-    with ThreadPoolExecutor(8) as threads:
-        list(threads.map(pixels.compressed_image, good * 50))
-    assert warnings.filters == before

@@ -70,17 +70,6 @@ def test_files_at_the_same_time_stay_streams(parts: list[Path]) -> None:
     assert len(ForeignSource(both, ["/left"], size=SIZE, align="time").spec.streams) == 2
 
 
-def test_a_part_may_lack_a_topic(parts: list[Path]) -> None:
-    write_part(parts[3], range(30, 40), ("/left",))
-    source = ForeignSource(parts[0].parent, ["/right"], size=SIZE, align="time", rate=50)
-    assert source.alignment["right"] == {"messages": 110, "repeated": 0, "dropped": 0}
-    assert [stop - start for start, stop in source.pauses["right"]] == [10]
-    with pytest.raises(UsageError, match="no topic /up"):
-        ForeignSource(parts[0].parent, ["/up"], size=SIZE)
-    with pytest.raises(UsageError, match="name one --topic or more; it has images on"):
-        ForeignSource(parts[0].parent, size=SIZE)
-
-
 def test_a_part_that_was_cut_before_its_first_message_is_left_out_and_said(
     parts: list[Path],
 ) -> None:
@@ -94,20 +83,6 @@ def test_a_part_that_was_cut_before_its_first_message_is_left_out_and_said(
         os.truncate(part, 42)
     with pytest.raises(LogDamagedError, match="there is no message before"):
         ForeignSource(parts[0].parent, ["/right"], size=SIZE)
-
-
-@pytest.mark.parametrize("length", [8, 42, 95])
-def test_a_log_that_was_cut_before_its_first_message_is_damaged(
-    cdmisfa: Cdmisfa, parts: list[Path], length: int
-) -> None:
-    os.truncate(parts[0], length)
-    out = parts[0].parent / "out"
-    for words in (["learn"], ["convert", "-o", out], ["view", "--save", out]):
-        done = cdmisfa(*words, parts[0])
-        assert (done.code, done.err.count("\n")) == (3, 1), done.err
-        assert f"{parts[0]}: " in done.err
-        assert "there is no message before" in done.err
-    assert not out.exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])

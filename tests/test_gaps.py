@@ -17,7 +17,7 @@ from contracts.sources import SourceContract
 from folders import contents, coverage
 
 from cdmisfa.core.blocks import FrameSource
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError
 from recorder.config import Split
 from recorder.images.framing import FRAME_PIXELS, default_size, fitted
 from recorder.images.options import Align, Fit
@@ -105,15 +105,6 @@ def test_images_at_other_times_than_their_frames_are_said(
     assert not ForeignSource(path, align="index").warnings
 
 
-def test_a_gap_of_more_frames_than_there_can_be_names_where_it_is(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", [0, *(1_700_000_000_000 + i * 20 for i in range(30))])
-    with pytest.raises(UsageError) as refused:
-        ForeignSource(path)
-    assert str(refused.value).startswith(f"{path}: /cam: it has a gap of 1.7e+09 s after 0 s, ")
-    assert str(refused.value).endswith("choose a part without, with --start or --end")
-    assert ForeignSource(path, start=1).frames == 30
-
-
 def test_a_gap_comes_again_with_every_turn(tmp_path: Path) -> None:
     source = ForeignSource(write_log(tmp_path / "log.mcap", PAUSED), loop=True)
     assert [values(source, 150)[0] for _ in range(4)] == [250, 400, 700, 850]
@@ -126,12 +117,6 @@ def test_held_gaps_show_the_last_image(tmp_path: Path) -> None:
     source.seek(90)
     assert values(source, 170) == (90, [*range(90, 100), *[99] * 150, *range(100, 110)])
     assert "the last image is shown" in source.warnings[0]
-
-
-def test_a_few_images_that_are_late_are_no_gap(tmp_path: Path) -> None:
-    times = [*range(0, 1000, STEP_MS), *range(1180, 2000, STEP_MS)]
-    source = ForeignSource(write_log(tmp_path / "log.mcap", times))
-    assert (source.gaps, source.frames) == (False, len(times))
 
 
 def test_a_part_of_a_log_is_taken(tmp_path: Path) -> None:
@@ -258,14 +243,6 @@ def test_a_dataset_has_an_episode_between_gaps(cdmisfa: Cdmisfa, tmp_path: Path)
 def _frames(source: Any, stream: int, low: int, high: int) -> np.ndarray:
     source.seek(low)
     return np.asarray(source.take(stream, high - low).frames)
-
-
-def test_images_that_change_their_size_are_said_and_shown(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.mcap", range(0, 2000, STEP_MS), [(12, 16)] * 50 + [(6, 8)])
-    done = cdmisfa("learn", log, "--max-iterations", "1", "--json")
-    assert done.code == 0
-    done = cdmisfa("convert", log, "-o", tmp_path / "rec")
-    assert "at 1000000000 ns: images change from 16x12 to 8x6" in done.err
 
 
 IMAGE = np.arange(24 * 32, dtype=np.uint32).reshape(24, 32).astype(np.uint8)

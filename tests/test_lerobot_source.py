@@ -93,15 +93,7 @@ def test_numbers_come_back_as_they_were_exported(cdmisfa: Cdmisfa, tmp_path: Pat
     with pytest.raises(UsageError, match="no numbers state; it has observation"):
         ForeignSource(out, fields=["state"])
     table = out / "data/chunk-000/file-000.parquet"
-    rows = pq.read_table(table)
-    lacking = np.where(np.arange(101) == 7, np.nan, 0)
-    pq.write_table(rows.append_column("lacking", pa.array(lacking)), table)
-    info = json.loads((out / "meta/info.json").read_text())
-    info["features"]["lacking"] = {"dtype": "float64", "shape": [1]}
-    (out / "meta/info.json").write_text(json.dumps(info))
-    with pytest.raises(UsageError, match="frame 7 lacks a number of lacking"):
-        ForeignSource(out, fields=["lacking"])
-    pq.write_table(rows.slice(0, 50), table)
+    pq.write_table(pq.read_table(table).slice(0, 50), table)
     with pytest.raises(LogDamagedError, match="LeRobot's layout"):
         ForeignSource(out, fields=fields)
 

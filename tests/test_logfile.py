@@ -13,7 +13,6 @@ from mcap.reader import NonSeekingReader, make_reader
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.log.files import partial_path
 from recorder.log.logfile import LogFile
-from recorder.mcap.store import PARTIAL
 
 SECOND = 1_000_000_000
 
@@ -117,20 +116,6 @@ def test_nothing_is_overwritten_without_force(tmp_path, left):
     assert not partial_path(tmp_path / "a.mcap").exists()
 
 
-def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
-    log = LogFile(tmp_path / "a.mcap")
-    log.path.write_bytes(b"precious")
-    with pytest.raises(UsageError, match="appeared"):
-        log.finish()
-    assert log.path.read_bytes() == b"precious"
-    assert readable(log.partial) == []
-
-
-def test_a_folder_that_is_missing_is_named(tmp_path):
-    with pytest.raises(LogWriteError, match=r"nowhere/a\.mcap\.partial cannot be written"):
-        LogFile(tmp_path / "nowhere" / "a.mcap")
-
-
 @pytest.mark.parametrize("aside", [False, True])
 def test_a_write_that_failed_is_named_once_and_for_all(tmp_path, aside):
     log, channel = open_log(tmp_path / "a.mcap", compression="none", aside=aside)
@@ -174,10 +159,3 @@ def test_the_same_calls_give_the_same_bytes(tmp_path):
             for i in range(120):
                 log.write(channel, i * SECOND // 50, bytes([i]) * 40, i)
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-
-
-def test_one_schema_is_registered_once(tmp_path):
-    with LogFile(tmp_path / "a.mcap") as log:
-        assert log.add_schema("X", "protobuf", b"1") == log.add_schema("X", "protobuf", b"1")
-        assert log.add_schema("X", "protobuf", b"2") != log.add_schema("X", "protobuf", b"1")
-    assert PARTIAL == ".partial"

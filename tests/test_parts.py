@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Cdmisfa
 from contracts.sources import SourceContract, same
 from folders import contents
 from waiting import running, wait_for
@@ -109,18 +108,6 @@ def test_a_lost_part_is_not_written_over(parts: Path, split: Split, tmp_path: Pa
     assert contents(folder) == before
 
 
-def test_another_split_is_refused(tmp_path: Path) -> None:
-    record_scene("oscillatory", tmp_path / "a", frames=400, split=BY_TIME)
-    before = contents(tmp_path / "a")
-    with pytest.raises(UsageError, match="recorded with --split"):
-        record_scene("oscillatory", tmp_path / "a", frames=500, resume=True)
-    with pytest.raises(UsageError, match="holds 150 frames, more than --frames 100"):
-        record_scene("oscillatory", tmp_path / "a", frames=100, split=BY_TIME, resume=True)
-    assert contents(tmp_path / "a") == before
-    record_scene("oscillatory", tmp_path / "a", frames=60, force=True)
-    assert sorted(contents(tmp_path / "a")) == ["x1.mcap", "x2.mcap", "x3.mcap"]
-
-
 def test_limits_are_read() -> None:
     for text, split in {
         "512MB": Split(size=512_000_000),
@@ -129,17 +116,3 @@ def test_limits_are_read() -> None:
         "0.5h": Split(seconds=1800),
     }.items():
         assert Split.parse(text) == Split.parse(str(split)) == split
-
-
-@pytest.mark.parametrize("text", ["", "512", "0MB", "-1s", "10 minutes", "nanGB", "1e9s"])
-def test_other_limits_are_refused(cdmisfa: Cdmisfa, text: str, tmp_path: Path) -> None:
-    done = cdmisfa("record", "oscillatory", "-o", tmp_path / "rec", f"--split={text}")
-    assert (done.code, "512MB or 10min" in done.err) == (2, True)
-    assert not (tmp_path / "rec").exists()
-
-
-def test_each_part_is_a_row(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    words = ("record", "oscillatory", "-o", tmp_path / "rec", "--frames", "120")
-    views = cdmisfa(*words, "--split", "2s", "--json").json["views"]
-    assert [(v["name"], v["frames"]) for v in views[:2]] == [("x1", 100), ("x1", 20)]
-    assert views[1]["file"].endswith("x1-001.mcap")

@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import RAW, encoded, raw
+from camera_files import RAW, raw
 from conftest import Cdmisfa
 from message_files import write_mcap
-from PIL import Image
 
-from cdmisfa import ArraySource, Module, Recipe, Recording, Run, make_frame
+from cdmisfa import Module, Recipe, Run, make_frame
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.experiments.run_folder import with_recipes
 from recorder.images.options import Depth, Fit
 from replay.camera_logs.source import ForeignSource
 from replay.runs.modules import load_modules, save_modules
@@ -123,50 +121,24 @@ def test_a_recording_of_a_log_keeps_its_recipe(cdmisfa: Cdmisfa, tmp_path: Path)
     assert {one.recipe for one in module} <= {recipe}
 
 
-def test_frames_that_are_the_pictures_say_their_size() -> None:
-    shown = ArraySource({"a": np.zeros((40, 9, 12), np.uint8)})
-    module = module_of(None, (9, 12))
-    for source in (Recording(np.zeros((40, 9, 12))).source(), shown):
-        (own,) = with_recipes([module], source, source.describe())
-        assert own.recipe == Recipe((9, 12), raw=(9, 12))
-
-
-def test_a_jpeg_is_turned_as_its_exif_says(tmp_path: Path) -> None:
-    picture = of_type("u1", 20, 30)[0]
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(picture).save(tmp_path / "a.png", exif=exif)
-    recipe = Recipe((30, 20))
-    turned = make_frame((tmp_path / "a.png").read_bytes(), recipe)
-    np.testing.assert_array_equal(turned, np.rot90(picture, -1))
-    np.testing.assert_array_equal(make_frame(encoded(turned), recipe), turned)
-
-
 @pytest.mark.parametrize(
     ("recipe", "given", "why"),
     [
         (Recipe((8, 16)), np.zeros((4, 7, 20), np.uint8), "20x7 is smaller than the .* 16x8"),
         (Recipe((8, 16), raw=(20, 40)), np.zeros((4, 40, 20), np.uint8), "20x40 .* 40x20: turn it"),
-        (Recipe((8, 16)), np.full((4, 20, 40), 1.5), "pictures of float64 .*: give .n, height"),
         (
             Recipe((8, 16)),
             np.full((4, 8, 16), 200.0),
             "hold 200: scale them to 0 to 1, or give uint8",
         ),
-        (Recipe((8, 16)), np.zeros((4, 20, 40, 2), np.uint8), r"uint8 \(20, 40, 2\) given"),
-        (Recipe((8, 16)), np.zeros((20, 40), np.uint8), r"pictures of uint8 \(40,\) given"),
         (Recipe((8, 16)), [b"nothing"], "a picture cannot be taken: .* broken"),
-        (Recipe((8, 16)), "abc", "given"),
         (Recipe((8, 16)), None, "one picture or none given"),
-        (Recipe((8, 16)), b"abc", "one picture or none given"),
         (
             Recipe((3,), fields=("a", "b")),
             np.zeros((4, 2)),
             r"float64 of shape \(4, 2\) .* give \(n, 3\).*a, b",
         ),
-        (Recipe((3,)), [["a", "b", "c"]], r"given: give \(n, 3\)"),
         (Recipe((3,)), [[1.0, np.nan, 2.0]], "frame 0 holds nan at place 1, .* no finite number"),
-        (Recipe((3,)), np.full((2, 3), np.inf), "frame 0 holds inf"),
     ],
 )
 def test_what_a_module_cannot_take_is_refused_in_a_line(

@@ -14,12 +14,10 @@ from camera_files import HEIGHT, PACKED, RAW, WIDTH, packed, pictures, raw
 from conftest import Cdmisfa
 from folders import flip
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from mcap.writer import Writer
 from message_files import START, STEP, every, learned_alike, write_mcap
 from video_packets import COUNT, FOXGLOVE, GROUP, foxglove, video
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.decoding import MessageKind
 from replay.camera_logs.source import ForeignSource
 
 SIZE = (HEIGHT, WIDTH)
@@ -89,16 +87,6 @@ def test_a_video_is_shown_again_from_the_next_whole_picture(tmp_path: Path) -> N
             source.take(0, 1)
 
 
-def test_pictures_of_a_lost_one_are_not_made_up(tmp_path: Path) -> None:
-    pytest.importorskip("av")
-    packets = video("h264")[: 2 * GROUP] + video("h264")[2 * GROUP + 1 :]
-    path = write_video_messages(tmp_path / "a.mcap", packets)
-    with ForeignSource(path, size=SIZE) as source:
-        source.seek(2 * GROUP)
-        with pytest.raises(LogDamagedError, match="is broken there, or one that it needs: learn"):
-            source.take(0, 1)
-
-
 def film(path: Path, packets: Sequence[bytes]) -> tuple[int, int]:
     """Write a film of packets of H.264; gives place and size of the one of frame 17."""
     av: Any = pytest.importorskip("av")
@@ -151,40 +139,3 @@ def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Pa
         source.take(0, 8)
     for row, frame in enumerate(shown(path, range(8))):
         np.testing.assert_array_equal(frame, list(pictures(8))[row])
-
-
-def write_channels(path: Path, channels: Sequence[tuple[MessageKind, Sequence[bytes]]]) -> Path:
-    """A log whose channels of /cam take turns, message by message."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2048)
-        writer.start()
-        numbers = []
-        for kind, _ in channels:
-            schema = writer.register_schema(kind.schema, kind.language, kind.definition)
-            of = {"number": str(len(numbers))}  # without which it would be the same
-            numbers.append(writer.register_channel("/cam", kind.encoding, schema, of))
-        row = 0
-        for turn in zip(*(messages for _, messages in channels), strict=True):
-            for number, message in zip(numbers, turn, strict=True):
-                writer.add_message(number, START + row * STEP, message, START + row * STEP)
-                row += 1
-        writer.finish()
-    return path
-
-
-def test_channels_of_one_topic_and_kind_are_one_stream(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    images = list(pictures(40))
-    halves = [(RAW, [raw(image) for image in images[start::2]]) for start in (0, 1)]
-    path = write_channels(tmp_path / "a.mcap", halves)
-    for topics in ((), ("/cam",)):
-        with ForeignSource(path, topics, size=SIZE) as source:
-            np.testing.assert_array_equal(source.take(0, 40).frames, images)
-    for row, frame in enumerate(shown(path, range(40))):  # by a pass over the log
-        np.testing.assert_array_equal(frame, images[row])
-    path = write_channels(
-        tmp_path / "b.mcap", [halves[0], (PACKED, list(map(packed, images[1::2])))]
-    )
-    for words in ((), ("--topic", "/cam")):
-        done = cdmisfa("convert", path, *words, "-o", tmp_path / "rec")
-        assert done.code == 2
-        assert "foxglove.RawImage in protobuf, foxglove.CompressedImage in protobuf" in done.err

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, pictures, write_cameras
+from camera_files import HEIGHT, WIDTH, pictures
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from message_files import START, STEP, every, learned_alike, write_mcap
 from test_foreign import raw_json
-from test_numbers import bag, joint_state
+from test_numbers import joint_state
 
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError
 from recorder.images.decoding import MessageKind, stamp_of
 from replay.camera_logs.source import ForeignSource
 
@@ -84,25 +84,6 @@ def test_ros_says_it_in_the_header_that_a_message_begins_with(ros1: bool) -> Non
     with pytest.raises(LogDamagedError, match="cut short"):
         stamp(bytes(pack(message, name))[:9])
     assert stamp_of(kind._replace(definition=b"# of\nfloat64 a\nHeader header")) is None
-
-
-def test_what_says_no_time_is_refused(tmp_path: Path) -> None:
-    pytest.importorskip("rosbags")
-    write_cameras(tmp_path / "a.mcap", {"/cam": (20, 20)})
-    (tmp_path / "t.csv").write_text("s,a\n0,1\n1,2\n")
-    for path, topics, options, why in (
-        (bag(tmp_path, ros1=True), ["/chatter"], {"fields": ["data"]}, "have no header"),
-        (bag(tmp_path, ros1=False), ["/joint_states"], {"fields": ["position"]}, "all say 7000"),
-        (tmp_path / "a.mcap", [], {}, "the headers on /cam all say 0 ns: leave out --set"),
-        (tmp_path / "t.csv", [], {"time": "s"}, "is no topic of messages: leave out input.stamp"),
-    ):
-        with pytest.raises(UsageError, match=why):
-            ForeignSource(path, topics, stamp="header", **options)
-    plain = write_mcap(
-        tmp_path / "j.mcap", MessageKind("k", "json"), {"/k": every(STEP, [b'{"k": 1}'] * 2)}
-    )
-    with pytest.raises(LogDamagedError, match=r"no time of its own, as header.stamp or timestamp"):
-        ForeignSource(plain, fields=["k"], stamp="header")
 
 
 def test_learning_by_headers_is_the_same_from_the_conversion(

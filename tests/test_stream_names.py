@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -107,13 +106,3 @@ def test_names_are_distinct_and_stay_as_they_are(said: list[str]) -> None:
     assert len(set(names)) == len(names) == len(said)
     assert all(stream_name(name) == name for name in map(stream_name, said))
     assert not any("/" in name or name.startswith(".") or not name for name in names)
-
-
-def test_of_logs_with_one_topic_the_file_is_named_too(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    write_log(tmp_path)
-    files = [tmp_path / name for name in ("a.mcap", "b.mcap")]
-    for file in files:
-        shutil.copy(tmp_path / "robot.mcap", file)
-    words = (*files, "--topic", TOPICS[0], "--align", "index")
-    found = cdmisfa("learn", *words, *QUICK, "--json").json["undecided"]
-    assert found == [f"a_{NAMES[0]}", f"b_{NAMES[0]}"]

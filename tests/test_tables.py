@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -153,35 +152,6 @@ def test_distances_in_a_list_that_were_not_measured_are_the_end_of_a_range(tmp_p
     assert said[0].endswith("left out, the first is row 2")
 
 
-@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
-def test_numbers_that_float64_rounds_are_said(tmp_path: Path, name: str) -> None:
-    times, big = np.arange(ROWS) / 10, [2**53 + i for i in range(ROWS)]
-    path = write_table(tmp_path / name, {"t": times, "a": big, "b": range(ROWS)})
-    assert [line.partition(": ")[2] for line in taken(path)[1]] == [
-        "numbers beyond 2^53 may be rounded, to float64"
-    ]
-    assert taken(path, fields=["b"])[1] == taken(path, range=(0, 9))[1] == ()
-
-
-@pytest.mark.parametrize(
-    ("field", "why"),
-    [
-        ("state[3]", "there are 3 members only"),
-        ("state[1:4]", r"there are 3 members only, all of them are \["),
-        ("word", "is no number but a text: name another"),
-        ("a.b", "is no number but dict: name one of its fields: x"),
-        ("n[0]", "what the index is of is no list"),
-    ],
-)
-def test_a_field_that_is_none_is_named_as_it_was_written(
-    tmp_path: Path, field: str, why: str
-) -> None:
-    columns = {"state": [[1, 2, 3]] * 2, "word": ["x", "y"], "a.b": [{"x": 1}] * 2, "n": [1, 2]}
-    path = write_table(tmp_path / "t.parquet", columns)
-    with pytest.raises(UsageError, match=rf"t.parquet: --field {re.escape(field)}:? {why}"):
-        ForeignSource(path, rate=5, fields=[field])
-
-
 def test_commands_take_tables_and_say_what_was_left_out(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     rows = [f"{i / 50},{'' if i == 7 else i}" for i in range(60) if i not in (20, 21)]
     path = tmp_path / "t.csv"
@@ -206,30 +176,3 @@ def test_commands_take_tables_and_say_what_was_left_out(cdmisfa: Cdmisfa, tmp_pa
     )
     assert refused.code == 2
     assert f"{path} is no run, npz is for the signals of one: choose images or mp4" in refused.err
-
-
-def test_a_recording_of_values_says_how_it_is_taken(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    rec, again = tmp_path / "rec", tmp_path / "again"
-    assert cdmisfa("convert", written(tmp_path, {}), "--set", "input.time=t", "-o", rec).code == 0
-    for words in (["convert", rec, "-o", again], ["learn", rec, "--color"]):
-        done = cdmisfa(*words)
-        assert done.code == 2
-        assert "it is a recording of values, not of images: learn, view, export" in done.err
-    assert cdmisfa("convert", rec, "--field", "values", "-o", again).code == 0
-
-
-def test_frames_that_are_held_in_a_gap_are_counted(tmp_path: Path) -> None:
-    path = written(tmp_path, {ROWS - 1: "5.0,1,1"})
-    with ForeignSource(path, time="t", gaps="hold") as source:
-        assert (source.frames, source.alignment["t"]["repeated"]) == (51, 39)
-    with ForeignSource(path, time="t") as source:
-        assert (source.frames, source.alignment["t"]["repeated"]) == (51, 0)
-
-
-@pytest.mark.parametrize("value", ["-3.2,3.2", "-10,-5", "0,1"])
-def test_a_range_of_numbers_may_begin_below_0(cdmisfa: Cdmisfa, tmp_path: Path, value: str) -> None:
-    path = written(tmp_path, {})
-    convert = ("convert", path, "--set", "input.time=t", "-o", tmp_path / "rec", "--set")
-    assert cdmisfa(*convert, f"input.range={value}").code == 0
-    done = cdmisfa(*convert, "input.range=5,-5")
-    assert (done.code, "the smaller first" in done.err) == (2, True)

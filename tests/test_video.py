@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import struct
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,24 +11,14 @@ import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_video
 from conftest import Cdmisfa
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.pixels import shrink
 from replay.camera_logs.pictures import VideoImages
 from replay.camera_logs.source import ForeignSource
 
-av = pytest.importorskip("av")
+pytest.importorskip("av")
 
 SIZE = (HEIGHT, WIDTH)
-
-
-@pytest.fixture(scope="module")
-def videos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two videos of 120 frames; not to be changed."""
-    folder = tmp_path_factory.mktemp("videos")
-    paths = [folder / "left.mp4", folder / "right.mp4"]
-    for seed, path in enumerate(paths):
-        write_video(path, pictures(120, seed), codec="libx264", pixels="yuv420p")
-    return paths
 
 
 def test_a_lossless_video_gives_its_very_pixels(tmp_path: Path) -> None:
@@ -156,36 +145,3 @@ def test_a_video_that_lost_its_end_says_so(tmp_path: Path) -> None:
     assert source.spec.length < 50
     assert any("it states 4 s, its last frame is at" in said for said in source.warnings)
     source.close()
-
-
-def test_a_size_that_is_too_large_is_refused(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mkv", pictures(20))
-    words = ("convert", tmp_path / "a.mkv", "-o", tmp_path / "rec", "--size", "320x240")
-    large = cdmisfa(*words)
-    assert (large.code, "smaller --size" in large.err) == (2, True), large.err
-    assert str(tmp_path / "a.mkv") in large.err
-    assert not (tmp_path / "rec").exists()
-
-
-def test_videos_of_one_name_are_told_apart_by_their_folders(
-    cdmisfa: Cdmisfa, videos: list[Path], tmp_path: Path
-) -> None:
-    files = [tmp_path / side / "cam.mp4" for side in "lr"]
-    for file, video in zip(files, videos, strict=True):
-        file.parent.mkdir()
-        file.write_bytes(video.read_bytes())
-        file.with_name("é.mp4").write_bytes(video.read_bytes())
-    copies = [file.with_name("é.mp4") for file in files]
-    assert ForeignSource(files, size=SIZE).spec.streams == ("l_cam", "r_cam")
-    done = cdmisfa("convert", *copies, "-o", tmp_path / "rec", "--size", "16x12")
-    assert done.code == 0, done.err
-    assert {p.name for p in (tmp_path / "rec").iterdir()} == {"l_e.mcap", "r_e.mcap"}
-    with pytest.raises(UsageError, match=r"cam\.mp4 is named twice: leave one out"):
-        ForeignSource([files[0], files[0]], size=SIZE)
-
-
-def test_without_pyav_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_video(tmp_path / "a.mkv", pictures(3))
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(CdmisfaError, match=r"pip install 'cdmisfa\[video\]'"):
-        ForeignSource(tmp_path / "a.mkv", size=SIZE)

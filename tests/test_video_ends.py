@@ -9,7 +9,7 @@ import pytest
 from camera_files import pictures, write_video
 from conftest import Cdmisfa
 
-av = pytest.importorskip("av")
+pytest.importorskip("av")
 
 FRAMES = 40
 FRAGMENTS = {"movflags": "frag_keyframe+empty_moov", "g": "5"}
@@ -27,7 +27,7 @@ STATED: dict[str, tuple[str, str, str, Mapping[str, str]]] = {
     "avi": ("avi", "mjpeg", "yuvj420p", {}),
     "wmv": ("wmv", "wmv2", "yuv420p", {}),
 }
-"""Containers that state where they end."""
+
 
 NOT_STATED: dict[str, tuple[str, str, str, Mapping[str, str]]] = {
     "mkv, live": ("mkv", "ffv1", "gray", {"live": "1"}),
@@ -37,6 +37,7 @@ NOT_STATED: dict[str, tuple[str, str, str, Mapping[str, str]]] = {
     ),
     "mpeg": ("mpg", "mpeg1video", "yuv420p", {}),
 }
+"""Containers that state where they end."""
 
 
 def written(
@@ -103,30 +104,6 @@ def test_what_does_not_state_its_end_is_whole_with_a_remark(
     assert f"{path}: {UNKNOWN}" in cdmisfa("info", path).out
     learned = cdmisfa("learn", path, "--max-iterations", 1)
     assert UNKNOWN not in learned.err  # nobody can act on it there
-
-
-@pytest.mark.parametrize("kind", STATED)
-def test_missing_frames_within_a_video_are_no_missing_end(
-    cdmisfa: Cdmisfa, tmp_path: Path, kind: str
-) -> None:
-    path = tmp_path / f"film.{STATED[kind][0]}"
-    _, codec, pixels, options = STATED[kind]
-    write_video(
-        *(path, pictures(FRAMES)),
-        codec=codec,
-        pixels=pixels,
-        options=options,
-        drop=frozenset({11, 12, 13, 30}),
-    )
-    done = cdmisfa("verify", path)
-    assert done.code == 0, done.out
-
-
-def test_a_file_without_a_byte_is_no_video(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    path = tmp_path / "film.mp4"
-    path.touch()
-    done = cdmisfa("learn", path)
-    assert (done.code, done.err.count("\n"), str(path) in done.err) == (3, 1, True), done.err
 
 
 @pytest.mark.parametrize(("ending", "codec"), [("avi", "libx264"), ("mpg", "libx264")])
