@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from kernel_agent import STAY, KernelAgent
-from reference.agent import IDLE_EPSILON, has_gap, ready_to_save
+from reference.agent import has_gap, ready_to_save
 
 from cdmisfa.agents.agent import CONSTANT, NOVEL, Agent, begin_abstraction, new_agent
 from cdmisfa.core.config import LearnerConfig
@@ -133,13 +133,6 @@ def test_gaps() -> None:
     assert has_gap(bench.agent.memory, 0, 3 * TAU)
 
 
-def test_the_mean_change_leaves_out_what_has_none() -> None:
-    bench = Bench()
-    assert bench.step(np.array([np.nan, 1.0, 2.0]))["xi"] == 1.5
-    assert bench.step(np.array([0.5, 1.5]))["xi"] == 1.0
-    assert math.isnan(bench.step(np.nan)["xi"])
-
-
 def test_eta_is_over_all_novel_blocks_and_eta_inst_over_the_last() -> None:
     bench = Bench()
     y = np.random.default_rng(0).standard_normal((40, TAU, 1))
@@ -248,14 +241,6 @@ def test_the_iteration_that_saves_changes_neither_reward_nor_policy() -> None:
     assert bench.step()["saved"]
     np.testing.assert_array_equal(bench.values(), before)
     assert bench.memory["rewards"] == count
-
-
-def test_idle_counts_iterations_without_exploration() -> None:
-    bench = Bench(epsilon_start=2 * IDLE_EPSILON, epsilon_tail_decay=0.4)
-    assert bench.step()["epsilon"] < IDLE_EPSILON
-    for k in range(2, 6):
-        bench.step()
-        assert bench.memory["idle"] == k
 
 
 @given(st.integers(1, 8), st.lists(st.tuples(st.floats(0, 1), *[st.floats(0, 0.99)] * 3)))

@@ -50,26 +50,6 @@ def test_cameras_keep_the_number_of_frames(camera: str) -> None:
     np.testing.assert_array_equal(seen.frames, again.frames)
 
 
-@pytest.mark.parametrize(
-    ("name", "package"),
-    [
-        ("cartpole", "gymnasium"),
-        ("cliff", "gymnasium"),
-        ("pong", "ale_py"),
-        ("china", "sklearn"),
-        ("cheetah", "pybullet"),
-    ],
-)
-def test_what_is_played_is_the_same_every_time(name: str, package: str) -> None:
-    pytest.importorskip(package)
-    maker, *arguments = STREAMS[name]["make"]
-    one, again = (getattr(worlds, maker)(np.random.default_rng(1), 60, *arguments) for _ in "ab")
-    assert one.frames.shape == (60, 48, 64)
-    assert len(one.state) == 60
-    np.testing.assert_array_equal(one.frames, again.frames)
-    np.testing.assert_array_equal(one.state, again.state)
-
-
 def test_modules_are_judged_against_batch_sfa() -> None:
     source = ArenaSource(WORDS, 0)
     good, _ = source.reference("x1", *TERMS)

@@ -23,6 +23,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import SIGNALS, values
 from cdmisfa.features.incsfa import Feature, IncrementalFeature
+from cdmisfa.features.recursive import RecursiveFeature
 from recorder.cameras.readers import Camera
 from recorder.cameras.words import CAMERAS
 from recorder.images.pixels import Shown
@@ -48,6 +49,11 @@ class TestProgress(LearnerContract):
 class TestIncSFA(FeatureContract):
     def open(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> Feature:
         return IncrementalFeature(config, n_inputs, rng)
+
+
+class TestRecursiveSFA(FeatureContract):
+    def open(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> Feature:
+        return RecursiveFeature(n_inputs, components=n_inputs, outputs=config.outputs)
 
 
 class TestVideo(CameraContract):

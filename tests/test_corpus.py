@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import json
 import os
 import re
 import shlex
@@ -21,15 +19,13 @@ from conftest import Cdmisfa
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.processes import WorkerDied
-from recorder.log.files import held
 from replay.corpus import index as indexing
 from replay.corpus import rows as looking
 from replay.corpus.finding import INDEX, found_logs
-from replay.corpus.index import MOST_NAMED, index_logs, read_index
-from replay.corpus.rows import MARK, SCHEMA, Answer, Task
-from replay.integrity.info import LogInfo
+from replay.corpus.index import index_logs, read_index
+from replay.corpus.rows import SCHEMA, Answer, Task
 
 ROOT = Path(__file__).parents[1]
 
@@ -115,15 +111,6 @@ class TestRows:
             "7",
             30,
         )
-
-    def test_a_run_is_one_log_with_its_configuration(self, corpus: Path) -> None:
-        index_logs([corpus])
-        found = [r for r in rows_of(corpus) if r["kind"] == "run"]
-        assert {(r["path"], r["log"], r["seed"]) for r in found} == {
-            ("runs/first/run.mcap", "runs/first", 0)
-        }
-        for stated in (json.loads(r["configuration"]) for r in found):
-            assert stated["config"]["learner"]["tau"] == 100
 
     def test_what_is_broken_is_a_row_that_says_why(self, corpus: Path) -> None:
         index_logs([corpus])
@@ -214,12 +201,6 @@ class TestUpToDate:
         assert made.read == 1 + 2  # what could not be opened is looked at again
         assert row(corpus, "night/one/x1.mcap", "/view/x1")["crc"] == "ok"  # kept as it was
 
-    def test_a_folder_and_its_index_can_move(self, corpus: Path, tmp_path: Path) -> None:
-        index_logs([corpus])
-        moved = corpus.rename(tmp_path / "elsewhere")
-        assert index_logs([moved]).read == 0
-        assert all((moved / r["path"]).exists() for r in rows_of(moved))
-
     def test_an_index_of_several_lies_where_it_is_told(self, corpus: Path, tmp_path: Path) -> None:
         out = tmp_path / "all.parquet"
         made = index_logs([f"{corpus}/*.mcap", corpus / "night"], out)
@@ -246,46 +227,6 @@ class TestBadInput:
         index_logs([corpus])
         assert row(corpus, "r\\xff.mcap")["problem"] == "its name is not UTF-8: give it another"
 
-    def test_files_that_vanish_or_change_meanwhile(
-        self, corpus: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        log = corpus / "robot.mcap"
-        (corpus / "night" / "one" / "x1.mcap").touch()
-        describe = looking.describe_reader
-
-        def changing(reader: Any, **how: Any) -> LogInfo:
-            info = describe(reader, **how)
-            if reader.path.name == "robot.mcap":
-                os.utime(log, ns=(1, 1))
-            (corpus / "torn.mcap").unlink(missing_ok=True)
-            return info
-
-        monkeypatch.setattr(looking, "describe_reader", changing)
-        made = index_logs([corpus])
-        assert (made.logs, made.gone) == (9, ["torn.mcap"])
-        assert row(corpus, "robot.mcap")["problem"].endswith("index again")
-        monkeypatch.undo()
-        assert index_logs([corpus]).read == 1
-        assert row(corpus, "robot.mcap")["problem"] is None
-
-    def test_two_at_once(self, corpus: Path) -> None:
-        index_logs([corpus])
-        before = (corpus / INDEX).read_bytes()
-        with held(corpus), pytest.raises(UsageError, match="in use by another process"):
-            index_logs([corpus], full=True)
-        assert (corpus / INDEX).read_bytes() == before
-
-    def test_an_index_of_another_version(self, cdmisfa: Cdmisfa, corpus: Path) -> None:
-        index_logs([corpus])
-        table = read_index(corpus / INDEX)
-        pq.write_table(table.replace_schema_metadata({MARK: b"7"}), corpus / INDEX)
-        with pytest.raises(UsageError, match="version 7, this program has 1: make it again"):
-            read_index(corpus / INDEX)
-        done = cdmisfa("index", corpus)
-        assert done.code == 0
-        assert "version 7: it is made anew" in done.err
-        assert len(rows_of(corpus)) == table.num_rows
-
     def test_what_is_no_index_is_left_alone(self, corpus: Path, tmp_path: Path) -> None:
         other = tmp_path / "other.parquet"
         pq.write_table(pa.table({"a": [1]}), other)
@@ -298,23 +239,6 @@ class TestBadInput:
             index_logs([corpus], other)
         with pytest.raises(UsageError, match=r"robot.mcap is no index of logs"):
             read_index(corpus / "robot.mcap")
-
-    def test_a_full_disk_leaves_the_index_before(
-        self, corpus: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        index_logs([corpus])
-        before = (corpus / INDEX).read_bytes()
-        os.utime(corpus / "robot.mcap", ns=(1, 1))
-
-        def full(table: pa.Table, path: Path, **_: Any) -> None:
-            Path(path).write_bytes(b"half")
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-        monkeypatch.setattr(indexing.pq, "write_table", full)
-        with pytest.raises(LogWriteError, match="No space left"):
-            index_logs([corpus])
-        assert (corpus / INDEX).read_bytes() == before
-        assert [path.name for path in corpus.glob("*.partial")] == []
 
     def test_a_log_that_kills_its_worker_is_a_row(
         self, corpus: Path, monkeypatch: pytest.MonkeyPatch
@@ -343,13 +267,6 @@ class TestBadInput:
         index_logs([corpus], deep=True, full=True, stop=lambda: True)
         assert len({r["path"] for r in rows_of(corpus)}) == 10  # the rest is as it was
 
-    def test_many_broken_files(self, tmp_path: Path) -> None:
-        rng = np.random.default_rng(0)
-        for i in range(500):
-            (tmp_path / f"{i}.mcap").write_bytes(b"\x89MCAP0\r\n" * (i % 2) + rng.bytes(i))
-        made = index_logs([tmp_path])
-        assert (made.logs, made.broken) == (500, 500)
-
 
 class TestSummary:
     def test_it_says_how_much_there_is_and_what_is_broken(
@@ -370,22 +287,12 @@ class TestSummary:
         assert 2 * 39.98 < recordings["seconds"] < 3 * 39.98
         assert (kinds["run"]["logs"], kinds["not read"]["logs"]) == (1, 2)
 
-    def test_long_lists_of_broken_logs_end(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-        for number in range(MOST_NAMED + 3):
-            (tmp_path / f"{number:02}.mcap").touch()
-        said = cdmisfa("index", tmp_path).out
-        assert said.count("empty, nothing was written") == MOST_NAMED
-        assert "and 3 more logs with a problem" in said
-
     def test_deep_names_the_same_messages_in_other_files(self, corpus: Path) -> None:
         repacked(corpus / "night" / "one" / "x1.mcap", corpus / "again.mcap")
         index_logs([corpus], deep=True)
         one, two = (row(corpus, f"{name}.mcap", "/truth") for name in ("again", "night/one/x1"))
         assert one["contents"] == two["contents"] != row(corpus, "robot.mcap")["contents"]
         assert one["identity"] != two["identity"]
-
-    def test_a_folder_that_is_not_there_is_refused(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-        assert cdmisfa("index", tmp_path / "missing").code == 2
 
 
 def test_the_commands_of_the_pages_work(

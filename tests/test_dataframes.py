@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ import cdmisfa
 from cdmisfa import Run
 from cdmisfa.core.errors import UsageError
 from replay.arrays import ArrayLog
-from replay.export.tables import export_signals
 
 ROWS = 60
 COLUMNS = {
@@ -70,14 +68,6 @@ def test_a_module_takes_tables_of_each_library(kind: str, module: Any) -> None:
         module.transform(table(kind, COLUMNS | {"name": ["a"] * ROWS}))
 
 
-@pytest.mark.parametrize("kind", ["pandas", "pandas nullable", "polars"])
-def test_one_column_is_one_number_a_frame(kind: str) -> None:
-    column = table(kind)["brake"]
-    np.testing.assert_array_equal(
-        ArrayLog({"x": column}).take(0, ROWS).frames, COLUMNS["brake"][:, None]
-    )
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     ("columns", "said"),
@@ -116,14 +106,3 @@ def test_signals_of_a_run_are_tables_of_each_library(run: Run) -> None:
     assert polars["reward"].is_nan().sum() == 0
     assert polars["reward"].mean() == pytest.approx(np.nanmean(signals["reward"]))
     assert [list(eta) for eta in pandas["eta"]] == polars["eta"].to_list()
-
-
-def test_the_mean_of_an_exported_signal_is_a_number(run: Run, tmp_path: Path) -> None:
-    duckdb = pytest.importorskip("duckdb")
-    signals = run.signals
-    export_signals(run.path, tmp_path / "signals.parquet", "parquet")
-    query = "SELECT avg(reward), count(reward), count(*) FROM '{}'"
-    with duckdb.connect() as database:
-        found = database.sql(query.format(tmp_path / "signals.parquet")).fetchall()
-    known = signals["reward"][~np.isnan(signals["reward"])]
-    assert found == [(pytest.approx(known.mean()), len(known), len(signals["reward"]))]

@@ -19,7 +19,6 @@ from waiting import running, wait_for
 
 import cdmisfa as package
 from cdmisfa.core.arrays import GRAY, centred, mean_of
-from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.camera_logs.lerobot import PAUSE
 from replay.corpus.episodes import EpisodeSource
 from replay.inputs import locations
@@ -93,15 +92,6 @@ def test_episodes_are_learned_as_one_log_with_pauses_is(cdmisfa: Cdmisfa, tmp_pa
     (folder / "ep2.mcap").unlink()
     without = cdmisfa("check", run, "--json")
     assert (without.code, without.json["other_files"]) == (4, ["ep2.mcap"])
-
-
-def test_logs_of_the_same_time_are_ordered_by_their_paths_as_numbers(tmp_path: Path) -> None:
-    images = scenes(1, 12)[0]
-    names = [f"{day}/{i}.mcap" for day in ("d2", "d10") for i in (2, 10)]
-    paths = [write_log(tmp_path / name, images) for name in reversed(names)]
-    with opened(*paths) as source:
-        assert [row["file"] for row in source.describe()["files"]] == names
-        assert len(source.copies) == 3
 
 
 def test_streams_of_the_same_name_are_one_and_a_missing_one_is_a_gap(tmp_path: Path) -> None:
@@ -198,22 +188,11 @@ def test_a_log_damaged_in_the_middle_is_left_out_from_there_on(
     assert "the log is left out" in without.err
 
 
-def test_a_log_that_changes_meanwhile_is_left_out(tmp_path: Path) -> None:
-    one, two = scenes(2, 30)
-    paths = write_log(tmp_path / "1.mcap", one), write_log(tmp_path / "2.mcap", two, 1000)
-    with opened(*paths) as source:
-        write_log(paths[0], two)
-        assert source.take(0, 10).t == 50
-        assert "it was changed since it was first opened" in source.salvaged()[0]
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("oscillatory", "--set", "input.centre=episode"), "oscillatory is a scene"),
         (("oscillatory", "--episodes"), "oscillatory is a scene"),
         (("av:lavfi:testsrc", "--set", "input.centre=episode"), "input.centre is for logs"),
-        (("CORPUS", "--color", "auto"), "--color auto looks at one log"),
         (("CORPUS", "--topic", "/no"), "no topic /no"),
         (("CORPUS/../broken",), "corpus.parquet is damaged"),
         (("CORPUS", "--set", "input.holdout=0.5", "--loop"), "input.holdout is for camera logs"),
@@ -233,20 +212,6 @@ def test_what_episodes_cannot_be_is_refused_in_a_line(
     assert done.code in (2, 3)
     assert said in done.err
     assert len(done.err.splitlines()) == 1
-
-
-def test_python_refuses_another_centre_and_episodes_of_arrays(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "1.mcap", scenes(1, 12)[0])
-    with pytest.raises(UsageError, match="centre is all: choose one of run, episode"):
-        package.learn(str(path), centre="all")
-    with pytest.raises(UsageError, match="episodes are logs"):
-        package.Recording(np.zeros((10, 2)), episodes=True)
-    with pytest.raises(UsageError, match="oscillatory is a scene"):
-        package.learn("oscillatory", centre="episode")
-    torn = tmp_path / "2.mcap"
-    torn.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(LogDamagedError):
-        package.learn([str(torn)], episodes=True)
 
 
 # Killed and resumed
@@ -401,15 +366,6 @@ def test_what_is_held_out_are_whole_episodes_where_one_fits(tmp_path: Path) -> N
         assert [len(b) for b in source.pieces(0, 260, 280, 16)] == [16, 4]
 
 
-def test_a_run_lists_so_many_episodes_and_no_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    paths = [write_log(tmp_path / f"{i}.mcap", x, i * 100) for i, x in enumerate(scenes(3, 12))]
-    monkeypatch.setattr("replay.corpus.episodes.MOST", 2)
-    with pytest.raises(UsageError, match="3 logs are more episodes than one run lists, 2"):
-        opened(*paths)
-
-
 def test_recordings_of_scenes_are_episodes(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     for seed in (1, 0):
@@ -424,19 +380,3 @@ def test_recordings_of_scenes_are_episodes(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     assert cdmisfa("check", run).code == 0
     assert cdmisfa("index", folder / "rec0").code == 0  # it stays one recording
     assert cdmisfa("learn", folder / "rec0", "--json").json["source"]["kind"] == "recording"
-
-
-@pytest.mark.parametrize("below", [".", "day"])
-def test_recordings_in_one_folder_are_episodes_of_their_own(
-    below: str, cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    folder = tmp_path / "logs" / below
-    folder.mkdir(parents=True)
-    for seed in (1, 0):
-        words = ("--view", "x1", "--seed", seed, "--frames", 200, "-o", tmp_path / f"rec{seed}")
-        assert cdmisfa("record", "oscillatory", *words).code == 0
-        (tmp_path / f"rec{seed}" / "x1.mcap").rename(folder / f"{seed}.mcap")
-    (folder / "2.mcap").write_bytes((folder / "1.mcap").read_bytes())
-    corpus = tmp_path / "logs"
-    assert cdmisfa("index", corpus).code == 0
-    assert "3 episodes" in cdmisfa("learn", corpus, "--max-iterations", 1).err

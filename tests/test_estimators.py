@@ -15,9 +15,7 @@ from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from sklearn.utils.estimator_checks import check_estimator
-from waiting import python
 
-from cdmisfa.core.errors import UsageError
 from cdmisfa.estimators import IncSFA, OnlineSFA, RecursiveSFA
 from cdmisfa.features.sfa import batch_sfa, slowness
 
@@ -166,12 +164,6 @@ def test_what_cannot_be_learned_is_refused(
         make(**parameters).fit(X)
 
 
-@pytest.mark.parametrize("nu", [-1.0, 2.0, "quick"])
-def test_a_learning_rate_is_from_0_to_1(nu: Any) -> None:
-    with pytest.raises(ValueError, match=f"nu={nu!r} given: it is"):
-        IncSFA(nu=nu).fit(np.ones((9, 2)))
-
-
 def samples(X: NDArray[np.float64]) -> list[dict[str, float]]:
     return [dict(zip("abcdef", row, strict=True)) for row in X.tolist()]
 
@@ -198,26 +190,3 @@ def test_a_sample_that_lacks_something_is_a_gap(lost: Any) -> None:
     assert online.slowness == sfa.slowness_[0]
     centre = dict(zip("abcdef", sfa.mean_.tolist(), strict=True))
     assert online.transform_one({}) == online.transform_one(centre)
-
-
-def test_more_features_than_there_are_is_refused_of_a_sample() -> None:
-    with pytest.raises(UsageError, match="20 outputs"):
-        OnlineSFA(20).learn_one({"a": 1.0})
-    assert OnlineSFA(3).transform_one({"a": 1.0}) == dict.fromkeys(
-        ("onlinesfa0", "onlinesfa1", "onlinesfa2"), 0.0
-    )
-
-
-@pytest.mark.parametrize(
-    ("name", "package", "extra"),
-    [("RecursiveSFA", "sklearn", "sklearn"), ("OnlineSFA", "river", "river")],
-)
-def test_without_its_package_it_says_what_to_install(name: str, package: str, extra: str) -> None:
-    code = (
-        f"import sys; sys.modules[{package!r}] = None\n"
-        f"import cdmisfa.estimators as e\nhelp(e.{name})\n"
-        f"try: e.{name}(2, n_whitened=4)\nexcept Exception as error: print(repr(error))"
-    )
-    done = python("-c", code, check=True)
-    assert "window: " in done.stdout
-    assert f"which is missing: pip install 'cdmisfa[{extra}]'" in done.stdout.splitlines()[-1]

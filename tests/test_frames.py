@@ -17,10 +17,9 @@ from cdmisfa.core.arrays import as_frames
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.expansion import EXPANSIONS, Expansion, expand, quadratic
+from cdmisfa.core.expansion import expand, quadratic
 from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.outputs import project
-from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import lib
 from recorder.world.oscillatory import OscillatorySource
 
@@ -102,41 +101,6 @@ def test_only_uint8_are_pixels(kind: str) -> None:
             call(frames)  # type: ignore[operator]
 
 
-def test_rows_of_unequal_length_are_refused() -> None:
-    with pytest.raises(UsageError, match="unequal length"):
-        abstraction(2).update([[1.0, 2.0], [1.0]])  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("phi", "offset"),
-    [(np.ones(SMALL), np.zeros(1)), (np.ones((2, SMALL)), np.zeros(1)), (np.ones((1, 4)), [0.0])],
-)
-def test_weights_that_do_not_fit_are_refused(phi: Any, offset: Any) -> None:
-    with pytest.raises(UsageError, match="given: give"):
-        project(phi, offset, np.zeros((3, SMALL)))
-
-
-@pytest.mark.parametrize("frames", [np.zeros(5), np.zeros((2, 3, 4)), np.zeros((4, 5), bool), "x"])
-def test_batch_sfa_takes_frames_only(frames: Any) -> None:
-    with pytest.raises(UsageError, match="given: give"):
-        batch_sfa(frames, 1)
-
-
-def test_an_expansion_that_gives_another_size_than_it_says_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(EXPANSIONS, "short", Expansion(lambda n: n + 1, lambda frames: frames))
-    with pytest.raises(UsageError, match=r"give \(n, 6\)"):
-        expand("short", np.zeros((3, SMALL)))
-
-
-@pytest.mark.parametrize("block", [np.zeros((100, 2)), [1.0], None])
-def test_a_learner_takes_blocks_only(block: Any) -> None:
-    learner = CuriousLearner(LearnerConfig(), SourceSpec(("a",), (2,), "float64"), 0)
-    with pytest.raises(UsageError, match=r"given: a learner takes the blocks of a source"):
-        learner.step(block)
-
-
 @pytest.mark.parametrize("t", [2**70, -1, 1.5, "3"])
 @pytest.mark.parametrize("config", [LearnerConfig(), ProgressConfig()])
 def test_a_block_of_no_frame_number_is_refused_before_anything_is_drawn(
@@ -148,12 +112,6 @@ def test_a_block_of_no_frame_number_is_refused_before_anything_is_drawn(
     with pytest.raises(UsageError, match="frames have numbers from 0 on"):
         learner.step(replace(block, t=t))
     assert learner.state.policy_rng == before
-
-
-def test_a_source_in_place_of_its_spec_is_refused() -> None:
-    source: Any = OscillatorySource()
-    with pytest.raises(UsageError, match=r"OscillatorySource given as spec: .*source\.spec"):
-        CuriousLearner(LearnerConfig(), source, 0)
 
 
 def test_a_block_of_another_order_in_memory_gives_the_same_bits() -> None:

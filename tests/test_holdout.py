@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,11 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.blocks import description
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError
-from cdmisfa.experiments.holdout import hold_out, judged
-from cdmisfa.experiments.session import Session
-from cdmisfa.experiments.sources import configure_for, log_settings
+from cdmisfa.experiments.holdout import judged
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.features.sfa import batch_sfa, slowness
 from cdmisfa.modules import Module
@@ -148,18 +144,6 @@ def test_going_on_keeps_to_what_the_run_learns_from(
     assert forked["frames"] == forked["held_out"]["frames"][0] == 5400
 
 
-def test_a_run_that_states_something_else_is_described_without(
-    cdmisfa: Cdmisfa, log: Path, tmp_path: Path
-) -> None:
-    run = tmp_path / "run"
-    cdmisfa("learn", log, *LEARN, "-o", run, "--no-rerun", "--max-iterations", "3")
-    document = json.loads((run / "run.json").read_text())
-    for odd in (7, {}, {"frames": None}, {"frames": [0, 1], "fitted": [0, 1], "modules": [3]}):
-        document["result"]["held_out"] = odd
-        (run / "run.json").write_text(json.dumps(document))
-        assert cdmisfa("info", run, "--json").json["held_out"] is None
-
-
 @pytest.mark.parametrize("size", [7, 100, 5000])
 def test_slowness_in_pieces_is_that_of_all_frames(size: int) -> None:
     x = values(3000)
@@ -180,22 +164,6 @@ def test_no_step_leads_across_what_is_missing() -> None:
     )
     assert still == math.inf
     assert math.isnan(none)
-
-
-def test_judging_is_stopped_at_once_and_done_when_the_run_is_resumed(
-    cdmisfa: Cdmisfa, log: Path, tmp_path: Path
-) -> None:
-    whole = cdmisfa("learn", log, *LEARN).json
-    settings = ("learner.expansion=none", "learner.outputs=2")
-    with ForeignSource(log, time="t") as source:
-        hold_out(source, None, judged=True)
-        about = description(source)
-        learner = configure_for(source.spec, about, words=log_settings(settings, log)).learner
-        session = Session(source, learner, tmp_path / "run")
-        stopped = session.learn(stop=lambda: bool(session.learner.over), rerun=False)
-        assert (stopped.ended, stopped.held_out) == ("interrupted", None)
-        resumed = Session.resume(source, learner, tmp_path / "run").learn(rerun=False)
-    assert resumed.held_out == whole["held_out"]
 
 
 def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -> None:

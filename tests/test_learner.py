@@ -97,12 +97,6 @@ def test_signals_have_the_documented_shapes(whole: Trial) -> None:
     assert modules == 3
 
 
-def test_each_iteration_watches_what_the_last_one_chose(whole: Trial) -> None:
-    for before, after in zip(whole.signals, whole.signals[1:], strict=False):
-        assert after.stream == before.next_stream
-        assert (before.next_stream == before.stream) == (before.action == 0)
-
-
 def test_what_a_block_does_not_have_is_nan(whole: Trial) -> None:
     for record in whole.signals:
         known = not record.novel
@@ -358,24 +352,6 @@ def test_a_feature_that_learns_in_python_gives_the_same_bits(algorithm: str) -> 
             digest.add(alone.step(one))
         hashes.append(digest.hexdigest())
     assert hashes[0] == hashes[1]
-
-
-def test_a_feature_of_another_shape_is_refused() -> None:
-    def feature(
-        config: LearnerConfig, n_inputs: int, rng: np.random.Generator
-    ) -> IncrementalFeature:
-        return IncrementalFeature(config, n_inputs - 1, rng)
-
-    with pytest.raises(UsageError, match=r"phi of \(1, 4\): it must be \(1, 5\)"):
-        CuriousLearner(CONFIG, SPEC, 0, feature=feature)
-
-
-def test_one_stream_alone_is_learned_and_never_left() -> None:
-    found = trial(0, modules=1, source=OscillatorySource(("x2",)))
-    (module,) = found.learner.modules
-    assert module.policy.tolist() == [0]
-    assert {record.next_stream for record in found.signals} == {0}
-    assert module.eta[0] == pytest.approx(0.006, abs=0.001)
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,8 @@ import pytest
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
-from cdmisfa.core.learning import Keyframe
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.modules import Module
-from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.modules import SlowFeatures, load_modules, save_modules
 
 EASY = {"delta": 1.0, "eta_dot_window": 3, "min_variance": 0.0, "warm_up": 0, "tau": 20}
@@ -80,26 +78,12 @@ def with_width(width: int, **values: Any) -> Module:
     return Module(1, "a", 0, 9, phi, mean, zero, zero, zero, policy, **values)
 
 
-def test_values_are_values_even_as_uint8() -> None:
-    frames = np.array([[3, 4]], np.uint8)
-    assert with_width(2, expansion="none", scale=1.0).transform(frames).tolist() == [[7.0]]
-    assert with_width(2).transform(frames)[0, 0] == pytest.approx(7 / 255)
-
-
 @pytest.mark.parametrize("kind", ["int8", "bool", "int64", "U1"])
 def test_what_is_neither_pixel_nor_value_is_refused(kind: str) -> None:
     with pytest.raises(UsageError, match=r"frames of \S+ given: give uint8 pixels or float"):
         with_width(2).transform(np.ones((3, 2)).astype(kind))
     with pytest.raises(UsageError, match="given"):
         SlowFeatures(with_width(2)).transform(np.zeros((5, 11)))
-
-
-def test_a_single_frame_is_not_read_as_many() -> None:
-    module = with_width(48 * 128, expansion="none")
-    for given in (module, SlowFeatures(module)):
-        with pytest.raises(UsageError, match=r"a single frame of shape \(48, 128\) given: .*None"):
-            given.transform(np.zeros((48, 128), np.uint8))
-        assert given.transform(np.zeros((1, 48, 128), np.uint8)).shape == (1, 1)
 
 
 def test_modules_come_back_in_order_and_to_the_bit(tmp_path: Path) -> None:
@@ -135,30 +119,6 @@ def test_a_file_of_something_else_is_refused_in_words(data: bytes, tmp_path: Pat
         load_modules(tmp_path)
     with pytest.raises(UsageError, match="does not exist"):
         load_modules(tmp_path / "elsewhere")
-
-
-def test_keyframes_keep_both() -> None:
-    learner, _ = learned("uint8", "none")
-    keyframe = Keyframe(learner.iteration, 0, learner.state, {})
-    modules = decode_keyframe(encode_keyframe(keyframe)).state.modules
-    assert {(module.expansion, module.scale) for module in modules} == {("none", 1 / 255)}
-
-
-def test_a_write_that_fails_leaves_the_earlier_modules_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "modules.npz"
-    save_modules(path, [with_width(2)])
-    before = path.read_bytes()
-
-    def full(file: Any, **arrays: Any) -> None:
-        file.write(b"PK")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(LogWriteError, match=r"modules\.npz cannot be written: No space left"):
-        save_modules(path, [with_width(3)])
-    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [(path.name, before)]
 
 
 @pytest.mark.parametrize(

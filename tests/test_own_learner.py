@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 from contracts.learners import LearnerContract
-from waiting import python
 
 from cdmisfa.agents.learners import learner_entry
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Learner
 from cdmisfa.experiments.sources import configure
 from cdmisfa.experiments.store import read_rows
 from cdmisfa.experiments.sweep import plan, sweep
-from cdmisfa.experiments.trial import has_whole_trials, run_trial
 
 ROOT = Path(__file__).parents[1]
 OWN = "watcher:Watcher"
@@ -50,19 +47,6 @@ def test_it_learns_is_checked_and_resumed(cdmisfa: Cdmisfa, tmp_path: Path) -> N
     assert result["mean"] == whole["mean"]
 
 
-def test_another_process_finds_it_on_pythonpath(tmp_path: Path) -> None:
-    words = ("learn", "oscillatory", "--algorithm", OWN, "--max-iterations", "3", "--no-rerun")
-    env = {"PYTHONPATH": f"{ROOT / 'examples'}:{ROOT}"}
-    done = python("-m", "cdmisfa", *words, "-o", tmp_path / "run", cwd=tmp_path, env=env)
-    assert done.returncode == 0, done.stderr
-    done = python("-m", "cdmisfa", "check", tmp_path / "run", cwd=tmp_path, env=env)
-    assert done.returncode == 0, done.stderr
-    done = python("-m", "cdmisfa", "check", "run", cwd=tmp_path, env={"PYTHONPATH": str(ROOT)})
-    assert done.returncode == 2
-    assert done.stderr.startswith("cdmisfa: the learner watcher:Watcher cannot be imported")
-    assert done.stderr.count("\n") == 1
-
-
 def test_a_sweep_uses_it_and_knows_its_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -75,14 +59,6 @@ def test_a_sweep_uses_it_and_knows_its_code(
     monkeypatch.setattr("inspect.getfile", lambda found: __file__)
     other = plan(["oscillatory"], grid={}, seeds=[0], settings=settings)[0].id
     assert planned[0] == planned[1] != other
-
-
-def test_it_has_no_whole_trials() -> None:
-    config = learner_entry(OWN).configuration()
-    assert has_whole_trials(LearnerConfig())
-    assert not has_whole_trials(config)
-    with pytest.raises(UsageError, match=r"learner\.algorithm watcher:Watcher has no whole trials"):
-        run_trial(config, seed=0)
 
 
 def test_its_keys_are_those_of_its_configuration() -> None:

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import write_cameras
 from conftest import Cdmisfa
 from hypothesis import given
 from hypothesis import strategies as st
-from moving_pictures import LENGTH, MovingPictures
+from moving_pictures import MovingPictures
 
 from cdmisfa import Run
 from cdmisfa.agents.learners import LEARNERS, open_learner
@@ -24,15 +23,13 @@ from cdmisfa.agents.progress.judging import (
     flatness,
     gain,
     hopeless,
-    new_streams,
-    outcome,
     promising,
 )
 from cdmisfa.agents.progress.learner import ProgressLearner
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import Learner
-from cdmisfa.core.signals import STATES, canonical_bytes
+from cdmisfa.core.signals import canonical_bytes
 from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure
@@ -108,30 +105,6 @@ def test_what_changes_is_learned_anew_or_known(attention: str) -> None:
     assert len(learner.modules) == 2
     (changed, other) = learner.summary()["streams"]
     assert (changed["state"], changed["module"]) == ("known", other["module"])
-
-
-def test_what_only_drifts_does_not_hold_a_run_up() -> None:
-    """Its slow output is nowhere seen again, so that it is begun anew; but not for ever."""
-    source = MovingPictures("dawn", "swing")
-    learner = ProgressLearner(ProgressConfig(components=8), source.spec, 0)
-    assert learn_blocks(source, learner, max_iterations=1500) == "all_decided"
-    assert "swing" in [m.stream for m in learner.modules]
-
-
-def test_what_is_too_slow_to_be_tested_says_so() -> None:
-    own = new_streams(1)[0]
-    own["state"], own["module"], own["slowness"] = 1, 0, 0.0004
-    assert "raise learner.test_frames and learner.window" in outcome("a", own, None, 2000)["why"]
-    own["slowness"] = 0.002
-    assert outcome("a", own, None, 2000)["why"] == ""
-
-
-def test_what_does_not_change_is_not_learned_twice() -> None:
-    source = MovingPictures("swing", "stroll", "noise", seed=3)
-    learner = ProgressLearner(ProgressConfig(components=8, watch=10**6), source.spec, 0)
-    learn_blocks(source, learner, max_iterations=1500)
-    assert len(learner.modules) == 2
-    assert sorted(outcomes(learner).values()) == ["given_up", "learned", "learned"]
 
 
 def test_live_recorded_and_resumed_are_the_same_bit_for_bit(tmp_path: Path) -> None:
@@ -238,11 +211,6 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
 def test_wrong_settings_are_named(setting: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         configure("icub", settings=("learner.algorithm=progress", f"learner.{setting}"))
-
-
-def test_a_preset_of_another_learner_is_named() -> None:
-    with pytest.raises(UsageError, match=r"preset icub: .* is progress: leave that preset out"):
-        configure("icub", "icub", ("learner.algorithm=progress",))
 
 
 def test_the_preset_is_the_defaults() -> None:
@@ -361,36 +329,6 @@ def test_rules_choose_what_they_are_for(
         explore=0.1,
     )
     assert RULES[name](situation)[0] == chosen
-
-
-def test_peoples_own_logs_are_learned_from_with_it(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    write_cameras(tmp_path / "robot.mcap", {"/left": (120, 20), "/right": (120, 20)})
-    topics = ("--topic", "/left", "--topic", "/right")
-    cameras = (tmp_path / "robot.mcap", *topics, "--size", "16x12")
-    words = ("learn", *cameras, "--loop", "--max-iterations", 30)
-    done = cdmisfa(*words, "--json", "-o", tmp_path / "run")
-    assert done.code == 0
-    rows = done.json["streams"]
-    assert [set(row) for row in rows] == 2 * [
-        {"stream", "state", "module", "blocks", "slowness", "why"}
-    ]
-    assert {row["state"] for row in rows} <= set(STATES)
-    assert [row["stream"] for row in rows] == ["left", "right"]
-    told = cdmisfa(*words)
-    assert all(f"{name}: " in told.out for name in ("left", "right"))
-    paper = cdmisfa(*words, "--algorithm", "2.0", "--json")
-    assert (paper.code, "streams" in paper.json) == (0, False)
-    converted = tmp_path / "recording"
-    assert cdmisfa("convert", *cameras, "-o", converted).code == 0
-    again = cdmisfa("learn", converted, "--loop", "--max-iterations", 30, "--json")
-    assert again.json["signals_sha256"] == done.json["signals_sha256"]
-
-
-def test_a_loop_is_as_long_as_it_says() -> None:
-    source = MovingPictures("swing")
-    first = source.take(0, 5).frames
-    source.seek(LENGTH)
-    assert (source.take(0, 5).frames == first).all()
 
 
 def test_eight_outputs_are_decided_as_one_and_marked(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ import pytest
 from conftest import Cdmisfa
 from contracts.sources import SourceContract
 from PIL import Image
-from rerun.chunk import RrdReader
 from view_data import View
 from waiting import python
 
@@ -107,15 +106,9 @@ def test_pictures_of_any_type_are_the_same_frames() -> None:
         ({"cam": np.zeros((9, 3, 20, 30))}, r"cam: .*move its colours last, np.moveaxis"),
         (1000 * numbers().reshape(-1, 4, 5), "scale them to 0 to 1"),
         (["one", 2], "no numbers"),
-        ([[1, 2], [3]], "unequal length"),
         (np.zeros((0, 3)), "it is empty"),
-        (5, r"it has shape \(\)"),
-        ({}, "no array given"),
         ({"a": numbers(), "b": pictures(4, 5)}, "a rows of 3 and b pictures"),
-        (np.ma.masked_less(numbers(), 0), "masked"),
         ("nowhere.npz", "no such file"),
-        (["nowhere.npz", "x.mcap"], "no such file"),
-        ("gym:Nothing-v0", "cannot be made"),
         (numbers()[:10], "10 frames are left at frame 0, 40 are needed"),
     ],
 )
@@ -127,21 +120,6 @@ def test_what_cannot_be_learned_from_is_one_line(
         learn(given)
     assert "\n" not in str(found.value)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("how", "said"),
-    [
-        ({"algoritm": "2.0"}, "did you mean learner.algorithm"),
-        ({"algorithm": "3.0"}, "no learner.algorithm"),
-        ({"tau": "many"}, "learner.tau is 'many'"),
-        ({"size": (8, 8)}, r"learn\(Recording\(source, size=...\)\)"),
-        ({"seed": "x"}, "seed is 'x'"),
-    ],
-)
-def test_a_wrong_setting_is_one_line(how: dict[str, Any], said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        learn(numbers(), **how)
 
 
 @pytest.mark.parametrize("show", [numbers, lambda: pictures(12, 16)])
@@ -193,14 +171,6 @@ def test_a_damaged_file_of_arrays_is_one_line(
     found = cdmisfa("learn", tmp_path / name)
     assert (found.code, found.err.count("\n")) == (3, 1), found.err
     assert f"{name} is no file of NumPy's arrays" in found.err
-
-
-def test_a_temporary_run_goes_with_what_holds_it() -> None:
-    run = learn(numbers(), **FEW)
-    path = run.path
-    assert path.is_dir()
-    del run
-    assert not path.exists()
 
 
 @pytest.mark.parametrize("method", ["block", "event", "finish"])
@@ -291,45 +261,6 @@ def test_what_is_shown_is_short_with_a_small_picture(given: Any) -> None:
         with Image.open(io.BytesIO(base64.b64decode(png[1]))) as picture:
             assert max(picture.size) <= 960
     assert len(repr(learn(given, **FEW).signals)) < 500
-
-
-@pytest.mark.parametrize("given", [numbers(), pictures(6, 8)])
-def test_a_source_shows_what_comes_next_and_stays_where_it_is(given: Any) -> None:
-    stored, stepped = Recording(given).source(), cdmisfa.ArraySource({"made": iter(given)})
-    with stored, stepped:
-        for source in (stored, stepped):
-            source.take(0, 30)
-            page = source._repr_html_()
-            assert ("data:image/png" in page) == (source is stored or source.spec.images)
-            assert repr(source).startswith(f"<{type(source).__name__} ")
-            assert len(repr(source)) < 200
-            np.testing.assert_array_equal(source.take(0, 40).frames, given[30:70])
-        stored.seek(400)
-        assert "data:image/png" not in stored._repr_html_()
-
-
-def test_several_logs_are_viewed_together(tmp_path: Path) -> None:
-    logs = [ROOT / "sample_logs" / "icub" / f"{name}.mcap" for name in ("left", "right")]
-    Recording(*logs).view(tmp_path / "view.rrd")
-    paths = " ".join(c.entity_path for c in RrdReader(tmp_path / "view.rrd").stream())
-    assert [view for view in ("left", "center", "right") if view in paths] == ["left", "right"]
-    with pytest.raises(UsageError, match="of arrays, view the run"):
-        Recording(numbers()).view(tmp_path / "view.rrd")
-
-
-def test_without_a_notebook_a_view_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(CdmisfaError, match="no display"):
-        Recording(ROOT / "sample_logs" / "icub").view()
-
-
-def test_a_module_shows_its_weights() -> None:
-    run = learn("oscillatory", max_modules=1)
-    (module,) = run.modules
-    assert repr(module).startswith("<Module 1, of x1, saved at iteration ")
-    assert len(repr(run.features[0])) < 200
-    assert "data:image/png" in module._repr_html_()
 
 
 def test_the_library_lists_what_a_user_needs_and_explains_each() -> None:

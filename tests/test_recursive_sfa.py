@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -13,10 +12,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from numpy.typing import NDArray
-from waiting import python
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.features.incsfa import Feature
 from cdmisfa.features.recursive import PIECE, RecursiveFeature
 from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import ffi, lib
@@ -171,18 +168,6 @@ def test_change_is_free_of_scale_and_falls() -> None:
     assert max(first[1:]) <= np.sqrt(2)
 
 
-def test_goes_on_from_its_state_with_the_same_bits() -> None:
-    frames = np.random.default_rng(3).integers(0, 256, (400, 60), dtype=np.uint8)
-    straight, restored = RecursiveFeature(60, 8, 2), RecursiveFeature(60, 8, 2)
-    straight.update(frames[:200])
-    for own, saved in zip(restored.state, straight.state, strict=True):
-        own[...] = saved
-    for sfa in (straight, restored):
-        sfa.update(frames[200:])
-    for one, other in zip(straight.state, restored.state, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda sfa: pickle.loads(pickle.dumps(sfa))])
 def test_a_copy_learns_on_its_own(copied: Callable[[RecursiveFeature], RecursiveFeature]) -> None:
     frames = np.random.default_rng(3).integers(0, 256, (400, 60), dtype=np.uint8)
@@ -216,33 +201,6 @@ def test_what_are_no_frames_is_refused(frames: NDArray[Any]) -> None:
 def test_sizes_that_make_no_sense_are_refused(options: tuple[int, ...]) -> None:
     with pytest.raises(UsageError, match="at least 1"):
         RecursiveFeature(*options)
-
-
-def test_no_frames_change_nothing() -> None:
-    sfa = RecursiveFeature(10, 4)
-    assert sfa.update(np.zeros((0, 10))).shape == (0,)
-    assert not sfa.state.counts.any()
-
-
-def test_it_is_a_feature() -> None:
-    assert isinstance(RecursiveFeature(10, 4), Feature)
-
-
-def test_the_number_of_threads_changes_no_bit() -> None:
-    code = (
-        "import hashlib, numpy as np;"
-        "from cdmisfa.features.recursive import RecursiveFeature;"
-        "f = np.random.default_rng(0).integers(0, 256, (300, 3000), dtype=np.uint8);"
-        "s = RecursiveFeature(3000, 16, 3); [s.update(f[i:i + 40]) for i in range(0, 300, 40)];"
-        "print(hashlib.sha256(s.phi.tobytes() + repr(s.compare(s.phi[0])).encode()).hexdigest())"
-    )
-    hashes = set()
-    for threads in ("1", "2", "5"):
-        names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
-        environment = {**os.environ, **dict.fromkeys(names, threads)}
-        done = python("-c", code, env=environment, check=True)
-        hashes.add(done.stdout)
-    assert len(hashes) == 1
 
 
 @given(n=st.integers(0, 40), seed=st.integers(0, 10**6), kind=st.integers(0, 4))

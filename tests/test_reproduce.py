@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 
-from benchmarks.paper import ablation, costs, difficulty, scenes
+from benchmarks.paper import costs, difficulty
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -68,14 +68,6 @@ def test_quick_runs_reproduce_the_claim_and_write_everything(
     assert document["figures"] == ([] if name == "five" else [f"{name}.png"])
     assert all((folder / figure).stat().st_size > 1000 for figure in document["figures"])
     assert document["trials"] == len((folder / "rows.jsonl").read_text().splitlines())
-
-
-def test_it_needs_matplotlib_before_it_computes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("cdmisfa.studies.paper.reproduce.find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"pip install 'cdmisfa\[paper\]'"):
-        stability(tmp_path)
 
 
 def test_a_change_is_followed_early_and_not_late(tmp_path: Path) -> None:
@@ -290,37 +282,6 @@ def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
     rows = judged(icub.Icub(), trials).tables[0]["rows"]
     assert [row[1:3] for row in rows[1:]] == [["1 of 1", "**0 of 1**"]] * 2
     assert len(icub.Icub().draw(trials, tmp_path)) == 3
-
-
-def test_ablation_tells_what_comes_out_without_each_reading() -> None:
-    right = {"streams": [0, 1, 2], "policies": ["011", "101", "110"]}
-    none: dict[str, Any] = {"streams": [], "policies": [], "follows": []}
-    both = ablation.SHARE | ablation.VARIANCE
-    trials = [
-        Trial(c, none if c["keys"] == both else GOOD if c["scene"] == "icub" else right, {})
-        for c in ablation.CONDITIONS
-    ]
-    (_, readings), (_, components) = ablation.tables(trials)
-    failed = [row[0] for row in readings if row[2] != "1 of 1"]
-    assert failed == ["share and least variance: equation 3 alone"]
-    assert len(components) == 12
-    assert [row[0] for row in components if row[1] != "1 of 1"] == ["8, neither"]
-
-
-def test_scenes_are_told_by_who_learns_which_object() -> None:
-    one = GOOD | {"streams": [0], "policies": ["011"], "follows": [[0.99, 0.0]], "saved_at": [600]}
-    trials = [
-        Trial(
-            c,
-            (GOOD if c["learner"] == "progress" or c["added"] == "plain" else one)
-            | {"iterations": 300 if c["learner"] == "progress" else 1400},
-            {},
-        )
-        for c in scenes.CONDITIONS
-    ]
-    ((_, rows),) = scenes.tables(trials)
-    assert rows[0] == ["plain", "1 of 1", "1, 1", "1 of 1", "1, 1", "1 of 1", "300"]
-    assert rows[-1][1:4] == ["**0 of 1**", "1, 0", "1 of 1"]
 
 
 @pytest.mark.parametrize("name", ["costs", "difficulty"])

@@ -120,19 +120,6 @@ def test_the_clustering_errors_are_recorded_and_decide() -> None:
     assert 0 < sum(after) < len(after)
 
 
-def test_2_0_has_no_clustering_error() -> None:
-    source = OscillatorySource()
-    learner = CuriousLearner(
-        LearnerConfig(delta=1.0, tau=10, eta_dot_window=5, min_variance=0.0), source.spec, 0
-    )
-    for _ in range(100):
-        signals = learner.step(source.take(learner.stream, learner.tau))
-        assert math.isnan(signals.roc_error_inst)
-        assert math.isnan(signals.roc_error)
-        assert np.isnan(signals.roc_error_frozen).all()
-    assert len(signals.roc_error_frozen) > 0
-
-
 def test_1_0_can_learn_the_paper_s_modules_too() -> None:
     config = LearnerConfig(algorithm="1.0")
     trials = [run_trial(config, seed=seed, max_iterations=6000) for seed in range(1000, 1006)]

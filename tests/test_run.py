@@ -13,10 +13,8 @@ from run_data import parts_of, read_signals
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
-from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.learning import Learner, Sink
-from cdmisfa.core.signals import BlockSignals, SignalsHash
-from cdmisfa.experiments.documents import write_json
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.signals import SignalsHash
 from cdmisfa.experiments.loop import ENDINGS
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run as run_it
@@ -90,29 +88,6 @@ def test_it_ends_as_it_is_told_and_leaves_a_whole_run(
     assert json.loads((out / "run.json").read_text())["result"] == result.as_json()
 
 
-@pytest.mark.parametrize(("n", "kept"), [(1, [0]), (8, [0, 7]), (51, [0, 50]), (53, [0, 50, 52])])
-def test_the_last_weights_are_in_the_log_once(n: int, kept: list[int], tmp_path: Path) -> None:
-    shown: list[Any] = []
-
-    class Last(Sink):
-        def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-            shown.append(learner.phi.copy())
-
-    run(tmp_path / "run", max_iterations=n, sinks=[Last()])
-    found = parts_of(tmp_path / "run", "phi")
-    assert [t for t, _ in found] == [CONFIG.tau * k for k in kept]
-    for (_, phi), k in zip(found, kept, strict=True):
-        np.testing.assert_array_equal(phi, shown[k])
-
-
-def test_without_a_folder_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run().run is None
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_seed_decides_and_logging_does_not(tmp_path: Path) -> None:
     one, two, other = run(seed=1), run(tmp_path / "run", seed=1), run(seed=2)
     assert one.signals_sha256 == two.signals_sha256 != other.signals_sha256
@@ -184,29 +159,3 @@ def test_a_run_that_breaks_leaves_what_it_has_and_nothing_older(
     assert not (tmp_path / "run.json").exists()
     assert logged(tmp_path).count == 5
     assert logged(tmp_path).hexdigest() == run(max_iterations=5).signals_sha256
-
-
-def test_json_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    write_json(path, {"a": 1})
-    with pytest.raises(TypeError):
-        write_json(path, {"a": object()})
-    assert json.loads(path.read_text()) == {"a": 1}
-    with pytest.raises(CdmisfaError, match="is a file: name a folder"):
-        write_json(path / "b.json", {})
-
-
-def test_the_folder_is_held_until_the_view_is_built(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[Path] = []
-
-    def build(folder: Path, view: Path) -> None:
-        with pytest.raises(UsageError, match="in use by another process"):
-            run(folder, force=True)
-        assert (folder / "run.mcap").is_file()
-        seen.append(view)
-
-    monkeypatch.setattr("replay.view.build.build_view", build)
-    run(tmp_path / "run", rerun=True)
-    assert seen == [tmp_path / "run" / "run.rrd"]

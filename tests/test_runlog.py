@@ -5,12 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
-import subprocess
-import sys
-import textwrap
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +16,7 @@ from run_data import IMAGE, VECTOR, parts_of, read_signals, rows_of, run_of, sig
 
 import replay
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SIGNALS, canonical_bytes
 from replay.runs.codec import (
     decode_matrix,
@@ -29,7 +24,6 @@ from replay.runs.codec import (
     encode_matrix,
     encode_signals,
 )
-from replay.runs.folders import is_run
 from replay.runs.log import read_header
 
 
@@ -143,35 +137,6 @@ def test_a_header_or_a_version_that_cannot_be_is_damage(tmp_path, monkeypatch, k
         list(read_signals(path))
 
 
-def test_a_run_that_was_killed_reads_up_to_the_last_second(tmp_path):
-    program = """
-        import os, signal, sys, time
-        sys.path.insert(0, sys.argv[2])
-        from pathlib import Path
-        import numpy as np
-        from run_data import VECTOR, having, run_of
-        from replay.runs import writer
-        writer.FLUSH_SECONDS = 0.2
-        log = writer.RunWriter(Path(sys.argv[1]), VECTOR, {})
-        for signals, block in run_of(VECTOR, 22):
-            if signals.iteration == 20:
-                time.sleep(0.25)
-            log.block(block, signals, having(np.zeros((1, 2))))
-        os.kill(os.getpid(), signal.SIGKILL)
-    """
-    path = tmp_path / "run.mcap"
-    here = str(Path(__file__).parent)
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program), str(path), here], timeout=60
-    )
-    assert done.returncode == -signal.SIGKILL
-    assert not path.exists()
-    back = list(read_signals(tmp_path))
-    assert 21 <= len(back) <= 22
-    for signals, (expected, _) in zip(back, run_of(VECTOR, 22), strict=False):
-        assert canonical_bytes(signals) == canonical_bytes(expected)
-
-
 def test_a_partial_log_reads_wherever_it_was_cut(tmp_path, monkeypatch):
     monkeypatch.setattr("replay.runs.writer.CHUNK_BYTES", 4096)
     whole = tmp_path / "whole.mcap"
@@ -189,14 +154,6 @@ def test_a_partial_log_reads_wherever_it_was_cut(tmp_path, monkeypatch):
     os.truncate(whole, len(data) // 2)
     with pytest.raises(LogDamagedError, match="cut short"):
         list(read_signals(whole))
-
-
-def test_what_is_no_run_is_refused_by_name(tmp_path):
-    with pytest.raises(UsageError, match=r"holds no run\.mcap"):
-        read_header(tmp_path)
-    with pytest.raises(UsageError, match="no such file or folder"):
-        list(read_signals(tmp_path / "nothing"))
-    assert not is_run(tmp_path)
 
 
 def test_a_message_does_not_depend_on_how_arrays_lie_in_memory():
@@ -242,11 +199,6 @@ def test_signals_are_columns_over_all_iterations(folder):
                 assert np.isnan(column[k][len(expected) :]).all()
 
 
-def test_a_run_without_iterations_has_empty_columns(tmp_path):
-    write_run(tmp_path / "run.mcap", VECTOR, 0)
-    assert replay.Run(tmp_path).signals["y_frozen"].shape == (0, 0, 0, 0)
-
-
 def test_the_result_is_there_once_the_run_has_ended(folder):
     path, _ = folder
     assert replay.Run(path).result is None
@@ -254,10 +206,3 @@ def test_the_result_is_there_once_the_run_has_ended(folder):
     assert replay.Run(path / "run.mcap").result == {"iterations": ITERATIONS}
     (path / "run.json").write_text("{")
     assert replay.Run(path).result is None
-
-
-def test_the_packages_hand_it_on():
-    import cdmisfa
-
-    assert issubclass(cdmisfa.Run, replay.Run)
-    assert {"Run", "RecordedSource"} <= set(dir(replay))

@@ -18,7 +18,6 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.experiments.loop import Digest, learn_blocks
-from cdmisfa.public.recording import Recording
 from cdmisfa.watching import WatchEnv
 from recorder.cameras.stepped import ArraySource
 from recorder.world.oscillatory import OscillatorySource
@@ -130,36 +129,13 @@ def test_where_the_source_ends_it_is_truncated() -> None:
         env.step(0)
 
 
-def test_episodes_of_arrays_begin_anew() -> None:
-    with WatchEnv(Recording(pictures()).source(), tau=20) as env:
-        for _ in range(2):
-            env.reset(seed=0)
-            np.testing.assert_array_equal(env.step(1)[0], pictures()["right"][:20])
-
-
-def test_without_a_seed_episodes_differ_and_follow_from_the_first() -> None:
-    def chosen() -> list[int]:
-        env, found = WatchEnv(OscillatorySource(), "2.0"), []
-        for seed in (3, None, None):
-            _, info = env.reset(seed=seed)
-            for _ in range(20):
-                *_, info = env.step(info["stream"])
-                found.append(info["stream"])
-        return found
-
-    assert chosen() == chosen()
-    assert chosen()[:20] != chosen()[20:40]
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: WatchEnv(np.zeros((9, 2))), "ndarray given: WatchEnv takes an open source"),
-        (lambda: WatchEnv("oscillatory"), r"str given: .*, as OscillatorySource\(\), ArraySource"),  # type: ignore[arg-type]
         (lambda: WatchEnv(OscillatorySource(), "progres"), "progres"),
         (lambda: WatchEnv(OscillatorySource(), observe="frame"), '"block" or "outputs"'),
         (lambda: WatchEnv(OscillatorySource(), max_iterations=0), "max_iterations=0 given"),
-        (lambda: WatchEnv(OscillatorySource(), max_iterations="9"), "max_iterations='9' given"),
         (lambda: WatchEnv(OscillatorySource(), taus=3), "unknown key learner.taus"),
         (lambda: WatchEnv(OscillatorySource()).step(0), r"call reset\(\)"),
     ],
@@ -167,25 +143,6 @@ def test_without_a_seed_episodes_differ_and_follow_from_the_first() -> None:
 def test_what_it_cannot_take_is_refused(make: Any, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         make()
-
-
-@pytest.mark.parametrize("action", [-1, 3, 0.5, "left", None])
-def test_what_is_no_stream_is_refused(action: Any) -> None:
-    env = WatchEnv(OscillatorySource())
-    env.reset(seed=0)
-    with pytest.raises(UsageError, match="the actions are 0 to 2"):
-        env.step(action)
-
-
-def test_without_gymnasium_it_says_what_to_install() -> None:
-    code = (
-        "import sys; sys.modules['gymnasium'] = None\n"
-        "import cdmisfa\nhelp(cdmisfa.WatchEnv)\n"
-        "try: cdmisfa.WatchEnv(None)\nexcept Exception as error: print(repr(error))"
-    )
-    done = python("-c", code, check=True)
-    assert "max_iterations: " in done.stdout
-    assert "is missing: pip install 'cdmisfa[gym]'" in done.stdout.splitlines()[-1]
 
 
 def test_the_example_of_ppo_runs(tmp_path: Path) -> None:
