@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 from applied_data import SIZE, TAU, camera, learned, make_run
-from camera_files import pictures, write_images, write_pictures
+from camera_files import pictures, write_images
 from conftest import Cdmisfa
 from mcap.reader import make_reader
 from message_files import write_table
@@ -21,13 +20,11 @@ from view_data import View, scalars
 from waiting import started
 
 from cdmisfa import Run
-from cdmisfa.core.errors import LogWriteError
-from cdmisfa.experiments.apply import Application, Totals, follow
+from cdmisfa.experiments.apply import Application, Totals
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
-from replay.arrays import ArrayLog
 from replay.camera_logs.source import ForeignSource
-from replay.export.applied import Applied, written
+from replay.export.applied import Applied
 from replay.runs.modules import save_modules
 
 
@@ -146,39 +143,6 @@ def test_what_came_before_damage_is_kept(run: Path, cdmisfa: Cdmisfa, tmp_path: 
     assert cdmisfa("apply", run, log, "-o", tmp_path / "w.csv", "--salvage").code == 0
 
 
-def test_every_whole_frame_before_a_damaged_one_is_applied(
-    run: Path, cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    write_pictures(tmp_path / "pngs", 90)
-    (tmp_path / "pngs" / "53.png").write_bytes(b"")
-    done = cdmisfa("apply", run, tmp_path / "pngs", "--rate", 50, "-o", tmp_path / "o.parquet")
-    assert (done.code, "53.png" in done.err) == (3, True)
-    table = pq.read_table(tmp_path / "o.parquet")
-    shown = np.stack(list(pictures(53)))
-    np.testing.assert_array_equal(outputs(table, 1), Run(run).modules[0].transform(shown))
-
-
-@pytest.mark.parametrize("form", ["parquet", "csv"])
-def test_a_full_disk_leaves_nothing_and_says_so(
-    form: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*batch: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    writer = SimpleNamespace(write_batch=full, close=full)
-    monkeypatch.setattr(pq, "ParquetWriter", lambda *told, **how: writer)
-    monkeypatch.setattr(pacsv, "CSVWriter", lambda *told: writer)
-    application, out = Application(run), tmp_path / "out" / f"o.{form}"
-    source = ForeignSource(camera(tmp_path / "a.mcap", 30), size=SIZE)
-    about = source.spec, application.modules
-    with (
-        pytest.raises(LogWriteError, match="cannot be written: No space left"),
-        written(out, *about, force=False) as sink,
-    ):
-        follow(application.to(source), [sink], Totals(*about))
-    assert list(out.parent.iterdir()) == []
-
-
 def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
     run: Path, tmp_path: Path
 ) -> None:
@@ -204,23 +168,14 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
     [
         ("apply RUN oscillatory", 2, r"frames of \(2,\), and the modules learned from \(6, 8\)"),
         ("apply RUN small.mcap", 2, "4x4, cropped to 4x3, is smaller than 8x6: .* larger images$"),
-        ("apply RUN t.csv --rate 9", 2, "t.csv shows numbers, and the modules learned from pict"),
-        ("apply RUN n.npy", 2, r"n.npy shows frames of \(3,\), and the modules .* \(6, 8\)"),
         ("apply RUN nan.npy", 2, "nan: row 1, counted from 0, holds what is no finite number"),
-        ("apply RUN upright.npy", 2, "upright.npy: a picture of 12x16 .* were of 16x12: turn it"),
-        ("apply RUN text.npy", 2, "its values are of type <U1, no numbers"),
-        ("apply RUN colour.npy", 2, r"colour: it has shape \(9, 3, 12, 16\), so move its colours"),
         ("apply RUN none.mcap", 2, "none.mcap: no such file"),
         ("apply RUN empty.mcap", 3, "empty.mcap"),
         ("apply a.mcap a.mcap", 2, "a.mcap"),
         ("apply EMPTY a.mcap", 2, "has no modules: learn longer"),
         ("apply RUN a.mcap --to csv", 2, "name it with -o"),
-        ("apply RUN a.mcap --to tea", 2, "'tea' is not one of 'parquet', 'csv', 'mcap'"),
-        ("apply RUN a.mcap -o o.csv --to mcap", 2, "name it o.mcap"),
         ("apply RUN a.mcap -o there.csv", 2, "there.csv exists"),
         ("apply RUN a.mcap -o v.xlsx", 2, "v.xlsx: name a file with .parquet, .csv, .mcap, .rrd,"),
-        ("apply RUN a.mcap -o v.pqt --to csv", 2, "v.pqt: name a file with .parquet, .csv"),
-        ("apply RUN a.mcap --start 5 --end 3", 2, "--start 5 is no earlier than --end 3"),
         ("apply RUN RUN", 2, "is a run, not a recording"),
     ],
 )
@@ -230,12 +185,7 @@ def test_what_cannot_be_applied_is_refused_in_a_line(
     camera(tmp_path / "a.mcap", 30)
     tiny = [(20 * i, image[:4, :4]) for i, image in enumerate(pictures(30))]
     write_images(tmp_path / "small.mcap", {"/cam": tiny})
-    write_table(tmp_path / "t.csv", {"x": [1.0, float("nan"), 3.0]})
-    arrays: dict[str, Any] = {"n": np.zeros((9, 3)), "nan": [[1.0], [float("nan")]]}
-    arrays |= {"upright": np.zeros((9, 16, 12), np.uint8), "text": ["a"]}
-    arrays["colour"] = np.zeros((9, 3, 12, 16), np.uint8)
-    for name, array in arrays.items():
-        np.save(tmp_path / f"{name}.npy", array)
+    np.save(tmp_path / "nan.npy", [[1.0], [float("nan")]])
     (tmp_path / "empty.mcap").write_bytes(b"")
     (tmp_path / "there.csv").write_text("mine")
     if "EMPTY" in words:
@@ -285,35 +235,6 @@ def test_lines_come_block_by_block_and_are_those_of_what_was_recorded(
         assert [module["alive"] for module in line["modules"]] == applied.alive.tolist()
 
 
-@pytest.mark.parametrize("kind", ["npz", "npy", "recording", "folder"])
-def test_pictures_of_any_source_give_the_same(
-    kind: str, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    shown = np.stack(list(pictures(50)))
-    named = tmp_path / f"cam.{kind}"
-    if kind == "npz":
-        np.savez_compressed(named, cam=shown)
-    elif kind == "npy":
-        np.save(named, shown)
-    elif kind == "recording":
-        record(ArrayLog({"cam": shown}), named)
-    else:
-        write_pictures(named, 50)
-    rate = ("--rate", 50) if kind == "folder" else ()
-    done = cdmisfa("apply", run, named, *rate, "-o", tmp_path / "o.parquet")
-    assert done.code == 0, done.err
-    table = pq.read_table(tmp_path / "o.parquet")
-    np.testing.assert_array_equal(outputs(table, 1), Run(run).modules[0].transform(shown))
-
-
-def test_lines_of_a_log_are_its_table(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    log = camera(tmp_path / "a.mcap", 70)
-    lines = cdmisfa("apply", run, log, "--to", "stdout").out.splitlines()
-    y = np.concatenate([json.loads(line)["modules"][0]["y"] for line in lines])
-    frames = ForeignSource(log, size=SIZE).take(0, 70).frames
-    np.testing.assert_array_equal(y, Run(run).modules[0].transform(frames))
-
-
 def test_a_reader_that_goes_away_ends_it(run: Path) -> None:
     with started("apply", run, LIVE, "--to", "stdout") as command:
         assert command.stdout is not None
@@ -322,25 +243,6 @@ def test_a_reader_that_goes_away_ends_it(run: Path) -> None:
         command.stdout.close()
         assert command.wait(30) == 1
         assert "Traceback" not in command.stderr.read()
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        ((LIVE, "a.mcap"), "a.mcap is no live stream, as the others are"),
-        ((LIVE, "--start", "3"), "is a live stream: --start is for logs"),
-        ((LIVE, "--loop"), "live streams cannot go back: leave out --loop"),
-        (("a.mcap", "--to", "stdout", "--json"), "use one of them"),
-    ],
-)
-def test_what_is_not_for_live_streams_is_refused(
-    words: tuple[str, ...], why: str, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    camera(tmp_path / "a.mcap", 30)
-    named = {"a.mcap": tmp_path / "a.mcap"}
-    done = cdmisfa("apply", run, *(named.get(word, word) for word in words))
-    assert done.code == 2, done.err
-    assert why in done.err.splitlines()[-1]
 
 
 def test_a_module_that_is_not_alive_knows_nothing() -> None:

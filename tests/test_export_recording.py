@@ -192,36 +192,6 @@ def test_rerun_opens_the_dataset(dataset):
     np.testing.assert_array_equal([known[t] for t in range(FRAMES)], truth.astype(np.float32))
 
 
-@pytest.mark.filterwarnings("ignore:The video decoding and encoding capabilities of torchvision")
-def test_lerobot_itself_loads_the_dataset(dataset):
-    module = pytest.importorskip(
-        "lerobot.datasets.lerobot_dataset",
-        reason="lerobot is not installed: it asks for an older Rerun, so that it needs an "
-        "environment of its own (CONTRIBUTING.md)",
-        exc_type=ImportError,
-    )
-    folder, pixels, truth = dataset
-    loaded = module.LeRobotDataset("cdmisfa/test", root=folder, video_backend="pyav")
-    assert (len(loaded), loaded.fps, loaded.num_episodes) == (FRAMES, 50, 1)
-    for t in (0, FIRST, FRAMES - 1):
-        item = loaded[t]
-        assert item["task"] == "what test shows"
-        for stream, view in enumerate(("left", "right")):
-            seen = np.round(item[f"observation.images.{view}"].numpy() * 255)
-            np.testing.assert_array_equal(seen, np.stack([pixels[stream, t]] * 3))
-        known = item["observation.environment_state"].numpy()
-        np.testing.assert_array_equal(known, truth[t].astype(np.float32))
-    several = folder.parent / "several"
-    record_images(folder.parent / "inverted", inverted=True)
-    export([folder.parent / "r", folder.parent / "inverted"], several, "lerobot", lossless=True)
-    loaded = module.LeRobotDataset("cdmisfa/several", root=several, video_backend="pyav")
-    assert (len(loaded), loaded.num_episodes) == (2 * FRAMES, 2)
-    item = loaded[FRAMES + FIRST]
-    assert (int(item["episode_index"]), int(item["frame_index"])) == (1, FIRST)
-    seen = np.round(item["observation.images.left"].numpy() * 255)
-    np.testing.assert_array_equal(seen, np.stack([255 - pixels[0, FIRST]] * 3))
-
-
 def test_several_recordings_become_episodes_of_a_dataset(cdmisfa, tmp_path):
     pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
     paths = [tmp_path / "one", tmp_path / "two"]
@@ -322,31 +292,6 @@ def test_what_cannot_be_exported_is_said_and_nothing_is_touched(why, tmp_path, m
     with pytest.raises(UsageError, match=why):
         export(tmp_path / "r", tmp_path / out, form, **options)
     assert contents(tmp_path) == before
-
-
-@pytest.mark.parametrize("form", ["images", "mp4"])
-def test_values_have_no_images(form, oscillatory_recording, tmp_path):
-    with pytest.raises(UsageError, match="holds no images"):
-        export(oscillatory_recording, tmp_path / form, form)
-    assert contents(tmp_path) == {}
-
-
-def test_an_export_replaces_another(tmp_path):
-    record_images(tmp_path / "r", views=("left",))
-    export(tmp_path / "r", tmp_path / "out", "images")
-    export(tmp_path / "r", tmp_path / "out", "mp4", force=True)
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["left.mp4"]
-
-
-def test_the_command_says_what_is_lost(cdmisfa, tmp_path):
-    record_images(tmp_path / "r")
-    said = cdmisfa("export", tmp_path / "r", "--to", "mp4", "-o", tmp_path / "films")
-    assert (said.code, said.out) == (0, f"{2 * FRAMES} frames written to {tmp_path / 'films'}\n")
-    assert said.err == "H.264 changes pixels a little: --lossless keeps them all\n"
-    words = ("export", tmp_path / "r", "--to", "lerobot", "-o", tmp_path / "robot", "--lossless")
-    said = cdmisfa(*words, "--json")
-    assert said.json["rows"] == FRAMES
-    assert said.err == ""
 
 
 def test_every_command_of_the_page_on_datasets_works(cdmisfa, tmp_path, monkeypatch):

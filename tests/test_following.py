@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
-from run_data import VECTOR, write_run
 
-from replay.following import OutputHistory, read_outputs
-from replay.runs.run import read_outline
-
-NO_TRUTH = (np.empty(0, np.int64), np.empty((0, 2)))
+from replay.following import OutputHistory
 
 
 def output_of(y, *truth):
@@ -56,24 +50,3 @@ def test_no_phase_is_seen_in_what_does_not_go_round():
     found = output_of(np.array([1.0, 3.0, 1.0, 3.0]), places).best_fit(("box_y",))
     assert found.function == "box_y"
     np.testing.assert_allclose(found(np.array([0.4, 0.6])), [1.0, 3.0])
-
-
-def test_a_module_of_one_stream_alone_is_shown_with_all_that_its_candidate_said(tmp_path):
-    heard = {}
-    for algorithm in ("progress", "2.0"):
-        run = tmp_path / algorithm
-        run.mkdir()
-        table = {"algorithm": algorithm}
-        written = write_run(
-            run / "run.mcap",
-            VECTOR,
-            30,
-            saves=True,
-            learner=table,
-            edit=lambda r: dataclasses.replace(r, stream=0),
-        )
-        heard[algorithm] = read_outputs(run, read_outline(run), NO_TRUTH, 6, 20_000)[1].t[0]
-    said = [r for r in written if np.isfinite(r.y).all()]
-    first_save = next(r.t for r in written if r.saved)
-    assert heard["progress"] == said[0].t
-    assert heard["2.0"] == next(r.t for r in said if r.t > first_save)

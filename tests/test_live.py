@@ -6,21 +6,17 @@ import contextlib
 import socket
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from headless import needs_driver, shown
 from run_data import IMAGE, VECTOR, having, read_signals, run_of
-from test_view_world import LIVE as SCENE_SOURCE
-from test_view_world import SCENE, without_models
 from test_viewer import addresses
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.session import run
 from recorder.world.oscillatory import OscillatorySource
-from replay.runs.writer import RunWriter
 from replay.view import live
 from replay.view.live import LiveView
 
@@ -68,23 +64,6 @@ def test_the_progress_learner_is_shown_by_its_streams(sent):
         expected = [np.log10(r.learning_error) for r in records if r.stream == s]
         np.testing.assert_array_equal(found[np.isfinite(found)], expected)
     assert not any(path.startswith("policy/") for path in sent)
-
-
-def test_the_robot_turns_to_what_is_watched(tmp_path, monkeypatch):
-    """As in the view of a finished run, whose first tab a live view has, too."""
-    without_models(monkeypatch)
-    sent = {}
-
-    def keep(self, path, times, columns, **_):
-        sent.setdefault(path, []).append(times)
-
-    monkeypatch.setattr("rerun.RecordingStream.send_columns", keep)
-    with LiveView(SCENE, {**MANIFEST, "source": SCENE_SOURCE}, 40, 1) as view:
-        feed(view, SCENE)
-    assert {"scene/watching", "scene/box", "scene/ball", "scene/cylinder"} <= set(sent)
-    with LiveView(IMAGE, MANIFEST, 40, 1) as view:
-        feed(view, IMAGE)
-    assert {"wall/frame", *(f"wall/{s + 1}_{n}" for s, n in enumerate(IMAGE.streams))} <= set(sent)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
@@ -135,24 +114,3 @@ def test_a_resumed_run_shows_what_went_before(tmp_path, sent):
     expected = [s.epsilon for s in read_signals(folder)]
     assert len(expected) == 50
     np.testing.assert_array_equal(np.concatenate(sent["signals/epsilon"]), expected)
-
-
-def test_what_went_before_has_a_picture_of_each_block(tmp_path, monkeypatch):
-    """Also where a block begins at no multiple of its length, as after a gap."""
-    sent, spec, tau = [], IMAGE, 15
-
-    def keep(self, times, values):
-        if self.path == "world/watched":
-            sent.extend(times[0].as_arrow_array().to_pylist())
-
-    writer, begins = RunWriter(tmp_path / "run.mcap", spec, MANIFEST, watched_every=2), []
-    for signals, block in run_of(spec, 30, tau=tau):
-        t = block.t + (37 if signals.iteration >= 10 else 0)
-        moved = replace(signals, t=t, log_time=spec.time_ns(t))
-        writer.block(replace(block, t=t), moved, having(np.ones((1, 192))))
-        begins.append(t)
-    writer.finish()
-    monkeypatch.setattr("replay.view.columns.Column.send", keep)
-    with LiveView(spec, MANIFEST, tau, 1) as view:
-        view.earlier(tmp_path)
-    assert sent == [t + t % 2 for t in begins]

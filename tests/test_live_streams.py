@@ -23,6 +23,7 @@ from contracts.sources import ForwardContract
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from live_cameras import Robot
+from rtsp_camera import RATE, rtsp_camera
 from waiting import Clock, started, wait_for
 
 from cdmisfa import ArraySource, GymSource
@@ -385,3 +386,31 @@ def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
     cdmisfa("recover", str(tmp_path / "rec"), "-o", str(tmp_path / "saved"))
     with RecordedSource(tmp_path / "saved") as source:
         assert source.frames > 0
+
+
+def test_a_network_camera_shows_what_it_sees_at_its_own_rate() -> None:
+    with rtsp_camera(100) as word, open_live([word], InputOptions()) as source:
+        assert source.spec.streams == ("left",)
+        assert source.spec.fps == RATE
+        frames = source.take(0, 20).frames
+    assert frames.shape == (20, 48, 64)
+    bars = frames.astype(float).mean(axis=1).argmax(axis=1)
+    moved = np.diff(bars) % 56
+    assert moved.max() < 28  # forward: a picture that is late comes twice, and none goes back
+    assert moved.sum() > 10
+
+
+def test_a_network_camera_that_breaks_is_connected_to_anew() -> None:
+    said: list[str] = []
+    options = InputOptions(rate=RATE)
+    with (
+        rtsp_camera(40) as word,
+        open_live([word], options, say=said.append) as source,
+    ):
+        source.take_all(2 * RATE)
+    assert any("left" in line and "connecting to it anew" in line for line in said), said
+
+
+def test_a_network_camera_that_shows_nothing_is_said() -> None:
+    with rtsp_camera(1) as word, pytest.raises(UsageError, match="left ended before a picture"):
+        open_live([word], InputOptions())

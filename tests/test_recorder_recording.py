@@ -15,8 +15,8 @@ from waiting import running, started, wait_for
 
 from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig, Split
-from recorder.log.files import held, partial_path
-from recorder.log.manifest import RECORDING
+from recorder.log.files import RECORDING, held, partial_path
+from recorder.log.manifest import RecordingStart, read_start, store_start
 from recorder.log.messages import RECORDING_METADATA
 from recorder.log.resume import frames_held
 from recorder.recording import RecordingStoppedError, record, record_scene
@@ -343,3 +343,36 @@ def test_a_source_that_was_opened_by_name_is_recorded_as_by_name(name: str, tmp_
 def test_a_scene_takes_its_own_configuration(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="oscillatory takes OscillatoryConfig, not IcubConfig"):
         record_scene("oscillatory", tmp_path / "rec", IcubConfig())
+
+
+def test_a_recording_stores_what_its_unfinished_views_shall_be(tmp_path: Path) -> None:
+    first = RecordingStart("icub", 1, {"a": 5, "b": 5}, {"a": "5s", "b": "5s"})
+    store_start(tmp_path, ["a", "b"], first)
+    store_start(tmp_path, ["a"], RecordingStart("icub", 1, {"a": 9}))
+    assert read_start(tmp_path) == RecordingStart("icub", 1, {"a": 9, "b": 5}, {"b": "5s"})
+    store_start(tmp_path, ["a"])
+    assert read_start(tmp_path).frames == {"b": 5}
+    store_start(tmp_path, ["b"])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "noted",
+    [
+        "{",
+        "[]",
+        "7",
+        '{"frames": 3}',
+        '{"frames": {"a": true, "b": -1, "c": "x"}, "split": {"a": 3}, "scene": 4, "seed": -1}',
+        '{"frames": {}, "seed": 1e300}',
+    ],
+)
+def test_what_makes_no_sense_in_it_is_passed_over(tmp_path: Path, noted: str) -> None:
+    (tmp_path / RECORDING).write_text(noted)
+    assert read_start(tmp_path) == RecordingStart()
+
+
+def test_a_folder_that_is_a_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "nowhere").write_text("a file")
+    with pytest.raises(UsageError, match="nowhere is a file: name a folder"):
+        store_start(tmp_path / "nowhere", ["a"], RecordingStart("", None, {"a": 1}))

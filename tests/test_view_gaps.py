@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import rerun as rr
 from run_data import IMAGE, block_of, having, module_of, parts_of, run_of
 from view_data import View
 
@@ -15,10 +14,8 @@ from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.recordings.source import RecordedSource
 from replay.runs.modules import load_modules, save_modules
-from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view
-from replay.view.columns import Column, Target
 
 ITERATIONS, TAU, EVERY = 15, 40, 20
 GAP_AFTER, GAP = 4, 95
@@ -104,26 +101,6 @@ def test_a_bar_ends_where_a_gap_begins(shown, lane):
         assert states[begin] == [IMAGE.streams[records[GAP_AFTER].stream]]
 
 
-def test_pictures_hang_with_the_stream_that_they_are_of(shown):
-    _, records, rows = shown
-    for s, name in enumerate(IMAGE.streams):
-        own = [r for r in records if r.stream == s]
-        pictures = rows[f"/wall/{s + 1}_{name}"]
-        assert pictures["iteration"] == [r.iteration for r in own]
-        for t, (image,) in zip(pictures["frame"], pictures["Image:buffer"], strict=True):
-            assert at(records, t).stream == s
-            assert {40 * s + 20, 250} == set(image)
-
-
-def test_axes_reach_to_the_end_of_the_run(shown):
-    folder, records, rows = shown
-    end = records[-1].t + TAU
-    assert read_outline(folder).end == end
-    assert rows["/attends"]["frame"][-1] == end
-    axes = {time["end"] for _, _, time, *_ in View(folder / "run.rrd").views("TimeSeries")}
-    assert max(axes) >= end
-
-
 @pytest.mark.parametrize("entity", ["/world/truth", "/signals/y", "/learned/1/followed"])
 def test_a_line_of_every_frame_ends_where_a_gap_begins(shown, entity):
     _, _, rows = shown
@@ -134,16 +111,6 @@ def test_a_line_of_every_frame_ends_where_a_gap_begins(shown, entity):
     assert np.isnan(values[here]).all()
     if entity != "/signals/y":  # which nothing is there of at first
         assert np.isfinite([values[here - 1], values[here + 1]]).all()
-
-
-def test_a_line_of_blocks_ends_where_a_gap_begins_and_a_table_has_each_value(shown):
-    _, records, rows = shown
-    eta = rows["/signals/eta"]
-    starts, iterations = [r.t for r in records], [r.iteration for r in records]
-    starts.insert(GAP_AFTER, GAP_AFTER * TAU)
-    iterations.insert(GAP_AFTER, GAP_AFTER)  # the row behind it is the last of that iteration
-    assert (eta["frame"], eta["iteration"]) == (starts, iterations)
-    assert np.isnan(eta["Scalars:scalars"][GAP_AFTER]).all()
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -164,15 +131,3 @@ def test_an_output_is_there_on_all_frames_of_its_own_stream_alone(shown, number)
         assert value == pytest.approx(module.transform(frames[t][None])[0, 0])
     for end in (t for t in y if t not in said):  # a line ends where another stream was watched
         assert end not in own
-
-
-def test_a_gap_between_two_handfuls_of_rows_ends_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    sent = []
-    monkeypatch.setattr(Column, "send", lambda self, times, values: sent.append(values[:, 0]))
-    with rr.RecordingStream("test") as recording:
-        column = Target(recording, IMAGE).lines("a", ["a"], within=1)
-        for frames in ([0, 1], [2], [5, 6, 9]):
-            column.add(np.array(frames), None, np.array(frames)[:, None])
-            column.flush()
-    nan = np.nan
-    np.testing.assert_equal(np.concatenate(sent), [0, 1, 2, nan, 5, 6, nan, 9])

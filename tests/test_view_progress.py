@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fnmatch
 import itertools
 
@@ -16,15 +15,10 @@ from run_data import (
     UNTOLD,
     VECTOR,
     by_progress,
-    module_of,
-    parts_of,
     write_run,
 )
 from view_data import View, scalars, tabs_of, views_of
 
-from cdmisfa.core.signals import NO_STATE
-from replay.palette import CYCLE, packed
-from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view.build import build_view
 from replay.view.summary import summary_text
@@ -83,15 +77,6 @@ def test_each_stream_has_its_learning_error_where_it_was_watched(shown):
         np.testing.assert_array_equal(found, [r.interest[s] for r in records])
 
 
-def test_saves_and_thresholds_are_marked(shown):
-    records, _, view = shown
-    saved = [r for r in records if r.saved]
-    assert view.rows["/streams/saved"]["frame"] == [r.t for r in saved]
-    assert view.numbers("/streams/saved").tolist() == [np.log10(r.learning_error) for r in saved]
-    assert set(view.numbers("/streams/threshold")) == {np.log10(0.05 + 0.25)}
-    assert set(view.numbers("/streams/settled")) == {np.log10(0.05)}
-
-
 def test_nothing_is_there_that_the_run_does_not_tell(shown):
     names = shown[-1].names
     of_2_0 = ("/policy/", "/gate/", "/decision/R", "/decision/Q", "/decision/adv", "/abstraction/d")
@@ -99,21 +84,6 @@ def test_nothing_is_there_that_the_run_does_not_tell(shown):
     of_2_0 += ("/learns", "/novelty", "/mostly/novelty", "/does", "/explores", "/abstraction/s")
     assert [n for n in names if n.startswith(of_2_0)] == []
     assert {"/signals/learning_error", "/signals/state", "/signals/band_mean/1"} <= names
-
-
-def test_what_2_0_tells_has_nothing_of_streams(tmp_path):
-    missing = {"change": np.nan, "tested": np.nan, "fitted": np.nan, "learning_error": np.nan}
-
-    def plain(signals):
-        none = np.full(3, np.nan), np.full(3, NO_STATE)
-        return dataclasses.replace(signals, **missing, interest=none[0], state=none[1])
-
-    write_run(tmp_path / "run.mcap", VECTOR, 12, edit=plain, learner={"algorithm": "2.0"})
-    build_view(tmp_path, tmp_path / "run.rrd")
-    names = View(tmp_path / "run.rrd").names
-    new = tuple(f"/signals/{name}" for name in (*missing, "interest", "state"))
-    assert [n for n in names if n.startswith(("/streams", *new))] == []
-    assert {"/signals/Q", "/signals/xi", "/novelty"} <= names
 
 
 def has_something(view, entity):
@@ -145,11 +115,6 @@ def check_no_view_is_empty(run):
     return checked
 
 
-def test_the_gate_and_the_decision_have_no_tab(shown):
-    _, folder, _ = shown
-    assert list(tabs_of(folder)) == ["Overview", "Candidate", "Modules", "Table"]
-
-
 @pytest.mark.parametrize("algorithm", ["2.0", "1.0", "progress"])
 def test_no_view_of_any_learner_is_empty(
     algorithm, cdmisfa: Cdmisfa, tmp_path, oscillatory_recording
@@ -158,19 +123,6 @@ def test_no_view_of_any_learner_is_empty(
     words = ["learn", oscillatory_recording, "--loop", "--algorithm", algorithm, "-o", run]
     assert cdmisfa(*words, "--max-iterations", 60).code == 0
     assert check_no_view_is_empty(run) > 25
-
-
-def test_a_short_run_shows_its_weights_and_says_why_there_is_no_interest(
-    cdmisfa: Cdmisfa, tmp_path, oscillatory_recording
-):
-    words = ["learn", oscillatory_recording, "--algorithm", "progress", "-o", tmp_path / "run"]
-    assert cdmisfa(*words, "--max-iterations", 8).code == 0
-    *_, (t, phi) = parts_of(tmp_path / "run", "phi")
-    assert (t, bool(phi.any())) == (7 * 40, True)
-    view = View(tmp_path / "run" / "run.rrd")
-    assert view.rows["/abstraction/phi"]["frame"][-1] == t
-    none = "no line yet: none was watched long enough"
-    assert any(name.endswith(none) for name in view.titles())
 
 
 def test_the_summary_says_what_became_of_each_stream(shown):
@@ -190,45 +142,3 @@ def test_the_summary_says_what_became_of_each_stream(shown):
     assert f"- **{second}**: known by module 2 (of {first}) after 8 blocks" in text
     assert f"- **{third}**: being learned" in text
     assert "It ended: nothing was left." in text
-
-
-def test_weights_are_those_of_the_stream_that_is_shown(tmp_path):
-    """The log has at the end of each block those of the stream that comes next."""
-
-    def turn(record):
-        turned = by_progress(record)
-        return dataclasses.replace(turned, next_stream=(record.iteration + 1) % 3, action=1)
-
-    write_run(tmp_path / "run.mcap", VECTOR, 12, learner=PROGRESS, edit=turn)
-    build_view(tmp_path, tmp_path / "run.rrd")
-    shown = View(tmp_path / "run.rrd").rows["/abstraction/phi"]
-    bars = [set(values["buffer"]) for (values,) in shown["BarChart:values"]]
-    assert shown["iteration"] == list(range(1, 12))
-    assert bars == [{float(k - 1)} for k in shown["iteration"]]
-
-
-def test_a_module_hangs_its_weights_with_what_is_slow_and_frames_by_output(tmp_path):
-    records = write_run(
-        tmp_path / "run.mcap", IMAGE, ITERATIONS, learner=PROGRESS, edit=by_progress
-    )
-    rng, size = np.random.default_rng(0), 12 * 16
-    module = module_of(1, 8, rng.standard_normal((2, size)))
-    module = dataclasses.replace(module, slow=np.array([1, 0]), eta=np.ones(2))
-    save_modules(
-        tmp_path / "modules.npz",
-        [dataclasses.replace(module, band_mean=np.ones(2), band_sd=np.ones(2))],
-    )
-    build_view(tmp_path, tmp_path / "run.rrd")
-    view = View(tmp_path / "run.rrd")
-    words = [view.static[f"/modules/1/weights/{j}/words"]["Points2D:labels"] for j in (1, 2)]
-    assert words == [["1 slow"], ["2 not slow"]]
-    output = view.static["/modules/1/output"]
-    assert output["SeriesLines:names"] == ["output 1"]
-    assert output["SeriesLines:colors"] == [packed(CYCLE[0])]  # of left, which its tab names
-    rows = [f"/modules/1/sheet/{row}" for row in ("1_least", "2_middle", "3_greatest")]
-    said = [view.static[f"{row}/words"]["Points2D:labels"][0] for row in rows]
-    ends = [[float(x) for x in text.split(": ")[1].split(" to ")] for text in said]
-    assert ends == sorted(ends)
-    y = view.numbers("/modules/1/output")
-    assert (ends[0][0], ends[-1][-1]) == (round(y.min(), 2), round(y.max(), 2))
-    assert {r.stream for r in records} == {0, 1, 2}

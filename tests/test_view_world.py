@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import itertools
 import math
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from run_data import IMAGE, PROGRESS, VECTOR, module_of, write_run
+from run_data import IMAGE, PROGRESS, VECTOR, write_run
 from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
@@ -26,10 +24,9 @@ from recorder.world.icub.source import TRUTH
 from replay.following import OutputHistory, read_outputs
 from replay.palette import colour, packed
 from replay.runs.log import read_batches
-from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view.build import build_view
-from replay.view.world import PRESET, places_of, world_of_run
+from replay.view.world import places_of
 
 CONFIG = section_table(IcubConfig())
 SCENE = SourceSpec(("left", "center", "right"), (12, 32), "uint8", TRUTH, 50.0, IMAGE.start_ns)
@@ -55,26 +52,6 @@ def test_eyes_stand_where_those_of_the_simulator_stand(yaw):
         half = math.atan(eye.height / 2 / eye.focal)
         assert math.degrees(2 * half) == pytest.approx(config.eyes.vertical_fov)
     np.testing.assert_allclose(np.mean([e.place for e in gaze.eyes], axis=0), gaze.middle.place)
-
-
-def test_a_head_that_takes_frames_to_turn_is_shown_on_its_way(tmp_path):
-    config = section_table(IcubConfig(transit=9.0, texture=True))
-    records = write_run(tmp_path / "run.mcap", SCENE, ITERATIONS, source={**LIVE, "scene": config})
-    build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
-    rows = View(tmp_path / "run.rrd").rows
-    ways = [
-        (b.t - n, b.t)
-        for a, b in itertools.pairwise(records)
-        if (n := 5 * abs(b.stream - a.stream))
-    ]
-    shown = [records[0].t, *(t for low, high in ways for t in range(low, high + 1))]
-    assert rows["/scene/watching"]["frame"] == rows["/scene/neck"]["frame"] == shown
-    angles = [
-        2 * math.acos(min(q[0][3], 1.0)) for q in rows["/scene/neck"]["Transform3D:quaternion"]
-    ]
-    assert np.abs(np.diff(angles)).max() < math.radians(20)
-    red, _, blue = scenery_of(config).objects[0].colour
-    assert blue > red + 0.3
 
 
 def test_objects_stand_where_the_world_knew_them_and_the_head_looks_at_what_is_watched(tmp_path):
@@ -117,34 +94,6 @@ def test_without_the_robots_models_there_is_the_rest_and_a_line_that_says_so(tmp
     assert "/scene/neck" not in rows
 
 
-def test_a_recording_that_is_gone_is_said_and_one_that_is_there_is_read(tmp_path):
-    source = {"kind": "recording", "scene": "icub", "config_sha256": "0" * 64}
-    manifest = {
-        "source": source,
-        "config": {"scene": CONFIG},
-        "command": {"source": ["../gone", 3]},
-    }
-    write_run(tmp_path / "run.mcap", SCENE, 1)
-    header = dataclasses.replace(read_outline(tmp_path).header, manifest=manifest)
-    scenery, unsure = world_of_run(header, tmp_path)
-    assert (scenery, unsure) == (scenery_of(CONFIG), PRESET)
-    for broken in ({"kind": "icub", "scene": {"kind": "icub", "eyes": 3}}, {"kind": "icub"}, 7):
-        header = dataclasses.replace(header, manifest={"source": broken})
-        assert world_of_run(header, tmp_path)[0] is None
-
-
-def test_the_recording_says_what_stood_where(tmp_path):
-    """The sample recording is one of before there were channels for it."""
-    sample = Path(__file__).parents[1] / "sample_logs" / "icub"
-    with LogReader(sample / "left.mcap") as reader:
-        data = bytes(reader.attachment_data(reader.attachments[0]))
-    digest = hashlib.sha256(data).hexdigest()
-    source = {"kind": "recording", "scene": "icub", "config_sha256": digest}
-    write_run(tmp_path / "run.mcap", SCENE, 1, source=source)
-    header = read_outline(tmp_path).header
-    assert world_of_run(header, tmp_path, sample) == (scenery_of(CONFIG), None)
-
-
 def outputs_of(run: Path) -> tuple[OutputHistory, ...]:
     pieces = [piece for batch in read_batches(run) for piece in batch.truth]
     truth = np.concatenate([t for t, _ in pieces]), np.concatenate([v for _, v in pieces])
@@ -170,19 +119,6 @@ def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
         r = np.corrcoef(followed[np.isin(frames, output.t)], output.y)[0, 1]
         assert r == pytest.approx(found.r)
         assert [n for n in names if n.startswith(f"Module {number} on") and f"{found.r:.2f}" in n]
-
-
-def test_a_module_that_said_nothing_later_is_asked_itself(tmp_path):
-    records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
-    last = records[-1]
-    told = (last.iteration, np.array([[2.0, 0.0]]), last.stream, VECTOR.streams[last.stream])
-    save_modules(tmp_path / "modules.npz", [module_of(i, *told) for i in (1, 2, 3)])
-    build_view(tmp_path, tmp_path / "run.rrd")
-    watched = View(tmp_path / "run.rrd").rows["/world/watched"]
-    shown = dict(zip(watched["frame"], (v[0] for v in watched["Scalars:scalars"]), strict=True))
-    *_, output = outputs_of(tmp_path)
-    assert output.module == last.module
-    np.testing.assert_allclose(output.y, [2 * shown[t] for t in output.t.tolist()])
 
 
 @pytest.mark.parametrize("algorithm", ["2.0", "progress"])
@@ -217,14 +153,6 @@ def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
         frame = centres.get(record.t, frame)
         x, y = hang[record.stream]
         assert frame == pytest.approx([x + width / 2, y + height / 2])
-
-
-def test_a_wall_is_wider_than_high_and_no_picture_hangs_over_another():
-    for count in (1, 2, 5, 16):
-        hang = places_of(count, 128, 48)
-        assert len(set(hang)) == count
-        for i, (x, y) in enumerate(hang):
-            assert all(abs(x - a) >= 128 or abs(y - b) >= 48 for a, b in hang[:i])
 
 
 def test_a_recording_shows_its_world(tmp_path, monkeypatch):
