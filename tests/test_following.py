@@ -1,11 +1,19 @@
-"""A module's output, and the quantity of the world that it follows."""
+"""A module's output on the frames of its stream, and the quantity of the world it follows."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from run_data import IMAGE, VECTOR, module_of, write_run
 
 from replay.following import OutputHistory
+from replay.outputs import EACH, OwnStream, Thinned
+from replay.runs.log import read_batches
 
 
 def output_of(y, *truth):
@@ -50,3 +58,74 @@ def test_no_phase_is_seen_in_what_does_not_go_round():
     found = output_of(np.array([1.0, 3.0, 1.0, 3.0]), places).best_fit(("box_y",))
     assert found.function == "box_y"
     np.testing.assert_allclose(found(np.array([0.4, 0.6])), [1.0, 3.0])
+
+
+def heard(run: Path, module, spec) -> tuple[OwnStream, np.ndarray, np.ndarray]:
+    own, t, y = OwnStream(module, spec), [], []
+    for batch in read_batches(run):
+        for frames, _, outputs in own.take(batch):
+            t += frames.tolist()
+            y += outputs[:, 0].tolist()
+    return own, np.array(t), np.array(y)
+
+
+@pytest.mark.parametrize("spec", [IMAGE, VECTOR])
+def test_outputs_are_those_on_every_logged_frame_of_the_stream(tmp_path: Path, spec) -> None:
+    records = write_run(tmp_path / "run.mcap", spec, 60)
+    rng = np.random.default_rng(3)
+    module = module_of(1, 30, rng.standard_normal((1, int(np.prod(spec.frame_shape)))), stream=1)
+    own, t, y = heard(tmp_path / "run.mcap", module, spec)
+    blocks = [r.t for r in records if r.stream == 1]
+    step = 10 if spec.images else 1
+    assert t.tolist() == [f for start in blocks for f in range(start, start + 40, step)]
+    assert own.count == len(t)
+
+    watched = [part for b in read_batches(tmp_path / "run.mcap") for part in b.watched]
+    every = dict(zip(np.concatenate([f for f, _ in watched]).tolist(),
+                     np.concatenate([v for _, v in watched]), strict=True))  # fmt: skip
+    frames = np.array([every[i] for i in t.tolist()])
+    np.testing.assert_array_equal(y, module.transform(frames)[:, 0])
+    np.testing.assert_allclose(own.mean, frames.mean(axis=0))
+    np.testing.assert_allclose(own.deviation, frames.std(axis=0), atol=1e-9)
+    scaled = module.phi[0].reshape(spec.frame_shape) * own.deviation * module.scale
+    np.testing.assert_allclose(own.saliency(), scaled)
+
+    sheet = own.sheet()
+    assert (sheet.least[0].y, sheet.greatest[-1].y) == (y.min(), y.max())
+    picks = (*sheet.least, *sheet.middle, *sheet.greatest)
+    assert len({pick.t for pick in picks}) == len(picks)
+    for part in (sheet.least, sheet.middle, sheet.greatest):
+        assert 0 < len(part) <= EACH
+        assert [pick.y for pick in part] == sorted(pick.y for pick in part)
+    for pick in picks:
+        assert pick.y == y[t.tolist().index(pick.t)]
+        np.testing.assert_array_equal(pick.frame, every[pick.t])
+
+
+def test_weights_of_an_expansion_are_no_picture(tmp_path: Path) -> None:
+    write_run(tmp_path / "run.mcap", VECTOR, 6)
+    module = replace(module_of(1, 3, np.ones((1, 5))), expansion="quadratic")
+    own, *_ = heard(tmp_path / "run.mcap", module, VECTOR)
+    assert own.saliency() is None
+
+
+@given(st.lists(st.integers(0, 400)), st.integers(2, 90))
+def test_rows_kept_do_not_depend_on_how_they_came(sizes: list[int], most: int) -> None:
+    parts, one = Thinned(most), Thinned(most)
+    numbers = np.arange(sum(sizes))
+    one.add(numbers, -numbers)
+    for part in np.split(numbers, np.cumsum(sizes))[:-1]:
+        parts.add(part, -part)
+    kept = parts.columns[0].tolist() if sizes else []
+    assert kept == one.columns[0].tolist() == (-one.columns[1]).tolist()
+    assert len(kept) == one.count if one.step == 1 else most // 4 <= len(kept) <= most
+    if len(kept) > 1:
+        assert max(np.diff([*kept, len(numbers)])) <= 3 * one.step
+
+
+@pytest.mark.parametrize("period", [2, 3, 4, 8, 40])
+def test_rows_kept_of_something_periodic_show_every_phase_of_it(period: int) -> None:
+    rows = Thinned(500)
+    rows.add(np.arange(20_000) % period)
+    phases = np.bincount(rows.columns[0], minlength=period)
+    assert phases.min() > 0.6 * phases.mean()
