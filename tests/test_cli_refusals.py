@@ -162,7 +162,6 @@ CASES: dict[str, tuple[str, ...]] = {
     "reproduce stabillity -o x": ("no experiment 'stabillity': did you mean stability?",),
     # what is read from no URL, and what is the URL of no log
     "results https://host/a/b": ("https://host/a/b is a URL: name a path on this machine",),
-    "view RUN --save a.rrd --all-views https://host/a/b": ("https://host/a/b is a URL: name a",),
     "info gs://bucket/a.mcap": ("s3, http, https",),
     "info https://host": ("names no file",),
     "record foxglove://[x]:9/cam -o x --frames 1": ("foxglove://[x]:9/cam names no host",),

@@ -28,7 +28,6 @@ from replay.recordings.source import RecordedSource
 from replay.runs.compare import told_otherwise
 from replay.runs.log import read_header
 from replay.storage import identity
-from replay.view.build import build_view
 
 CONFIG = LearnerConfig(tau=20)
 ITERATIONS = 12
@@ -200,7 +199,6 @@ def test_a_stopped_run_does_nothing_that_takes_as_long_as_its_log_and_is_resumed
     assert (stopped.ended, stopped.iterations) == ("interrupted", 2)
     assert all("sample_sha256" in view for view in stopped.source["views"])
     assert sorted(file.name for file in out.iterdir()) == ["modules.npz", "run.json", "run.mcap"]
-    build_view(out, tmp_path / "v.rrd", all_views=recording)
     whole = learn(recording, tmp_path / "whole")
     resumed = learn(recording, out, resume=True)
     assert resumed.as_json() | {"run": ""} == whole.as_json() | {"run": ""}

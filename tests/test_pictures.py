@@ -45,7 +45,7 @@ def test_every_tab_of_a_run_is_drawn(code: dict[str, Any], tmp_path: Path) -> No
         folder.mkdir()
         learner = {"algorithm": algorithm, "settled": 0.05, "agreement": 0.25}
         write_run(folder / "run.mcap", IMAGE, 3, learner=learner)
-        shown = run_layout(read_outline(folder), nothing, all_views=True)
+        shown = run_layout(read_outline(folder), nothing)
         assert tabs(shown) <= drawn(code, *sources)
 
 

@@ -56,7 +56,7 @@ def shown(tmp_path_factory):
             modules.append(module_of(len(modules) + 1, *place))
     writer.finish()
     save_modules(folder / "modules.npz", modules)
-    build_view(folder, folder / "run.rrd", every=EVERY, all_views=recording)
+    build_view(folder, folder / "run.rrd", every=EVERY)
     return folder, records, View(folder / "run.rrd").rows
 
 
@@ -66,11 +66,7 @@ def at(records, frame):
 
 
 @pytest.mark.parametrize(
-    "entity",
-    [
-        *("/world/watched", "/world/truth", "/abstraction/phi", "/learned/1/followed"),
-        *("/views/1_left", "/views/2_center", "/views/3_right"),
-    ],
+    "entity", ["/world/watched", "/world/truth", "/abstraction/phi", "/learned/1/followed"]
 )
 def test_what_was_watched_stands_at_its_iteration(shown, entity):
     _, records, rows = shown

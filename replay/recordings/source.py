@@ -6,7 +6,6 @@ import bisect
 import filecmp
 import functools
 import itertools
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +19,7 @@ from google.protobuf import message
 from cdmisfa.core.blocks import Block, HeadPose, freeze
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import parse_json
-from recorder.log.messages import POSE_TOPIC, RECORDING_METADATA
+from recorder.log.messages import POSE_TOPIC
 from recorder.log.scenery import turns_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
@@ -29,26 +28,6 @@ from replay.recordings.view_file import ViewFile, intersection
 from replay.storage.identity import Identity, LoggedSource, LogIdentity
 from replay.storage.opening import log_files
 from replay.stored import merged
-
-
-def head_poses(path: Path) -> dict[str, HeadPose]:
-    """Where the head is in each view of a recording.
-
-    Returns:
-        By the view's name; without the views that do not say it.
-
-    Raises:
-        UsageError: there is no such recording.
-        LogDamagedError: it cannot be read.
-    """
-    found: dict[str, HeadPose] = {}
-    for file in log_files(path):
-        with LogReader(file) as reader:
-            facts = next((r.metadata for r in reader.metadata if r.name == RECORDING_METADATA), {})
-            pose = first_pose(reader)
-        if pose is not None and "view" in facts:
-            found[facts["view"]] = pose
-    return found
 
 
 def first_pose(reader: LogReader) -> HeadPose | None:
@@ -66,12 +45,6 @@ def first_pose(reader: LogReader) -> HeadPose | None:
         raise LogDamagedError(f"{reader.path} {POSE_TOPIC}: not a foxglove.PoseInFrame") from error
     place, turn = pose.position, pose.orientation
     return HeadPose((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
-
-
-def yaw_of(pose: HeadPose) -> float:
-    """How far the head is turned, degrees to the left."""
-    _, _, z, w = pose.quaternion
-    return math.degrees(2 * math.atan2(z, w))
 
 
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")

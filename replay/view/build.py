@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +22,18 @@ from cdmisfa.core.untrusted import opened_regular
 from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.inputs import About, Logged, holds_run, open_to_look
-from replay.recordings.source import RecordedSource, head_poses
-from replay.runs.columns import Blocks
+from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import Frames, read_batches, read_header
 from replay.runs.modules import load_modules
-from replay.runs.run import Outline, Tally, read_outline, stated_source, states_whole
+from replay.runs.run import Tally, read_outline
 from replay.view.columns import FRAME, MOST_STREAMS, Target
 from replay.view.labels import label, part
 from replay.view.layouts import blueprint, lines, time_axis
 from replay.view.modules import ModulesView
 from replay.view.panels import run_layout
 from replay.view.run import RunView
-from replay.view.scene import SceneView, gaze_view, scene_view, write_gaze, write_heads
+from replay.view.scene import SceneView, scene_view
 from replay.view.summary import summary_text
 from replay.view.world import WorldView, world_of_recording, write_learned
 
@@ -53,7 +52,6 @@ def build_view(
     *,
     every: int = 10,
     force: bool = True,
-    all_views: Path | None = None,
     tab: str | None = None,
     beside: Sequence[Path] = (),
     inputs: InputOptions | None = None,
@@ -66,7 +64,6 @@ def build_view(
         out: the file.
         every: show every so many watched frames, of those that were kept.
         force: replace an existing file.
-        all_views: the recording that the run learned from, to show what was not watched too.
         tab: name of the tab that is open; by default the first.
         beside: more camera logs, or files of the recording.
         inputs: which streams of camera logs; by default all of images.
@@ -89,9 +86,7 @@ def build_view(
             raise UsageError(f"{path}: one run is shown at a time; compare --save shows several")
         log = run_log(path)
         with recording_to(out, _name(log), log, force=force) as recording:
-            _write_run(recording, log, every, all_views, tab)
-    elif all_views is not None:
-        raise UsageError(f"{path} is a recording: all of its views are shown anyway")
+            _write_run(recording, log, every, tab)
     else:
         with recording_to(out, path.resolve().stem, path, force=force) as recording:
             write_recording(recording, [path, *beside], every, tab, inputs, about)
@@ -165,7 +160,6 @@ def _write_run(
     recording: rr.RecordingStream,
     log: Path,
     every: int,
-    all_views: Path | None,
     tab: str | None,
 ) -> None:
     header, folder = read_header(log), log.parent
@@ -175,7 +169,7 @@ def _write_run(
     tally, view = Tally(header), RunView(recording, header, streams, every)
     known = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
     modules = ModulesView(Target(recording, header.spec), known)
-    world = WorldView(recording, header, folder, streams, every, all_views)
+    world = WorldView(recording, header, folder, streams, every)
     truth: list[Frames] = []
     for note in world.notes:
         view.event(0, 0, note, "WARN")
@@ -195,19 +189,9 @@ def _write_run(
         view.event(outline.end, outline.iterations, note, "WARN")
     text = label(summary_text(outline, _name(log), events))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
-    head = all_views is not None and write_unwatched(recording, all_views, log, outline, every)
     world.flush()
     first = world.tab(write_learned(recording, log, outline, truth))
-    recording.send_blueprint(
-        run_layout(
-            outline,
-            first,
-            sheets=modules.sheets(),
-            all_views=all_views is not None,
-            head=head,
-            tab=tab,
-        )
-    )
+    recording.send_blueprint(run_layout(outline, first, sheets=modules.sheets(), tab=tab))
 
 
 def _name(log: Path) -> str:
@@ -250,9 +234,7 @@ def write_recording(
             recording.log("events", rr.TextLog(label(note), level="WARN"))
     properties: Any = {"frames": count, "streams": label(", ".join(spec.streams)), "fps": spec.fps}
     recording.send_property("recording", rr.AnyValues(**properties))
-    poses = {name: pose for p in paths for name, pose in head_poses(p).items()} if ours else {}
-    head = write_heads(target, poses)
-    layout = recording_layout(spec, first + count, head=head, scene=scene is not None, tab=tab)
+    layout = recording_layout(spec, first + count, scene=scene is not None, tab=tab)
     recording.send_blueprint(layout)
 
 
@@ -261,7 +243,6 @@ def write_views(
     source: Logged,
     count: int,
     every: int,
-    blocks: Blocks | None = None,
     scene: SceneView | None = None,
 ) -> None:
     """Write every view of a recording, and what the world knows, from the source's t on.
@@ -271,13 +252,11 @@ def write_views(
         source: the recording.
         count: how many frames.
         every: show images of every this many frames.
-        blocks: of a run, for its views; its truth is there already.
         scene: where what the world knows is shown, too.
     """
     first, spec = source.t, source.spec
     columns = [target.frames(view) for view in view_entities(spec)]
     truth = target.lines("world/truth", spec.truth, within=1)
-    has_truth = spec.truth and blocks is None
     for t in range(first, first + count, BLOCK):
         stop = min(t + BLOCK, first + count)
         for stream, column in enumerate(columns):
@@ -286,9 +265,8 @@ def write_views(
                 block = source.take(stream, high - low)
                 frames = np.arange(low, high)
                 keep = frames % (every if spec.images else 1) == 0
-                iterations = None if blocks is None else blocks.iteration(frames[keep])
-                column.add(frames[keep], iterations, block.frames[keep])
-                if has_truth and stream == 0:
+                column.add(frames[keep], None, block.frames[keep])
+                if spec.truth and stream == 0:
                     truth.add(frames, None, block.truth)
                 if scene is not None and stream == 0:
                     scene.move(frames, block.truth)
@@ -296,44 +274,6 @@ def write_views(
         column.flush()
     if scene is not None:
         scene.flush()
-
-
-def write_unwatched(
-    recording: rr.RecordingStream, path: Path, log: Path, outline: Outline, every: int
-) -> bool:
-    """Write all views of the recording that a run learned from, also while not watched.
-
-    Where the recording has head poses, they say where the head was turned.
-
-    Returns:
-        Whether there is a head.
-
-    Raises:
-        UsageError: the run learned from another recording, or from a live scene.
-        LogDamagedError: it cannot be read.
-    """
-    learned_from, target = stated_source(log), Target(recording, outline.header.spec)
-    with contextlib.closing(RecordedSource(path, loop=True)) as source:
-        whole = states_whole(learned_from)
-        described = source.describe() if whole else source.describe_at_once()
-        if _hashes(described) != _hashes(learned_from) or not _hashes(learned_from):
-            raise UsageError(
-                f"{path} is not the recording that this run learned from: the SHA-256 of its "
-                "files are others"
-            )
-        write_views(target, source, outline.end - source.t, every, outline.blocks)
-    poses = head_poses(path)
-    if not write_heads(target, poses):
-        return False
-    write_gaze(target, outline, poses)
-    return True
-
-
-def _hashes(described: Any) -> list[str]:
-    """Identity of the files of views: the SHA-256 of each, or of a sample of it."""
-    views = described.get("views", ()) if isinstance(described, Mapping) else ()
-    found = (view.get("sha256", view.get("sample_sha256")) for view in views)
-    return [str(known) for known in found if known is not None]
 
 
 def view_entities(spec: SourceSpec) -> list[str]:
@@ -345,7 +285,6 @@ def recording_layout(
     spec: SourceSpec,
     frames: int,
     *,
-    head: bool = False,
     scene: bool = False,
     tab: str | None = None,
 ) -> rrb.Blueprint:
@@ -354,8 +293,7 @@ def recording_layout(
     Args:
         spec: of its source.
         frames: where it ends.
-        head: where the head looks is there.
-        scene: so is the world in 3D.
+        scene: the world in 3D is there.
         tab: name of the one that is open.
     """
     axis, tabs = time_axis(frames), list[rrb.Container]()
@@ -368,12 +306,7 @@ def recording_layout(
         views = rrb.Grid(*(_image(*place) for place in places), grid_columns=min(len(places), 3))
     else:
         views = rrb.Vertical(*(lines(name, [place], axis) for name, place in places))
-    beside: list[rrb.View] = []
-    if spec.truth:
-        beside.append(lines("What the world knows", ["/world/truth"], axis))
-    if head:
-        beside.append(gaze_view("Where the head looks"))
-    below = [rrb.Horizontal(*beside, column_shares=[3, 1][: len(beside)])] if beside else []
+    below = [lines("What the world knows", ["/world/truth"], axis)] if spec.truth else []
     tabs.append(rrb.Vertical(views, *below, name="Views"))
     return blueprint(*tabs, name="Recording", length=frames, tab=tab)
 

@@ -12,8 +12,8 @@ from cdmisfa.core.signals import SIGNALS
 from replay.runs.log import PHI_EVERY
 from replay.runs.run import Outline
 from replay.view.columns import FRAME, ITERATION, TIMELINE_SIGNALS, power_of_ten
-from replay.view.labels import label, part
-from replay.view.lanes import ATTENDS, MOSTLY
+from replay.view.labels import label
+from replay.view.lanes import ATTENDS
 from replay.view.layouts import (
     CROSSED,
     Panel,
@@ -36,7 +36,7 @@ from replay.view.layouts import (
 )
 from replay.view.modules import sheet_size
 from replay.view.run import HARDLY_WATCHED, lines_of
-from replay.view.scene import gaze_view, scene_view
+from replay.view.scene import scene_view
 from replay.view.world import WALL, bounds
 
 PAGES, MOST_MODULES = 12, 6
@@ -73,8 +73,6 @@ def run_layout(
     world: WorldTab,
     *,
     sheets: int = 0,
-    all_views: bool = False,
-    head: bool = False,
     tab: str | None = None,
 ) -> rrb.Blueprint:
     """The layout of a run, ready to be sent.
@@ -85,8 +83,6 @@ def run_layout(
         outline: the run in short.
         world: what is shown of the world.
         sheets: modules whose pictures of least to greatest output are there.
-        all_views: what was not watched is there too.
-        head: where the head was turned is there too.
         tab: name of the tab that is open; by default the first.
 
     Raises:
@@ -96,7 +92,6 @@ def run_layout(
     own = tabs_of("progress" if outline.header.by_progress else "paper")
     tabs = [panels.world()] if world.scene or world.lessons else []
     tabs += [*map(panels.tab, own), panels.modules(sheets)]
-    tabs += [panels.all_views(head=head)] if all_views else []
     return blueprint(*tabs, panels.table(), name="Run", length=outline.end, tab=tab)
 
 
@@ -299,24 +294,6 @@ class Panels:
         title = title or f"Output of module {i} wherever its own stream was watched"
         entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
         return lines(title, entities, axis or self._axis)
-
-    def all_views(self, *, head: bool) -> rrb.Container:
-        """All streams, watched or not."""
-        names = self._spec.streams
-        places = [(label(name), f"/views/{part(names, s)}") for s, name in enumerate(names)]
-        if not self._spec.images:
-            curves = [view for name, place in places for view in self._curves(name, [place])]
-            return rrb.Vertical(*curves, name="All views")
-        pictures = [rrb.Spatial2DView(origin=place, name=name) for name, place in places]
-        rows: Views = [
-            rrb.Grid(*pictures, grid_columns=min(len(pictures), 3)),
-            self._lanes("What it mostly watches", [f"/{MOSTLY}/{ATTENDS}"]),
-        ]
-        if head:
-            title = "Where the head is turned [degrees to the left]"
-            turned = self._curves(title, ["/head/yaw"], legend=False)
-            rows.append(rrb.Horizontal(*turned, gaze_view("Where it looks"), column_shares=[2, 1]))
-        return rrb.Vertical(*rows, row_shares=[3, 1, 2][: len(rows)], name="All views")
 
     def _pictures(self) -> rrb.View | rrb.Container:
         """What each stream showed last, or of numbers what is watched now."""

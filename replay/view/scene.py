@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -20,14 +20,11 @@ from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
 from cdmisfa.core.arrays import FloatArray, IntArray
-from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import CdmisfaError
 from recorder.log.scenery import ROAMING, Eye, Gaze, Scenery, Thing
-from replay.palette import GREY, Rgb, colour, packed_all, pale
-from replay.recordings.source import yaw_of
+from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
-from replay.runs.run import Outline
 from replay.view.columns import Column, Target
 from replay.view.labels import label, part
 
@@ -291,75 +288,13 @@ def _as_seen(model: Path) -> Any:
     return tree
 
 
-POSES = "head/poses"
-GAZE = "head/poses/watching"
-YAW = "head/yaw"
-
-ARROW = 0.25
-"""Length of the arrow along a gaze, in metres."""
-
-
-def write_heads(target: Target, poses: Mapping[str, HeadPose]) -> bool:
-    """Show in 3D where the head looks for each view: an arrow along its gaze.
-
-    Poses are in the robot's root frame: x to the back, y to the right, z up.
-
-    Returns:
-        Whether there is a pose for every view; otherwise nothing is shown.
-    """
-    names = target.spec.streams
-    if not set(poses) >= set(names):
-        return False
-    target.log(POSES, rr.ViewCoordinates.BRU)
-    for s, name in enumerate(names):
-        place, pose = f"{POSES}/{part(names, s)}", poses[name]
-        turn = rr.Quaternion(xyzw=pose.quaternion)
-        target.log(place, rr.Transform3D(translation=pose.position, quaternion=turn))
-        arrow = rr.Arrows3D(
-            vectors=[[-ARROW, 0, 0]],
-            radii=[0.005],
-            colors=packed_all([colour(s)]),
-            labels=[label(name)],
-        )
-        target.log(place, arrow)
-    return True
-
-
-def write_gaze(target: Target, outline: Outline, poses: Mapping[str, HeadPose]) -> None:
-    """Show where a run turned the head: `/head/yaw` in degrees, and an arrow in 3D."""
-    blocks = outline.blocks
-    watched = [poses[name] for name in target.spec.streams]
-    yaws = np.array([yaw_of(pose) for pose in watched])
-    names = ["head turned to the left [degrees]"]
-    column = target.lines(YAW, names, [pale(0)], steps=True)
-    column.add(blocks.starts, blocks.iterations, yaws[blocks.streams][:, None])
-    turns = np.flatnonzero(np.diff(blocks.streams, prepend=-1))
-    if len(turns):
-        turned = rr.Transform3D.columns(
-            translation=[watched[s].position for s in blocks.streams[turns]],
-            quaternion=[watched[s].quaternion for s in blocks.streams[turns]],
-        )
-        target.send(GAZE, blocks.starts[turns], blocks.iterations[turns], turned)
-    column.flush()
-    arrow = rr.Arrows3D(vectors=[[-1.4 * ARROW, 0, 0]], radii=[0.003], colors=packed_all([GREY]))
-    target.log(GAZE, arrow)
-
-
 def scene_view() -> rrb.View:
     """The world in 3D, seen from in front of the robot."""
-    place, target = (-1.5, -0.85, 0.72), (-0.38, 0.0, 0.0)
-    return _view_3d(SCENE, "The world, and where it looks", place, target)
-
-
-def gaze_view(name: str) -> rrb.View:
-    """The head's poses, seen from above and behind."""
-    return _view_3d(POSES, name, (0.45, 0.0, 0.75), (-0.12, 0.0, 0.24))
-
-
-def _view_3d(origin: str, name: str, place: Any, target: Any) -> rrb.View:
     return rrb.Spatial3DView(
-        origin=f"/{origin}",
-        name=name,
+        origin=f"/{SCENE}",
+        name="The world, and where it looks",
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(position=place, look_target=target, eye_up=(0.0, 0.0, 1.0)),
+        eye_controls=rrb.EyeControls3D(
+            position=(-1.5, -0.85, 0.72), look_target=(-0.38, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
+        ),
     )

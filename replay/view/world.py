@@ -167,15 +167,12 @@ PRESET = (
 )
 
 
-def world_of_run(
-    header: RunHeader, run: Path, recording: Path | None = None
-) -> tuple[Scenery | None, str | None]:
+def world_of_run(header: RunHeader, run: Path) -> tuple[Scenery | None, str | None]:
     """Scenery of a run, and what is uncertain about it.
 
     Args:
         header: of its log.
         run: its folder.
-        recording: which it learned from, where that is known.
 
     Returns:
         No world where the run was in none that is described here.
@@ -185,7 +182,7 @@ def world_of_run(
         return _told(_table(source.get("scene")))
     if source.get("scene") != KIND:
         return None, None
-    for place in _places(header, run, recording):
+    for place in _places(header, run):
         with contextlib.suppress(CdmisfaError, OSError):
             found = world_of_recording(place, sha256=str(source.get("config_sha256")))
             if found is not None:
@@ -223,10 +220,8 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
     return scenery_of(config, None if pose is None else pose.position)
 
 
-def _places(header: RunHeader, run: Path, recording: Path | None) -> Iterator[Path]:
+def _places(header: RunHeader, run: Path) -> Iterator[Path]:
     """Places where the recording may be that a run learned from."""
-    if recording is not None:
-        yield recording
     named = _table(header.manifest.get("command")).get("source")
     for name in named if isinstance(named, list) else []:
         with contextlib.suppress(OSError, ValueError):
@@ -254,7 +249,6 @@ class WorldView:
         run: its folder.
         streams: those that are shown.
         every: where things are is shown at every so many frames, as pictures are.
-        learned_from: the recording that the run learned from, where that is known.
 
     Attributes:
         notes: what a person should know of it.
@@ -267,10 +261,9 @@ class WorldView:
         run: Path,
         streams: Sequence[int],
         every: int,
-        learned_from: Path | None = None,
     ) -> None:
         target = Target(recording, header.spec)
-        scenery, unsure = world_of_run(header, run, learned_from)
+        scenery, unsure = world_of_run(header, run)
         self._tab = WorldTab(scene=scenery is not None)
         self._view: SceneView | WallView | None = None
         self.notes: list[str] = [] if unsure is None else [unsure]

@@ -37,11 +37,6 @@ from recorder.log.files import refuse_taken, refuse_unless
     default=10,
     help="Show the images of every Nth frame; numbers are all shown.",
 )
-@options.path(
-    "--all-views",
-    "RECORDING",
-    "Also show what was not watched, from the recording that the run learned from.",
-)
 @options.look_options
 @options.force
 def view_command(
