@@ -1,5 +1,6 @@
 """Recordings: the same bytes however they are made, readable by others, safe from any end."""
 
+import errno
 import hashlib
 import json
 import os
@@ -13,7 +14,7 @@ from foxglove_schemas_protobuf import RawImage_pb2
 from mcap.reader import make_reader
 from waiting import running, started, wait_for
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.config import RecordConfig, Split
 from recorder.log.files import RECORDING, held, partial_path
 from recorder.log.manifest import RecordingStart, read_start, store_start
@@ -234,6 +235,27 @@ def test_resume_takes_what_stands_before_the_first_damage(oscillatory, tmp_path,
     assert 1000 < whole_frames(path, "x1") < 2000
     record_scene("oscillatory", tmp_path, frames=3000, resume=True)
     assert contents(tmp_path) == contents(oscillatory)
+
+
+def test_an_error_of_the_disk_while_resuming_costs_no_frame(tmp_path, monkeypatch):
+    record_scene("oscillatory", tmp_path / "a", frames=3000)
+    (tmp_path / "a" / "x1.mcap").rename(tmp_path / "a" / "x1.mcap.partial")
+    before, left = contents(tmp_path / "a"), iter(range(7))
+
+    def failing(read):
+        def fails(*args):
+            if next(left, None) is None:
+                raise OSError(errno.EIO, "Input/output error")
+            return read(*args)
+
+        return fails
+
+    for name in ("pread", "preadv"):
+        monkeypatch.setattr(os, name, failing(getattr(os, name)))
+    with pytest.raises(LogDamagedError, match="Input/output error"):
+        record_scene("oscillatory", tmp_path / "a", frames=3100, resume=True)
+    monkeypatch.undo()
+    assert contents(tmp_path / "a") == before
 
 
 def test_a_finished_recording_is_made_longer_and_never_shorter(oscillatory, tmp_path):
