@@ -156,7 +156,7 @@ def sampled(source: LoggedSource) -> str:
 
 def _digest(logs: Sequence[Mapping[str, Any]]) -> str:
     """What identifies a log: of one file its own checksum, of several that of all."""
-    for name in ("sha256", "sample_sha256", "index_sha256"):
+    for name in ("sha256", "sample_sha256"):
         if len(logs) == 1 and name in logs[0]:
             return str(logs[0][name])
     return hashlib.sha256(json.dumps(logs, sort_keys=True).encode()).hexdigest()
