@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import resource
 import time
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from cdmisfa import kernels
 from cdmisfa.agents.agent import NOVEL, OUTCOME, as_struct, new_agent, rules
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.processes import Workers
+from cdmisfa.core.processes import Submit, workers
 from cdmisfa.experiments.sources import configure
 from cdmisfa.experiments.sweep import compute, plan
 from recorder.world.oscillatory import OscillatorySource
@@ -53,17 +52,17 @@ def learn_frames(frames: int) -> tuple[float, float]:
 
 def apart(frames: int) -> tuple[float, float]:
     """`learn_frames` in a process of its own, so that the peak is this one's."""
-    with contextlib.closing(Workers(1)) as worker:
-        worker.submit(learn_frames, 1000).result()  # imports
-        return worker.submit(learn_frames, frames).result()
+    with workers(1) as submit:
+        submit(learn_frames, 1000).result()  # imports
+        cost: tuple[float, float] = submit(learn_frames, frames).result()
+        return cost
 
 
-def trials(jobs: int, frames: int) -> Callable[[], int]:
-    """A call that learns 4 times that many frames in some processes, which stay for the next."""
-    workers = Workers(jobs)
+def trials(submit: Submit, frames: int) -> Callable[[], int]:
+    """A call that learns 4 times that many frames in the processes of `workers`."""
 
     def call() -> int:
-        for future in [workers.submit(learn_frames, frames) for _ in range(4)]:
+        for future in [submit(learn_frames, frames) for _ in range(4)]:
             future.result()
         return 4
 
@@ -102,8 +101,9 @@ def main(*, quick: bool = False) -> None:
     for frames in lengths:
         cost, peak = apart(frames)
         by_frames.append([frames, round(cost, 2), round(peak, 1)])
-    jobs = {"1": trials(1, 40 * lengths[0]), "2": trials(2, 40 * lengths[0])}
-    walls = interleaved(jobs, 2 if quick else 3, time.perf_counter_ns)
+    with workers(1) as one, workers(2) as two:
+        jobs = {"1": trials(one, 40 * lengths[0]), "2": trials(two, 40 * lengths[0])}
+        walls = interleaved(jobs, 2 if quick else 3, time.perf_counter_ns)
     by_jobs = [
         [n, round(middle(t) / 1000), f"{ratio(walls['1'], t):.2f}x"] for n, t in walls.items()
     ]

@@ -57,7 +57,7 @@ def seconds(
 
     out = run.parent / "out"
     before, start = used(), time.perf_counter()
-    assert not apply_to_logs(run, [str(logs)], out, engine="dask", scheduler=address).failed
+    assert not apply_to_logs(run, [str(logs)], out, scheduler=address).failed
     took = time.perf_counter() - start, used() - before
     shutil.rmtree(out)
     return took
@@ -95,7 +95,7 @@ def main(*, quick: bool = False) -> None:
         "spreading",
         "Modules applied to many logs by dask",
         f"{MODULES} modules of {OUTPUTS[-1]} outputs applied to {LOGS} films of {FRAMES} frames of "
-        "640x480, by `cdmisfa apply --engine dask`, from its call to the last file, the index of "
+        "640x480, by `cdmisfa apply --scheduler`, from its call to the last file, the index of "
         "the logs included; workers of one thread each, which are there before. Two clusters take "
         f"turns; the machine had a load of {load:.1f} meanwhile, which a second worker takes a "
         "second share of: how many seconds of processors all workers took together says whether "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import resource
 import shlex
@@ -22,11 +21,11 @@ from applied_data import camera, make_run
 from camera_files import pictures
 from conftest import Cdmisfa
 from engine_tasks import apply_or_die
-from test_sweep import busiest_worker
 from waiting import running, started, wait_for
 
 from cdmisfa import Run
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.processes import WorkersError
 from cdmisfa.experiments.apply import corpus as applying
 from cdmisfa.experiments.apply.corpus import STORE, AppliedLogs, apply_to_logs
 from recorder.recording import record
@@ -96,48 +95,41 @@ def test_a_folder_of_logs_becomes_one_table(
     assert "failed: broken.mcap: " in told.out
 
 
-def test_the_same_bytes_come_of_every_engine_though_workers_are_killed(
+def test_the_same_bytes_come_of_processes_and_of_dask_though_a_worker_is_killed(
     run: Path, logs: Path, tmp_path: Path, cluster: tuple[str, list[subprocess.Popen[bytes]]]
 ) -> None:
     for seed in range(8):
         camera(logs / f"more-{seed}.mcap", 300, seed)
     apply_to_logs(run, [str(logs)], tmp_path / "here")
-    killed: list[int] = []
-
-    def kill_local(*_: int) -> None:
-        if not killed:
-            killed.append(busiest_worker())
-            os.kill(killed[0], signal.SIGKILL)
-
-    there = apply_to_logs(run, [str(logs)], tmp_path / "two", jobs=2, progress=kill_local)
+    there = apply_to_logs(run, [str(logs)], tmp_path / "two", jobs=2)
     assert (applied_now(there), there.failed) == ((12, 0, 0), [])
     address, workers = cluster
-    where: dict[str, Any] = {"engine": "dask", "scheduler": address}
     far = apply_to_logs(
-        run, [str(logs)], tmp_path / "far", **where, progress=lambda *_: workers[0].kill()
+        run,
+        [str(logs)],
+        tmp_path / "far",
+        scheduler=address,
+        progress=lambda *_: workers[0].kill(),
     )
     assert workers[0].wait() == -signal.SIGKILL
     assert (applied_now(far), far.failed) == ((12, 0, 0), [])
     assert files(tmp_path / "here") == files(tmp_path / "two") == files(tmp_path / "far")
 
 
-def test_a_log_that_kills_its_workers_is_a_row_and_the_rest_is_done(
+def test_a_log_that_kills_its_worker_ends_the_work_and_the_rest_is_kept(
     run: Path, logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    deadly = camera(logs / "deadly.mcap", 30)
-    monkeypatch.setattr(applying, "compute", apply_or_die)
-    found = apply_to_logs(run, [str(logs)], tmp_path / "out", jobs=2)
-    assert [(row["log"], row["error"][:26]) for row in found.failed] == [
-        ("deadly.mcap", "every worker that tried it")
-    ]
-    assert found.exit_code == 1
-    assert Path(f"{deadly}.deaths").read_text() == "..."
-    assert len(files(tmp_path / "out")) == 4
-    monkeypatch.undo()
-    again = apply_to_logs(run, [str(logs)], tmp_path / "out")
-    assert (applied_now(again), len(again.failed)) == ((0, 5, 0), 1)
-    last = apply_to_logs(run, [str(logs)], tmp_path / "out", retry_failed=True)
-    assert (applied_now(last), last.failed) == ((1, 4, 0), [])
+    deadly = camera(logs / "zz-deadly.mcap", 30)
+    with monkeypatch.context() as patched:
+        patched.setattr(applying, "compute", apply_or_die)
+        with pytest.raises(WorkersError, match="what is finished is kept"):
+            apply_to_logs(run, [str(logs)], tmp_path / "out", jobs=2)
+    assert Path(f"{deadly}.deaths").read_text() == "."
+    before = files(tmp_path / "out")
+    again = apply_to_logs(run, [str(logs)], tmp_path / "out", jobs=2)
+    assert again.failed == []
+    assert before.items() <= files(tmp_path / "out").items()
+    assert len(files(tmp_path / "out")) == 5
 
 
 def test_only_what_is_missing_or_has_changed_is_done(
@@ -326,7 +318,6 @@ def test_the_commands_of_the_page_work(
         ("none*.mcap -o out", "no file or folder matches"),
         ("EMPTY -o out", "there is no log"),
         ("oscillatory --frames 5 -o out", "out: name a file, oscillatory is none of many logs"),
-        ("LOGS -o out --scheduler tcp://x:1", "needs --engine dask"),
     ],
 )
 def test_what_cannot_be_is_refused_in_a_line(

@@ -34,7 +34,6 @@ def test_a_shell_completes_commands_options_choices_and_files(
     assert of("") == list(COMMANDS)
     assert of("lea") == ["learn"]
     assert of("learn x --max-mod") == ["--max-modules"]
-    assert of("sweep x --engine ") == ["local", "dask"]
     for command in ("learn", "convert", "view", "info", "check", "apply"):
         assert of(f"{command} x") == [None]
 

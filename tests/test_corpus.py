@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.processes import WorkerDied
+from cdmisfa.core.processes import WorkersError
 from replay.corpus import index as indexing
 from replay.corpus import rows as looking
 from replay.corpus.finding import INDEX, found_logs
@@ -240,21 +240,22 @@ class TestBadInput:
         with pytest.raises(UsageError, match=r"robot.mcap is no index of logs"):
             read_index(corpus / "robot.mcap")
 
-    def test_a_log_that_kills_its_worker_is_a_row(
+    def test_what_was_read_is_kept_when_a_worker_is_killed(
         self, corpus: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         def dying(
             work: Callable[[Sequence[Task]], Answer], batches: Sequence[Sequence[Task]], jobs: int
-        ) -> Iterator[tuple[int, Answer | WorkerDied]]:
-            for number, tasks in enumerate(batches):
-                deadly = any(task.path == "robot.mcap" for task in tasks)
-                yield number, WorkerDied("it died") if deadly else work(tasks)
+        ) -> Iterator[tuple[int, Answer]]:
+            yield 0, work(batches[0])
+            raise WorkersError("it died")
 
-        monkeypatch.setattr(indexing, "run_all", dying)
+        monkeypatch.setattr(indexing, "BATCH", 4)
+        with monkeypatch.context() as patched:
+            patched.setattr(indexing, "run_all", dying)
+            with pytest.raises(WorkersError, match="it died"):
+                index_logs([corpus])
         made = index_logs([corpus])
-        assert (made.logs, made.read) == (10, 10)
-        assert row(corpus, "robot.mcap")["problem"] == "it died"
-        assert row(corpus, "seen")["problem"] is None
+        assert (made.logs, made.kept, made.read) == (10, 4, 6)
 
     def test_what_was_read_is_kept_when_it_is_stopped(
         self, corpus: Path, monkeypatch: pytest.MonkeyPatch

@@ -1,15 +1,13 @@
-"""Worker processes: they end with who asked, and bring nothing of it with them."""
+"""Worker processes: they end with who asked, bring nothing of it with them, and may die."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import psutil
@@ -17,113 +15,135 @@ import pytest
 from engine_tasks import die_while_sending, sleep_for, trace
 from waiting import wait_for
 
-from cdmisfa.core.processes import Workers
+from cdmisfa.core.processes import ONE_THREAD, WorkersError, run_all, workers
 
 SCRIPT = """
-import contextlib, sys
+import sys
 from engine_tasks import sleep_for, trace
-from cdmisfa.core.processes import Workers
+from cdmisfa.core.processes import workers
 print("begun")
-with contextlib.closing(Workers(2)) as workers:
-    print(workers.submit(trace, (sys.argv[1], 3, "")).result(), flush=True)
-    futures = [workers.submit(sleep_for, 600) for _ in range(2)]
-    futures[0].result()
+with workers(2) as submit:
+    print(submit(trace, (sys.argv[1], 3, "")).result(), flush=True)
+    futures = [submit(bytes, 1 << 20), *(submit(sleep_for, 600) for _ in range(2))]
+    futures[1].result()
 """
 """A user's script, which does not ask whether it is the main module."""
 
 
 def begun(folder: Path) -> tuple[subprocess.Popen[str], list[psutil.Process]]:
-    """The script, with its two workers asleep."""
+    """The script, with its two workers asleep, and all processes that it has."""
     (folder / "script.py").write_text(SCRIPT)
     here = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     process = subprocess.Popen(
         [sys.executable, "script.py", str(folder)],
         cwd=folder,
-        env=here,
+        env={**here, "TMPDIR": str(folder)},
         text=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,
     )
-
-    def workers() -> list[psutil.Process]:
-        found = psutil.Process(process.pid).children()
-        return [child for child in found if "spawn_main" in " ".join(child.cmdline())]
-
-    wait_for(lambda: (folder / "3").exists() and len(workers()) == 2, seconds=60)
-    return process, workers()
+    wait_for(lambda: (folder / "3").exists(), seconds=60)
+    time.sleep(1)
+    children = psutil.Process(process.pid).children(recursive=True)
+    assert len(children) >= 2
+    return process, children
 
 
-def test_they_end_when_their_parent_is_killed(tmp_path: Path) -> None:
-    process, workers = begun(tmp_path)
-    process.kill()
-    left = psutil.wait_procs(workers, timeout=20)[1]
-    for worker in left:  # which would keep the pipe open
-        worker.kill()
-    out, _ = process.communicate()
-    assert out.split() == ["begun", "9"]
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_they_end_with_their_parent_and_leave_nothing(tmp_path: Path, how: signal.Signals) -> None:
+    process, children = begun(tmp_path)
+    if how == signal.SIGINT:  # of a terminal: to all of them
+        os.killpg(process.pid, how)
+    else:
+        process.kill()
+    left = psutil.wait_procs(children, timeout=20)[1]
+    for child in left:  # which would keep the pipe open
+        child.kill()
+    out, err = process.communicate(timeout=60)
     assert left == []
+    assert out.split() == ["begun", "9"]
+    assert not list(tmp_path.glob("cdmisfa-workers-*"))
+    if how == signal.SIGINT:
+        assert err.count("Traceback") == 1
+        assert err.rstrip().endswith("KeyboardInterrupt")
 
 
-def test_ctrl_c_of_a_terminal_is_for_their_parent_only(tmp_path: Path) -> None:
-    process, workers = begun(tmp_path)
-    time.sleep(0.5)  # Python overlooks a signal that comes just as it begins to wait for a lock
-    os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode != 0
-    assert err.count("Traceback") == 1
-    assert err.rstrip().endswith("KeyboardInterrupt")
-    assert psutil.wait_procs(workers, timeout=20)[1] == []
-
-
-def test_closing_does_not_wait_for_what_they_are_doing() -> None:
-    workers = Workers(1)
-    future = workers.submit(sleep_for, 600)
-    wait_for(future.running, seconds=60)
-    start = time.monotonic()
-    workers.close()
-    workers.close()
-    assert time.monotonic() - start < 10
-    with pytest.raises(BrokenProcessPool):
-        future.result()
-
-
-def test_what_sends_large_results_is_not_waited_for() -> None:
-    workers = Workers(2)
-    futures = [workers.submit(bytes, 1 << 26) for _ in range(8)]
-    futures[0].result()  # others are in the midst of being sent
-    closing = threading.Thread(target=workers.close, daemon=True)
-    closing.start()
-    closing.join(20)
-    assert not closing.is_alive()
+def test_leaving_does_not_wait_for_what_they_are_doing() -> None:
+    with workers(2) as submit:
+        futures = [submit(sleep_for, 600), *(submit(bytes, 1 << 26) for _ in range(8))]
+        assert len(futures[1].result()) == 1 << 26
+        start = time.monotonic()
+    assert time.monotonic() - start < 5
     assert all(future.done() for future in futures)
 
 
-def test_one_that_is_killed_while_it_sends_costs_its_own_result_only() -> None:
-    """The other lives, and must not keep its half message open."""
-    with contextlib.closing(Workers(2)) as workers:
-        workers.submit(os.getpid).result()
-        sleeping = workers.submit(sleep_for, 600)
-        with pytest.raises(BrokenProcessPool):
-            workers.submit(die_while_sending, 1 << 30).result(timeout=20)
-        assert workers.submit(abs, -3).result(timeout=20) == 3
-        assert sleeping.running()
+def killed_while_sending(size: int, seconds: float) -> None:
+    """Have one of two workers die so many seconds after it began to send a result."""
+    with workers(2) as submit:
+        sleeping = submit(sleep_for, 600)
+        submit(os.getpid).result()
+        submit(die_while_sending, size, seconds).result(timeout=60)
+        sleeping.result(timeout=10)  # the other result may have come before the end
+
+
+@pytest.mark.parametrize(
+    ("size", "seconds"), [(100, 0.0), (3000, 1e-4), (60_000, 1e-3), (1 << 29, 0.1), (1 << 29, 0.3)]
+)
+def test_one_that_is_killed_while_it_sends_ends_the_work(size: int, seconds: float) -> None:
+    with pytest.raises(WorkersError, match="a worker process was killed"):
+        killed_while_sending(size, seconds)
+
+
+def killed_after(seconds: float, number: int) -> None:
+    """Kill a worker while many results of all sizes come, and wait for these."""
+    with workers(2) as submit:
+        submit(abs, 1).result()
+        pids = [child.pid for child in psutil.Process().children() if _is_worker(child)]
+        futures = [submit(bytes, size) for size in (100, 30_000, 5_000_000) * 100]
+        time.sleep(seconds)
+        os.kill(pids[number % len(pids)], signal.SIGKILL)
+        start = time.monotonic()
+        try:
+            for future in futures:
+                future.result(timeout=30)
+            submit(abs, 1).result()
+        finally:
+            assert time.monotonic() - start < 5
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_one_that_is_killed_at_any_time_ends_the_work_soon(number: int) -> None:
+    with pytest.raises(WorkersError, match="a worker process was killed"):
+        killed_after(0.03 * number, number)
+
+
+def _is_worker(process: psutil.Process) -> bool:
+    return "popen_loky_posix" in " ".join(process.cmdline())
 
 
 def test_errors_come_back_and_what_cannot_be_sent_is_one() -> None:
-    with contextlib.closing(Workers(1)) as workers:
+    with workers(1) as submit:
         for asked, error in (
-            (workers.submit(int, "x"), ValueError),
-            (workers.submit(threading.Lock), TypeError),
-            (workers.submit(len, threading.Lock()), TypeError),
+            (submit(int, "x"), ValueError),
+            (submit(threading.Lock), TypeError),
         ):
             with pytest.raises(error):
                 asked.result(timeout=60)
-        assert workers.submit(abs, -3).result(timeout=60) == 3
+        assert submit(abs, -3).result(timeout=60) == 3
 
 
 def test_they_have_their_environment_before_anything_is_imported(tmp_path: Path) -> None:
-    workers = Workers(1, environment={"OPENBLAS_NUM_THREADS": "1"})
-    assert workers.submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
-    workers.close()
+    with workers(1) as submit:
+        assert submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
+        assert submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result() >= {signal.SIGINT}
+    assert ONE_THREAD["OPENBLAS_NUM_THREADS"] == "1"
     assert trace((str(tmp_path), 2, "")) == 4
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_every_task_is_computed_once(tmp_path: Path, jobs: int) -> None:
+    tasks = [(str(tmp_path), number, "") for number in range(20)]
+    assert sorted(run_all(trace, tasks, jobs=jobs)) == [(n, n * n) for n in range(20)]
+    assert {file.stat().st_size for file in tmp_path.iterdir()} == {1}
+    assert list(run_all(trace, [], jobs=jobs)) == []

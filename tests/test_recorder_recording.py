@@ -300,7 +300,7 @@ def recorder(tmp_path):
             lambda: sum(p.stat().st_size for p in folder.glob("*.partial")) >= 1 << 17, 60, process
         )
         commands = {n: Path(f"/proc/{n}/cmdline").read_text() for n in children(process)}
-        yield process, [pid for pid, command in commands.items() if "spawn_main" in command]
+        yield process, [pid for pid, command in commands.items() if "popen_loky" in command]
 
 
 def test_a_killed_rendering_process_ends_the_recording_with_one_line(recorder, tmp_path):

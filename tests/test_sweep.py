@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,15 @@ import click
 import psutil
 import pytest
 from camera_files import write_cameras
-from click.testing import CliRunner
 from conftest import Cdmisfa
 from engine_tasks import trace
-from waiting import started, wait_for
+from waiting import running, started, wait_for
 
-from cdmisfa.cli.commands.trials import parse_grid, parse_seeds, results_command, sweep_command
+from cdmisfa.cli.commands.trials import parse_grid, parse_seeds
 from cdmisfa.core import processes
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.processes import EngineError, WorkerDied, run_all
+from cdmisfa.core.processes import WorkersError, run_all
 from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.session import run
@@ -153,7 +153,7 @@ def test_logs_are_swept_as_the_options_say(tmp_path: Path, cdmisfa: Cdmisfa) -> 
 
 
 def test_only_trials_of_other_code_are_computed_again_and_it_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[int, int, int]] = []
     quick: dict[str, Any] = {"max_iterations": 30, "progress": lambda *n: calls.append(n)}
@@ -164,10 +164,10 @@ def test_only_trials_of_other_code_are_computed_again_and_it_is_said(
     assert len((tmp_path / ROWS).read_bytes().splitlines()) == 4
     monkeypatch.setattr(sweeping, "code", lambda: "0.0+other")
     words = ["oscillatory", "--seeds", "0:5", "--max-iterations", "30", "-o", str(tmp_path)]
-    said = CliRunner().invoke(sweep_command, words)
-    assert said.exit_code == 0
-    assert "4 trials that were finished before are computed again: the code" in said.stderr
-    assert "computed again" not in CliRunner().invoke(sweep_command, words).stderr
+    said = cdmisfa("sweep", *words)
+    assert said.code == 0
+    assert "4 trials that were finished before are computed again: the code" in said.err
+    assert "computed again" not in cdmisfa("sweep", *words).err
 
 
 def test_failed_trials_are_listed_and_retried_when_asked(
@@ -242,17 +242,15 @@ def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, jobs: str) -> None:
     )
 
 
-# Engines
+# Workers
 
 
-def test_a_task_whose_worker_dies_is_tried_again_and_given_up_alone(tmp_path: Path) -> None:
-    modes = {1: "always", 2: "once"}
-    tasks = [(str(tmp_path), n, modes.get(n, "")) for n in range(8)]
-    found = dict(run_all(trace, tasks, jobs=2))
-    assert isinstance(found.pop(1), WorkerDied)
-    assert found == {n: n * n for n in range(8) if n != 1}
-    attempts = [(tmp_path / str(n)).stat().st_size for n in range(8)]
-    assert attempts == [1, processes.ATTEMPTS, 2, 1, 1, 1, 1, 1]
+def test_a_task_whose_worker_dies_ends_the_work(tmp_path: Path) -> None:
+    tasks = [(str(tmp_path), n, "always" if n == 5 else "") for n in range(40)]
+    found = dict[int, int]()
+    with pytest.raises(WorkersError, match="a worker process was killed"):
+        found.update(run_all(trace, tasks, jobs=2))
+    assert (tmp_path / "5").stat().st_size == 1
 
 
 def busiest_worker() -> int:
@@ -260,28 +258,59 @@ def busiest_worker() -> int:
     used: dict[int, float] = {}
     for process in psutil.Process().children():
         with contextlib.suppress(psutil.Error):
-            if any("spawn_main" in word for word in process.cmdline()):
+            if any("popen_loky_posix" in word for word in process.cmdline()):
                 used[process.pid] = sum(process.cpu_times()[:2])
     return max(used, key=lambda pid: used[pid])
 
 
-def test_local_processes_give_the_same_rows_though_one_is_killed(
+def test_local_processes_give_the_same_rows_also_after_one_was_killed(
     tmp_path: Path, local: dict[str, Any]
 ) -> None:
-    killed: list[int] = []
+    finished = 0
 
-    def kill_a_worker(*_: int) -> None:
-        if not killed:
-            victim = busiest_worker()
-            killed.append(victim)
-            os.kill(victim, signal.SIGKILL)
+    def kill_a_worker(done: int, *_: int) -> None:
+        nonlocal finished
+        finished = done
+        if done == 3:
+            os.kill(busiest_worker(), signal.SIGKILL)
 
-    report = sweep(
-        "oscillatory", tmp_path, grid=GRID, seeds=range(8), jobs=2, progress=kill_a_worker
-    )
-    assert killed
-    assert report.failed == ()
+    how: dict[str, Any] = {"grid": GRID, "seeds": range(8), "jobs": 2}
+    with pytest.raises(WorkersError, match="what is finished is kept"):
+        sweep("oscillatory", tmp_path, **how, progress=kill_a_worker)
+    assert 3 <= finished < 16
+    report = sweep("oscillatory", tmp_path, **how)
+    assert (report.skipped, report.failed) == (finished, ())
     assert rows_of(tmp_path) == local
+
+
+def test_a_killed_worker_ends_the_command_with_one_line(tmp_path: Path) -> None:
+    words = ("sweep", "oscillatory", "--seeds", "0:4000", "--jobs", "2", "-o", tmp_path)
+    with started(*words) as process:
+        wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
+        children = psutil.Process(process.pid).children(recursive=True)
+        worker = next(c for c in children if "popen_loky_posix" in " ".join(c.cmdline()))
+        worker.kill()
+        start = time.monotonic()
+        complaint = process.communicate(timeout=30)[1]
+    assert time.monotonic() - start < 5
+    assert process.returncode == 1
+    assert complaint.splitlines() == [
+        "cdmisfa: a worker process was killed, by somebody or for lack of memory: say the same "
+        "again, what is finished is kept"
+    ]
+    assert psutil.wait_procs(children, timeout=10)[1] == []
+
+
+def test_ctrl_c_of_a_terminal_ends_the_command_and_its_workers(tmp_path: Path) -> None:
+    words = ("sweep", "oscillatory", "--seeds", "0:4000", "--jobs", "2", "-o", tmp_path)
+    with running("-m", "cdmisfa", *words, start_new_session=True) as process:
+        wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
+        children = psutil.Process(process.pid).children(recursive=True)
+        os.killpg(process.pid, signal.SIGINT)
+        complaint = process.communicate(timeout=10)[1]
+    assert process.returncode == 130
+    assert len(complaint.splitlines()) == 1
+    assert psutil.wait_procs(children, timeout=10)[1] == []
 
 
 def test_dask_gives_the_same_rows_though_a_worker_is_killed(
@@ -302,7 +331,6 @@ def test_dask_gives_the_same_rows_though_a_worker_is_killed(
         tmp_path / "dask",
         grid=GRID,
         seeds=range(8),
-        engine="dask",
         scheduler=address,
         progress=kill_a_worker,
     )
@@ -315,16 +343,20 @@ def test_dask_gives_the_same_rows_though_a_worker_is_killed(
 def test_a_silent_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(processes, "CONNECT_SECONDS", 0.5)
-    with pytest.raises(EngineError, match=r"127\.0\.0\.1:9"):
-        list(run_all(trace, [("", 0, "")], engine="dask", scheduler="tcp://127.0.0.1:9"))
+    with pytest.raises(WorkersError, match=r"127\.0\.0\.1:9"):
+        list(run_all(trace, [("", 0, "")], scheduler="tcp://127.0.0.1:9"))
 
 
-def test_a_scheduler_that_goes_away_ends_the_sweep_in_words(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("lost", "why"), [("KilledWorker", "every dask worker .* died"), ("", "went away")]
+)
+def test_a_cluster_that_is_lost_ends_the_sweep_in_words(
+    monkeypatch: pytest.MonkeyPatch, lost: str, why: str
 ) -> None:
+    distributed = pytest.importorskip("distributed")
+
     class LostClient:
         def __init__(self, *_: Any, **__: Any) -> None:
-            self.ncores = lambda: {"worker": 1}
             self.wait_for_workers = self.close = lambda *_, **__: None
 
         def get_executor(self, **_: Any) -> Any:
@@ -332,30 +364,23 @@ def test_a_scheduler_that_goes_away_ends_the_sweep_in_words(
 
         def submit(self, *_: Any) -> Future[Any]:
             future: Future[Any] = Future()
-            future.cancel()
-            future.set_running_or_notify_cancel()
+            if lost:
+                future.set_exception(distributed.KilledWorker("task", None, 3))
+            else:
+                future.cancel()
+                future.set_running_or_notify_cancel()
             return future
 
-    distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(distributed, "Client", LostClient)
-    with pytest.raises(EngineError, match="went away"):
-        list(run_all(trace, [("", n, "") for n in range(3)], engine="dask"))
+    tasks = [("", n, "") for n in range(3)]
+    with pytest.raises(WorkersError, match=why):
+        list(run_all(trace, tasks, scheduler="tcp://127.0.0.1:9"))
 
 
-@pytest.mark.parametrize(
-    ("asked", "why"),
-    [
-        ({"engine": "slurm"}, "no engine 'slurm'"),
-        ({"scheduler": "tcp://localhost:8786"}, "needs --engine dask"),
-        ({"engine": "dask"}, r"pip install 'cdmisfa\[dask\]'"),
-    ],
-)
-def test_an_engine_that_is_not_there_is_refused(
-    monkeypatch: pytest.MonkeyPatch, asked: dict[str, str], why: str
-) -> None:
+def test_a_scheduler_without_dask_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=why):
-        list(run_all(trace, [("", 0, "")], **asked))
+    with pytest.raises(UsageError, match=r"pip install 'cdmisfa\[dask\]'"):
+        list(run_all(trace, [("", 0, "")], scheduler="tcp://127.0.0.1:9"))
 
 
 # Results
@@ -390,11 +415,11 @@ def test_means_and_deviations_are_over_finished_seeds(known: Path) -> None:
     assert "eta_1" not in two.measures
 
 
-def test_results_are_printed_in_every_form(known: Path) -> None:
+def test_results_are_printed_in_every_form(cdmisfa: Cdmisfa, known: Path) -> None:
     def shown(*options: str) -> str:
-        found = CliRunner().invoke(results_command, [str(known), *options])
-        assert found.exit_code == 0, found.output
-        return found.stdout
+        found = cdmisfa("results", known, *options)
+        assert found.code == 0, found.err
+        return found.out
 
     first, second = csv.DictReader(shown("--csv").splitlines())
     assert (first["learner.nu"], float(first["iterations_sd"])) == ("1", 10.0)
@@ -415,18 +440,19 @@ def test_a_folder_without_a_sweep_is_refused(tmp_path: Path) -> None:
 # The command
 
 
-def test_the_command_prints_one_document_and_says_what_failed(tmp_path: Path) -> None:
+def test_the_command_prints_one_document_and_says_what_failed(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
     record_scene("oscillatory", tmp_path / "log", frames=1000)
     words = [str(tmp_path / "log"), "--grid", "learner.tau=100,2000", "--seeds", "0:2"]
     words += ["--max-iterations", "20", "-o", str(tmp_path / "s"), "--json"]
-    found = CliRunner().invoke(sweep_command, words)
-    document = json.loads(found.stdout)
-    assert found.exit_code == 1
+    found = cdmisfa("sweep", *words)
+    document = found.json
+    assert found.code == 1
     assert (document["trials"], document["computed"], len(document["failed"])) == (4, 2, 2)
     assert {row["point"]["learner.tau"] for row in document["failed"]} == {"2000"}
     assert all("frames" in row["error"] for row in document["failed"])
-    shown = CliRunner().invoke(results_command, [str(tmp_path / "s"), "--json"])
-    ended = json.loads(shown.stdout)["points"][0]
+    ended = cdmisfa("results", tmp_path / "s", "--json").json["points"][0]
     assert (ended["done"], ended["measures"]["iterations"]["mean"]) == (2, 10.0)  # as the log did
 
 

@@ -200,21 +200,11 @@ preset = click.option(
     metavar="NAME",
     help="Preset (icub, icub-real, oscillatory, cameras) or a .toml file; by default the source's.",
 )
-
-
-def engine(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`--engine` and `--scheduler`."""
-    scheduler = click.option(
-        "--scheduler", metavar="ADDRESS", help="Address of a dask scheduler that runs."
-    )
-    where = click.option(
-        "--engine",
-        type=click.Choice(["local", "dask"]),
-        default="local",
-        show_default=True,
-        help="Where to compute: in processes of this machine, or in workers of dask.",
-    )
-    return where(scheduler(command))
+scheduler = click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Compute in the workers of the dask cluster at this address, instead of --jobs.",
+)
 
 
 def _be_quiet(ctx: click.Context, param: click.Parameter, given: bool) -> None:

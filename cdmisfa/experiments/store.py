@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
-from cdmisfa.core.processes import WorkerDied, run_all
+from cdmisfa.core.processes import run_all
 from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, parse_json
 from recorder.log.files import held, make_folder, refuse_named_as_file, refuse_special, to_disk
 
@@ -211,7 +211,6 @@ def run_trials(
     compute: Callable[[Task], Mapping[str, Any]],
     *,
     jobs: int = 1,
-    engine: str = "local",
     scheduler: str | None = None,
     retry_failed: bool = False,
     begin: Callable[[Sequence[Task]], None] = lambda missing: None,
@@ -224,15 +223,14 @@ def run_trials(
         folder: where the rows are; made where it does not exist.
         compute: a trial's result, or under "error" why there is none; importable by workers.
         jobs: local processes.
-        engine: where to compute, see `engines.ENGINES`.
-        scheduler: address of a dask scheduler.
+        scheduler: address of a dask scheduler, whose workers compute instead.
         retry_failed: compute trials again that failed before.
         begin: called with those to be computed, once the folder is held and before the first.
         progress: called with the trials finished, failed, and asked for.
 
     Raises:
-        UsageError: another process holds the folder, or there is no such engine.
-        EngineError: no scheduler answers.
+        UsageError: another process holds the folder.
+        WorkersError: a worker died, or no scheduler answers.
     """
     refuse_special(folder)
     refuse_named_as_file(folder)
@@ -250,7 +248,7 @@ def run_trials(
         skipped = len(trials) - len(missing)
         left = {trial.id for trial in missing}
         failed = sum(store.rows[t.id]["status"] == FAILED for t in trials if t.id not in left)
-        computed = run_all(compute, missing, jobs=jobs, engine=engine, scheduler=scheduler)
+        computed = run_all(compute, missing, jobs=jobs, scheduler=scheduler)
         for finished, (index, result) in enumerate(computed, start=skipped + 1):
             row = _row(missing[index], result)
             store.add(row)
@@ -293,9 +291,7 @@ def answer(
         return {"error": f"{type(error).__name__}: {error}"}
 
 
-def _row(trial: StoredTrial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]:
-    if isinstance(result, WorkerDied):
-        result = {"error": result.what}
+def _row(trial: StoredTrial, result: Mapping[str, Any]) -> dict[str, Any]:
     failed = "error" in result
     return {
         "id": trial.id,

@@ -81,7 +81,6 @@ def sweep(
     grid: Mapping[str, Sequence[Any]] | None = None,
     seeds: Iterable[int] = range(20),
     jobs: int = 1,
-    engine: str = "local",
     scheduler: str | None = None,
     retry_failed: bool = False,
     progress: Callable[[int, int, int], None] = lambda finished, failed, total: None,
@@ -95,15 +94,14 @@ def sweep(
         grid: values to try, by configuration key; every combination is a point.
         seeds: every point is tried with each of them.
         jobs: local processes.
-        engine: where to compute, see `processes.ENGINES`.
-        scheduler: address of a dask scheduler.
+        scheduler: address of a dask scheduler, whose workers compute instead.
         retry_failed: compute trials again that failed before.
         progress: called with the trials finished, failed, and asked for.
         how: further arguments of `plan`, for all trials.
 
     Raises:
-        UsageError: a wrong key, value, source or engine, found before any trial starts.
-        EngineError: no scheduler answers.
+        UsageError: a wrong key, value or source, found before any trial starts.
+        WorkersError: a worker died, or no scheduler answers.
     """
     folder = Path(folder).resolve()
     if log := next(folder.glob("*.mcap*"), None):
@@ -119,7 +117,6 @@ def sweep(
         folder,
         compute,
         jobs=jobs,
-        engine=engine,
         scheduler=scheduler,
         retry_failed=retry_failed,
         begin=lambda missing: write_json(folder / REQUEST, request),

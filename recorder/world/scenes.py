@@ -191,27 +191,23 @@ def render_in_processes(
     Raises:
         CdmisfaError: a process died, or could not open the scene.
     """
-    from concurrent.futures.process import BrokenProcessPool  # 20 ms, of no use to one process
-
-    from cdmisfa.core.processes import Workers
+    from cdmisfa.core.processes import WorkersError, workers
 
     pending: deque[Future[list[Block]]] = deque()
-    workers = Workers(jobs)
     opened = SCENES[scene.name].open, scene.config, scene.record
     try:
-        for request in requests(starts, frames):
-            pending.append(workers.submit(_render, opened, request))
-            if len(pending) > _AHEAD * jobs:
+        with workers(jobs) as submit:
+            for request in requests(starts, frames):
+                pending.append(submit(_render, opened, request))
+                if len(pending) > _AHEAD * jobs:
+                    yield from pending.popleft().result()
+            while pending:
                 yield from pending.popleft().result()
-        while pending:
-            yield from pending.popleft().result()
-    except BrokenProcessPool as error:
+    except WorkersError as error:
         raise CdmisfaError(
             "a rendering process ended: go on with --resume; if it ends again, with --jobs 1 to "
             "see why, or with more memory"
         ) from error
-    finally:
-        workers.close()
 
 
 @cache

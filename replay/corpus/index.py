@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_line
-from cdmisfa.core.processes import WorkerDied, run_all
+from cdmisfa.core.processes import WorkersError, run_all
 from cdmisfa.core.untrusted import check_regular, parse_json
 from recorder.log.files import atomic_write, held, make_folder, refuse_unless
 from replay.corpus.finding import INDEX, found_logs
@@ -192,16 +192,20 @@ def index_logs(
         old = old.filter(pc.is_in(indexed, listed))
         answers: dict[int, Answer] = {}
         saved = done = 0
-        for at, count, answer in _looked(tasks, deep, full, jobs):
-            answers[at] = answer
-            done += count
-            told(done, len(tasks))
-            if stop() and done < len(tasks):
-                made.stopped = True
-                break
-            if done - saved >= SAVED_EVERY:
-                saved = done
-                _write(old, answers, index)
+        try:
+            for at, count, answer in _looked(tasks, deep, full, jobs):
+                answers[at] = answer
+                done += count
+                told(done, len(tasks))
+                if stop() and done < len(tasks):
+                    made.stopped = True
+                    break
+                if done - saved >= SAVED_EVERY:
+                    saved = done
+                    _write(old, answers, index)
+        except WorkersError:
+            _write(old, answers, index)
+            raise
         made.read = sum(len(answer.looked) for answer in answers.values())
         made.kept += done - made.read
         table = old
@@ -351,25 +355,15 @@ def _keys(logs: pa.Table) -> pa.ChunkedArray:
 def _looked(
     tasks: Sequence[Task], deep: bool, full: bool, jobs: int
 ) -> Iterator[tuple[int, int, Answer]]:
-    """Look at logs, as many at a time as one process takes; where that dies, at each by itself.
+    """Look at logs, as many at a time as one process takes.
 
     Yields:
         The number of the first task of some that follow one another, how many, what was found.
     """
     batches = [tasks[at : at + BATCH] for at in range(0, len(tasks), BATCH)]
     work = functools.partial(_look, deep=deep, full=full)
-    died: list[int] = []
     for number, answer in run_all(work, batches, jobs=min(jobs, math.ceil(len(batches) / 4))):
-        if isinstance(answer, WorkerDied):
-            died.append(number * BATCH)
-        else:
-            yield number * BATCH, len(batches[number]), answer
-    alone = [(at + i, task) for at in died for i, task in enumerate(tasks[at : at + BATCH])]
-    for number, answer in run_all(work, [[task] for _, task in alone], jobs=max(jobs, 2)):
-        at, task = alone[number]
-        if isinstance(answer, WorkerDied):
-            answer = look([task._replace(problem=answer.what)], deep, full)
-        yield at, 1, answer
+        yield number * BATCH, len(batches[number]), answer
 
 
 def _look(tasks: Sequence[Task], *, deep: bool, full: bool) -> Answer:

@@ -56,7 +56,7 @@ STDOUT = "stdout"
 @options.salvage
 @options.input_options("topics", "fields", "rate", "start", "end", "align", keys=True)
 @options.jobs
-@options.engine
+@options.scheduler
 @options.retry_failed
 @options.force
 @options.as_json

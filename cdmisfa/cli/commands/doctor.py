@@ -32,7 +32,7 @@ EXTRAS = {
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "sklearn": (("sklearn",), "RecursiveSFA and IncSFA, estimators of scikit-learn"),
     "river": (("river",), "OnlineSFA, a transformer of river"),
-    "dask": (("distributed",), "sweep and reproduce --engine dask"),
+    "dask": (("distributed",), "--scheduler of sweep, apply and reproduce"),
 }
 """Optional parts of the package: the modules they bring, and what needs them."""
 

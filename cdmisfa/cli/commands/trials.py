@@ -51,7 +51,7 @@ MOST_SEEDS = 1_000_000
 @options.loop
 @options.input_options()
 @options.jobs
-@options.engine
+@options.scheduler
 @options.retry_failed
 @options.as_json
 @options.quiet
@@ -168,7 +168,7 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
     "--trials", type=click.IntRange(1), help="Trials per condition, instead of the paper's number."
 )
 @options.jobs
-@options.engine
+@options.scheduler
 @options.path("--recording", "DIR", "Recording of the iCub scene.")
 @click.option("--quick", is_flag=True, help="Few trials, enough to test the claim.")
 @options.as_json

@@ -120,7 +120,6 @@ def apply_to_logs(
     loop: bool = False,
     salvage: bool = False,
     jobs: int = 1,
-    engine: str = "local",
     scheduler: str | None = None,
     retry_failed: bool = False,
     force: bool = False,
@@ -129,7 +128,7 @@ def apply_to_logs(
 ) -> AppliedLogs:
     """Apply the modules of a run to each of many logs that has no outputs in a folder yet.
 
-    Files are the same to the byte whatever `jobs` and `engine`. A log that was written again since
+    Files are the same to the byte whatever `jobs`, and on dask. A log that was written again since
     is applied to again, as by its size and time of change.
 
     Args:
@@ -142,8 +141,7 @@ def apply_to_logs(
         loop: start a log again at its end.
         salvage: pass over what is damaged.
         jobs: local processes.
-        engine: where to compute, see `processes.ENGINES`.
-        scheduler: address of a dask scheduler.
+        scheduler: address of a dask scheduler, whose workers compute instead.
         retry_failed: apply to logs again that failed before.
         force: replace outputs of other modules, or with other options.
         indexing: called with the logs that were looked at, and how many are to be.
@@ -152,7 +150,7 @@ def apply_to_logs(
     Raises:
         UsageError: there is no such run or log, or the folder holds something else.
         LogWriteError: the disk does not take a file; those before are kept.
-        EngineError: no scheduler answers.
+        WorkersError: a worker died, or no scheduler answers.
     """
     application, out = Application(run), Path(out).resolve()
     inputs = inputs or InputOptions()
@@ -199,7 +197,6 @@ def apply_to_logs(
             folder,
             compute,
             jobs=jobs,
-            engine=engine,
             scheduler=scheduler,
             retry_failed=retry_failed,
             begin=begin,

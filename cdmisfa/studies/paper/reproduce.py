@@ -67,10 +67,10 @@ def reproduce(
         recording: of the iCub scene; by default one beside the folder, made if it is missing.
         jobs: processes.
         progress: called with the finished trials and all.
-        where: engine and scheduler, see `run_trials`.
+        where: scheduler, see `run_trials`.
 
     Raises:
-        UsageError: no such experiment or engine, or matplotlib is missing.
+        UsageError: no such experiment, or matplotlib is missing.
         CdmisfaError: a trial failed; the others are kept.
     """
     if name not in EXPERIMENTS:
