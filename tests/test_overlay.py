@@ -10,7 +10,7 @@ from run_data import VECTOR, having, run_of, write_run
 from view_data import View, scalars, views_of
 
 from cdmisfa.core.errors import UsageError
-from replay.runs.compare import Difference, first_difference, side_by_side
+from replay.runs.compare import first_difference, side_by_side
 from replay.runs.writer import RunWriter
 from replay.view import overlay
 from replay.view.overlay import build_overlay
@@ -48,70 +48,18 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
         found = view.rows[f"/compare/{name}/epsilon"]
         assert found["iteration"] == list(range(12))
         np.testing.assert_array_equal(scalars(found)[:, 0], expected)
-        stay = [s.R[0, 0, 0] for s in signals]
-        np.testing.assert_array_equal(view.numbers(f"/compare/{name}/R_stay/1_x1"), stay)
+        powers = scalars(view.rows[f"/compare/{name}/eta_dot"])[:, 0]
+        np.testing.assert_allclose(10**powers, [np.ravel(s.eta_dot)[0] for s in signals])
     with pytest.raises(UsageError, match="--force"):
         build_overlay(runs, side_by_side(runs), out)
     with pytest.raises(UsageError, match="no tab 'nowhere'"):
         build_overlay(runs, side_by_side(runs), out, force=True, tab="nowhere")
 
 
-@pytest.mark.parametrize("name", ["eta_dot", "xi"])
-def test_what_falls_through_powers_of_ten_is_drawn_so(name, three, tmp_path):
-    runs, (records, *_) = three
-    build_overlay(runs, side_by_side(runs), tmp_path / "all.rrd")
-    view = View(tmp_path / "all.rrd")
-    assert not [entity for entity in view.names if entity.endswith(f"/{name}")]
-    found = scalars(view.rows[rf"/compare/1_a\/run/log_{name}"])[:, 0]
-    np.testing.assert_allclose(
-        np.power(10, found), [np.ravel(getattr(r, name))[0] for r in records]
-    )
-
-
-@pytest.mark.parametrize("batch", [500, 2])
-def test_where_a_fork_begins_is_marked_on_each_curve(batch, three, tmp_path, monkeypatch):
-    """Or, on one that has no value in that iteration, at its next value."""
-    runs, (records, *_) = three
-    monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", batch)
-    monkeypatch.setattr("replay.runs.log.RunHeader.forked_at", 5)
-    build_overlay(runs, side_by_side(runs), tmp_path / "all.rrd")
-    view = View(tmp_path / "all.rrd")
-    for s, name in enumerate(VECTOR.streams):
-        own = [(r.iteration, r.learning_error) for r in records if r.stream == s]
-        first, value = next(point for point in own if point[0] >= 5)
-        mark = view.rows[rf"/compare/1_a\/run/forked/learning_error_of/{s + 1}_{name}"]
-        assert (mark["iteration"], scalars(mark).tolist()) == ([first], [[value]])
-
-
-def test_the_table_begins_with_what_runs_were_told_otherwise_and_says_which_are_identical(three):
-    runs, _ = three
-    first, equal, other = side_by_side(runs)
-    other = dataclasses.replace(other, told=(("seed", 3, 4), ("learner.nu", 0.05, 0.1)))
-    text = overlay.table_text((first, equal, other))
-    same, told, head, _, *lines = [line for line in text.splitlines() if line]
-    assert same == f"Identical to {first.name}, bit for bit: {equal.name}."
-    assert told == "What they were told otherwise: seed, learner.nu."
-    assert head.startswith("| run | seed | learner.nu | modules |")
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    assert [row[:3] for row in cells] == [
-        [first.name, "3", "0.05"],
-        [equal.name, "3", "0.05"],
-        ["c", "4", "0.1"],
-    ]
-    assert [row[-1] for row in cells[:2]] == ["-", "identical"]
-    assert overlay.table_text((first, equal, equal)).startswith("All 3 runs are identical")
-
-
-def test_runs_that_are_the_same_until_one_ends_are_said_to_be():
-    found = Difference(5, "", (), "ended after 5 iterations", "goes on")
-    assert overlay._shortly(found) == "identical as far as both go, 5 iterations"
-
-
 def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):
     def tell_errors_alone(signals):
         none = {name: np.full(np.shape(getattr(signals, name)), np.nan) for name in ("eta_dot",)}
-        bare = dict.fromkeys(("xi", "share"), np.nan)
-        return dataclasses.replace(signals, **none, **bare, R=np.empty((0, 2, 0)))
+        return dataclasses.replace(signals, **none, share=np.nan, R=np.empty((0, 2, 0)))
 
     written = write_run(tmp_path / "run.mcap", VECTOR, 12, edit=tell_errors_alone)
     tabs = []
@@ -124,9 +72,9 @@ def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):
     monkeypatch.setattr(overlay, "blueprint", take)
     out = tmp_path / "all.rrd"
     build_overlay([tmp_path], side_by_side([tmp_path]), out)
-    assert [tab.name for tab in tabs] == ["Overview", "Streams", "All curves"]
-    names = [view.name for view in tabs[-1].contents]
-    assert names == [overlay.CURVES[n] for n in CURVES_LEFT]
+    assert [tab.name for tab in tabs] == ["Overview", "Streams"]
+    names = [view.name for view in tabs[0].contents[1].contents]
+    assert names == [overlay.CURVES[n] for n in ("epsilon", "eta", "tested")]
     views = [view for tab in tabs for view in views_of(tab)]
     assert len({id(view) for view in views}) == len(views)  # a view has one place
     found = View(out).rows
@@ -134,13 +82,10 @@ def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):
         assert all(entity in found for entity in view.contents if isinstance(view.contents, list))
     name = tmp_path.name
     own = [s.iteration for s in written if s.stream == 1]
-    curve = found[f"/compare/1_{name}/learning_error_of/2_x2"]
+    curve = found[f"/compare/1_{name}/learning_error/2_x2"]
     assert own == [0, 2, 9]
     assert curve["iteration"] == [0, 2, 2, 9, 9]  # it ends where another stream is watched
     assert np.isnan(scalars(curve)).ravel().tolist() == [False, True, False, True, False]
-
-
-CURVES_LEFT = ("eta", "learning_error", "tested", "epsilon")
 
 
 def test_the_command_exits_with_4_only_for_two_that_differ(three, tmp_path, cdmisfa):

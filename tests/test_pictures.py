@@ -54,7 +54,8 @@ def test_every_tab_of_a_recording_and_of_a_comparison_is_drawn(
 ) -> None:
     assert tabs(recording_layout(VECTOR, 10, scene=True)) == drawn(code, code["SAMPLE"])
     runs, _ = three
-    assert tabs(overlay._layout(side_by_side(runs), None)) == drawn(code, *code["COMPARED"])
+    layout = overlay._layout(side_by_side(runs), ["a", "b", "c"], None)
+    assert tabs(layout) == drawn(code, *code["COMPARED"])
 
 
 def test_what_is_drawn_is_there(code: dict[str, Any]) -> None:

@@ -54,9 +54,7 @@ VIEWS = {
     "recording": (SAMPLE, "World", "--at", "540"),
     "recording-views": (SAMPLE, "Views", "--at", "540"),
     "compare": ("by 2.0", "Overview"),
-    "rewards": ("by 2.0", "Rewards"),
     "errors": ("by progress", "Streams"),
-    "curves": ("by 2.0", "All curves"),
 }
 """Pictures of views: the run or recording, the tab, and further options."""
 
