@@ -15,7 +15,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.mcap.chunks import Chunks
+from recorder.mcap.chunks import Chunks, MessageTable, Pairs
 from recorder.mcap.records import (
     CHUNK_PEEK,
     MAX_CHUNK,
@@ -28,7 +28,6 @@ from recorder.mcap.records import (
     crc32,
 )
 from recorder.mcap.store import FileStore, OnePass, Store
-from recorder.mcap.tables import MessageTable, Pairs
 from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]

@@ -15,9 +15,9 @@ from cdmisfa.core.errors import UsageError
 from recorder.images.decoding import MessageKind, decoder_of
 from recorder.images.messages import Decoder
 from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
+from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
-from recorder.mcap.tables import MessageTable
 from replay.camera_logs.stream import (
     MessageImages,
     NothingLoggedError,

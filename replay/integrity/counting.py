@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
-from recorder.mcap.tables import MessageTable
 
 Times = NDArray[np.uint64]
 Result = TypeVar("Result")

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from recorder.mcap.chunks import check_size, decompressed
+from recorder.mcap.chunks import MessageTable, check_size, decompressed, walked_table
 from recorder.mcap.records import (
     CHUNK_HEADER,
     MalformedRecord,
@@ -20,7 +20,6 @@ from recorder.mcap.records import (
     crc32,
 )
 from recorder.mcap.store import Store
-from recorder.mcap.tables import MessageTable, walked_table
 from recorder.mcap.walk import LogStructure
 
 _MOST_CHANNELS: Final = 64

@@ -16,9 +16,9 @@ from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels.frames import gather
 from cdmisfa.kernels.frames import layout as kernel_layout
 from recorder.log.manifest import ViewMetadata
+from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
-from recorder.mcap.tables import MessageTable
 
 
 class RowRange(NamedTuple):

@@ -20,9 +20,9 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.core.untrusted import MAX_LIST, parse_json
+from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import PARTIAL
-from recorder.mcap.tables import MessageTable
 from replay.runs.codec import (
     decode_columns,
     decode_matrices,
