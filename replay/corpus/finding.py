@@ -35,12 +35,14 @@ class Found(NamedTuple):
         changed: what differs when it was written again: the time of its last change in
             nanoseconds; "" of a URL, and where it cannot be opened.
         problem: why it cannot be opened.
+        path: what it is called in an index; "" before it is in one.
     """
 
     file: str
     bytes: int = 0
     changed: str = ""
     problem: str = ""
+    path: str = ""
 
 
 def found_logs(words: Sequence[str | Path]) -> Iterator[Found]:

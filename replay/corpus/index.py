@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,8 +19,8 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_l
 from cdmisfa.core.processes import WorkersError, run_all
 from cdmisfa.core.untrusted import check_regular, parse_json
 from recorder.log.files import atomic_write, held, make_folder, refuse_unless
-from replay.corpus.finding import INDEX, found_logs
-from replay.corpus.rows import MARK, SCHEMA, VERSION, Answer, Task, look
+from replay.corpus.finding import INDEX, Found, found_logs
+from replay.corpus.rows import MARK, SCHEMA, VERSION, Answer, look
 from replay.storage.location import is_url, location
 from replay.storage.opening import no_such
 
@@ -33,8 +32,6 @@ MOST_NAMED: Final = 20
 
 SAVED_EVERY: Final = 5000
 """Logs after which what is known is written, so that a kill costs no more than these."""
-
-_SHA256: Final = Task._fields.index("sha256")
 
 _SAME: Final = (
     "scene",
@@ -86,18 +83,13 @@ class IndexedLog(NamedTuple):
 
     Attributes:
         name: as the index has it, relative to its folder.
-        kind: "recording" or "foreign"; None where it could not be read.
         files: as they are opened.
         states: bytes of each, and what differs when it was written again, as `Found` has them.
-        identities: what another file with the same messages has, too; None where it could not be
-            read.
     """
 
     name: str
-    kind: str | None
     files: list[str]
     states: list[tuple[int, str]]
-    identities: list[str | None]
 
 
 def indexed_logs(index: Path) -> list[IndexedLog]:
@@ -109,7 +101,6 @@ def indexed_logs(index: Path) -> list[IndexedLog]:
         UsageError: it is no index, or one of another version.
         LogDamagedError: it is damaged.
     """
-    columns = ["log", "path", "kind", "bytes", "changed", "identity", "contents"]
     table = read_index(index)
     table = table.filter(pc.equal(table["number"], 0))
     views = table.filter(pc.equal(table["kind"], "recording")).select(["log", "configuration"])
@@ -121,14 +112,13 @@ def indexed_logs(index: Path) -> list[IndexedLog]:
     except (ValueError, AttributeError) as error:
         raise _damaged(index, error) from error
     found: dict[str, IndexedLog] = {}
-    for row in table.select(columns).to_pylist():
+    for row in table.select(["log", "path", "kind", "bytes", "changed"]).to_pylist():
         if row["kind"] != "run":
             path = row["path"]
             name = row["log"] if row["log"] in recordings else path
-            log = found.setdefault(name, IndexedLog(name, row["kind"], [], [], []))
+            log = found.setdefault(name, IndexedLog(name, [], []))
             log.files.append(path if "://" in path else str(index.parent / path))
             log.states.append((row["bytes"], row["changed"]))
-            log.identities.append(row["contents"] or row["identity"])
     return list(found.values())
 
 
@@ -155,7 +145,6 @@ def index_logs(
     out: Path | None = None,
     *,
     deep: bool = False,
-    full: bool = False,
     jobs: int = 1,
     told: Callable[[float, float | None], None] = lambda done, total: None,
     stop: Callable[[], bool] = lambda: False,
@@ -168,8 +157,7 @@ def index_logs(
     Args:
         words: folders, patterns, files and URLs.
         out: the index; by default corpus.parquet in the folder that is the one word.
-        deep: decode every log, for its checksums, gaps, shapes and a checksum of each stream.
-        full: read every byte, and keep what is known of those with the same SHA-256.
+        deep: decode every log, for its checksums, gaps and shapes.
         jobs: processes; what is found does not depend on them.
         told: how many of the logs that are to be read were.
         stop: asked now and then; true ends it with what was read.
@@ -186,32 +174,33 @@ def index_logs(
         made = Indexed(index)
         there = _there(words, index.parent)
         old = _known(index, made)
-        tasks, indexed, listed = _tasks(there, old, deep, full), old["path"], there["path"]
-        made.gone = _without(pc.unique(indexed), listed).to_pylist()
-        made.kept = len(there) - len(tasks)
-        old = old.filter(pc.is_in(indexed, listed))
-        answers: dict[int, Answer] = {}
-        saved = done = 0
+        known = _states(old, deep)
+        logs = [log for path, log in sorted(there.items()) if known.get(path) != log[1:3]]
+        made.gone = [path for path in pc.unique(old["path"]).to_pylist() if path not in there]
+        made.kept = len(there) - len(logs)
+        old = old.filter(pc.is_in(old["path"], pa.array(there, pa.string())))
+        looked: list[str] = []
+        rows: dict[int, pa.Table] = {}
+        saved = 0
         try:
-            for at, count, answer in _looked(tasks, deep, full, jobs):
-                answers[at] = answer
-                done += count
-                told(done, len(tasks))
-                if stop() and done < len(tasks):
+            for at, some, answer in _looked(logs, deep, jobs):
+                rows[at] = answer.rows
+                made.gone += answer.gone
+                looked += (log.path for log in some)
+                told(len(looked), len(logs))
+                if stop() and len(looked) < len(logs):
                     made.stopped = True
                     break
-                if done - saved >= SAVED_EVERY:
-                    saved = done
-                    _write(old, answers, index)
+                if len(looked) - saved >= SAVED_EVERY:
+                    saved = len(looked)
+                    _write(old, looked, rows, index)
         except WorkersError:
-            _write(old, answers, index)
+            _write(old, looked, rows, index)
             raise
-        made.read = sum(len(answer.looked) for answer in answers.values())
-        made.kept += done - made.read
+        made.read = len(looked)
         table = old
-        if answers or made.gone or not index.exists() or made.anew:
-            table = _write(old, answers, index)
-    made.gone += itertools.chain(*(answer.gone for answer in answers.values()))
+        if looked or made.gone or not index.exists() or made.anew:
+            table = _write(old, looked, rows, index)
     made.streams, made.logs = table.num_rows, len(pc.unique(table["path"]))
     first = pc.equal(table["number"], 0)
     broken = table.filter(pc.and_(first, pc.is_valid(table["problem"])))
@@ -308,19 +297,16 @@ def _place_of(words: Sequence[str | Path], out: Path | None) -> Path:
     raise UsageError(f"{named}: no folder, which would hold its index: say where, with -o")
 
 
-def _there(words: Sequence[str | Path], folder: Path) -> pa.Table:
-    """The logs that are there, with their paths relative to the folder of the index."""
+def _there(words: Sequence[str | Path], folder: Path) -> dict[str, Found]:
+    """Return the logs that are there by their paths, which are relative to the index's folder."""
     below = os.path.join(folder, "")
-    found: dict[str, Task] = {}
+    found: dict[str, Found] = {}
     for log in found_logs(words):
         path = log.file.removeprefix(below)
         if len(path) == len(log.file) and "://" not in path:
             path = os.path.relpath(path, folder)
-        found[path] = Task(log.file, path, *log[1:])
-    columns = list(zip(*found.values(), strict=True)) or [()] * len(Task._fields)
-    types = (pa.int64() if name == "bytes" else pa.string() for name in Task._fields)
-    arrays = [pa.array(column, kind) for column, kind in zip(columns, types, strict=True)]
-    return pa.table(arrays, list(Task._fields))
+        found[path] = log._replace(path=path)
+    return found
 
 
 def _known(index: Path, made: Indexed) -> pa.Table:
@@ -333,55 +319,35 @@ def _known(index: Path, made: Indexed) -> pa.Table:
     return read_index(index)
 
 
-def _tasks(there: pa.Table, old: pa.Table, deep: bool, full: bool) -> list[Task]:
-    """The logs that are not as the index has them, or with `full` all."""
+def _states(old: pa.Table, deep: bool) -> dict[str, tuple[int, str]]:
+    """Return size and time of change by path of what an index knows, with `deep` of it decoded."""
     known = old.filter(pc.and_(pc.not_equal(old["changed"], ""), pc.or_(old["deep"], not deep)))
-    at = pc.index_in(_keys(there), _keys(known))
-    if full:
-        tasks = there.set_column(_SHA256, "sha256", known["sha256"].take(at))
-    else:
-        tasks = there.filter(pc.is_null(at))
-    tasks = tasks.take(pc.sort_indices(tasks["path"]))
-    return [Task(*row.values()) for row in tasks.to_pylist()]
-
-
-def _keys(logs: pa.Table) -> pa.ChunkedArray:
-    """What is another one for a log that was written again."""
-    return pc.binary_join_element_wise(
-        logs["path"], pc.cast(logs["bytes"], pa.string()), logs["changed"], "\0"
-    )
+    columns = (known[name].to_pylist() for name in ("path", "bytes", "changed"))
+    return {path: (size, changed) for path, size, changed in zip(*columns, strict=True)}
 
 
 def _looked(
-    tasks: Sequence[Task], deep: bool, full: bool, jobs: int
-) -> Iterator[tuple[int, int, Answer]]:
-    """Look at logs, as many at a time as one process takes.
+    logs: Sequence[Found], deep: bool, jobs: int
+) -> Iterator[tuple[int, Sequence[Found], Answer]]:
+    """Read logs, as many at a time as one process takes.
 
     Yields:
-        The number of the first task of some that follow one another, how many, what was found.
+        The number of some logs that follow one another, the logs, and their rows.
     """
-    batches = [tasks[at : at + BATCH] for at in range(0, len(tasks), BATCH)]
-    work = functools.partial(_look, deep=deep, full=full)
+    batches = [logs[at : at + BATCH] for at in range(0, len(logs), BATCH)]
+    work = functools.partial(look, deep=deep)
     for number, answer in run_all(work, batches, jobs=min(jobs, math.ceil(len(batches) / 4))):
-        yield number * BATCH, len(batches[number]), answer
+        yield number, batches[number], answer
 
 
-def _look(tasks: Sequence[Task], *, deep: bool, full: bool) -> Answer:
-    return look(tasks, deep, full)
-
-
-def _write(old: pa.Table, answers: Mapping[int, Answer], index: Path) -> pa.Table:
+def _write(
+    old: pa.Table, looked: Sequence[str], rows: Mapping[int, pa.Table], index: Path
+) -> pa.Table:
     """Write what is known by now, in the order of paths: of what was not looked at, as before."""
-    parts = [answers[at] for at in sorted(answers)]
-    looked = pa.array(itertools.chain(*(part.looked for part in parts)), pa.string())
-    kept = old.filter(pc.invert(pc.is_in(old["path"], looked)))
-    tables = [kept.cast(SCHEMA), *(part.rows for part in parts)]
+    kept = old.filter(pc.invert(pc.is_in(old["path"], pa.array(looked, pa.string()))))
+    tables = [kept.cast(SCHEMA), *(rows[at] for at in sorted(rows))]
     table = pa.concat_tables(tables).unify_dictionaries().combine_chunks()
     table = table.take(pc.sort_indices(table["path"])).replace_schema_metadata(SCHEMA.metadata)
     with atomic_write(index) as partial:
         pq.write_table(table, partial, compression="zstd")
     return table
-
-
-def _without(values: pa.Array, others: pa.ChunkedArray) -> pa.Array:
-    return values.filter(pc.invert(pc.is_in(values, others)))

@@ -1,35 +1,31 @@
-"""What the index says of one log: a row a stream, one with the problem where it cannot be read."""
+"""Rows of the index for one log: one a stream, or one with the problem of a log that is broken."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import numpy as np
 import pyarrow as pa
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import parse_json
 from recorder.log.messages import view_topic
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import MalformedRecord, Segment
+from recorder.mcap.records import MalformedRecord
 from replay.arrays import are_arrays
-from replay.camera_logs.alignment import Times, missing
+from replay.camera_logs.alignment import missing
 from replay.camera_logs.opening import identity_of, image_topics, only_foreign, open_images
-from replay.corpus.finding import state_of_log
-from replay.integrity.counting import read_once
+from replay.corpus.finding import Found, state_of_log
 from replay.integrity.info import ChannelInfo, LogInfo, describe_log, describe_reader
 from replay.integrity.state import failed_state
-from replay.storage.identity import FilesIdentity, Identity, LogIdentity
+from replay.storage.identity import Identity, LogIdentity
 from replay.storage.location import is_url, location
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Rises whenever a column changes its meaning."""
 
 MARK: Final = b"cdmisfa.corpus"
@@ -63,9 +59,6 @@ SCHEMA: Final = pa.schema(
         ("gaps", pa.int64()),
         ("compression", _WORD),
         ("identity", pa.string()),
-        ("sha256", pa.string()),
-        ("content", pa.string()),
-        ("contents", pa.string()),
         ("crc", _WORD),
         ("state", _WORD),
         ("seed", pa.int64()),
@@ -78,69 +71,41 @@ SCHEMA: Final = pa.schema(
 """Columns of the index; docs/how-to/corpus.md says what each is."""
 
 
-class Task(NamedTuple):
-    """A log to be looked at.
-
-    Attributes:
-        file: what is opened.
-        path: what it is called in the index.
-        bytes: see `Found`.
-        changed: see `Found`.
-        problem: see `Found`; then it is not opened.
-        sha256: of all its bytes as the index has it, which tells whether it changed.
-    """
-
-    file: str
-    path: str
-    bytes: int
-    changed: str
-    problem: str = ""
-    sha256: str | None = None
-
-
 class Answer(NamedTuple):
     """Rows of some logs.
 
     Attributes:
         rows: of them.
-        looked: paths of those that are not as they were.
-        gone: paths of those of them that are not there any more.
+        gone: paths of those that are not there any more.
     """
 
     rows: pa.Table
-    looked: Sequence[str]
     gone: Sequence[str]
 
 
-def look(tasks: Sequence[Task], deep: bool, full: bool) -> Answer:
-    """Look at some logs.
+def look(logs: Sequence[Found], deep: bool) -> Answer:
+    """Read the rows of some logs.
 
     Args:
-        tasks: which.
-        deep: decode them, for checksums, gaps, shapes, and what their messages are.
-        full: read all of their bytes, for their SHA-256.
+        logs: which, with their paths in the index.
+        deep: decode them, for checksums, gaps and shapes.
     """
     rows: list[dict[str, Any]] = []
-    looked, gone = [], []
-    for task in tasks:
+    gone = []
+    for log in logs:
         try:
-            found = [] if task.problem else list(_rows_of(location(task.file), task, deep, full))
-        except _SameError:
-            continue
+            found = [] if log.problem else list(_rows_of(location(log.file), log, deep))
         except Exception as raised:  # whatever a broken file makes a library of others raise
-            if not (is_url(task.file) or os.path.lexists(task.file)):
-                looked.append(task.path)
-                gone.append(task.path)
+            if not (is_url(log.file) or os.path.lexists(log.file)):
+                gone.append(log.path)
                 continue
             error = _as_ours(raised)
             crc, state = failed_state(error)
-            task = task._replace(problem=str(error).removeprefix(f"{task.file}: "))
+            log = log._replace(problem=str(error).removeprefix(f"{log.file}: "))
             found = [{"crc": crc, "state": state}]
-        looked.append(task.path)
-        contents = _contents(found)
         for number, row in enumerate(found or [{"state": "not read"}]):
-            rows.append({**_row(task, row, deep), "number": number, "contents": contents})
-    return Answer(pa.Table.from_pylist(rows, SCHEMA), looked, gone)
+            rows.append({**_row(log, row, deep), "number": number})
+    return Answer(pa.Table.from_pylist(rows, SCHEMA), gone)
 
 
 def _as_ours(raised: Exception) -> CdmisfaError:
@@ -150,42 +115,26 @@ def _as_ours(raised: Exception) -> CdmisfaError:
     return LogDamagedError(said or f"{type(raised).__name__}: {raised}")
 
 
-class _SameError(Exception):
-    """A log has the bytes that it had."""
-
-
-def _row(task: Task, row: Mapping[str, Any], deep: bool) -> dict[str, Any]:
-    path = task.path
-    own = {"path": path, "log": path, "bytes": task.bytes, "changed": task.changed, "deep": deep}
-    problem = "; ".join(filter(None, (task.problem, row.get("problem")))) or None
+def _row(log: Found, row: Mapping[str, Any], deep: bool) -> dict[str, Any]:
+    path = log.path
+    own = {"path": path, "log": path, "bytes": log.bytes, "changed": log.changed, "deep": deep}
+    problem = "; ".join(filter(None, (log.problem, row.get("problem")))) or None
     return {**own, **row, "problem": problem and _said(problem)}
 
 
-def _contents(rows: Sequence[Mapping[str, Any]]) -> str | None:
-    """A checksum of the messages of a log, in whatever order its streams are."""
-    known = sorted((row["topic"], row["content"]) for row in rows if row.get("content"))
-    return hashlib.sha256(json.dumps(known).encode()).hexdigest() if known else None
-
-
-def _rows_of(place: Path, task: Task, deep: bool, full: bool) -> Iterator[dict[str, Any]]:
-    sha256 = None
-    if full:
-        sha256 = _all_bytes(place)
-        if sha256 == task.sha256:
-            raise _SameError
-    info, identity, contents = _described(place, deep)
+def _rows_of(place: Path, log: Found, deep: bool) -> Iterator[dict[str, Any]]:
+    info, identity, images = _described(place, deep)
     problems = [f"{p.where}: {p.what}" for p in info.problems]
-    if not is_url(task.file) and state_of_log(place) != (task.bytes, task.changed):
+    if not is_url(log.file) and state_of_log(place) != (log.bytes, log.changed):
         problems.append("it changed while it was indexed: index again")
     records = [record for found in info.metadata.values() for record in found.values()]
     stated = {name: value for record in records for name, value in record.items()}
     about = {
-        "log": _log_of(task.path, info),
-        "bytes": task.bytes or info.size.file,
+        "log": _log_of(log.path, info),
+        "bytes": log.bytes or info.size.file,
         "kind": info.kind,
         "compression": " ".join(sorted(info.size.compression)) or None,
         "identity": identity,
-        "sha256": sha256,
         "crc": info.crc,
         "state": info.state,
         "seed": info.seed if info.seed is None or -(2**63) <= info.seed < 2**63 else None,
@@ -193,8 +142,8 @@ def _rows_of(place: Path, task: Task, deep: bool, full: bool) -> Iterator[dict[s
         "problem": "; ".join(problem.replace(f"{place}: ", "") for problem in problems),
     }
     view = stated if info.kind == "recording" else {}
-    for channel, content in zip(info.channels, contents, strict=True):
-        yield {**about, **_stream(channel, view), **content}
+    for channel, shown in zip(info.channels, images, strict=True):
+        yield {**about, **_stream(channel, view), **shown}
     if not info.channels:
         yield about
 
@@ -222,61 +171,20 @@ def _stream(channel: ChannelInfo, view: Mapping[str, str]) -> dict[str, Any]:
     return found
 
 
-def _described(place: Path, deep: bool) -> tuple[LogInfo, str | None, Sequence[Mapping[str, Any]]]:
-    """A log, its identity, and what its messages were found to be, of each channel."""
+def _described(place: Path, deep: bool) -> tuple[LogInfo, str, list[dict[str, Any]]]:
+    """Return what a log is, its identity, and what the images of each channel show."""
     if only_foreign(place) or are_arrays([place]):
-        info = describe_log(place, decode=deep)
-        contents = [_shown(place, c.topic) if deep else {} for c in info.channels]
-        return info, _hash_of(identity_of(place, ())), contents
-    with LogReader(place, salvage=True, check="chunks") as reader:
-        identity = _hash_of(LogIdentity(reader))
-        if not deep:
+        info, sha256 = describe_log(place, decode=deep), _hash_of(identity_of(place, ()))
+        topics = [c.topic for c in info.channels] if deep else []
+    else:
+        with LogReader(place, salvage=True, check="chunks") as reader:
+            sha256 = _hash_of(LogIdentity(reader))
             info = describe_reader(reader, decode=False)
-            return info, identity, [{} for _ in info.channels]
-
-    def all_of(reader: LogReader) -> tuple[LogInfo, list[dict[str, Any]]]:
-        content = _Content(reader)
-        return describe_reader(reader, decode=True, told=content.add), content.found()
-
-    info, found = read_once(place, all_of)
-    if info.kind != "foreign":
-        return info, identity, found
-    images = set(image_topics(place))
-    pairs = zip(info.channels, found, strict=True)
-    shown = ({**own, **_shown(place, c.topic)} if c.topic in images else own for c, own in pairs)
-    return info, identity, list(shown)
-
-
-class _Content:
-    """What the messages of each channel of a log are, and when."""
-
-    def __init__(self, reader: LogReader) -> None:
-        self._reader = reader
-        self._hashes: dict[int, Any] = {}
-        self._times: dict[int, list[Times]] = {}
-
-    def add(self, segment: Segment) -> None:
-        """Take the messages of a chunk in."""
-        table = self._reader.table(segment)
-        if table is None:
-            return
-        for number in np.unique(table.channel).tolist():
-            own = table.select(table.channel == number)
-            self._times.setdefault(number, []).append(own.log_time.copy())
-            digest = self._hashes.setdefault(number, hashlib.sha256())
-            for _, _, log_time, _, data in own.rows():
-                digest.update(struct.pack("<QQ", log_time, len(data)))
-                digest.update(data)
-
-    def found(self) -> list[dict[str, Any]]:
-        """A checksum of times and messages of each channel, in their order, and its gaps."""
-        known: list[dict[str, Any]] = []
-        for number in sorted({*self._reader.channels, *self._hashes}):
-            digest = self._hashes.get(number)
-            times = np.sort(np.concatenate(self._times.get(number, [np.empty(0, np.uint64)])))
-            content = None if digest is None else digest.hexdigest()
-            known.append({"content": content, "gaps": missing(times)})
-        return known
+        if deep:
+            info = describe_log(place, decode=True)
+        topics = image_topics(place) if deep and info.kind == "foreign" else []
+    images = [_shown(place, c.topic) if c.topic in topics else {} for c in info.channels]
+    return info, sha256, images
 
 
 def _shown(place: Path, topic: str) -> dict[str, Any]:
@@ -295,17 +203,6 @@ def _shown(place: Path, topic: str) -> dict[str, Any]:
 def _hash_of(identity: Identity) -> str:
     """What identifies a log before all of it is read."""
     return str(next(v for k, v in identity.sample().items() if k.endswith("sha256")))
-
-
-def _all_bytes(place: Path) -> str:
-    """SHA-256 of all of a log."""
-    if place.is_dir():
-        return FilesIdentity(place, (f for f in place.rglob("*") if f.is_file())).sha256(_ignore)
-    return FilesIdentity(place).sha256(_ignore)
-
-
-def _ignore(count: int) -> None:
-    """Nobody is told how many bytes were hashed."""
 
 
 def _configuration(stated: Mapping[str, str]) -> str | None:

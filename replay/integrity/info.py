@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -16,7 +16,7 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import Problem, Segment
+from recorder.mcap.records import Problem
 from replay.arrays import are_arrays
 from replay.camera_logs.opening import channels_of, log_format, only_foreign
 from replay.camera_logs.pictures import FolderImages
@@ -300,16 +300,11 @@ def _bytes_of(place: Path) -> int:
     return sum(path.stat().st_size for path in files if path.is_file())
 
 
-def describe_reader(
-    reader: LogReader,
-    *,
-    decode: bool | None = None,
-    told: Callable[[Segment], None] = lambda _: None,
-) -> LogInfo:
-    """Describe an MCAP file; `told` is called with each chunk that is decoded."""
+def describe_reader(reader: LogReader, *, decode: bool | None = None) -> LogInfo:
+    """Describe an MCAP file."""
     if decode is None:
         decode = sum(s.size for s in reader.segments) <= CHECK_BYTES
-    counts, channels = count_messages(reader, decode=decode, told=told), []
+    counts, channels = count_messages(reader, decode=decode), []
     name = reader.path.name
     for number, found in sorted(counts.items()):
         undefined = Channel(number, f"(channel {number}, never defined)", "", {}, 0)

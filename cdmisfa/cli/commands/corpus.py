@@ -40,12 +40,7 @@ JOBS = click.option(
 @click.option(
     "--deep",
     is_flag=True,
-    help="Decode every log: checksums, gaps, shapes, and what is twice in other files.",
-)
-@click.option(
-    "--full",
-    is_flag=True,
-    help="Read every byte: what changed shows by SHA-256, not by size and time.",
+    help="Decode every log: damage that no summary shows, gaps, shapes.",
 )
 @JOBS
 @options.as_json
@@ -56,11 +51,10 @@ def index_command(
     corpus: tuple[str, ...],
     out: Path | None,
     deep: bool,
-    full: bool,
     jobs: int | None,
     as_json: bool,
 ) -> None:
-    """Index what is in many logs: streams, times, damage, doubles.
+    """Index what is in many logs: streams, times, damage.
 
     CORPUS is a folder, with all that is in it, a pattern such as 'logs/**/*.mcap', or
     several: recordings, runs, logs of others. The index is one Parquet file, a row a stream; a
@@ -73,7 +67,6 @@ def index_command(
             corpus,
             out,
             deep=deep,
-            full=full,
             jobs=jobs or os.cpu_count() or 1,
             told=shown.update,
             stop=stop,
