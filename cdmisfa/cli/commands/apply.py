@@ -103,8 +103,10 @@ def apply_command(
     typed = click.core.ParameterSource.COMMANDLINE
     if given := [name for name in where if ctx.get_parameter_source(name) == typed]:
         raise UsageError(f"--{given[0].replace('_', '-')} goes with logs, and a folder as -o")
+    if form is not None and (out is None or out.suffix != f".{form}"):
+        raise UsageError(f"--to {form}: name it with -o, a folder or a file like out.{form}")
     logs = logs_of(source)
-    place = place_of(out, form, logs, force=force)
+    place = place_of(out, logs, force=force)
     application = Application(run)
     told: dict[str, Any] = {"inputs": inputs, "loop": loop, "salvage": salvage, "say": tell}
     rows, failed = list[dict[str, Any]](), list[CdmisfaError]()
@@ -230,26 +232,19 @@ def applied(
     return totals
 
 
-def place_of(
-    out: Path | None, form: str | None, logs: Sequence[Sequence[str]], *, force: bool
-) -> Path | None:
-    """The file that is written of one log, in the form asked for; None where nothing is.
+def place_of(out: Path | None, logs: Sequence[Sequence[str]], *, force: bool) -> Path | None:
+    """Return the file that is written of one log; None where nothing is.
 
     Raises:
-        UsageError: a file for several logs, or of another form, a form without a file, or it
-            exists.
+        UsageError: a file for several logs, or it exists.
     """
     from recorder.log.files import refuse_taken
 
     if out is None:
-        if form is not None:
-            raise UsageError(f"--to {form} is written to a file: name it with -o")
         return None
     ending = out.suffix.lower().removeprefix(".")
     if is_folder(out):
         raise UsageError(f"{out}: name a file, {' '.join(logs[0])} is none of many logs")
-    if form not in (None, ending):
-        raise UsageError(f"{out}: as {form} it is written, name it {out.stem}.{form}")
     if len(logs) > 1:
         raise UsageError(
             f"{len(logs)} logs are a file each: name a folder with -o, without .{ending}"

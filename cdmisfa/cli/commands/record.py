@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +12,13 @@ import click
 from click.core import ParameterSource
 
 from cdmisfa.cli import options
-from cdmisfa.cli.commands.streams import print_recording, record_streams, refuse_logs
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.printing import (
+    print_document,
+    print_table,
     say_about,
     say_changes,
+    say_counts,
     tell,
 )
 from cdmisfa.cli.progress import bar
@@ -94,9 +96,9 @@ def record_command(
                 "--view and --jobs"
             )
         writing |= {"preset": preset, "settings": settings, "seed": seed, "as_json": as_json}
-        record_streams(ctx, source, out, inputs, **writing)
+        _record_streams(ctx, source, out, inputs, **writing)
         return
-    refuse_logs(source)
+    _refuse_logs(source)
     resumed = out if writing["resume"] else None
     start = RecordingStart() if resumed is None else _start(resumed)
     named = "".join(source) or start.scene
@@ -105,7 +107,7 @@ def record_command(
     asked = named or given_seed or writing["frames"] or writing["split"]
     if resumed is not None and not asked and (files := recorded(resumed)):
         say_complete(resumed)
-        print_recording(resumed, files, as_json=as_json)
+        _print_recording(resumed, files, as_json=as_json)
         return
     if not named:
         where = "" if resumed is None else f"{resumed} does not say of what it is: "
@@ -113,7 +115,78 @@ def record_command(
     seed = seed if given_seed or start.seed is None else start.seed
     configuration = configure(named, preset, of_scene(settings, inputs), seed)
     files = _record_scene(ctx, configuration, out, **writing)
-    print_recording(out, files, as_json=as_json)
+    _print_recording(out, files, as_json=as_json)
+
+
+def _record_streams(
+    ctx: click.Context,
+    words: Sequence[str],
+    out: Path,
+    inputs: InputOptions,
+    *,
+    as_json: bool,
+    force: bool,
+    frames: int | None = None,
+    split: str | None = None,
+    **how: Any,
+) -> None:
+    """Record live streams until there are so many frames, they end, or Ctrl-C."""
+    from cdmisfa.experiments.sources import open_cameras_now
+    from recorder.config import Split
+    from recorder.live import RecordedWhileWatched, record_watched
+    from recorder.log.files import refuse_existing
+    from recorder.recording import DEFAULT_FRAMES
+
+    refuse_existing(out, force=force, goes_on=False)
+    source, configuration = open_cameras_now(words, inputs, say=tell, **how)
+    notice = "finishing the recording; again to stop at once\n"
+    with contextlib.closing(source), stoppable(notice=notice) as stop:
+        frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)
+        recorded = RecordedWhileWatched(
+            source,
+            out,
+            settings=configuration.record,
+            split=None if split is None else Split.parse(split),
+            force=force,
+        )
+        with bar("recording", "frames") as shown:
+            record_watched(
+                recorded,
+                frames=frames,
+                stop=stop,
+                progress=lambda done: shown.update(done, frames),
+            )
+    if recorded.ended and not stop():
+        tell(f"ended at frame {recorded.t}: {recorded.ended}")
+    say_counts(recorded)
+    _print_recording(out, recorded.files, as_json=as_json)
+    if stop() and frames is not None and recorded.t < frames:
+        ctx.exit(stop.exit_code)
+
+
+def _refuse_logs(words: Sequence[str]) -> None:
+    """Refuse what is recorded already, and more than one scene."""
+    from recorder.world.scenes import SCENES
+
+    logs = [w for w in words if w and w not in SCENES and (Path(w).exists() or set("*?:") & set(w))]
+    if logs:
+        convert = f"cdmisfa convert {shlex.join(logs)} -o REC"
+        raise UsageError(f"{logs[0]} is a log, no scene: write it as a recording with {convert}")
+    if len(words) > 1:
+        raise UsageError(f"{' '.join(words)}: record one scene at a time")
+
+
+def _print_recording(folder: Path, files: Sequence[ViewRecording], *, as_json: bool) -> None:
+    """Print the file of each view of a recording."""
+    if as_json:
+        frames = sum(file.frames for file in files if file.name == files[0].name)
+        rows = [file.as_json() for file in files]
+        print_document(recording=str(folder), frames=frames, views=rows)
+        return
+    print_table(
+        ("view", "file", "frames", "bytes", "sha256"),
+        [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files],
+    )
 
 
 def _start(folder: Path) -> RecordingStart:
@@ -215,7 +288,7 @@ def convert_command(
                 force=force,
             )
         say_changes(frames)
-    print_recording(out, files, as_json=as_json)
+    _print_recording(out, files, as_json=as_json)
     if frames.left_out:
         ctx.exit(LogDamagedError.exit_code)
 
