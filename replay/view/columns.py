@@ -200,7 +200,6 @@ class Target:
         rgbs: Sequence[Colour] | None = None,
         width: float | None = None,
         *,
-        steps: bool = False,
         within: int = 0,
     ) -> Column:
         """A column that is drawn as lines, whose names and colours are said once.
@@ -210,16 +209,13 @@ class Target:
             names: of the lines.
             rgbs: their colours.
             width: of a line.
-            steps: a value holds until the next one; there is nothing between two values.
             within: see `Column`.
         """
-        modes = rr.components.InterpolationMode
         style = rr.SeriesLines(
             names=[label(name) for name in names],
             colors=packed_all(rgbs or [pale(i) for i in range(len(names))]),
             widths=None if width is None else [width] * len(names),
             aggregation_policy=AGGREGATION,
-            interpolation_mode=modes.StepAfter if steps else modes.Linear,
         )
         return Column(self, path, style, within=within)
 

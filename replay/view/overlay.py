@@ -60,8 +60,8 @@ def build_overlay(
     roots = [f"compare/{part([row.name for row in rows], i)}" for i in range(len(rows))]
     with recording_to(out, out.stem, out, force=force) as recording:
         text = label("\n".join(text_table(HEAD, (row.cells() for row in rows))))
-        document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-        recording.log("summary", document, static=True)
+        table = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+        recording.log("summary", table, static=True)
         for number, (run, row, root) in enumerate(zip(runs, rows, roots, strict=True)):
             header, columns = row.outline.header, dict[str, Column]()
             target, shown = Target(recording, header.spec), row.outline.streams(MOST_STREAMS)
@@ -69,8 +69,8 @@ def build_overlay(
                 for entity, kept, values in _curves(signals, header.spec.streams, shown):
                     path, within = f"{root}/{entity}", signals.tau if ERROR in entity else 0
                     if path not in columns:
-                        n = values.shape[1]
-                        names, rgbs = [row.name] * n, [colour(number)] * n
+                        names = [row.name] * values.shape[1]
+                        rgbs = [colour(number)] * len(names)
                         columns[path] = target.lines(path, names, rgbs, within=within)
                     columns[path].add(signals.frames[kept], signals.iterations[kept], values)
             for column in columns.values():
@@ -101,14 +101,12 @@ def _layout(rows: Sequence[Row], roots: Sequence[str], tab: str | None) -> rrb.B
         return lines(title, [f"/{root}/{entity}" for root in roots], time_axis(length))
 
     curves = [panel(title, name) for name, title in CURVES.items() if name in told]
-    table = rrb.TextDocumentView(origin="/summary", name="Runs")
-    grid = rrb.Grid(*curves, grid_columns=2)
-    tabs = [rrb.Vertical(table, grid, row_shares=[1, 3], name="Overview")]
+    first = rrb.TextDocumentView(origin="/summary", name="Runs"), rrb.Grid(*curves, grid_columns=2)
+    tabs = [rrb.Vertical(*first, row_shares=[1, 3], name="Overview")]
     if ERROR in told:
-        names = outline.names()
-        errors = [
-            panel(f"Learning error of {label(names[s])}", f"{ERROR}/{part(names, s)}")
-            for s in outline.streams(MOST_STREAMS)
-        ]
+        names, shown = outline.names(), outline.streams(MOST_STREAMS)
+        titles = [f"Learning error of {label(names[s])}" for s in shown]
+        places = [f"{ERROR}/{part(names, s)}" for s in shown]
+        errors = map(panel, titles, places)
         tabs.append(rrb.Vertical(*errors, name="Streams"))
     return blueprint(*tabs, name="Comparison", timeline=ITERATION, length=length, tab=tab)
