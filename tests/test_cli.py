@@ -182,7 +182,7 @@ class TestRuns:
         document = cdmisfa("learn", "oscillatory", "--preset", preset, *SHORT).json
         assert (document["frames"], document["run"]) == (150, None)
 
-    @pytest.mark.parametrize("form", ["parquet", "npz", "csv", "arrow"])
+    @pytest.mark.parametrize("form", ["parquet", "npz", "csv"])
     def test_export(
         self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, form: str
     ) -> None:

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
-from contracts.exports import FormContract
 from contracts.learners import FeatureContract, LearnerContract
 from contracts.sources import CameraContract
 
@@ -28,7 +27,6 @@ from recorder.cameras.readers import Camera
 from recorder.cameras.words import CAMERAS
 from recorder.images.pixels import Shown
 from recorder.world.oscillatory import OscillatorySource
-from replay.export.forms import FORMS
 
 
 class TestCurious(LearnerContract):
@@ -109,23 +107,6 @@ def test_a_camera_that_shows_something_else_breaks_its_contract(shown: list[Show
 
     with pytest.raises(AssertionError):
         Wrong().test_its_pictures_are_of_one_kind_and_no_older_than_now()
-
-
-class TestParquet(FormContract):
-    form = FORMS["parquet"]
-
-
-class TestImages(FormContract):
-    form = FORMS["images"]
-
-
-class TestFilms(FormContract):
-    form = FORMS["mp4"]
-
-
-class TestLerobot(FormContract):
-    form = FORMS["lerobot"]
-    options: ClassVar = {"name": "robot"}
 
 
 def test_signals_that_are_not_said_do_not_exist() -> None:

@@ -30,9 +30,7 @@ RECORDING = "recording.json"
 Beside the logs, because these hold the same bytes whatever length was wanted first.
 """
 
-OF_FILES: Final = frozenset(
-    {".arrow", ".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"}
-)
+OF_FILES: Final = frozenset({".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"})
 """Endings of what is a file wherever it is written."""
 
 _HELD: Final[set[tuple[int, int]]] = set()

@@ -1,16 +1,14 @@
-"""The forms in which a run's signals or a recording's frames can be written for other programs."""
+"""Write a run's signals or a recording's frames for other programs, in one of several forms."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.registry import Registry, did_you_mean
+from cdmisfa.core.registry import did_you_mean
 from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
 from replay.camera_logs.opening import only_foreign
@@ -26,42 +24,13 @@ _ALIKE: Final = ("streams", "frame_shape", "dtype", "truth", "fps")
 """What recordings have in common that become one dataset."""
 
 
-@dataclass(frozen=True, slots=True)
-class Form:
-    """A form in which other programs read what was logged.
+RECORDED: Final = ("images", "mp4", "lerobot")
+"""Forms of the frames of a recording; the others are of the signals of a run."""
 
-    Attributes:
-        of: what is written so: the signals of a "run", or the frames of a "recording".
-        write: writes a run's folder, or an open source of frames, to a path that does not exist,
-            as a file or a folder, and returns how many there are of `unit`. It takes the word
-            `lossless` where `lossy` is set.
-        unit: what is counted.
-        lossy: whether it may lose a little of what was logged.
-    """
+LOSSY: Final = ("mp4", "lerobot")
+"""Forms that may change pixels a little."""
 
-    of: Literal["run", "recording"]
-    write: Callable[..., int]
-    unit: str
-    lossy: bool = False
-
-
-def _write_lerobot(source: Logged, folder: Path, **how: Any) -> int:
-    return write_dataset([source], folder, **how)
-
-
-def _table(form: str) -> Form:
-    return Form("run", partial(export_signals, form=form), "iterations")
-
-
-FORMS: Registry[Form] = Registry(
-    "form",
-    {
-        **{form: _table(form) for form in TABLES},
-        "images": Form("recording", write_images, "images"),
-        "mp4": Form("recording", write_films, "frames", lossy=True),
-        "lerobot": Form("recording", _write_lerobot, "frames", lossy=True),
-    },
-)
+FORMS: Final = (*TABLES, *RECORDED)
 """Every form."""
 
 WRITTEN = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
@@ -85,7 +54,7 @@ def export(
         path: a run; for a form of recordings a recording, or camera logs; for LeRobot several
             folders of recordings, too.
         out: the file; for those forms the folder, or for one view's video a file *.mp4.
-        form: one of `FORMS`; see `export_signals`.
+        form: one of `FORMS`.
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images that become a video.
         inputs: which streams of camera logs; by default all of images.
@@ -103,10 +72,8 @@ def export(
     """
     if form not in FORMS:
         raise UsageError(f"no form {form!r} for --to: {did_you_mean(form, FORMS)}")
-    described = FORMS[form]
-    if lossless and not described.lossy:
-        lossy = " and ".join(name for name, other in FORMS.items() if other.lossy)
-        raise UsageError(f"{form} loses nothing: --lossless is for {lossy}")
+    if lossless and form not in LOSSY:
+        raise UsageError(f"{form} loses nothing: --lossless is for {' and '.join(LOSSY)}")
     if out.exists() and not force:
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     refuse_special(out)
@@ -116,62 +83,71 @@ def export(
     for named in paths:
         if not named.exists():
             raise no_such(named)
-    if form in TABLES:
-        refuse_unless(out, f"{form} is written", f".{form}", "")
-    elif form in ("images", "lerobot") or (form == "mp4" and out.suffix != ".mp4"):
-        refuse_named_as_file(out)
-    if described.of == "recording":
-        words: dict[str, Any] = {"lossless": lossless} if described.lossy else {}
+    if form in RECORDED:
+        if form != "mp4" or out.suffix != ".mp4":
+            refuse_named_as_file(out)
+        if holds_run(paths[0]):
+            raise UsageError(f"{paths[0]} is a run, {form} is for recordings: name the recording")
         if form == "lerobot":
-            words |= {"name": out.name, "task": task}
-        if form != "lerobot" or not _are_recordings(paths):
-            return _export_recording(paths, out, form, words, inputs, about)
-        _refuse_others(out)
-        with (
-            contextlib.closing(_opened_in_turn(paths, inputs, about)) as opened,
-            atomic_write(out) as place,
-        ):
-            return write_dataset(opened, place, **words)
+            return _export_dataset(paths, out, inputs, about, lossless=lossless, task=task)
+        return _export_images(paths, out, form, inputs, about, lossless=lossless)
+    refuse_unless(out, f"{form} is written", f".{form}", "")
     if out.is_dir():
         raise UsageError(f"{out} is a folder: name the file to write")
     if not all(map(holds_run, paths)):
-        frames = " or ".join(name for name, other in FORMS.items() if other.of == "recording")
         raise UsageError(
-            f"{paths[0]} is no run, {form} is for the signals of one: choose {frames} with --to"
+            f"{paths[0]} is no run, {form} is for the signals of one: choose "
+            f"{' or '.join(RECORDED)} with --to"
         )
     if len(paths) > 1:
         raise UsageError(f"signals are of one run, {len(paths)} were named")
-    if form in TABLES:  # one of them is two files
-        return described.write(paths[0], out, force=force)
-    with atomic_write(out) as place:
-        return described.write(paths[0], place)
+    return export_signals(paths[0], out, form)
 
 
-def _export_recording(
+def _export_images(
     paths: list[Path],
     out: Path,
     form: str,
-    words: Mapping[str, Any],
     inputs: InputOptions | None,
     about: About,
+    *,
+    lossless: bool,
 ) -> int:
-    path = paths[0]
-    if holds_run(path):
-        raise UsageError(f"{path} is a run, {form} is for recordings: name the recording")
+    """Write every view as PNG files or as a video."""
     with contextlib.closing(open_to_look(paths, inputs)) as source:
-        if form in ("images", "mp4") and not source.spec.images:
-            raise UsageError(f"{path} holds no images: its frames are values")
-        if form == "mp4" and out.suffix == ".mp4" and not out.is_dir():
-            if len(source.spec.streams) > 1:
-                raise UsageError(f"{path} has several views: name a folder, not {out.name}")
-            about(source)
-            with atomic_write(out) as film:
-                write_film(source, 0, film, **words)
-            return source.frames
+        if not source.spec.images:
+            raise UsageError(f"{paths[0]} holds no images: its frames are values")
+        film = form == "mp4" and out.suffix == ".mp4" and not out.is_dir()
+        if film and len(source.spec.streams) > 1:
+            raise UsageError(f"{paths[0]} has several views: name a folder, not {out.name}")
         _refuse_others(out)
         about(source)
         with atomic_write(out) as place:
-            return FORMS[form].write(source, place, **words)
+            if form == "images":
+                return write_images(source, place)
+            if not film:
+                return write_films(source, place, lossless=lossless)
+            write_film(source, 0, place, lossless=lossless)
+            return source.frames
+
+
+def _export_dataset(
+    paths: list[Path],
+    out: Path,
+    inputs: InputOptions | None,
+    about: About,
+    *,
+    lossless: bool,
+    task: str | None,
+) -> int:
+    """Write a LeRobot dataset; several folders of recordings are logs of their own in it."""
+    _refuse_others(out)
+    logs = [[path] for path in paths] if _are_recordings(paths) else [paths]
+    with (
+        contextlib.closing(_opened_in_turn(logs, inputs, about)) as opened,
+        atomic_write(out) as place,
+    ):
+        return write_dataset(opened, place, name=out.name, lossless=lossless, task=task)
 
 
 def _are_recordings(paths: Sequence[Path]) -> bool:
@@ -187,24 +163,24 @@ def _are_recordings(paths: Sequence[Path]) -> bool:
 
 
 def _opened_in_turn(
-    paths: Sequence[Path], inputs: InputOptions | None, about: About
+    logs: Sequence[Sequence[Path]], inputs: InputOptions | None, about: About
 ) -> Generator[Logged]:
-    """Yield each recording, open until the next is asked for.
+    """Yield each log, open until the next is asked for.
 
     Raises:
         UsageError: one has other streams, sizes or rates than the first, or as for `open_to_look`.
         LogDamagedError: one is damaged.
     """
     first = None
-    for path in paths:
-        with contextlib.closing(open_to_look([path], inputs)) as source:
+    for paths in logs:
+        with contextlib.closing(open_to_look(paths, inputs)) as source:
             about(source)
             first = first or source.spec
             for what in _ALIKE:
                 one, other = getattr(first, what), getattr(source.spec, what)
                 if one != other:
                     raise UsageError(
-                        f"{path}: its {what} is {other}, that of {paths[0]} {one}: export "
+                        f"{paths[0]}: its {what} is {other}, that of {logs[0][0]} {one}: export "
                         "them by themselves, or convert them first"
                     )
             yield source

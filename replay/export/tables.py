@@ -1,10 +1,9 @@
 """A run's signals as a table that other tools read: a row an iteration, a column a signal.
 
-Every table is made from the one table of signals. What is missing is null in Parquet and Arrow,
-and NaN in npz and CSV. Parquet and Arrow carry each signal's
-symbol, equation, unit and dimensions as the column's metadata, and the run's configuration as
-the table's; npz has both as JSON in the arrays `_signals` and `_run`, CSV in a file beside it as
-the W3C's "CSV on the Web" has it.
+Every table is made from the one table of signals. What is missing is null in Parquet,
+and NaN in npz and CSV. Parquet carries each signal's symbol, equation, unit and dimensions as the
+column's metadata, and the run's configuration as the table's; npz has both as JSON in the arrays
+`_signals` and `_run`.
 """
 
 from __future__ import annotations
@@ -24,43 +23,39 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, Signal
-from recorder.log.files import atomic_write, refuse_taken
+from recorder.log.files import atomic_write
 from replay.runs.columns import padded, whole_signals
 from replay.runs.log import RunHeader, read_columns, read_header
 
-TABLES = ("csv", "parquet", "npz", "arrow")
+TABLES = ("csv", "parquet", "npz")
 """What a run's signals can be written as."""
 
 CSV_LEAVES_OUT = tuple(s.name for s in SIGNALS.values() if "T" in s.dims)
 """Signals of every frame, for which a row an iteration has no room."""
 
 _ARROW = {"float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}
-_CSV = {"float64": "double", "int64": "integer", "bool": "boolean"}
 
 
-def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> int:
+def export_signals(run: Path, out: Path, form: str) -> int:
     """Write a run's signals to a file, and return how many iterations there are.
 
     CSV leaves out the outputs frame by frame; npz fills arrays that grow with the modules up
-    with NaN. `force` replaces an existing file of notes beside a CSV file.
+    with NaN.
+
+    Args:
+        run: the folder of the run.
+        out: the file; replaced.
+        form: one of `TABLES`.
 
     Raises:
-        UsageError: no such run, or the notes exist and `force` is not set.
+        UsageError: no such run.
         LogDamagedError: the run cannot be read.
         LogWriteError: the file cannot be written.
     """
-    header, notes = read_header(run), out.with_name(f"{out.name}-metadata.json")
-    if form == "csv":
-        refuse_taken(notes, force=force)
+    header = read_header(run)
+    write = {"csv": _write_csv, "npz": _write_npz, "parquet": _write_parquet}[form]
     with atomic_write(out) as partial:
-        if form == "npz":
-            return _write_npz(run, header, partial)
-        if form != "csv":
-            return _write_batches(run, header, partial, form)
-        with atomic_write(notes) as about:
-            columns, rows = _write_csv(run, header, partial)
-            about.write_text(json.dumps(_notes(out, header, columns), indent=1), "utf-8")
-        return rows
+        return write(run, header, partial)
 
 
 def signals_table(run: Path, names: Sequence[str] = tuple(SIGNALS)) -> pa.Table:
@@ -116,13 +111,9 @@ def _batches(run: Path, header: RunHeader, schema: pa.Schema) -> Iterator[pa.Rec
         yield pa.RecordBatch.from_arrays(arrays, schema=schema)
 
 
-def _write_batches(run: Path, header: RunHeader, out: Path, form: str) -> int:
+def _write_parquet(run: Path, header: RunHeader, out: Path) -> int:
     rows, schema = 0, _arrow_schema(header)
-    if form == "parquet":
-        writer = pq.ParquetWriter(out, schema, compression="zstd")
-    else:
-        writer = pa.ipc.new_file(str(out), schema)
-    with writer:
+    with pq.ParquetWriter(out, schema, compression="zstd") as writer:
         for batch in _batches(run, header, schema):
             writer.write_batch(batch)
             rows += len(batch)
@@ -138,48 +129,24 @@ def _write_npz(run: Path, header: RunHeader, out: Path) -> int:
     return len(arrays["iteration"])
 
 
-def _write_csv(run: Path, header: RunHeader, out: Path) -> tuple[list[tuple[str, Signal]], int]:
-    """Write the table; its columns with their signals, and how many rows."""
+def _write_csv(run: Path, header: RunHeader, out: Path) -> int:
     signals = [s for s in SIGNALS.values() if s.name not in CSV_LEAVES_OUT]
     modules = max((piece["band_sd"].shape[1] for piece in read_columns(run, header)), default=0)
-    columns: list[tuple[str, Signal]] = []
     rows = 0
     with open(out, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         for piece in read_columns(run, header):
             cells = [padded(signal, piece[signal.name], modules) for signal in signals]
             if not rows:
-                for signal, values in zip(signals, cells, strict=True):
-                    places = np.ndindex(values.shape[1:])
-                    columns += [(signal.name + _place(place), signal) for place in places]
-                writer.writerow(title for title, _ in columns)
+                writer.writerow(
+                    signal.name + _place(place)
+                    for signal, values in zip(signals, cells, strict=True)
+                    for place in np.ndindex(values.shape[1:])
+                )
             lists = (values.reshape(len(piece), -1).tolist() for values in cells)
             writer.writerows(map(chain.from_iterable, zip(*lists, strict=True)))
             rows += len(piece)
-    return columns, rows
-
-
-def _notes(out: Path, header: RunHeader, columns: list[tuple[str, Signal]]) -> dict[str, Any]:
-    """What the columns of a CSV file are, and of what run, for "CSV on the Web"."""
-    described = [
-        {
-            "titles": title,
-            "datatype": _CSV[signal.dtype],
-            "dc:description": signal.about,
-            "schema:alternateName": signal.symbol,
-            "schema:unitText": signal.unit,
-        }
-        for title, signal in columns
-    ]
-    return {
-        "@context": "http://www.w3.org/ns/csvw",
-        "url": out.name,
-        "tableSchema": {"columns": described},
-        "notes": [
-            {"signals": {signal.name: _about(signal) for _, signal in columns}},
-            {"run": _run(header)},
-        ],
-    }
+    return rows
 
 
 def _place(index: tuple[int, ...]) -> str:

@@ -161,8 +161,7 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
     "--to",
     "form",
     metavar="FORM",
-    help="Form: parquet, npz, csv, arrow, images, mp4, lerobot; by default what the "
-    "file's name ends in.",
+    help="Form: parquet, npz, csv, images, mp4, lerobot; by default what the file's name ends in.",
 )
 @options.out("The file to write, for a recording the folder.", required=True)
 @click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
@@ -182,14 +181,14 @@ def export_command(
 ) -> None:
     """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
 
-    Signals go to one file, Parquet, CSV, Arrow or NumPy's npz. CSV has no room for the
+    Signals go to one file, Parquet, CSV or NumPy's npz. CSV has no room for the
     outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
     PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
     camera logs of others, several at once, too, and numbers in them with --field. Folders of
     several recordings become episodes of one dataset.
     """
-    from replay.export.forms import FORMS, export
-    from replay.export.tables import CSV_LEAVES_OUT
+    from replay.export.forms import export
+    from replay.export.tables import CSV_LEAVES_OUT, TABLES
 
     if str(out) == "-":
         raise click.UsageError("-o - would be a file of this name: name another")
@@ -197,13 +196,14 @@ def export_command(
     rows = export(path, out, form, force=force, about=say_about, **chosen)
     if form == "csv":
         left_out = " and ".join(CSV_LEAVES_OUT)
-        tell(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them")
+        tell(f"CSV leaves out {left_out}: Parquet and npz hold them")
     if form in ("mp4", "lerobot") and not chosen["lossless"] and _is_film(out):
         tell("H.264 changes pixels a little: --lossless keeps them all")
     if as_json:
         print_document(path=" ".join(map(str, path)), file=str(out), rows=rows)
         return
-    print_line(f"{rows} {FORMS[form].unit} written to {out}")
+    unit = "iterations" if form in TABLES else "images" if form == "images" else "frames"
+    print_line(f"{rows} {unit} written to {out}")
 
 
 def _is_film(out: Path) -> bool:
