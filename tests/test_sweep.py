@@ -309,7 +309,7 @@ def test_ctrl_c_of_a_terminal_ends_the_command_and_its_workers(tmp_path: Path) -
         os.killpg(process.pid, signal.SIGINT)
         complaint = process.communicate(timeout=10)[1]
     assert process.returncode == 130
-    assert len(complaint.splitlines()) == 1
+    assert len(complaint.strip().splitlines()) == 1
     assert psutil.wait_procs(children, timeout=10)[1] == []
 
 
