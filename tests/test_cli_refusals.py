@@ -42,10 +42,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn oscillatory --preset icubs": ("did you mean icub?",),
     "learn oscillatory --preset icub": ("for the scene icub",),
     "record icub -o x --preset oscillatory": ("for the scene oscillatory, this is icub",),
-    "record oscillatory -o x --set scene.eyes.width=9": (
-        "scene.eyes.width means nothing",
-        "scene.streams",
-    ),
+    "record oscillatory -o x --set scene.eyes.width=9": ("unknown key scene.eyes.width",),
     "learn oscillatory --preset no.toml": ("no.toml",),
     "learn": ("SOURCE", "cdmisfa learn --help"),
     "learn oscillatory --sead 1": ("--seed",),

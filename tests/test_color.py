@@ -122,7 +122,7 @@ def test_a_scene_is_recorded_and_learned_in_colours(cdmisfa: Cdmisfa, tmp_path: 
         red, green, blue = np.split(source.take(0, 1).frames[0].astype(int), 3, axis=1)
     assert red.mean() > green.mean() > blue.mean()  # the table is brown
     refused = cdmisfa("record", "oscillatory", "--color", "-o", tmp_path / "none")
-    assert (refused.code, "scene.color means nothing" in refused.err) == (2, True)
+    assert (refused.code, "unknown key scene.color" in refused.err) == (2, True)
 
 
 N, H, W = 120, 24, 32

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-import os
 import reprlib
 import tomllib
 import types
@@ -19,10 +18,12 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
 from operator import index
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.untrusted import read_regular
 
 Section = TypeVar("Section")
 
@@ -33,11 +34,8 @@ LARGEST = 2**63 - 1
 MAX_COMPONENTS = 1000
 """More whitening components than this would take minutes a frame."""
 
-MAX_PRESET = 64 * 1024
-"""Largest preset, in bytes."""
-
-MAX_LINE = 1000
-"""Longest line of a preset: keys of many more parts take minutes to parse."""
+MAX_PRESET = 16 * 1024
+"""Largest preset, in bytes: keys of many parts take a time that grows with the square of them."""
 
 SHOWN = 120
 """Most characters of a value or key that an error shows."""
@@ -222,15 +220,13 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
     """
     try:
         if name.endswith(".toml"):
-            text = _preset_text(name)
+            text = read_regular(Path(name), MAX_PRESET).decode("utf-8").replace("\r\n", "\n")
         else:
             if name not in presets():
                 raise UsageError(f"no preset {name[:40]!r}: {did_you_mean(name, presets())}")
             text = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_text("utf-8")
         document = copy.deepcopy(_parsed(text))
-    except OSError as error:
-        raise UsageError(f"{name}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise UsageError(f"{name}: not TOML: {error}") from error
     except RecursionError:
         raise UsageError(f"{name}: not a preset: it is nested too deep") from None
@@ -244,24 +240,6 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
 def _parsed(text: str) -> dict[str, Any]:
     """A TOML document; once parsed it is known to every trial of a sweep."""
     return tomllib.loads(text)
-
-
-def _preset_text(name: str) -> str:
-    """The text of a preset's file, if it is one that is soon parsed."""
-    if os.path.exists(name) and not os.path.isfile(name):
-        raise UsageError(f"{name}: not a file")
-    with open(name, "rb") as file:
-        data = file.read(MAX_PRESET + 1)
-        if len(data) > MAX_PRESET:
-            size = max(os.fstat(file.fileno()).st_size, len(data))
-            raise UsageError(f"{name}: {size} bytes, a preset has up to {MAX_PRESET}")
-    text = data.decode("utf-8")
-    for number, line in enumerate(text.split("\n"), start=1):
-        if len(line) > MAX_LINE:
-            raise UsageError(
-                f"{name}: line {number} has {len(line)} characters, up to {MAX_LINE} are read"
-            )
-    return text.replace("\r\n", "\n")
 
 
 def shown(value: Any) -> str:

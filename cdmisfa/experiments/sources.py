@@ -191,7 +191,7 @@ def _configure(
 def _refuse_other_scene(
     kind: str, preset: str | None, of_preset: Mapping[str, Any], of_words: Mapping[str, Any]
 ) -> None:
-    """Refuse a preset or settings that are for another scene."""
+    """Refuse a preset or a setting that names another scene."""
     if of_preset.get("kind", kind) != kind:
         raise UsageError(
             f"the preset {preset} is for the scene {of_preset['kind']}, this is {kind}: choose "
@@ -199,14 +199,6 @@ def _refuse_other_scene(
         )
     if of_words.get("kind", kind) != kind:
         raise UsageError(f"scene.kind cannot be set: the source says that it is {kind}")
-    known = {name: [f.name for f in fields(entry.config)] for name, entry in SCENES.items()}
-    for key in (*of_preset, *of_words):
-        name = key.partition(".")[0]
-        if name not in known[kind] and any(name in others for others in known.values()):
-            raise UsageError(
-                f"scene.{key} means nothing to the scene {kind}, which has "
-                f"{', '.join(f'scene.{own}' for own in known[kind])}"
-            )
 
 
 def _refuse_keys_of_others(algorithm: str, keys: Iterable[str], preset: str | None = None) -> None:

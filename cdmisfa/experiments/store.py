@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
@@ -194,7 +194,6 @@ class SweepReport:
         skipped: how many of them were finished before.
         computed: how many finished now.
         failed: rows of those that failed, now or before.
-        outdated: how many of them were finished before by other code, and not reused.
     """
 
     folder: Path
@@ -202,7 +201,6 @@ class SweepReport:
     skipped: int
     computed: int
     failed: tuple[Mapping[str, Any], ...] = field(default=())
-    outdated: int = 0
 
 
 def run_trials(
@@ -244,7 +242,6 @@ def run_trials(
     with contextlib.closing(TrialStore(folder)) as store:
         missing = [trial for trial in trials if is_missing(trial)]
         begin(missing)
-        outdated = _outdated(missing, store.rows.values())
         skipped = len(trials) - len(missing)
         left = {trial.id for trial in missing}
         failed = sum(store.rows[t.id]["status"] == FAILED for t in trials if t.id not in left)
@@ -261,7 +258,6 @@ def run_trials(
         skipped=skipped,
         computed=sum(rows[trial.id]["status"] == DONE for trial in missing),
         failed=tuple(rows[t.id] for t in trials if rows[t.id]["status"] == FAILED),
-        outdated=outdated,
     )
 
 
@@ -302,14 +298,3 @@ def _row(trial: StoredTrial, result: Mapping[str, Any]) -> dict[str, Any]:
         "run": str(trial.log) if trial.log is not None and not failed else None,
         **(result if failed else {"result": result}),
     }
-
-
-def _outdated(trials: Sequence[StoredTrial], rows: Iterable[Mapping[str, Any]]) -> int:
-    """How many trials are in the rows already, but computed by other code."""
-    mine = {trial.code for trial in trials}
-    done = {
-        (json.dumps(row["point"], sort_keys=True), row["seed"])
-        for row in rows
-        if row["status"] == DONE and row.get("code") not in mine
-    }
-    return sum((json.dumps(dict(t.point), sort_keys=True), t.seed) in done for t in trials)

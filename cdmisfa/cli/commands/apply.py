@@ -164,13 +164,12 @@ def _apply_to_many(
     for line in itertools.islice(said, MOST_SAID):
         warn(line)
     if as_json:
-        counts = {name: getattr(found, name) for name in ("computed", "skipped", "anew")}
+        counts = {name: getattr(found, name) for name in ("computed", "skipped")}
         rows = [{k: v for k, v in row.items() if k != "exit_code"} for row in found.logs]
         print_document(run=run, out=found.out, **counts, logs=rows)
     else:
-        again = f" ({found.anew} again: the log or the code has changed)" if found.anew else ""
         print_line(
-            f"{counted(len(found.logs), 'log')}: {found.computed} tried now{again}, "
+            f"{counted(len(found.logs), 'log')}: {found.computed} tried now, "
             f"{found.skipped} before; of these {len(found.failed)} failed, or ended early"
         )
         for row in found.failed[:MOST_SAID]:

@@ -86,13 +86,8 @@ def sweep_command(
                 f"{out} keeps the trials that are finished: say the same again to go on"
             ) from None
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
-    if report.outdated:
-        tell(
-            f"{report.outdated} trials that were finished before are computed again: the code "
-            "of the learner or the recorder has changed since"
-        )
     if as_json:
-        counts = ("trials", "skipped", "computed", "outdated")
+        counts = ("trials", "skipped", "computed")
         each = {name: getattr(report, name) for name in counts}
         print_document(sweep=report.folder, **each, failed=failed)
     else:

@@ -89,14 +89,12 @@ class AppliedLogs:
         logs: a row each, by name: `log`, `out`, `frames`, `error`, `warnings`, and `exit_code`.
         computed: how many were tried now.
         skipped: how many were done, or had failed, before.
-        anew: how many were applied to again: they, or the code, had changed.
     """
 
     out: Path
     logs: Sequence[Mapping[str, Any]]
     computed: int
     skipped: int
-    anew: int
 
     @property
     def failed(self) -> list[Mapping[str, Any]]:
@@ -105,7 +103,7 @@ class AppliedLogs:
 
     @property
     def exit_code(self) -> int:
-        """Of the command."""
+        """Exit code of the command."""
         return max((row["exit_code"] for row in self.failed), default=0)
 
 
@@ -183,14 +181,12 @@ def apply_to_logs(
             )
             for name, files, states in logs
         ]
-        anew: list[Path] = []
 
         def begin(missing: Sequence[ApplyTrial]) -> None:
             write_json(folder / REQUEST, {**asked, "root": relative_path(root, folder)})
             for trial in missing:
-                if trial.log is not None and trial.log.exists():
-                    trial.log.unlink()
-                    anew.append(trial.log)
+                if trial.log is not None:
+                    trial.log.unlink(missing_ok=True)  # of a log or of code that has changed
 
         report = run_trials(
             trials,
@@ -204,7 +200,7 @@ def apply_to_logs(
         )
         known = {row["id"]: row for row in read_rows(folder)}
     rows = [_row(trial, known[trial.id]) for trial in trials]
-    return AppliedLogs(out, rows, report.trials - report.skipped, report.skipped, len(anew))
+    return AppliedLogs(out, rows, report.trials - report.skipped, report.skipped)
 
 
 def compute(trial: ApplyTrial) -> Mapping[str, Any]:
