@@ -53,9 +53,13 @@ class Outcome:
 Cdmisfa = Callable[..., Outcome]
 
 
+SLOW = ("test_bombs.py", "test_moments.py", "test_notebook.py", "test_readme.py", "test_viewer.py")
+"""Files with a test, or a group of tests, that takes tens of seconds."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with what would leave other processes idle at the end: a browser is slow to draw."""
-    items.sort(key=lambda item: item.path.name not in ("test_web.py", "test_notebook.py"))
+    """Begin with what would leave other processes idle at the end."""
+    items.sort(key=lambda item: item.path.name not in SLOW)
 
 
 @pytest.fixture(scope="session", autouse=True)

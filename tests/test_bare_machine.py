@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from waiting import python
 
+pytestmark = pytest.mark.xdist_group("bare_machine")  # one process makes what all of them share
+
 NOBODY = """
 import pwd
 

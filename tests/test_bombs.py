@@ -27,6 +27,8 @@ from replay.runs.folders import REQUEST, RUN_JSON, RUN_METADATA, read_run_json
 from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.log import read_header
 
+pytestmark = pytest.mark.xdist_group("bombs")  # one process makes what all of them share
+
 OWN = 112
 """Megabytes of a command that has read nothing yet."""
 

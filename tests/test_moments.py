@@ -32,6 +32,8 @@ EASY = ("learner.tau=40", "learner.eta_dot_window=8", "learner.warm_up=3", "lear
 EASIER = (*EASY, "learner.min_variance=1e-6", "learner.novel_share=0.0")
 """It saves modules at iterations 8 and 42."""
 
+pytestmark = pytest.mark.xdist_group("moments")  # one process makes what all of them share
+
 OF = {
     "2.0": EASIER,
     "progress": ("learner.tau=40", "learner.test_frames=40", "learner.watch=1000000"),

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
-from importlib import metadata
 from pathlib import Path
 
-import pytest
 from conftest import Cdmisfa
 from waiting import python
 
@@ -114,40 +111,9 @@ def test_rooms_and_files_stay_small() -> None:
     assert (crowded, long) == ({}, {})
 
 
-def test_a_package_hands_on_names_that_exist() -> None:
-    code = (
-        "import importlib, sys\n"
-        "for name in sys.argv[1:]:\n"
-        "    package = importlib.import_module(name)\n"
-        "    assert package.__doc__, name\n"
-        "    for public in getattr(package, '__all__', ()):\n"
-        "        getattr(package, public)\n"
-    )
-    done = python("-W", "ignore", "-c", code, *FORBIDDEN)
-    assert done.returncode == 0, done.stderr
-
-
-def test_the_library_shows_what_it_offers() -> None:
-    shown = python("-W", "ignore", "-c", "import cdmisfa; help(cdmisfa)").stdout
-    names = ["CdmisfaError", "GymSource", "Module", "Recording", "Run", "Sink"]
-    assert [name for name in names if f"class {name}(" not in shown] == []
-    assert "learn(source: " in shown
-    assert f"VERSION\n    {metadata.version('cdmisfa')}" in shown
-    example = "\n".join(line for line in shown.splitlines() if line.startswith(" " * 8))
-    lines = [line.strip() for line in example.splitlines()[:3]]
-    code = ["from cdmisfa import *", *lines, "assert len(outputs) == table.num_rows * 100"]
-    assert python("-W", "ignore", "-c", "\n".join(code)).returncode == 0, code
-
-
 def test_importing_the_library_imports_nothing_heavy() -> None:
     code = f"import cdmisfa, sys; print(sorted(set({HEAVY!r}) & set(sys.modules)))"
     assert python("-c", code).stdout.strip() == "[]"
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_every_folder_with_modules_is_a_package(package: str) -> None:
-    folders = {file.parent for file in (ROOT / package).rglob("*.py")}
-    assert [f for f in folders if not (f / "__init__.py").exists()] == []
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -191,11 +157,3 @@ def test_sources_without_compiled_kernels_say_so(tmp_path: Path) -> None:
     assert done.stderr.startswith("cdmisfa: ")
     assert "holds no compiled kernels: install cdmisfa" in done.stderr
     assert done.stderr.count("\n") == 1
-
-
-def test_commits_are_checked_as_make_lint_checks() -> None:
-    hooks = (ROOT / ".pre-commit-config.yaml").read_text("utf-8")
-    makefile = (ROOT / "Makefile").read_text("utf-8")
-    linted = re.findall(r"^\t\$\(BIN\)/(ruff|mypy|lint-imports)", makefile, re.MULTILINE)
-    hooked = re.findall(r"entry: \.venv/bin/(\S+)", hooks)
-    assert list(dict.fromkeys(hooked)) == linted

@@ -257,4 +257,5 @@ def test_a_program_that_fails_is_quoted():
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's /proc")
 def test_its_telemetry_is_off():
     with Program("--serve-grpc", "--port", str(viewer.free_port())) as program:
-        assert b"CI=1" in Path(f"/proc/{program.pid}/environ").read_bytes().split(b"\0")
+        environ = Path(f"/proc/{program.pid}/environ")  # empty until the program is executed
+        wait_for(lambda: b"CI=1" in environ.read_bytes().split(b"\0"), 30)
