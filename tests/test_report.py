@@ -61,16 +61,13 @@ def test_a_module_is_saved_where_all_rules_hold_and_nowhere_else(run: Path) -> N
     assert sum(row.blocks for row in rows) == len(told)
 
 
-def test_a_fork_is_judged_by_its_parents_rules_until_it_parts(
+def test_a_fork_is_shown_with_what_it_was_told_otherwise(
     cdmisfa: Cdmisfa, run: Path, tmp_path: Path
 ) -> None:
     first = read_told(run, frames=1).outline.saved[0].iteration
     fork, at = tmp_path / "fork", first + 5
     words = ("--iteration", at, "--set", "learner.delta=1e-9", "-o", fork, "--no-rerun")
     assert cdmisfa("fork", run, *words, "--max-iterations", at + 40).code == 0
-    told = read_told(fork, frames=1)
-    rules = deciding(conditions_of(told.outline, told.signals))
-    assert np.flatnonzero(np.all([r.holds for r in rules], axis=0)).tolist() == [first]
     page = Page(fork / "report.html")
     assert f"A fork of ../run after {at} iterations: learner.delta 0.02 became 1e-09." in page.text
     assert "the fork begins" in page.text

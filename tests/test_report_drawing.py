@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from replay.report.drawing import Axis, Plot, beside
+from replay.report.drawing import Axis, Plot
 
 
 @pytest.mark.parametrize(
@@ -39,17 +39,3 @@ def test_a_curve_keeps_its_extremes_and_its_gaps() -> None:
     assert {0.0, 90.0} <= {y for _, y in points}
     assert path.count("M") == 2
     assert not [x for x, _ in points if 400.5 < x < 419.5]
-
-
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (["left", "center"], ["left", "center"]),
-        (["arm_000/joint/position", "arm_001/joint/position"], ["…000…", "…001…"]),
-        (["camera_front_left", "camera_front_right"], ["…left", "…right"]),
-        (["a_camera_in_front", "a_camera"], ["a_camera_in_front", "a_camera"]),
-        (["one_long_name_alone"], ["one_long_name_alone"]),
-    ],
-)
-def test_long_names_are_told_apart(names: list[str], expected: list[str]) -> None:
-    assert [short for short, _, _ in beside(names, range(len(names)))] == expected

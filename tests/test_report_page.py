@@ -97,8 +97,8 @@ def test_the_same_by_keys(browser: Any, report: Path) -> None:
     at = 0
     for key, to in (
         (Keys.ARROW_RIGHT, 1),
-        (Keys.PAGE_UP, 11),
-        (Keys.ARROW_LEFT, 10),
+        (Keys.ARROW_RIGHT, 2),
+        (Keys.ARROW_LEFT, 1),
         (Keys.END, len(frames["t"]) - 1),
         (Keys.ARROW_RIGHT, len(frames["t"]) - 1),
         (Keys.HOME, 0),

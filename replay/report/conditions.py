@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.signals import NO_STATE, STATES
-from replay.runs.log import RunHeader
 from replay.runs.rules import rules_of
 from replay.runs.run import Outline
 
@@ -68,33 +67,13 @@ class Condition:
 def conditions_of(outline: Outline, signals: Mapping[str, NDArray[Any]]) -> tuple[Condition, ...]:
     """The rules for saving of a run's learner, as far as its log tells them.
 
-    Of a fork those of its parent hold until it parts from that.
+    Of a fork they are its own, also before it parts from its parent.
     """
     header = outline.header
     if not outline.iterations:
         return ()
     rules = _of_progress(outline, signals) if header.by_progress else _of_paper(outline, signals)
-    parent, at = _before(header), header.forked_at
-    if parent is not None and at is not None:
-        before = {r.short: r for r in conditions_of(replace(outline, header=parent), signals)}
-        rules = [
-            replace(rule, held=np.concatenate([before[rule.short].holds[:at], rule.holds[at:]]))
-            if rule.short in before
-            else rule
-            for rule in rules
-        ]
     return tuple(rules)
-
-
-def _before(header: RunHeader) -> RunHeader | None:
-    """A header as that of the parent of a fork, as far as it says; None of another run."""
-    fork = header.manifest.get("fork")
-    before = fork.get("before") if isinstance(fork, Mapping) else None
-    if not isinstance(before, Mapping) or "config" not in before:
-        return None
-    rest = {key: value for key, value in header.manifest.items() if key != "fork"}
-    found = replace(header, manifest={**rest, **before})
-    return found if found.by_progress == header.by_progress else None
 
 
 TOLD = {

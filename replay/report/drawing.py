@@ -5,10 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import math
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -24,12 +22,6 @@ WIDE = 1000
 BINS = 500
 """Places across a plot at which a curve has a least and a greatest value."""
 
-SHORT = 13
-"""Letters for which there is room left of a plot."""
-
-MARGIN = 5
-"""Pixels above and below the values of a plot."""
-
 
 def number(value: float) -> str:
     """A coordinate, as short as can be."""
@@ -39,26 +31,6 @@ def number(value: float) -> str:
 def colour_class(stream: int) -> str:
     """CSS class of a stream's colour."""
     return f"c{stream % len(CYCLE)}"
-
-
-def beside(names: Sequence[str], shown: Iterable[int]) -> list[tuple[str, str, str]]:
-    """The words left of a plot: of each stream what tells it apart, its colour, all of its name.
-
-    Words that all names begin or end with are left out of long ones.
-    """
-    words = [re.findall(r"[^\W_]+|[\W_]+", name) for name in names]
-    head = _alike(words)
-    tail = _alike([found[head:][::-1] for found in words])
-    own = ["".join(found[head : len(found) - tail]) for found in words]
-    short = [f"{'…' * bool(head)}{part}{'…' * bool(tail)}" for part in own]
-    if max(map(len, names)) <= SHORT or "" in own:
-        short = [*names]
-    return [(short[s], colour_class(s), names[s]) for s in shown]
-
-
-def _alike(lists: list[list[str]]) -> int:
-    """How many words all begin with."""
-    return sum(1 for _ in takewhile(lambda words: len({*words}) == 1, zip(*lists, strict=False)))
 
 
 @dataclass(slots=True)
@@ -126,7 +98,7 @@ class Plot:
 
     Attributes:
         about: what it shows, for who cannot see it.
-        names: left of it, in place of the ticks of an axis: as there is room, a colour, whole.
+        names: left of it, in place of the ticks of an axis, each with the class of its colour.
         frames: which pictures belong to places of it, if any.
         most: ticks across.
     """
@@ -137,7 +109,7 @@ class Plot:
     parts: list[str] = field(default_factory=list)
     labels: list[Label] = field(default_factory=list)
     ticks: list[Label] = field(default_factory=list)
-    names: list[tuple[str, str, str]] = field(default_factory=list)
+    names: list[tuple[str, str]] = field(default_factory=list)
     frames: str = ""
     most: int = 8
 

@@ -57,7 +57,7 @@ for (const plot of document.querySelectorAll("[data-frames]")) {
     const last = shown.x.length - 1;
     const to = {
       ArrowRight: at + 1, ArrowUp: at + 1, ArrowLeft: at - 1, ArrowDown: at - 1,
-      PageUp: at + 10, PageDown: at - 10, Home: 0, End: last,
+      Home: 0, End: last,
     }[event.key];
     if (event.key === "Escape") hide();
     if (to === undefined) return;
@@ -69,18 +69,3 @@ for (const plot of document.querySelectorAll("[data-frames]")) {
 addEventListener("beforeprint", () => {
   for (const folded of document.querySelectorAll("details")) folded.open = true;
 });
-
-for (const code of document.querySelectorAll("code.copy")) {
-  const button = document.createElement("button");
-  button.textContent = "copy";
-  button.setAttribute("aria-label", "copy " + code.textContent);
-  button.addEventListener("click", () => {
-    const range = document.createRange();
-    range.selectNodeContents(code);
-    getSelection().removeAllRanges();
-    getSelection().addRange(range);
-    document.execCommand("copy");
-    button.textContent = "copied";
-  });
-  code.after(button);
-}

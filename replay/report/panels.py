@@ -22,7 +22,6 @@ from replay.report.drawing import (
     Axis,
     Label,
     Plot,
-    beside,
     colour_class,
     data_uri,
     number,
@@ -81,7 +80,7 @@ def timeline(told: RunTold, frames: str) -> Plot:
         Axis(0, height, height),
         f"Which of {len(names)} streams was watched when, and when modules were saved",
         frames=frames,
-        names=beside(names, shown),
+        names=[(names[s], colour_class(s)) for s in shown],
     )
     _lanes_of_states(plot, told, row)
     for s in shown:
