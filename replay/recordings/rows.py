@@ -220,7 +220,7 @@ class ChannelRows:
     def _remedy(self) -> str:
         if self._reader.salvage:
             return "save what can be read with cdmisfa recover, and learn from that"
-        return "run cdmisfa verify; cdmisfa learn --salvage leaves out what is missing"
+        return "cdmisfa verify lists what is missing, cdmisfa learn --salvage leaves it out"
 
     def _times(self, number: int) -> NDArray[np.uint64]:
         """Log times of the channel's messages in a chunk."""
