@@ -21,8 +21,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.apply import Application, Totals, follow
 from cdmisfa.experiments.session import run
 from cdmisfa.modules import Module
+from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
-from recorder.images.recipe import Recipe
 from replay.arrays import ArrayLog
 from replay.export.applied import written
 from replay.export.frames import write_film

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.report import interleaved, middle, ratio, save
-from recorder.images.decoding import MessageKind, decoder_of
 from recorder.images.framing import default_size, fitted, size_of
+from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import IMAGES
 from recorder.mcap.reader import LogReader
 from replay.camera_logs.source import ForeignSource

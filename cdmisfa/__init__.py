@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from cdmisfa.watching import WatchEnv as WatchEnv
     from recorder.cameras.stepped import ArraySource as ArraySource
     from recorder.cameras.stepped import GymSource as GymSource
-    from recorder.images.recipe import Recipe as Recipe
-    from recorder.images.recipe import make_frame as make_frame
+    from recorder.images.framing import Recipe as Recipe
+    from recorder.images.framing import make_frame as make_frame
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
 
     __version__: str
@@ -68,7 +68,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.public.run": "Run",
         "cdmisfa.watching": "WatchEnv",
         "recorder.cameras.stepped": "GymSource",
-        "recorder.images.recipe": "Recipe make_frame",
+        "recorder.images.framing": "Recipe make_frame",
     },
     beside={
         "cdmisfa.agents.learner": "CuriousLearner",

@@ -19,7 +19,7 @@ from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.shown import Shown, weights
 
 if TYPE_CHECKING:  # the mind knows no images: who saves a module adds how they became frames
-    from recorder.images.recipe import Recipe
+    from recorder.images.framing import Recipe
 
 CHUNK = 1024
 """Frames that are turned into values at once."""

@@ -16,10 +16,9 @@ from cdmisfa.core.arrays import as_array
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, are_for
-from recorder.images.framing import Framing, framings
+from recorder.images.framing import Framing, framings, pixels_of
 from recorder.images.options import OF_EVERY_SOURCE, InputOptions
 from recorder.images.pixels import Shown, raw_image
-from recorder.images.recipe import pixels_of
 from replay.camera_logs.hue import CHOSEN, shows_hue
 from replay.camera_logs.opening import fits_topic
 from replay.storage.arrays import load_numbers

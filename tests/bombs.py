@@ -18,7 +18,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from message_files import every, write_mcap
 from PIL import Image
 
-from recorder.images.decoding import MessageKind
+from recorder.images.messages import MessageKind
 
 Writing = Callable[[Path], Path]
 """Writes into a folder, and says what."""

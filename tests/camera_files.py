@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from message_files import write_mcap
 from PIL import Image
 
-from recorder.images.decoding import MessageKind
+from recorder.images.messages import MessageKind
 
 HEIGHT, WIDTH = 12, 16
 START_MS = 1000

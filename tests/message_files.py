@@ -8,7 +8,7 @@ from typing import Any
 
 from mcap.writer import Writer
 
-from recorder.images.decoding import MessageKind
+from recorder.images.messages import MessageKind
 
 START = 10**18
 """The log time of what comes first, in nanoseconds."""

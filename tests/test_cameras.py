@@ -12,7 +12,7 @@ from camera_files import write_cameras, write_images, write_pictures
 from conftest import Cdmisfa
 from message_files import write_mcap
 
-from recorder.images.decoding import MessageKind
+from recorder.images.messages import MessageKind
 
 SMALL = ("--size", "16x12")
 QUICK = ("--max-iterations", "4", "--no-rerun", "--set", "learner.tau=10")

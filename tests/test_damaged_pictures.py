@@ -16,8 +16,8 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from message_files import every, write_mcap
 from PIL import Image
 
-from recorder.images.pixels import compressed_image
-from recorder.images.whole import MalformedImage
+from recorder.images.compressed import compressed_image
+from recorder.images.pixels import MalformedImage
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
 

@@ -16,8 +16,8 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from message_files import every, write_mcap
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.images import pixels
-from recorder.images.decoding import MessageKind
+from recorder.images import compressed
+from recorder.images.messages import MessageKind
 from replay.camera_logs import ahead, stream
 from replay.camera_logs.source import ForeignSource
 
@@ -176,8 +176,8 @@ def test_large_pictures_are_left_to_one_thread(
     """They are decoded within a limit of memory, which is of the whole process."""
     monkeypatch.setattr(ahead, "CORES", 2)
     log, limits = write(tmp_path / "log.mcap"), list[int]()
-    budget = pixels.budget
-    monkeypatch.setattr(pixels, "budget", lambda: limits.append(1) or budget())
+    budget = compressed.budget
+    monkeypatch.setattr(compressed, "budget", lambda: limits.append(1) or budget())
     frames = shown(log)[0]
     assert len(limits) < 10
     monkeypatch.setattr(stream, "AT_ONCE", 20)

@@ -22,16 +22,9 @@ from PIL import Image, ImageOps
 from video_packets import cdr as ros2
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.decoding import MessageKind
-from recorder.images.messages import image_decoder, stated_format
-from recorder.images.pixels import (
-    DISTANCES,
-    ENCODINGS,
-    MalformedImage,
-    compressed_image,
-    raw_image,
-    shrink,
-)
+from recorder.images.compressed import compressed_image
+from recorder.images.messages import MessageKind, image_decoder, stated_format
+from recorder.images.pixels import DISTANCES, ENCODINGS, MalformedImage, raw_image, shrink
 from replay.camera_logs.source import ForeignSource
 
 RAW_IMAGES = MessageKind("foxglove.RawImage", "protobuf")

@@ -30,7 +30,7 @@ from video_packets import FOXGLOVE, foxglove, video
 from web_server import serving
 
 from cdmisfa.core.blocks import FrameSource
-from recorder.images.decoding import MessageKind
+from recorder.images.messages import MessageKind
 from replay.camera_logs.source import ForeignSource
 from replay.corpus.index import read_index
 

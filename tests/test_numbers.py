@@ -17,8 +17,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from message_files import START, STEP, every, learned_alike, write_mcap, write_table
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.images.decoding import MessageKind, message_decoder
 from recorder.images.fields import Field, numbers_of
+from recorder.images.messages import MessageKind, message_decoder
 from recorder.log.messages import descriptor_set
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource

@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, IndexType
 from message_files import write_mcap
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.images.decoding import MessageKind
+from recorder.images.messages import MessageKind
 from recorder.mcap.reader import LogReader
 
 

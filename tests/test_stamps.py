@@ -17,7 +17,7 @@ from test_numbers import joint_state
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError
-from recorder.images.decoding import MessageKind, stamp_of
+from recorder.images.messages import MessageKind, stamp_of
 from replay.camera_logs.source import ForeignSource
 
 COUNT = 40

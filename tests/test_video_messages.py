@@ -18,7 +18,7 @@ from video_packets import COUNT, ENCODERS, FOXGLOVE, GROUP, KINDS, video
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.cameras.words import open_live
-from recorder.images.decoding import MessageKind
+from recorder.images.messages import MessageKind
 from recorder.images.options import InputOptions
 from recorder.images.videos import frame_gray
 from replay.camera_logs.opening import open_images

@@ -13,7 +13,7 @@ from typing import Any
 from camera_files import HEIGHT, WIDTH, pictures
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 
-from recorder.images.decoding import MessageKind
+from recorder.images.messages import MessageKind
 
 COUNT, GROUP = 60, 12
 FOXGLOVE = MessageKind("foxglove.CompressedVideo", "protobuf")

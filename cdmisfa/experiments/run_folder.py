@@ -16,7 +16,7 @@ from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import machine, write_json
 from cdmisfa.experiments.resume import COMMAND, FORK, SET_ASIDE
 from cdmisfa.modules import Module
-from recorder.images.recipe import Recipe
+from recorder.images.framing import Recipe
 from recorder.log.files import (
     held,
     logs_in,

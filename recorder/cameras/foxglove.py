@@ -20,9 +20,8 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.video import Steady
-from recorder.images.decoding import MessageKind, decoder_of
-from recorder.images.messages import Decoder, stated_format
-from recorder.images.options import IMAGES, Reading
+from recorder.images.messages import Decoder, MessageKind, decoder_of, stated_format
+from recorder.images.options import IMAGES, InputOptions
 from recorder.images.pixels import DISTANCES, Shown
 from recorder.images.videos import VideoPackets
 
@@ -75,7 +74,7 @@ class FoxgloveCamera:
         name: str,
         *,
         timeout: float,
-        reading: Reading = IMAGES,
+        reading: InputOptions = IMAGES,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.name, self._reading, self._say = name, reading, say

@@ -12,14 +12,7 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.names import stream_names
 from cdmisfa.core.registry import Registry
-from recorder.images.options import (
-    COLOR_RECIPE,
-    NUMBERS_RECIPE,
-    RECIPE,
-    VIDEO_RECIPE,
-    InputOptions,
-    Reading,
-)
+from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, InputOptions
 
 if TYPE_CHECKING:
     from recorder.cameras.readers import Camera
@@ -42,7 +35,7 @@ class CameraKind:
     Attributes:
         open: makes the camera of a word, KIND included, with the name of its stream; what it
             cannot open is a UsageError.
-        takes: what `open` takes besides, by name: of the input options what it can heed ("depth",
+        takes: what `open` takes besides, by name: of the input options what it can heed ("range",
             "fields", "color"), and "say", to be told what the user should know, in a line.
         recipe: how what it shows becomes gray and small, for the record.
     """
@@ -55,7 +48,7 @@ class CameraKind:
 def _foxglove(word: str, name: str, *, say: Callable[[str], None], **chosen: Any) -> Camera:
     from recorder.cameras.foxglove import FoxgloveCamera
 
-    return FoxgloveCamera(word, name, timeout=_TIMEOUT, reading=Reading(**chosen), say=say)
+    return FoxgloveCamera(word, name, timeout=_TIMEOUT, reading=InputOptions(**chosen), say=say)
 
 
 def _video(word: str, name: str, *, color: bool = False) -> Camera:
@@ -67,7 +60,7 @@ def _video(word: str, name: str, *, color: bool = False) -> Camera:
 CAMERAS: Registry[CameraKind] = Registry(
     "kind of camera",
     {
-        "foxglove": CameraKind(_foxglove, ("depth", "fields", "color", "say")),
+        "foxglove": CameraKind(_foxglove, ("range", "fields", "color", "say")),
         **{kind: CameraKind(_video, ("color",), VIDEO_RECIPE) for kind in _VIDEO},
     },
 )
@@ -128,7 +121,7 @@ def open_live(
         return _simulated(words, names, options, seed)
     kinds = [CAMERAS[scheme] for scheme in schemes]
     _refuse_inapplicable(words, [kind.takes for kind in kinds], options)
-    told = {"depth": options.range, "fields": options.fields, "color": options.color, "say": say}
+    told = {"range": options.range, "fields": options.fields, "color": options.color, "say": say}
     cameras = [
         kind.open(word, name, **{key: told[key] for key in kind.takes})
         for kind, word, name in zip(kinds, words, names, strict=True)
@@ -148,7 +141,7 @@ def open_live(
     readers = Readers(cameras, frames.frame, on_loss=options.lost, stall=options.stall, say=say)
     source = LiveSource(readers, names, about, rate=options.rate, hold=options.hold)
     may_show = [
-        "depth" in kind.takes and getattr(camera, "distances", None) is not False
+        "range" in kind.takes and getattr(camera, "distances", None) is not False
         for kind, camera in zip(kinds, cameras, strict=True)
     ]
     if options.range is not None and not any(may_show):
@@ -168,7 +161,7 @@ def _refuse_inapplicable(
             raise UsageError(f"{word} {_NO_FIELDS}")
         if options.color and "color" not in taken:
             raise UsageError(f"{word} shows gray images: leave out --color")
-    if options.range is not None and not any("depth" in taken for taken in takes):
+    if options.range is not None and not any("range" in taken for taken in takes):
         raise UsageError(f"{words[0]} {_NO_DISTANCES}")
 
 

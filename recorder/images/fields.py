@@ -11,7 +11,7 @@ import numpy as np
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import UsageError
 from recorder.images.options import Depth
-from recorder.images.whole import MalformedImage
+from recorder.images.pixels import MalformedImage
 
 MOST: Final = 100_000
 """Most numbers that a message may give."""

@@ -186,11 +186,6 @@ class InputOptions(InputConfig):
         return any(name not in OF_EVERY_SOURCE for name in self.chosen())
 
     @property
-    def reading(self) -> Reading:
-        """What is taken of messages and files."""
-        return Reading(self.range, self.fields, self.time, self.stamp, self.color is True)
-
-    @property
     def config(self) -> InputConfig:
         """The keys `input.*`."""
         return InputConfig(
@@ -235,30 +230,11 @@ def _written(value: Any) -> str:
     return "on" if value is True else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """What is taken of messages and files.
-
-    Attributes:
-        depth: what is shown of distances, see `raw_image`, and the range that numbers are kept in.
-        fields: the numbers that are taken instead of images; see `Field`.
-        time: the column of a table's times, with its unit; see `TableNumbers`.
-        stamp: the times of messages: those of the log, or those in their headers.
-        color: whether images are taken in their colours; see `raw_image`.
-    """
-
-    depth: Depth | None = None
-    fields: tuple[str, ...] = ()
-    time: str | None = None
-    stamp: Clock = "log"
-    color: bool = False
-
-
-IMAGES = Reading()
-"""Images, and no numbers."""
-
 _HINTS: Final = {
     name: next((a for a in typing.get_args(hint) if type(None) in typing.get_args(hint)), hint)
     for name, hint in typing.get_type_hints(InputOptions).items()
 }
 """The types of settings, without None."""
+
+IMAGES: Final = InputOptions()
+"""Images, and no numbers."""

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -13,10 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray
-from cdmisfa.core.errors import TooSmallError, UsageError
-from cdmisfa.core.untrusted import BUDGET, budget
+from cdmisfa.core.errors import LogDamagedError, TooSmallError, UsageError
 from recorder.images.options import Depth
-from recorder.images.whole import MalformedImage, load_picture, open_picture
 
 Shown = NDArray[Any]
 """What one message shows: a gray image, (height, width) uint8, or one in colours, (height, width,
@@ -47,47 +42,12 @@ _BAYER: Final[Mapping[str, str]] = {
 DISTANCES: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
 """Formats of distances: their numbers, and how many metres one is (REP 118)."""
 
-AT_ONCE: Final = 4_000_000
-"""Most pixels of an image that is decoded beside others, without a limit to the memory it takes."""
-
 _BAND: Final = 1 << 20
 """Pixels that are converted at a time: what is between takes several bytes each."""
 
-_WORDS: Final = ("I;16", "I;16B", "I")
-"""Pillow's modes of 16 bit."""
 
-_ORIENTATION: Final = 0x0112
-"""The tag of EXIF that says how a camera was held."""
-
-_TURNS: Final = (
-    *("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE"),
-    *("ROTATE_270", "TRANSVERSE", "ROTATE_90"),
-)
-"""What puts an image upright, by its orientation from 2 on; 1 is."""
-
-
-class _Strict:
-    """Makes warnings errors while any thread is within, for their filters are of all threads."""
-
-    def __init__(self) -> None:
-        self._lock, self._within = threading.Lock(), 0
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if not self._within:
-                self._before = warnings.catch_warnings()
-                self._before.__enter__()
-                warnings.simplefilter("error")
-            self._within += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._within -= 1
-            if not self._within:
-                self._before.__exit__(None, None, None)
-
-
-_STRICT: Final = _Strict()
+class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where
+    """No image that can be read; the caller adds where it was."""
 
 
 class UnknownPixels(MalformedImage):
@@ -167,10 +127,10 @@ def raw_image(
         colors = Image.frombuffer("RGB", shape, pixels, "raw", mode, 0, 1)
         return np.asarray(colors.convert("L"))  # as in `RECIPE`
 
-    return _by_bands(rows, gray)
+    return by_bands(rows, gray)
 
 
-def _by_bands(pixels: NDArray[Any], convert: Callable[[NDArray[Any]], Any]) -> ByteArray:
+def by_bands(pixels: NDArray[Any], convert: Callable[[NDArray[Any]], Any]) -> ByteArray:
     """Convert rows of pixels (height, width, ...) to gray, some rows at a time."""
     height, width = pixels.shape[:2]
     found = np.empty((height, width), np.uint8)
@@ -193,7 +153,7 @@ def _bayer(pixels: ByteArray, order: str, *, color: bool) -> ByteArray:
         green = ((total + 1) >> 1).astype(np.uint8)
         return np.stack([cells[:, :, order.index("r")], green, cells[:, :, order.index("b")]], 2)
     weights = np.array([{"r": 19595, "g": 19235, "b": 7471}[c] for c in order], np.uint32)
-    return _by_bands(cells, lambda part: (part @ weights + 32768) >> 16)
+    return by_bands(cells, lambda part: (part @ weights + 32768) >> 16)
 
 
 def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray:
@@ -207,7 +167,7 @@ def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray
         distance[~np.isfinite(distance) | (distance <= 0)] = near
         return np.floor((np.clip(distance, near, far) - near) * (255 / (far - near)) + 0.5)
 
-    return _by_bands(values, gray)
+    return by_bands(values, gray)
 
 
 def shrink(
@@ -241,75 +201,3 @@ def shrink(
         )
     small = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
     return np.asarray(small, np.uint8)
-
-
-def compressed_image(data: bytes, *, color: bool = False, most: int = MAX_PIXELS) -> ByteArray:
-    """The image in a JPEG or PNG, gray, (height, width) uint8.
-
-    Args:
-        data: the file.
-        color: give what has colours as they are, (height, width, 3) red, green and blue.
-        most: its pixels at most; no more than `AT_ONCE` in several threads at once.
-
-    Raises:
-        MalformedImage: it is neither, broken, or too large.
-    """
-    with _opened(data, most) as image:
-        if image.mode in _WORDS:
-            words = np.asarray(image)
-            return _by_bands(words, lambda part: (part.astype(np.int64) >> 8).clip(0, 255))
-        if image.mode not in ("L", "RGB"):
-            image = image.convert("RGB")
-        return np.array(image if color else image.convert("L"), np.uint8)
-
-
-def compressed_words(data: bytes) -> NDArray[np.uint16]:
-    """Decode a PNG of 16 bit, as distances are packed in, into (height, width).
-
-    Raises:
-        MalformedImage: it is none, broken, or too large.
-    """
-    with _opened(data) as image:
-        if image.mode not in _WORDS:
-            raise MalformedImage(f"its distances are packed as {image.mode}, not in 16 bit")
-        return np.asarray(image).astype(np.uint16)
-
-
-@contextmanager
-def _opened(data: bytes, most: int = MAX_PIXELS) -> Iterator[Image.Image]:
-    """Decode a JPEG or PNG, turned upright."""
-    limit = f"more than {BUDGET >> 20} MiB of memory, the limit"
-    try:
-        with nullcontext() if most <= AT_ONCE else budget(), _STRICT:
-            file = open_picture(data)
-            if not 0 < file.width * file.height <= most:
-                raise MalformedImage(f"an image of {file.width}x{file.height} is not read")
-            # Of a progressive JPEG all coefficients are held until its end.
-            held = file.width * file.height * (2 * len(file.getbands()) + 4)
-            if file.info.get("progressive") and held > BUDGET:
-                raise MalformedImage(
-                    f"a progressive JPEG of {file.width}x{file.height} in {file.mode} takes {limit}"
-                )
-            load_picture(file, data)
-            image: Image.Image = file
-            if 2 <= (orientation := _orientation(image)) <= 8:
-                image = image.transpose(Image.Transpose[_TURNS[orientation - 2]])
-            yield image
-    except MalformedImage:
-        raise
-    except MemoryError:
-        raise MalformedImage(f"its JPEG or PNG takes {limit}") from None
-    except Exception as error:  # Pillow raises whatever its codecs raise
-        raise MalformedImage(f"its JPEG or PNG is broken ({type(error).__name__})") from None
-
-
-def _orientation(image: Image.Image) -> int:
-    """EXIF's orientation, 1 to 8; 1, upright, where it is missing or broken."""
-    if "exif" not in image.info:
-        return 1
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            return int(image.getexif().get(_ORIENTATION, 1))
-    except Exception:  # Pillow raises whatever its parser raises; the picture may be whole
-        return 1

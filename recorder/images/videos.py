@@ -15,8 +15,7 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import BUDGET
-from recorder.images.pixels import MAX_PIXELS, raw_image
-from recorder.images.whole import MalformedImage
+from recorder.images.pixels import MAX_PIXELS, MalformedImage, raw_image
 
 HELD: Final = 17
 """Pictures that a decoder holds at most, where they are made from one another: 16 and its own."""

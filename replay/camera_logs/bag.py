@@ -15,8 +15,8 @@ import zstandard
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
-from recorder.images.decoding import MessageKind, decoder_of
-from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
+from recorder.images.messages import MessageKind, decoder_of
+from recorder.images.options import IMAGES, NUMBERS_RECIPE, InputOptions
 from recorder.mcap.records import MAX_CHUNK
 from replay.camera_logs.stream import (
     ChannelFacts,
@@ -91,8 +91,8 @@ class BagImages(MessageImages):
         LogDamagedError: rosbags cannot read it.
     """
 
-    def __init__(self, path: Path, topic: str | None, *, reading: Reading = IMAGES) -> None:
-        self.path, self.color = path, reading.color
+    def __init__(self, path: Path, topic: str | None, *, reading: InputOptions = IMAGES) -> None:
+        self.path, self.color = path, (reading.color is True)
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
         self._messages: Iterator[tuple[str, int, Any]] = iter(())
@@ -165,7 +165,7 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
     return found
 
 
-def bag_topics(path: Path, reading: Reading = IMAGES) -> list[str]:
+def bag_topics(path: Path, reading: InputOptions = IMAGES) -> list[str]:
     """The topics of a bag with what is wanted; raises as `bag_channels` does."""
     with _opened(path) as bag:
         kinds = bag.kinds()

@@ -16,9 +16,10 @@ from cdmisfa.core.arrays import ByteArray, FloatArray, IntArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, read_json
+from recorder.images.compressed import compressed_image
 from recorder.images.fields import bounded
-from recorder.images.options import NUMBERS_RECIPE, Reading
-from recorder.images.pixels import Shown, compressed_image
+from recorder.images.options import NUMBERS_RECIPE, InputOptions
+from recorder.images.pixels import Shown
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.camera_logs.pictures import VideoImages
 from replay.camera_logs.stream import (
@@ -134,7 +135,7 @@ class LeRobotNumbers(ImageStream):
     path: Path
     recipe = NUMBERS_RECIPE
 
-    def __init__(self, path: Path, topic: str | None, reading: Reading) -> None:
+    def __init__(self, path: Path, topic: str | None, reading: InputOptions) -> None:
         self.path, self.topic, self.fields = path, path.resolve().name, reading.fields
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: its numbers have no topics, leave {topic} out; see --field")
@@ -151,7 +152,7 @@ class LeRobotNumbers(ImageStream):
         with explained(path, "LeRobot's layout", held=numbers.nbytes):
             firsts = np.array([int(row["dataset_from_index"]) for row in rows]) - starts[:-1]
             at = np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))
-            self._numbers = bounded(numbers[at], reading.depth)
+            self._numbers = bounded(numbers[at], reading.range)
         if not (whole := np.isfinite(self._numbers).all(axis=1)).all():
             frame = int(np.argmin(whole))
             raise UsageError(

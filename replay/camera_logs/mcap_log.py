@@ -12,9 +12,8 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.decoding import MessageKind, decoder_of
-from recorder.images.messages import Decoder
-from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
+from recorder.images.messages import Decoder, MessageKind, decoder_of
+from recorder.images.options import IMAGES, NUMBERS_RECIPE, InputOptions
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
@@ -71,10 +70,10 @@ class McapImages(MessageImages):
         topic: str | None,
         *,
         salvage: bool = False,
-        reading: Reading = IMAGES,
+        reading: InputOptions = IMAGES,
         readers: Readers | None = None,
     ) -> None:
-        self.path, self.color = path, reading.color
+        self.path, self.color = path, (reading.color is True)
         self._own: tuple[int, NDArray[np.intp]] = -1, np.empty(0, np.intp)
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
@@ -146,7 +145,7 @@ class McapImages(MessageImages):
             yield segment, pairs[pairs[:, 1].argsort(kind="stable"), 0]
 
 
-def mcap_topics(path: Path, reading: Reading = IMAGES) -> list[str]:
+def mcap_topics(path: Path, reading: InputOptions = IMAGES) -> list[str]:
     """The topics of an MCAP log with what is wanted.
 
     Raises:
@@ -157,7 +156,7 @@ def mcap_topics(path: Path, reading: Reading = IMAGES) -> list[str]:
         return topics_in(reader, reading)
 
 
-def topics_in(reader: LogReader, reading: Reading) -> list[str]:
+def topics_in(reader: LogReader, reading: InputOptions) -> list[str]:
     """Return the topics of a log with what is wanted."""
     channels = reader.channels.values()
     found = (c.topic for c in channels if decoder_of(_kind(reader, c), reading) is not None)
@@ -165,7 +164,7 @@ def topics_in(reader: LogReader, reading: Reading) -> list[str]:
 
 
 def channels_on(
-    reader: LogReader, topic: str | None, reading: Reading
+    reader: LogReader, topic: str | None, reading: InputOptions
 ) -> tuple[list[Channel], Decoder]:
     """Return the channels of a topic and the decoder of their messages; see `choose_images`."""
     channels = [(c.topic, _kind(reader, c), c) for c in reader.channels.values()]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.options import IMAGES, Reading
+from recorder.images.options import IMAGES, InputOptions
 from recorder.images.videos import VideoPackets
 from replay.camera_logs.bag import BAGS, BagImages, bag_channels, bag_topics
 from replay.camera_logs.lerobot import (
@@ -74,7 +74,7 @@ def open_images(
     topic: str | None,
     *,
     salvage: bool = False,
-    reading: Reading = IMAGES,
+    reading: InputOptions = IMAGES,
     readers: Readers | None = None,
 ) -> ImageStream:
     """Open the images on a topic of a log, or in a folder, or numbers, at the times wanted.
@@ -106,7 +106,7 @@ def _open(
     topic: str | None,
     *,
     salvage: bool,
-    reading: Reading,
+    reading: InputOptions,
     readers: Readers | None = None,
 ) -> ImageStream:
     """Open a log with the reader of its format, which raises as `open_images` does."""
@@ -124,10 +124,10 @@ def _open(
     if reading.fields:
         raise UsageError(f"{path} holds images: --field is for messages, tables and datasets")
     if kind == "dataset":
-        return LeRobotImages(path, topic, color=reading.color)
+        return LeRobotImages(path, topic, color=(reading.color is True))
     if kind == "pictures":
-        return FolderImages(path, topic, color=reading.color)
-    return VideoImages(path, topic, color=reading.color)
+        return FolderImages(path, topic, color=(reading.color is True))
+    return VideoImages(path, topic, color=(reading.color is True))
 
 
 def _open_parts(path: Path, topic: str | None, **how: Any) -> ImageStream:
@@ -171,7 +171,7 @@ def identity_of(path: Path, streams: Sequence[ImageStream]) -> Identity:
     return FilesIdentity(path, (file for file in found if file.is_file()))
 
 
-def image_topics(path: Path, reading: Reading = IMAGES) -> list[str]:
+def image_topics(path: Path, reading: InputOptions = IMAGES) -> list[str]:
     """The topics of a camera log with images, or with the messages that are wanted.
 
     Raises:
@@ -220,7 +220,7 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
 
 
 def named_streams(
-    files: Sequence[Path], topics: Sequence[str], reading: Reading = IMAGES
+    files: Sequence[Path], topics: Sequence[str], reading: InputOptions = IMAGES
 ) -> list[tuple[Path, str | None]]:
     """The log and the topic of each stream that is meant.
 

@@ -20,10 +20,10 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, data_bytes, read_regular
+from recorder.images.compressed import check_png, compressed_image
 from recorder.images.options import VIDEO_RECIPE
-from recorder.images.pixels import MAX_PIXELS, compressed_image
+from recorder.images.pixels import MAX_PIXELS, MalformedImage
 from recorder.images.videos import frame_colors, frame_gray, pyav
-from recorder.images.whole import MalformedImage, check_png
 from recorder.mcap.records import MalformedRecord, Problem
 from replay.camera_logs.containers import extent_of
 from replay.camera_logs.stream import ImageStream, UnreadableError, begun, explained, sorted_times

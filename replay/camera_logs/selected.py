@@ -19,9 +19,8 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import stream_name, stream_names
 from recorder.images.options import VIDEO_RECIPE
-from recorder.images.pixels import DISTANCES, Shown
+from recorder.images.pixels import DISTANCES, MalformedImage, Shown
 from recorder.images.videos import VideoPackets
-from recorder.images.whole import MalformedImage
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, UnreadableError, sorted_times
 

@@ -143,7 +143,7 @@ class ForeignSource(AheadSource):
 
     def _open(self) -> None:
         """Open the streams, and find what is taken of them and when each image was."""
-        options, reading = self._options, self._options.reading
+        options, reading = self._options, self._options
         if options.end is not None and not options.start < options.end:
             raise UsageError(
                 f"--start {options.start:g} is no earlier than --end {options.end:g}, both in "

@@ -17,10 +17,20 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
-from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
-from recorder.images.messages import PACKED, SCHEMAS, Decoder, packed_picture, stated_format
-from recorder.images.options import RECIPE, Reading
-from recorder.images.pixels import AT_ONCE, Shown, compressed_image
+from recorder.images.compressed import AT_ONCE, compressed_image
+from recorder.images.messages import (
+    PACKED,
+    SCHEMAS,
+    Decoder,
+    MessageKind,
+    Stamp,
+    decoder_of,
+    packed_picture,
+    stamp_of,
+    stated_format,
+)
+from recorder.images.options import RECIPE, InputOptions
+from recorder.images.pixels import Shown
 from recorder.log.messages import VECTOR_SCHEMA
 
 
@@ -197,7 +207,7 @@ def choose_images(
     path: Path,
     topic: str | None,
     channels: Iterable[tuple[str, MessageKind, Found]],
-    reading: Reading,
+    reading: InputOptions,
 ) -> tuple[list[Found], Decoder]:
     """Choose the channels of a topic, of images or of fields, and the decoder of their messages.
 
@@ -254,7 +264,7 @@ class NothingLoggedError(LogDamagedError):
     """A log that was cut before its first message."""
 
 
-def holds_none(path: Path, reading: Reading) -> str:
+def holds_none(path: Path, reading: InputOptions) -> str:
     """The error text for a log without images, or without fields."""
     if reading.fields:
         return f"{path}: it holds no messages whose fields are known"

@@ -13,7 +13,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular
 from recorder.images.fields import EXACT, Field, bounded, is_path
-from recorder.images.options import IMAGES, NUMBERS_RECIPE, Reading
+from recorder.images.options import IMAGES, NUMBERS_RECIPE, InputOptions
 from recorder.images.pixels import Shown
 from replay.camera_logs.stream import (
     LAST_NS,
@@ -61,7 +61,7 @@ class TableNumbers(ImageStream):
     recipe = NUMBERS_RECIPE
     told_rounded = True
 
-    def __init__(self, path: Path, topic: str | None, reading: Reading = IMAGES) -> None:
+    def __init__(self, path: Path, topic: str | None, reading: InputOptions = IMAGES) -> None:
         self.path, self.topic, self.encoding = path, path.stem, path.suffix[1:]
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a table has no topics, leave {topic} out; see --field")
@@ -77,7 +77,7 @@ class TableNumbers(ImageStream):
         numbers = np.concatenate(list(columns.values()), axis=1)
         # A missing number is not out of bounds: input.range keeps no row without one.
         whole = ~np.any([np.isnan(own).all(axis=1) for own in columns.values()], axis=0)
-        whole &= np.isfinite(numbers).all(axis=1) | (reading.depth is not None)
+        whole &= np.isfinite(numbers).all(axis=1) | (reading.range is not None)
         if times is not None:
             whole &= times >= 0
         elif not whole.all():
@@ -101,7 +101,7 @@ class TableNumbers(ImageStream):
                 said.append(f"{late} rows stand after later ones: taken in the order of {of_times}")
             self._rows = self._rows[order]
             self.times = sorted_times(str(path), stamps[order])
-        self._numbers = bounded(numbers, reading.depth)[self._rows]
+        self._numbers = bounded(numbers, reading.range)[self._rows]
         if (np.abs(self._numbers) > EXACT).any():
             said.append("numbers beyond 2^53 may be rounded, to float64")
         self.warnings = [f"{path}: {line}" for line in said]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.modules import Module
-from recorder.images.recipe import Recipe
+from recorder.images.framing import Recipe
 from recorder.log.files import atomic_write
 from replay.runs.folders import MODULES_FILE
 from replay.storage.arrays import read_arrays

@@ -17,7 +17,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from cdmisfa.modules import Module
-from recorder.images.recipe import Recipe
+from recorder.images.framing import Recipe
 from replay.runs.columns import Blocks, SignalColumns, has_values, whole_signals
 from replay.runs.folders import MODULES_FILE, read_run_json, run_log
 from replay.runs.log import RunHeader, read_columns, read_header

@@ -30,8 +30,7 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Keyframe
 from cdmisfa.experiments.sources import configure
-from recorder.images.decoding import MessageKind
-from recorder.images.messages import image_decoder
+from recorder.images.messages import MessageKind, image_decoder
 from recorder.images.videos import VideoPackets
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images

@@ -9,18 +9,20 @@ from __future__ import annotations
 import io
 import re
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from cdmisfa.core.errors import LogDamagedError
-
-
-class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where
-    """No image that can be read; the caller adds where it was."""
-
+from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.untrusted import BUDGET, budget
+from recorder.images.pixels import MAX_PIXELS, MalformedImage, by_bands
 
 _JPEG: Final = b"\xff\xd8"
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
@@ -41,6 +43,92 @@ _AHEAD: Final = b"\xff\x00" * 8
 _NO_END: Final = "its JPEG is damaged: it lacks its end marker"
 _LEFT: Final = 64
 """Bytes before the end that may stand for nothing, too: some cameras leave a few."""
+
+
+AT_ONCE: Final = 4_000_000
+"""Most pixels of an image that is decoded beside others, without a limit to the memory it takes."""
+
+_WORDS: Final = ("I;16", "I;16B", "I")
+"""Pillow's modes of 16 bit."""
+
+_ORIENTATION: Final = 0x0112
+"""The tag of EXIF that says how a camera was held."""
+
+_TURNS: Final = (
+    *("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE"),
+    *("ROTATE_270", "TRANSVERSE", "ROTATE_90"),
+)
+"""What puts an image upright, by its orientation from 2 on; 1 is."""
+
+
+def compressed_image(data: bytes, *, color: bool = False, most: int = MAX_PIXELS) -> ByteArray:
+    """The image in a JPEG or PNG, gray, (height, width) uint8.
+
+    Args:
+        data: the file.
+        color: give what has colours as they are, (height, width, 3) red, green and blue.
+        most: its pixels at most; no more than `AT_ONCE` in several threads at once.
+
+    Raises:
+        MalformedImage: it is neither, broken, or too large.
+    """
+    with _opened(data, most) as image:
+        if image.mode in _WORDS:
+            words = np.asarray(image)
+            return by_bands(words, lambda part: (part.astype(np.int64) >> 8).clip(0, 255))
+        if image.mode not in ("L", "RGB"):
+            image = image.convert("RGB")
+        return np.array(image if color else image.convert("L"), np.uint8)
+
+
+def compressed_words(data: bytes) -> NDArray[np.uint16]:
+    """Decode a PNG of 16 bit, as distances are packed in, into (height, width).
+
+    Raises:
+        MalformedImage: it is none, broken, or too large.
+    """
+    with _opened(data) as image:
+        if image.mode not in _WORDS:
+            raise MalformedImage(f"its distances are packed as {image.mode}, not in 16 bit")
+        return np.asarray(image).astype(np.uint16)
+
+
+@contextmanager
+def _opened(data: bytes, most: int = MAX_PIXELS) -> Iterator[Image.Image]:
+    """Decode a JPEG or PNG, turned upright."""
+    limit = f"more than {BUDGET >> 20} MiB of memory, the limit"
+    try:
+        with nullcontext() if most <= AT_ONCE else budget():
+            file = open_picture(data)
+            if not 0 < file.width * file.height <= most:
+                raise MalformedImage(f"an image of {file.width}x{file.height} is not read")
+            # Of a progressive JPEG all coefficients are held until its end.
+            held = file.width * file.height * (2 * len(file.getbands()) + 4)
+            if file.info.get("progressive") and held > BUDGET:
+                raise MalformedImage(
+                    f"a progressive JPEG of {file.width}x{file.height} in {file.mode} takes {limit}"
+                )
+            load_picture(file, data)
+            image: Image.Image = file
+            if 2 <= (orientation := _orientation(image)) <= 8:
+                image = image.transpose(Image.Transpose[_TURNS[orientation - 2]])
+            yield image
+    except MalformedImage:
+        raise
+    except MemoryError:
+        raise MalformedImage(f"its JPEG or PNG takes {limit}") from None
+    except Exception as error:  # Pillow raises whatever its codecs raise
+        raise MalformedImage(f"its JPEG or PNG is broken ({type(error).__name__})") from None
+
+
+def _orientation(image: Image.Image) -> int:
+    """EXIF's orientation, 1 to 8; 1, upright, where it is missing or broken."""
+    if "exif" not in image.info:
+        return 1
+    try:
+        return int(image.getexif().get(_ORIENTATION, 1))
+    except Exception:  # Pillow raises whatever its parser raises; the picture may be whole
+        return 1
 
 
 def open_picture(data: bytes) -> ImageFile:
