@@ -20,7 +20,7 @@ import psutil
 from benchmarks.applying import MODULES, OUTPUTS, make_run
 from benchmarks.foreign import VGA, pictures
 from benchmarks.report import middle, save
-from cdmisfa.experiments.apply.corpus import apply_to_logs
+from cdmisfa.experiments.apply_logs import apply_to_logs
 from recorder.images.options import InputOptions
 from replay.arrays import ArrayLog
 from replay.export.frames import write_film

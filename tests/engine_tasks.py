@@ -34,7 +34,7 @@ def die_while_sending(size: int, seconds: float) -> bytes:
 
 def apply_or_die(trial: Any) -> Any:
     """Apply modules to a log, unless that kills its worker, as its name says; notes each death."""
-    from cdmisfa.experiments.apply.corpus import compute
+    from cdmisfa.experiments.apply_logs import compute
 
     if "deadly" in trial.name:
         with open(trial.files[0] + ".deaths", "a") as file:

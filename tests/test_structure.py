@@ -31,7 +31,6 @@ FORBIDDEN = {
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
     "cdmisfa.estimators": ("cdmisfa.experiments.session", "replay.palette", "recorder.config"),
     "cdmisfa.experiments": ("cdmisfa.studies.paper.reproduce", "cdmisfa.cli.app"),
-    "cdmisfa.experiments.apply": ("cdmisfa.studies.paper.reproduce", "cdmisfa.cli.app"),
     "cdmisfa.agents.progress": ("cdmisfa.experiments.session", "replay.palette", "rerun"),
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),
     "cdmisfa.public": ("cdmisfa.studies.demo", "cdmisfa.cli.app"),

@@ -144,7 +144,7 @@ def _apply_to_many(
     ctx: click.Context, run: Path, source: Sequence[str], out: Path, *, as_json: bool, **how: Any
 ) -> None:
     """Apply modules to each of many logs, into a folder, and print what became of them."""
-    from cdmisfa.experiments.apply.corpus import apply_to_logs
+    from cdmisfa.experiments.apply_logs import apply_to_logs
 
     calls = itertools.count()
     with bar("indexing", "logs") as shown:
@@ -206,7 +206,8 @@ def applied(
     force: bool,
 ) -> Totals:
     """Apply modules to an open source, into its file and to where blocks go as they come."""
-    from cdmisfa.experiments.apply import Totals, follow, written_to
+    from cdmisfa.experiments.apply import Totals, follow
+    from cdmisfa.experiments.apply_logs import written_to
     from replay.export.applied import LinesSink
 
     live = hasattr(source, "stop")

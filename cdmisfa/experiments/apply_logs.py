@@ -1,0 +1,329 @@
+"""Modules applied to each of many logs, in many processes: one file per log, one table of all."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
+from cdmisfa.core.names import stream_name
+from cdmisfa.core.untrusted import read_json
+from cdmisfa.experiments.apply import Application, Totals, follow
+from cdmisfa.experiments.documents import plain, write_json
+from cdmisfa.experiments.store import (
+    FAILED,
+    ROWS,
+    StoredTrial,
+    answer,
+    code,
+    read_rows,
+    run_trials,
+    trial_id,
+)
+from cdmisfa.modules import Module
+from recorder.images.options import InputOptions
+from recorder.log.files import (
+    found_path,
+    held,
+    make_folder,
+    refuse_existing,
+    relative_path,
+    to_disk,
+)
+from replay.corpus.finding import INDEX
+from replay.corpus.index import IndexedLog, index_logs, indexed_logs, is_index
+from replay.export.applied import AppliedSink, written
+
+STORE: Final = "_applied"
+"""Folder of the state of the logs; programs that read data sets skip names with an underscore."""
+
+REQUEST: Final = "apply.json"
+"""File in it that states which modules were applied, and with which options."""
+
+COMPUTED: Final = ("cdmisfa/modules", "cdmisfa/experiments/apply", "replay/export/applied")
+"""Modules of this package that decide the bytes of the files."""
+
+_LONGEST: Final = 48
+"""Most letters of a log's name that become part of a file's name."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ApplyTrial(StoredTrial):
+    """One log that modules are applied to; `log` is the file of the outputs.
+
+    Attributes:
+        name: the log's name, relative to the folder of all logs.
+        files: the log's files.
+        application: the modules.
+        part: where the file is written until it is complete.
+        options: arguments of `Application.open`.
+        frames: end after this many.
+    """
+
+    name: str
+    files: tuple[str, ...]
+    application: Application
+    part: Path
+    options: Mapping[str, Any]
+    frames: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class AppliedLogs:
+    """Outcome of applying modules to many logs.
+
+    Attributes:
+        out: the folder of the files.
+        logs: a row per log: `log`, `out`, `frames`, `error`, `warnings`, and `exit_code`.
+        computed: the number of logs that were tried now.
+        skipped: the number of logs that were finished, or had failed, before.
+    """
+
+    out: Path
+    logs: Sequence[Mapping[str, Any]]
+    computed: int
+    skipped: int
+
+    @property
+    def failed(self) -> list[Mapping[str, Any]]:
+        """The rows of logs with no outputs, or with outputs that end early."""
+        return [row for row in self.logs if row["error"]]
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command."""
+        return max((row["exit_code"] for row in self.failed), default=0)
+
+
+def apply_to_logs(
+    run: str | Path,
+    words: Sequence[str],
+    out: Path,
+    *,
+    form: str = "parquet",
+    inputs: InputOptions | None = None,
+    frames: int | None = None,
+    loop: bool = False,
+    salvage: bool = False,
+    force: bool = False,
+    indexing: Callable[[float, float | None], None] = lambda done, total: None,
+    **where: Any,
+) -> AppliedLogs:
+    """Apply the modules of a run to each of many logs that has no outputs in a folder yet.
+
+    The files are the same to the byte for any number of processes, and on dask. A log whose size
+    or time of change differs is applied to again.
+
+    Args:
+        run: the run's folder.
+        words: folders, patterns, files and URLs of logs, or indices of them.
+        out: the folder of the files; a shared one if workers run on other machines.
+        form: the ending of the files.
+        inputs: see `Application.open`, as for `loop` and `salvage`.
+        frames: end after this many frames of each stream.
+        loop: start a log again at its end.
+        salvage: skip damaged parts.
+        force: replace outputs of other modules or options.
+        indexing: called with the number of logs that were indexed, and of all.
+        where: `jobs`, `scheduler`, `retry_failed` and `progress` of `run_trials`.
+
+    Raises:
+        UsageError: there is no such run or log, or the folder holds something else.
+        LogWriteError: a file cannot be written; those before are kept.
+        WorkersError: a worker died, or no scheduler answers.
+    """
+    application, out = Application(run), Path(out).resolve()
+    inputs = inputs or InputOptions()
+    options = {"inputs": inputs, "loop": loop, "salvage": salvage}
+    depends = plain(options | {"form": form, "frames": frames, "inputs": asdict(inputs)})
+    request = {"schema": 1, "modules": application.identity, "options": depends}
+    folder, parts = out / STORE, out / STORE / "parts"
+    if not folder.exists():
+        refuse_existing(out, force=force, goes_on=False)
+    with contextlib.ExitStack() as stack:
+        with _writing(out):
+            make_folder(folder)
+        stack.enter_context(held(out))
+        stack.callback(shutil.rmtree, parts, ignore_errors=True)
+        shutil.rmtree(parts, ignore_errors=True)  # files that a killed process left
+        make_folder(parts)
+        root = _earlier_root(folder, request, force=force) or _common_root(words, out)
+        trials = []
+        for name, log in _find_logs(words, folder / INDEX, root, out, indexing, where):
+            file = _file_name(name, form)
+            version = code(*COMPUTED)
+            trial = ApplyTrial(
+                id=trial_id(name, log.states, application.identity, depends, version),
+                point={"log": name},
+                seed=0,
+                code=version,
+                log=out / file,
+                name=name,
+                files=tuple(f if "://" in f else os.path.normpath(f) for f in log.files),
+                application=application,
+                part=parts / file,
+                options=options,
+                frames=frames,
+            )
+            trials.append(trial)
+
+        def begin(missing: Sequence[ApplyTrial]) -> None:
+            write_json(folder / REQUEST, {**request, "root": relative_path(root, folder)})
+            for trial in missing:
+                (out / trial.part.name).unlink(missing_ok=True)  # the log or the code has changed
+
+        report = run_trials(trials, folder, compute, begin=begin, **where)
+        rows = {row["id"]: row for row in read_rows(folder)}
+    outcome = [_outcome(trial, rows[trial.id]) for trial in trials]
+    return AppliedLogs(out, outcome, report.trials - report.skipped, report.skipped)
+
+
+def compute(trial: ApplyTrial) -> Mapping[str, Any]:
+    """Apply modules to one log; return the outcome, or under "error" why there is none."""
+    return answer(trial, code(*COMPUTED), _compute)
+
+
+def _compute(trial: ApplyTrial) -> dict[str, Any]:
+    application = trial.application
+    column = trial.name if trial.part.suffix in (".parquet", ".csv") else None
+    with contextlib.closing(application.open(trial.files, **trial.options)) as source:
+        totals = Totals(source.spec, application.modules)
+        with (
+            written_to(
+                trial.part, source.spec, application.modules, force=True, log=column
+            ) as sink,
+            contextlib.closing(application.to(source, trial.frames)) as blocks,
+        ):
+            follow(blocks, [sink], totals)
+        warnings = [*getattr(source, "warnings", ()), *getattr(source, "changes", {}).values()]
+        warnings += getattr(source, "salvaged", list)()
+    assert trial.log is not None
+    with _writing(trial.log):
+        os.replace(trial.part, trial.log)
+        to_disk(trial.log.parent)
+    damaged = None if totals.damaged is None else str(totals.damaged)
+    return {"frames": totals.frames, "damaged": damaged, "warnings": warnings}
+
+
+def written_to(
+    place: Path,
+    spec: SourceSpec,
+    modules: Sequence[Module],
+    *,
+    force: bool,
+    log: str | None = None,
+) -> AbstractContextManager[AppliedSink]:
+    """Open the sink that writes a file of outputs, by the ending of its name; see `written`."""
+    if place.suffix.lower() == ".rrd":
+        from replay.view.applied import written_view  # takes half a second
+
+        return written_view(place, spec, modules, force=force)
+    return written(place, spec, modules, force=force, log=log)
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise LogWriteError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _earlier_root(folder: Path, request: Mapping[str, Any], *, force: bool) -> str:
+    """Return the folder that names are relative to since the first outputs were written, or "".
+
+    With `force`, the outputs are removed; other files stay.
+
+    Raises:
+        UsageError: the outputs are of other modules, or were made with other options.
+        LogDamagedError: the file that states it is damaged.
+    """
+    path, remedy = folder / REQUEST, "replace all of it with --force"
+    if force and path.exists():
+        names = [Path(row["run"]).name for row in read_rows(folder) if row.get("run")]
+        for output in (*(folder.parent / name for name in names), folder / ROWS, path):
+            output.unlink(missing_ok=True)
+    if not path.exists():
+        return ""
+    earlier = read_json(path, remedy)
+    if not isinstance(earlier, dict) or not isinstance(earlier.get("root"), str):
+        raise LogDamagedError(f"{path} is damaged: {remedy}")
+    if other := [name for name in request if earlier.get(name) != request[name]]:
+        raise UsageError(
+            f"{folder.parent} holds outputs of other {other[0]}: choose another folder, or {remedy}"
+        )
+    return found_path(earlier["root"], folder)
+
+
+def _common_root(words: Sequence[str], out: Path) -> str:
+    """Return the folder that holds all logs of this machine."""
+    folders = []
+    for word in words:
+        if "://" not in word:
+            magic = None if os.path.exists(word) else re.search(r"[*?[]", word)
+            path = os.path.abspath(word)
+            if magic is not None:
+                path = os.path.abspath(os.path.dirname(word[: magic.start()]))
+            folders.append(path if os.path.isdir(path) else os.path.dirname(path))
+    return os.path.commonpath(folders) if folders else str(out)
+
+
+def _find_logs(
+    words: Sequence[str],
+    index: Path,
+    root: str,
+    out: Path,
+    indexing: Callable[[float, float | None], None],
+    where: Mapping[str, Any],
+) -> list[tuple[str, IndexedLog]]:
+    """Index the logs that words name; return their names and entries in the order of names."""
+    indices = [Path(word).resolve() for word in words if is_index(Path(word))]
+    if others := [word for word in words if not is_index(Path(word))]:
+        index_logs(others, index, jobs=where.get("jobs", 1), told=indexing)
+        indices.append(index)
+    found: dict[str, IndexedLog] = {}
+    for path in indices:
+        for log in indexed_logs(path):
+            name = log.name
+            if "://" not in name:
+                name = os.path.normpath(path.parent / name)
+                if name.startswith(os.path.join(out, "")):
+                    continue
+                name = os.path.relpath(name, root) if name != root else os.path.basename(name)
+            found[name] = log
+    if not found:
+        raise UsageError(f"{' '.join(words)}: there is no log")
+    return sorted(found.items())
+
+
+def _file_name(log: str, form: str) -> str:
+    """Return a name of a file that no other log has, and that every program accepts."""
+    name = stream_name(log)[:_LONGEST]
+    if name != log:
+        name += f"-{hashlib.sha256(log.encode()).hexdigest()[:12]}"
+    return f"{name}.{form}"
+
+
+def _outcome(trial: ApplyTrial, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the outcome of a log as `apply --json` prints it, and its exit code."""
+    if row["status"] == FAILED:
+        failed = {"error": row["error"], "exit_code": row.get("exit_code", 1)}
+        return {"log": trial.name, "out": None, "frames": 0, "warnings": [], **failed}
+    result = row["result"]
+    return {
+        "log": trial.name,
+        "out": str(trial.log),
+        "frames": result["frames"],
+        "warnings": result["warnings"],
+        "error": result["damaged"],
+        "exit_code": 0 if result["damaged"] is None else LogDamagedError.exit_code,
+    }
