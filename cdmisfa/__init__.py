@@ -11,23 +11,14 @@ records sources, `replay` reads and shows what was logged.
 """
 
 import os
+from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.core.exports import exports
-
 if TYPE_CHECKING:
-    from cdmisfa.agents.learner import CuriousLearner as CuriousLearner
-    from cdmisfa.core.blocks import Block as Block
-    from cdmisfa.core.blocks import FrameSource as FrameSource
-    from cdmisfa.core.blocks import SeekableSource as SeekableSource
-    from cdmisfa.core.blocks import SourceSpec as SourceSpec
-    from cdmisfa.core.config import LearnerConfig as LearnerConfig
     from cdmisfa.core.errors import CdmisfaError as CdmisfaError
-    from cdmisfa.core.learning import Learner as Learner
     from cdmisfa.core.learning import Sink as Sink
     from cdmisfa.core.signals import SIGNALS as SIGNALS
-    from cdmisfa.core.signals import BlockSignals as BlockSignals
     from cdmisfa.estimators.batches import IncSFA as IncSFA
     from cdmisfa.estimators.batches import RecursiveSFA as RecursiveSFA
     from cdmisfa.modules import Module as Module
@@ -43,43 +34,25 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_home = os.path.dirname(os.path.dirname(__file__))
-for _name in ("recorder", "replay"):  # another project's package hides ours, or lies over it
-    if _spec := find_spec(_name):
-        _ours = os.path.dirname(_spec.origin or "") == f"{_home}/{_name}"
-        if _ours:
-            with open(_spec.origin or "", "rb") as _file:
-                _ours = b"from cdmisfa" in _file.read()
-        if not _ours:
-            raise ImportError(
-                f"{_name} is not cdmisfa's: {_spec.origin}; give cdmisfa an environment of its own"
-            )
-
-_load, __dir__, __all__ = exports(
-    __name__,
-    {
-        "cdmisfa.core.errors": "CdmisfaError",
-        "cdmisfa.core.learning": "Sink",
-        "cdmisfa.core.signals": "SIGNALS",
-        "cdmisfa.estimators.batches": "IncSFA RecursiveSFA",
-        "cdmisfa.modules": "Module",
-        "cdmisfa.public.learning": "learn",
-        "cdmisfa.public.recording": "Recording",
-        "cdmisfa.public.run": "Run",
-        "cdmisfa.watching": "WatchEnv",
-        "recorder.cameras.stepped": "GymSource",
-        "recorder.images.framing": "Recipe make_frame",
-    },
-    beside={
-        "cdmisfa.agents.learner": "CuriousLearner",
-        "cdmisfa.core.blocks": "Block FrameSource SeekableSource SourceSpec",
-        "cdmisfa.core.config": "LearnerConfig",
-        "cdmisfa.core.learning": "Learner",
-        "cdmisfa.core.signals": "BlockSignals",
-        "recorder.cameras.stepped": "ArraySource",
-        "recorder.world.oscillatory": "OscillatorySource",
-    },
-)
+# The module of each public name. It is imported on first use, so that commands start quickly.
+_MODULES = {
+    "CdmisfaError": "cdmisfa.core.errors",
+    "Sink": "cdmisfa.core.learning",
+    "SIGNALS": "cdmisfa.core.signals",
+    "IncSFA": "cdmisfa.estimators.batches",
+    "RecursiveSFA": "cdmisfa.estimators.batches",
+    "Module": "cdmisfa.modules",
+    "learn": "cdmisfa.public.learning",
+    "Recording": "cdmisfa.public.recording",
+    "Run": "cdmisfa.public.run",
+    "WatchEnv": "cdmisfa.watching",
+    "ArraySource": "recorder.cameras.stepped",
+    "GymSource": "recorder.cameras.stepped",
+    "Recipe": "recorder.images.framing",
+    "make_frame": "recorder.images.framing",
+    "OscillatorySource": "recorder.world.oscillatory",
+}
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
@@ -87,4 +60,25 @@ def __getattr__(name: str) -> Any:
         from importlib import metadata
 
         return metadata.version(__name__)
-    return _load(name)
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+# The package `recorder` or `replay` of another project may hide ours, or lie over it.
+_HOME = os.path.dirname(os.path.dirname(__file__))
+for _name in ("recorder", "replay"):
+    if _spec := find_spec(_name):
+        _ours = os.path.dirname(_spec.origin or "") == f"{_HOME}/{_name}"
+        if _ours:
+            with open(_spec.origin or "", "rb") as _file:
+                _ours = b"cdmisfa" in _file.read()
+        if not _ours:
+            raise ImportError(
+                f"{_name} is not cdmisfa's: {_spec.origin}; give cdmisfa an environment of its own"
+            )

@@ -20,11 +20,11 @@ from cdmisfa.core.config import (
     LearnerConfig,
     build,
     load_preset,
+    parse_settings,
     presets,
     section_table,
 )
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.options import parse_settings
 from recorder.config import RecordConfig
 from recorder.images.options import InputConfig
 from recorder.world.icub.config import IcubConfig

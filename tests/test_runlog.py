@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from run_data import IMAGE, VECTOR, parts_of, read_signals, rows_of, run_of, signals_of, write_run
 
-import replay
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SIGNALS, canonical_bytes
@@ -25,6 +24,7 @@ from replay.runs.codec import (
     encode_signals,
 )
 from replay.runs.log import read_header
+from replay.runs.run import Run
 
 
 @given(
@@ -184,7 +184,7 @@ def folder(tmp_path):
 
 def test_signals_are_columns_over_all_iterations(folder):
     path, records = folder
-    run = replay.Run(path)
+    run = Run(path)
     assert run.streams == VECTOR.streams
     assert set(run.signals) == set(SIGNALS)
     assert "etta" not in run.signals
@@ -201,8 +201,8 @@ def test_signals_are_columns_over_all_iterations(folder):
 
 def test_the_result_is_there_once_the_run_has_ended(folder):
     path, _ = folder
-    assert replay.Run(path).result is None
+    assert Run(path).result is None
     (path / "run.json").write_text(json.dumps({"result": {"iterations": ITERATIONS}}))
-    assert replay.Run(path / "run.mcap").result == {"iterations": ITERATIONS}
+    assert Run(path / "run.mcap").result == {"iterations": ITERATIONS}
     (path / "run.json").write_text("{")
-    assert replay.Run(path).result is None
+    assert Run(path).result is None

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import UsageError, one_line
-from cdmisfa.core.registry import Registry
+from cdmisfa.core.errors import Registry, UsageError, one_line
 
 if TYPE_CHECKING:  # the command line names the learners without numpy
     from cdmisfa.core.blocks import SourceSpec

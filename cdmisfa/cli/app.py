@@ -22,8 +22,7 @@ import click
 from cdmisfa.cli.interrupts import end_at_once, ignore_at_the_end, interruptible
 from cdmisfa.cli.options import quiet
 from cdmisfa.cli.printing import Stderr
-from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.errors import CdmisfaError, UsageError, did_you_mean
 from cdmisfa.core.untrusted import printable
 from replay.storage.location import with_urls
 

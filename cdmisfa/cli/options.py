@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.cli.printing import Stderr
+from cdmisfa.core.config import parse_settings
 from cdmisfa.core.errors import TooSmallError, UsageError
-from cdmisfa.core.options import parse_settings
 from replay.storage.location import location
 
 if TYPE_CHECKING:

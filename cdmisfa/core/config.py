@@ -13,7 +13,7 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
@@ -21,8 +21,7 @@ from operator import index
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from cdmisfa.core.errors import UsageError
-from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.core.untrusted import read_regular
 
 Section = TypeVar("Section")
@@ -371,3 +370,21 @@ def section_table(section: Any) -> dict[str, Any]:
             plain = list(value) if isinstance(value, tuple) else value
             table[field.name] = "auto" if value is None else plain
     return table
+
+
+def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Turn `section.key=value` words into sections of texts.
+
+    Raises:
+        UsageError: a word of another form.
+    """
+    sections: dict[str, dict[str, str]] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not (equals and section and dot and name):
+            raise UsageError(
+                f"--set {shown(word)}: write it as section.key=value, as learner.nu=0.02"
+            )
+        sections.setdefault(section, {})[name] = value.strip()
+    return sections

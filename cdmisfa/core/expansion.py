@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import as_frames
 from cdmisfa.core.blocks import PIXEL, UINT8
-from cdmisfa.core.registry import Registry
+from cdmisfa.core.errors import Registry
 
 
 @dataclass(frozen=True, slots=True)

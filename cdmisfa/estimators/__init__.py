@@ -1,11 +1,13 @@
 """Slow feature analysis in the interfaces of scikit-learn and of river."""
 
-from cdmisfa.core.exports import exports
+from importlib import import_module
+from typing import Any
 
-__getattr__, __dir__, __all__ = exports(
-    __name__,
-    {
-        "cdmisfa.estimators.batches": "IncSFA RecursiveSFA",
-        "cdmisfa.estimators.samples": "OnlineSFA",
-    },
-)
+_MODULES = {"IncSFA": "batches", "RecursiveSFA": "batches", "OnlineSFA": "samples"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import an estimator on first use: scikit-learn and river take a second each."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -11,10 +11,9 @@ from typing import Any
 
 from cdmisfa.agents.learners import learner_entry, open_learner
 from cdmisfa.core.blocks import SeekableSource, SourceSpec
-from cdmisfa.core.config import build, section_table
+from cdmisfa.core.config import build, parse_settings, section_table
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState
-from cdmisfa.core.options import parse_settings
 from cdmisfa.experiments.sources import configure, open_logs
 from recorder.cameras.words import is_live
 from recorder.config import RecordConfig

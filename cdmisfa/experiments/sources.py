@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS, learner_entry
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
-from cdmisfa.core.config import LearnerConfig, build, load_preset, section_table
-from cdmisfa.core.errors import UsageError, are_for
-from cdmisfa.core.options import parse_settings
-from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_settings, section_table
+from cdmisfa.core.errors import UsageError, are_for, did_you_mean
 from recorder.cameras.words import CAMERAS, is_live, open_live, refuse_stored
 from recorder.config import RecordConfig, SceneConfig
 from recorder.images.options import InputConfig, InputOptions

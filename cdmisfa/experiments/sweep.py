@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from cdmisfa.agents.learners import LEARNERS, learner_entry
-from cdmisfa.core.config import section_table
+from cdmisfa.core.config import parse_settings, section_table
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.options import parse_settings
 from cdmisfa.core.untrusted import MAX_LIST
 from cdmisfa.experiments.documents import as_text, write_json
 from cdmisfa.experiments.run_folder import module_table, with_recipes

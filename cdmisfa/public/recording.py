@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.errors import UsageError
-from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.core.shown import Shown
 from cdmisfa.experiments.sources import open_logs
 from cdmisfa.public.shown import view

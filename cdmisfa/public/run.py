@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.core.learning import Learner
-from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.shown import Shown
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.recompute import Run as RecomputedRun

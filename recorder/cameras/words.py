@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from cdmisfa.core.blocks import FrameSource
-from cdmisfa.core.errors import UsageError, are_for
+from cdmisfa.core.errors import Registry, UsageError, are_for
 from cdmisfa.core.names import stream_names
-from cdmisfa.core.registry import Registry
 from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, InputOptions
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ from weakref import WeakKeyDictionary
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
 from cdmisfa.core.config import section_table
-from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.registry import Registry
+from cdmisfa.core.errors import CdmisfaError, Registry, UsageError
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.source import IcubSource

@@ -7,8 +7,7 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Final
 
-from cdmisfa.core.errors import UsageError
-from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.errors import UsageError, did_you_mean
 from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
 from replay.camera_logs.opening import only_foreign

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
-from cdmisfa.core.registry import did_you_mean
+from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError, did_you_mean
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
 from cdmisfa.experiments.store import StoredTrial, answer, code, read_rows, run_trials, trial_id
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Trial
