@@ -25,7 +25,7 @@ from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
-from replay.runs.compare import told_otherwise
+from replay.runs.compare import different_settings
 from replay.runs.log import read_header
 from replay.storage import identity
 
@@ -156,7 +156,7 @@ def test_a_killed_run_goes_on_with_its_file_alone(recording: Path, tmp_path: Pat
         learn(other, tmp_path / "run", resume=True)
     result = learn(recording, tmp_path / "run", resume=True)
     assert result.as_json() | {"run": ""} == whole.as_json() | {"run": ""}
-    assert told_otherwise(tmp_path / "run", tmp_path / "whole") == ()
+    assert different_settings(tmp_path / "run", tmp_path / "whole") == ()
 
 
 def test_what_changes_meanwhile_is_damage_and_the_run_is_kept(

@@ -339,7 +339,7 @@ def test_compare_says_what_differs_and_shows_both(
         session.learn(rerun=False)
     found = cdmisfa("compare", parent, fork)
     assert found.code == 4
-    told = "fork was told otherwise: learner.epsilon_decay 0.999 against 0.5; seed 3 against 8"
+    told = "fork has other settings: learner.epsilon_decay 0.999 against 0.5; seed 3 against 8"
     assert told in found.out
     lines = found.out.splitlines()
     shown = [line.split()[0] for line in lines[lines.index(SIGNALS_OF) + 3 :]]
@@ -349,7 +349,7 @@ def test_compare_says_what_differs_and_shows_both(
     assert (document["identical"], document["first_difference"]["iteration"]) == (False, 20)
     first, second = document["signals"]["epsilon"]
     assert (first > second, document["signals"]["t"]) == (True, [800, 800])
-    keys = [told["key"] for told in document["runs"][1]["told_otherwise"]]
+    keys = [row["key"] for row in document["runs"][1]["different_settings"]]
     assert keys == ["learner.epsilon_decay", "seed"]
     assert document["runs"][1]["verdict"] in (SAME, OTHER)
     both = [read_outline(run) for run in (parent, fork)]

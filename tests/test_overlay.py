@@ -151,4 +151,6 @@ def test_a_run_that_ended_early_is_said_so(tmp_path):
         writer.block(block, signals, having(np.zeros((1, 2))))
     writer.finish()
     difference = first_difference(tmp_path / "a", tmp_path / "b")
-    assert str(difference) == "iteration 6: the first goes on, the second ended after 6 iterations"
+    assert (
+        str(difference) == "iteration 6: the first continues, the second ended after 6 iterations"
+    )

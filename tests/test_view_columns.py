@@ -16,7 +16,6 @@ from replay.runs.codec import (
     SIGNALS_DEFINITION,
     decode_columns,
     decode_matrices,
-    decode_matrix,
     encode_matrix,
     encode_signals,
 )
@@ -118,11 +117,12 @@ def test_matrices_of_one_size_are_read_bit_for_bit_however_they_are_laid_out():
     rows[1, 2] = np.array([0x7FF8_0000_0000_0001, 1 << 63, 0], np.uint64).view(np.float64)
     ours = [encode_matrix(5 * i, values) for i, values in enumerate(rows)]
     plain = [rewritten(MATRIX_DEFINITION, data) for data in ours]
-    for messages, pieces in ((ours, 1), (plain[1:], 3), ([encode_matrix(7, rows[0, :0])] * 2, 2)):
-        found = list(decode_matrices(messages))
-        expected = [decode_matrix(data) for data in messages]
-        assert len(found) == pieces
-        frames = np.concatenate([t + np.arange(len(values)) for t, values in expected])
-        np.testing.assert_array_equal(np.concatenate([t for t, _ in found]), frames)
-        values = np.concatenate([values for _, values in found])
-        assert values.tobytes() == b"".join(values.tobytes() for _, values in expected)
+    for messages, pieces, first in ((ours, 1, 0), (plain[1:], 3, 1)):
+        matrices = list(decode_matrices(messages))
+        assert len(matrices) == pieces
+        t = np.concatenate([t for t, _ in matrices])
+        np.testing.assert_array_equal(t, 5 * np.arange(first, len(rows)))
+        values = np.concatenate([values for _, values in matrices])
+        assert values.tobytes() == rows[first:].tobytes()
+    empty = list(decode_matrices([encode_matrix(7, rows[0, :0])] * 2))
+    assert [(t.tolist(), values.shape) for t, values in empty] == [([7], (1, 0, 3))] * 2

@@ -28,6 +28,7 @@ from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.words import is_live, open_live, refuse_stored
+from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
 from replay.arrays import TAKES, ArrayLog, are_arrays
 from replay.camera_logs.opening import ALL, only_foreign
@@ -77,7 +78,7 @@ class Application:
             raise UsageError(f"{path} has no modules: learn longer, or name another run")
         self.tau = int(run.header.manifest["config"]["learner"]["tau"])
         self._stack = Stack(self.modules)
-        self.recipe = self.modules[0].recipe or run.recipe()
+        self.recipe = self.modules[0].recipe or Recipe(run.header.spec.frame_shape)
         self._folder = run.log.parent
 
     @functools.cached_property

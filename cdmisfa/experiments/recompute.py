@@ -33,7 +33,7 @@ from replay.runs.compare import Difference, differing, first_differing
 from replay.runs.folders import run_log
 from replay.runs.keyframes import arrays_of, read_keyframe, read_keyframes
 from replay.runs.log import RunHeader, read_columns, read_header
-from replay.runs.run import other_files, stated_source
+from replay.runs.provenance import changed_files, stated_source
 from replay.stored import StoredSource
 
 SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
@@ -223,7 +223,7 @@ class Recomputation:
         """
         if self._source is None or self._words:
             return []
-        return other_files(stated_source(self.log), description(self._source, at_once=True))
+        return changed_files(stated_source(self.log), description(self._source, at_once=True))
 
     def close(self) -> None:
         """Let go of the source."""

@@ -25,7 +25,7 @@ from replay.runs.compare import differences
 from replay.runs.folders import RUN_FILE
 from replay.runs.keyframes import read_keyframe
 from replay.runs.log import RunHeader, read_header
-from replay.runs.run import known_to_both, stated_source
+from replay.runs.provenance import comparable, stated_source
 
 COMMAND = "command"
 """Key of a manifest: the command that began the run, which may differ when it is resumed."""
@@ -220,7 +220,7 @@ def refuse_difference(
     Raises:
         UsageError: there is one.
     """
-    source_then, source_now = known_to_both(stated_source(log), _json(manifest["source"]))
+    source_then, source_now = comparable(stated_source(log), _json(manifest["source"]))
     before = {
         **header.manifest,
         "source": source_then,

@@ -28,7 +28,7 @@ from recorder.log.files import (
 from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, REPORT_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.modules import save_modules
-from replay.runs.run import final_record
+from replay.runs.provenance import final_record
 from replay.runs.writer import RunWriter
 from replay.storage.identity import LoggedSource
 

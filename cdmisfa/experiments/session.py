@@ -46,7 +46,7 @@ from cdmisfa.experiments.run_folder import (
 )
 from recorder.log.files import folder_here
 from replay.runs.folders import run_log
-from replay.runs.run import stated_source, states_whole
+from replay.runs.provenance import has_whole_hashes, stated_source
 from replay.runs.writer import RunWriter
 
 Hashing = Callable[[int, int], None]
@@ -150,7 +150,7 @@ class Session:
                 "stopped: resume from its recording, or begin another run"
             )
         log, header = header_to_resume(folder_here(folder))
-        whole = header is not None and states_whole(stated_source(log))
+        whole = header is not None and has_whole_hashes(stated_source(log))
         described = description(source, at_once=not whole, told=hashing)
         session = cls(source, config, folder, described=described, **how)
         session._resumed = True

@@ -26,7 +26,7 @@ from replay.recordings.view_file import ViewFile
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
 from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, header_in
 from replay.runs.modules import load_modules
-from replay.runs.run import facts_sha256
+from replay.runs.provenance import facts_sha256
 from replay.storage.arrays import MAX_BYTES
 
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.signals import NO_STATE, STATES
-from replay.runs.rules import rules_of
-from replay.runs.run import Outline
+from replay.runs.run import Outline, rules_of
 
 LIVELY = (0.5, 2.0)
 """Variance of an output that the progress learner counts as alive."""

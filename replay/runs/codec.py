@@ -1,4 +1,4 @@
-"""Messages of a run's log, as protobuf: what each signal's field is follows from its declaration.
+"""Messages of a run's log, as protobuf; the field of each signal follows from its declaration.
 
 `cdmisfa.BlockSignals` has a field for each signal, and one with the sizes of all arrays, so that
 an empty array keeps its shape.
@@ -6,10 +6,10 @@ an empty array keeps its shape.
 `cdmisfa.Matrix` holds rows of float64 from frame t on: a block's vectors, its ground truth, or
 the abstraction's weights.
 
-Every number has a fixed width, so what is read is, bit for bit, what was written. Messages of
-the same shapes differ in their values alone: `Layout` says where each value stands in all of
-them. It writes messages, and reads many at once; protobuf's own parser reads those that another
-program laid out differently.
+Every number has a fixed width, so reading returns the written values bit for bit, and messages of
+the same shapes differ in their values alone. `Layout` holds the place of each value and reads many
+messages at once; protobuf's parser, which is slower, reads messages that another program laid out
+differently.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class Layout:
     """Places of the values in messages of the same shapes.
 
     Args:
-        fields: of each value its name, numpy type and shape, and the bytes that stand before it.
-        end: what stands behind all values.
+        fields: name, numpy type and shape of each value, and the bytes before it.
+        end: bytes after all values.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Layout:
             self._fixed[start : start + kind.itemsize * math.prod(shape)] = False
 
     def read(self, messages: Sequence[bytes]) -> dict[str, NDArray[Any]] | None:
-        """The values of n messages by name, (n, *shape); None where they are laid out otherwise."""
+        """Return the values of n messages by name, (n, *shape); None if their layout differs."""
         size = len(self._template)
         if any(len(data) != size for data in messages):
             return None
@@ -124,13 +124,10 @@ class Layout:
 
 @lru_cache
 def _around(shapes: tuple[tuple[int, ...], ...]) -> tuple[bytes, ...]:
-    """The parts of a message: its scalars, each array after what stands before it, its end.
+    """Return the parts of a message whose arrays have these shapes.
 
-    Args:
-        shapes: of all arrays.
-
-    Returns:
-        Places for the scalars (0) and for the arrays (2, 4, ...) are empty.
+    The parts are the scalars, then the bytes before each array and the array, then the end. The
+    scalars (0) and the arrays (2, 4, ...) are left empty.
     """
     parts, sizes = [b""], b""
     for signal, shape in zip(_ARRAYS, shapes, strict=True):
@@ -143,7 +140,7 @@ def _around(shapes: tuple[tuple[int, ...], ...]) -> tuple[bytes, ...]:
 
 @lru_cache
 def _layout(shapes: tuple[tuple[int, ...], ...]) -> Layout:
-    """Layout of records whose arrays have these shapes."""
+    """Return the layout of records whose arrays have these shapes."""
     *before, end = _around(shapes)[1::2]
     scalars = [(s, (), _tag(s)) for s in _SCALARS]
     arrays = [item for item in zip(_ARRAYS, shapes, before, strict=True) if item[2]]
@@ -168,7 +165,7 @@ _SCALARS_STRUCT = struct.Struct(
 
 
 def encode_signals(signals: BlockSignals) -> bytes:
-    """A record as the bytes of its message."""
+    """Encode a record as the bytes of its message."""
     scalars = _TAGGED.copy()
     scalars[1::2] = _SCALARS_OF(signals)
     arrays = list(map(np.ascontiguousarray, _ARRAYS_OF(signals), _ARRAY_TYPES))
@@ -179,7 +176,7 @@ def encode_signals(signals: BlockSignals) -> bytes:
 
 
 def decode_signals(data: bytes, where: str = "record") -> BlockSignals:
-    """The record in what `encode_signals` made.
+    """Decode a record from the bytes that `encode_signals` made.
 
     Raises:
         LogDamagedError: the bytes are not such a message, or its sizes contradict its values.
@@ -194,20 +191,20 @@ def decode_signals(data: bytes, where: str = "record") -> BlockSignals:
 
 
 def decode_columns(messages: Sequence[bytes], where: str = "record") -> Iterator[SignalColumns]:
-    """The records in messages as arrays, bit for bit what `decode_signals` makes of each."""
+    """Yield the records in messages as arrays, with the same bits as `decode_signals`."""
     for _, group in groupby(messages, key=len):
         same_size = list(group)
         first = decode_signals(same_size[0], where)
         layout = _layout(tuple([array.shape for array in _ARRAYS_OF(first)]))
-        found = layout.read(same_size)
-        if found is None or any(v.dtype == np.uint8 and v.max() > 1 for v in found.values()):
+        arrays = layout.read(same_size)
+        if arrays is None or any(v.dtype == np.uint8 and v.max() > 1 for v in arrays.values()):
             records = [decode_signals(data, where) for data in same_size]
             yield from columns_of_records(records)
             continue
         values = {}
         for name, signal in SIGNALS.items():
-            if name in found:
-                values[name] = found[name].astype(signal.dtype, copy=False)
+            if name in arrays:
+                values[name] = arrays[name].astype(signal.dtype, copy=False)
             else:  # an empty array
                 value = np.asarray(getattr(first, name), dtype=signal.dtype)
                 values[name] = np.broadcast_to(value, (len(same_size), *value.shape))
@@ -223,12 +220,12 @@ def _array(values: Any, shape: tuple[int, ...], signal: Signal, where: str) -> N
 
 
 def iteration_of(data: bytes, where: str = "record") -> int:
-    """The iteration of the record in the bytes of a message."""
+    """Return the iteration of the record in the bytes of a message."""
     return int(parsed(_SIGNALS, data, where).iteration)
 
 
 def encode_matrix(t: int, matrix: FloatArray) -> bytes:
-    """(rows, columns) values from frame t on as the bytes of a message."""
+    """Encode (rows, columns) values from frame t on as the bytes of a message."""
     values: Any = np.ascontiguousarray(matrix, dtype="<f8")
     return b"".join((_matrix_head(t, values.shape[1], values.nbytes), values))
 
@@ -239,59 +236,43 @@ def _matrix_head(t: int, columns: int, size: int) -> bytes:
 
 @lru_cache
 def _five_bytes(size: int) -> bytes:
-    """A number as a varint of five bytes."""
+    """Return a number as a varint of five bytes."""
     return bytes(size >> 7 * k & 0x7F | (k < 4) << 7 for k in range(5))
 
 
 def decode_matrices(
     messages: Sequence[bytes], where: str = "record"
 ) -> Iterator[tuple[IntArray, FloatArray]]:
-    """Frames and rows of the matrices in messages, those of one size together.
+    """Yield first frames (n,) and values (n, rows, columns) of n messages of the same size.
 
     Raises:
         LogDamagedError: a message holds no matrix.
     """
-    for _, group in groupby(messages, key=len):
+    for size, group in groupby(messages, key=len):
         same_size = list(group)
-        if (found := _matrices(same_size)) is not None:
-            values = found["values"]
-            frames = found["t"][:, None] + np.arange(values.shape[1])
-            yield frames.reshape(-1), values.reshape(frames.size, values.shape[2])
-            continue
-        for data in same_size:
-            t, rows = decode_matrix(data, where)
-            yield t + np.arange(len(rows)), rows
-
-
-def decode_matrix(data: bytes, where: str = "record") -> tuple[int, FloatArray]:
-    """The frame counter and (rows, columns) values of a message; see `decode_matrices`."""
-    if (found := _matrices([data])) is not None:
-        return int(found["t"][0]), found["values"][0]
-    decoded = parsed(_MATRIX, data, where)
-    values = np.array(decoded.values, dtype=np.float64)
-    if values.size and (decoded.columns == 0 or values.size % decoded.columns):
-        raise LogDamagedError(f"{where}: {values.size} values in rows of {decoded.columns}")
-    rows = values.size // decoded.columns if decoded.columns else 0
-    return decoded.t, values.reshape(rows, decoded.columns)
-
-
-def _matrices(messages: Sequence[bytes]) -> dict[str, NDArray[Any]] | None:
-    """T and values of messages of one size, where they are as `encode_matrix` lays them out."""
-    size = len(messages[0]) - _MATRIX_HEAD.size
-    columns = _MATRIX_HEAD.unpack_from(messages[0])[3] if size > 0 else 0
-    if columns == 0 or size % (8 * columns):
-        return None
-    head, float64 = _matrix_head(0, columns, size), _TYPES["float64"].stored
-    t = ("t", _TYPES["int64"].stored, (), head[:1])
-    values = ("values", float64, (size // (8 * columns), columns), head[9:])
-    return Layout([t, values]).read(messages)
+        size -= _MATRIX_HEAD.size
+        columns = _MATRIX_HEAD.unpack_from(same_size[0])[3] if size > 0 else 0
+        if columns and size % (8 * columns) == 0:
+            head, float64 = _matrix_head(0, columns, size), _TYPES["float64"].stored
+            t = ("t", _TYPES["int64"].stored, (), head[:1])
+            values = ("values", float64, (size // (8 * columns), columns), head[9:])
+            if (arrays := Layout([t, values]).read(same_size)) is not None:
+                yield arrays["t"], arrays["values"]
+                continue
+        for data in same_size:  # another program laid these out
+            decoded = parsed(_MATRIX, data, where)
+            matrix, columns = np.array(decoded.values, dtype=np.float64), decoded.columns
+            if matrix.size % columns if columns else matrix.size:
+                raise LogDamagedError(f"{where}: {matrix.size} values in rows of {columns}")
+            rows = matrix.size // columns if columns else 0
+            yield np.array([decoded.t], dtype=np.int64), matrix.reshape(1, rows, columns)
 
 
 def parsed(kind: Any, data: bytes, where: str) -> Any:
-    """A message of some kind in its bytes.
+    """Parse the bytes of a message of class `kind`.
 
     Raises:
-        LogDamagedError: there is none in them.
+        LogDamagedError: the bytes are not such a message.
     """
     try:
         return kind.FromString(data)
@@ -302,8 +283,8 @@ def parsed(kind: Any, data: bytes, where: str) -> Any:
 
 def _sentence(signal: Signal) -> str:
     facts = {"symbol": signal.symbol, "equation": signal.equation, "dimensions": signal.dims}
-    said = [f"{name} {value}" for name, value in facts.items() if value]
-    return "; ".join([signal.about.rstrip("."), *said, f"unit {signal.unit}"]) + "."
+    known = [f"{name} {value}" for name, value in facts.items() if value]
+    return "; ".join([signal.about.rstrip("."), *known, f"unit {signal.unit}"]) + "."
 
 
 _SIZES = ", ".join(f"{s.name} [{s.dims}]" for s in _ARRAYS)
@@ -323,12 +304,12 @@ _MATRIX_FIELDS = [
 def define_message(
     schema: str, stem: str, fields: Sequence[tuple[str, int, Any, bool, str]]
 ) -> tuple[Any, bytes]:
-    """A message's class, and its definition as a log stores it: a FileDescriptorSet.
+    """Return a message's class, and its definition as a log stores it, a FileDescriptorSet.
 
     Args:
-        schema: its full name.
-        stem: of its .proto file.
-        fields: of each the name, number, type, whether it is repeated, and a comment.
+        schema: full name of the message.
+        stem: stem of its .proto file.
+        fields: name, number, type, whether it is repeated, and comment of each field.
     """
     file = descriptor_pb2.FileDescriptorProto(
         name=f"cdmisfa/{stem}.proto", package="cdmisfa", syntax="proto3"

@@ -16,7 +16,7 @@ RUN_FILE = "run.mcap"
 """Name of the log in a run's folder."""
 
 RUN_JSON = "run.json"
-"""Name of the file that says how a run was begun and what came of it."""
+"""Name of the file with the command, the source and the result of a run."""
 
 MODULES_FILE = "modules.npz"
 """Name of the file of the frozen modules."""
@@ -31,17 +31,17 @@ RUN_METADATA = "cdmisfa.run"
 """Name of the metadata record that makes a log that of a run."""
 
 FINAL_METADATA = "cdmisfa.final"
-"""Name of the metadata record by which a finished run proves itself; see `final`."""
+"""Name of the metadata record of a finished run; see `final_record`."""
 
 REQUEST = "sweep.json"
-"""File of a sweep that names the trials it was asked for last."""
+"""Name of the file with the trials that a sweep was last asked for."""
 
 
 def run_log(path: Path) -> Path:
-    """The log of a run, given its folder or the log itself; a partial one where it was cut short.
+    """Return the log of a run, given its folder or the log itself; else its partial log.
 
     Raises:
-        UsageError: there is none, or what is there is no file.
+        UsageError: there is no log, or it is not a regular file.
     """
     path = Path(path)
     whole = path / RUN_FILE if path.is_dir() else path
@@ -51,20 +51,17 @@ def run_log(path: Path) -> Path:
             return candidate
     if path.is_dir():
         if any((path / name).is_file() for name in (RUN_JSON, MODULES_FILE)):
-            raise UsageError(
-                f"{path} lost its {RUN_FILE}, as if it was being replaced: run learn there again "
-                "with --force"
-            )
+            raise UsageError(f"{path} lost its {RUN_FILE}: run learn there again with --force")
         raise UsageError(f"{path} holds no {RUN_FILE}: name the folder of a run")
     raise no_such(path, remedy=f"name a run's folder or its {RUN_FILE}")
 
 
 def is_run(path: Path) -> bool:
-    """Whether a folder or a log is that of a run.
+    """Return whether a folder or a log is that of a run.
 
     Raises:
         UsageError: it does not exist.
-        LogDamagedError: it is no log, or a damaged one.
+        LogDamagedError: the log is damaged, or another kind of file.
     """
     path = Path(path)
     if path.is_dir():
@@ -74,7 +71,7 @@ def is_run(path: Path) -> bool:
 
 
 def read_run_json(folder: Path) -> Mapping[str, Any]:
-    """The run.json of a run; empty where there is none that can be read."""
+    """Return the run.json of a run; empty if it is missing or cannot be read."""
     try:
         document = read_json(folder / RUN_JSON, "learn again", most=MAX_LIST)
     except CdmisfaError:
@@ -91,11 +88,11 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def read_request(folder: Path) -> list[tuple[str, dict[str, Any]]]:
-    """The trials that a sweep was asked for last, in the order of its grid: each id and point.
+    """Return id and point of the trials that a sweep was last asked for, in the order of its grid.
 
     Raises:
-        UsageError: the file that says so is none, or too large.
-        LogDamagedError: it is damaged, or the disk does not give it.
+        UsageError: there is no such file, or it is too large.
+        LogDamagedError: it is damaged, or cannot be read.
     """
     path, remedy = folder / REQUEST, "run the sweep again to write it"
     request = read_json(path, remedy, most=MAX_LIST)

@@ -26,7 +26,6 @@ from recorder.mcap.store import PARTIAL
 from replay.runs.codec import (
     decode_columns,
     decode_matrices,
-    decode_matrix,
     parsed,
 )
 from replay.runs.columns import Blocks, SignalColumns
@@ -47,9 +46,9 @@ class RunHeader:
     """Header of a run's log.
 
     Attributes:
-        spec: what the learner's source delivered.
-        manifest: what the run was started with: `config` by sections, `seed`, `source`, and with
-            which `arithmetic` its learner computes.
+        spec: specification of the source.
+        manifest: inputs of the run: `config` by sections, `seed`, `source`, and the version of the
+            learner's `arithmetic`.
     """
 
     spec: SourceSpec
@@ -57,45 +56,45 @@ class RunHeader:
 
     @property
     def delta(self) -> float | None:
-        """Threshold of eta-dot, where the configuration names it."""
+        """Threshold of eta-dot, None if the configuration has none."""
         return self.number("delta")
 
     @property
     def by_progress(self) -> bool:
-        """Whether it is a run of the progress learner."""
+        """Whether the learner is the progress learner."""
         return bool(self.setting("learner", "algorithm") == "progress")
 
     @property
     def settled(self) -> tuple[float, float] | None:
-        """Change and learning error below which a stream is learned, of the progress learner."""
+        """Change and learning error below which the progress learner has learned a stream."""
         change, agreement = self.number("settled"), self.number("agreement")
         return None if change is None or agreement is None else (change, change + agreement)
 
     @property
     def clusters(self) -> bool:
-        """Whether its learner is CD-MISFA 1.0, which knows and saves by a clustering error."""
+        """Whether the learner is CD-MISFA 1.0, which saves modules by a clustering error."""
         return bool(self.setting("learner", "algorithm") == "1.0")
 
     @property
     def arithmetic(self) -> int:
-        """Version of the arithmetic with which its learner computed; see `arithmetic_of`."""
+        """Version of the learner's arithmetic; see `arithmetic_of`."""
         version = self.manifest.get(ARITHMETIC)
         return version if isinstance(version, int) else 0
 
     @property
     def forked_at(self) -> int | None:
-        """Iterations that a fork has in common with its parent; None of a run that is no fork."""
+        """Iterations that a fork shares with its parent; None if the run is no fork."""
         fork = self.manifest.get("fork")
         at = fork.get("at") if isinstance(fork, Mapping) else None
         return at if isinstance(at, int) and at >= 0 else None
 
     def number(self, key: str) -> float | None:
-        """A number of the learner's configuration, as `number("delta")`, or None."""
+        """Return a number of the learner's configuration, as `number("delta")`, or None."""
         value = self.setting("learner", key)
         return float(value) if isinstance(value, int | float) else None
 
     def setting(self, section: str, key: str) -> Any:
-        """A value of the run's configuration, as `setting("learner", "delta")`, or None."""
+        """Return a value of the run's configuration, as `setting("learner", "delta")`, or None."""
         config = self.manifest.get("config")
         table = config.get(section) if isinstance(config, Mapping) else None
         return table.get(key) if isinstance(table, Mapping) else None
@@ -157,7 +156,7 @@ MAX_BYTES = 16 * 1024 * 1024
 """Bytes of messages after which a batch ends earlier."""
 
 Frames = tuple[IntArray, NDArray[Any]]
-"""(n,) frames and (n, ...) what belongs to them."""
+"""(n,) frames and (n, ...) their values."""
 
 _ITERATION = re.compile(r"iteration (\d{1,18})")
 
@@ -167,8 +166,8 @@ class Batch:
     """Messages of some consecutive iterations, decoded.
 
     Attributes:
-        blocks: of the records, after the last one before them, which the first of the other
-            messages may belong to; none where no records were wanted.
+        blocks: blocks of the records, after the last block before them, to which the first of
+            the other messages may belong; empty if the records were not asked for.
         truth: ground truth, (n, D).
         phi: (t, (J, I)) weights of the abstraction.
     """
@@ -193,13 +192,13 @@ def read_batches(
 
     Args:
         path: the run's folder, or its log.
-        header: of its log, where that was read already.
-        every: decode images of every this many frames only.
-        topics: what is wanted of it.
-        start: the frame to begin at, the first of a block.
+        header: header of the log, if it was read already.
+        every: decode one image in so many frames.
+        topics: topics to read.
+        start: frame to begin at, the first of a block.
 
     Raises:
-        UsageError: there is no such run, or it is of another version of the signals.
+        UsageError: there is no such run, or it has another version of the signals.
         LogDamagedError: a message is damaged, or a finished file is cut short.
     """
     log = run_log(path)
@@ -217,18 +216,18 @@ def read_batches(
 def read_columns(
     path: Path, header: RunHeader | None = None, *, start: int = 0
 ) -> Iterator[SignalColumns]:
-    """The records of a run from a frame on, in order, as arrays; see `read_batches`."""
+    """Yield the records of a run from a frame on, in order, as arrays; see `read_batches`."""
     for batch in read_batches(path, header, topics=(SIGNALS_TOPIC,), start=start):
         yield from batch.signals
 
 
 class BatchReader:
-    """Makes batches of a run's log from its chunks, which are given in file order.
+    """Makes batches from the chunks of a run's log, in file order.
 
     Args:
-        log: of the run.
-        header: of the log.
-        channels: of the log.
+        log: path of the log, for messages.
+        header: header of the log.
+        channels: channels of the log.
         every: see `read_batches`, as `topics`.
     """
 
@@ -252,7 +251,7 @@ class BatchReader:
         self._bytes = 0
 
     def take(self, table: MessageTable) -> Iterator[Batch]:
-        """Take the messages of the next chunk, and give the batches that end with them."""
+        """Take the messages of the next chunk, and yield the batches that end with them."""
         wanted = np.isin(table.channel, list(self._wanted))
         frames = self._spec.frames_at(table.log_time)
         if self._spec.images and self._every > 1:
@@ -271,25 +270,28 @@ class BatchReader:
             self._bytes += size
 
     def _is_full(self, topic: str) -> bool:
-        """Whether a batch ends before this message: where possible, with a whole iteration."""
+        """Return whether a batch ends before this message: if possible, with a whole iteration."""
         if topic != SIGNALS_TOPIC:
             return self._bytes >= 4 * MAX_BYTES
         return self._bytes >= MAX_BYTES or len(self._data[topic]) >= BATCH_ITERATIONS
 
     def rest(self) -> Batch:
-        """The messages since the last batch ended, as one batch."""
+        """Return the messages since the last batch ended, as one batch."""
         spec, data = self._spec, self._data
         watched = self._images() if spec.images else self._rows(WATCHED_TOPIC, spec.frame_shape)
         signals = self._records()
         blocks = Blocks.concatenated([self._before, *map(Blocks.of, signals)])
-        where = f"{self._log} {PHI_TOPIC}"
         events = zip(data[EVENT_TOPIC], self._frames[EVENT_TOPIC], strict=True)
         batch = Batch(
             signals=signals,
             blocks=blocks,
             watched=watched,
             truth=self._rows(TRUTH_TOPIC, (len(spec.truth),)),
-            phi=tuple(decode_matrix(message, where) for message in data[PHI_TOPIC]),
+            phi=tuple(
+                (int(t), weights)
+                for matrices in decode_matrices(data[PHI_TOPIC], f"{self._log} {PHI_TOPIC}")
+                for t, weights in zip(*matrices, strict=True)
+            ),
             events=tuple(_event(message, t, self._log) for message, t in events),
         )
         self._begin(blocks.last())
@@ -297,9 +299,9 @@ class BatchReader:
 
     def _records(self) -> tuple[SignalColumns, ...]:
         where = f"{self._log} {SIGNALS_TOPIC}"
-        found = tuple(decode_columns(self._data[SIGNALS_TOPIC], where))
+        records = tuple(decode_columns(self._data[SIGNALS_TOPIC], where))
         streams = len(self._spec.streams)
-        for columns in found:
+        for columns in records:
             watched, rewards = columns["stream"], columns["R"]
             if (
                 watched.min() < 0
@@ -309,27 +311,28 @@ class BatchReader:
                 or (rewards.size and rewards.shape[1:] != (streams, 2, streams))
             ):
                 raise LogDamagedError(f"{where}: a record is about other streams than the run's")
-        return found
+        return records
 
     def _images(self) -> tuple[Frames, ...]:
         where, shape = f"{self._log} {WATCHED_TOPIC}", self._spec.frame_shape
-        found = [parsed(RawImage_pb2.RawImage, m, where).data for m in self._data[WATCHED_TOPIC]]
-        if not found:
+        images = [parsed(RawImage_pb2.RawImage, m, where).data for m in self._data[WATCHED_TOPIC]]
+        if not images:
             return ()
-        for pixels in found:
+        for pixels in images:
             if len(pixels) != math.prod(shape):
                 raise LogDamagedError(f"{self._log}: {len(pixels)} values do not fill {shape}")
-        whole = np.frombuffer(b"".join(found), np.uint8).reshape(len(found), *shape)
+        whole = np.frombuffer(b"".join(images), np.uint8).reshape(len(images), *shape)
         return ((np.array(self._frames[WATCHED_TOPIC], dtype=np.int64), whole),)
 
     def _rows(self, topic: str, shape: tuple[int, ...]) -> tuple[Frames, ...]:
-        """Rows of matrix messages, one per frame."""
-        found = []
-        for frames, values in decode_matrices(self._data[topic], f"{self._log} {topic}"):
+        """Return the rows of matrix messages, one per frame."""
+        pieces = []
+        for t, values in decode_matrices(self._data[topic], f"{self._log} {topic}"):
+            frames = (t[:, None] + np.arange(values.shape[1])).reshape(-1)
             if values.size != len(frames) * math.prod(shape):
                 raise LogDamagedError(f"{self._log}: {values.size} values do not fill {shape}")
-            found.append((frames, values.reshape(-1, *shape)))
-        return tuple(found)
+            pieces.append((frames, values.reshape(-1, *shape)))
+        return tuple(pieces)
 
 
 def _event(data: bytes, t: int, log: Path) -> Event:

@@ -1,14 +1,13 @@
 """The frozen modules of a run: modules.npz as plain arrays, and scikit-learn style transformers.
 
-Neither the learner nor scikit-learn is needed to use what was learned.
+Importing them needs neither the learner nor scikit-learn.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, Self
 
@@ -23,7 +22,6 @@ from recorder.log.files import atomic_write
 from replay.runs.folders import MODULES_FILE
 from replay.storage.arrays import read_arrays
 
-_NAME = re.compile(r"module([1-9]\d{0,8})_([a-z_]+)")
 _FIELDS = [field.name for field in dataclasses.fields(Module)]
 _SCALARS = {
     **dict.fromkeys(("index", "stream_index", "iteration"), "iu"),
@@ -32,7 +30,7 @@ _SCALARS = {
     "recipe": "U",
     "scale": "f",
 }
-"""Fields that are no arrays, and the kind of numpy type that each is stored as."""
+"""Scalar fields, and the kinds of numpy type that each may be stored as."""
 
 
 def save_modules(path: Path, modules: Iterable[Module]) -> None:
@@ -52,60 +50,44 @@ def save_modules(path: Path, modules: Iterable[Module]) -> None:
 
 
 def load_modules(path: Path) -> tuple[Module, ...]:
-    """The modules of a file, or of a run's folder, in the order of learning.
+    """Read the modules of a file or of a run's folder, in the order of learning.
 
     Raises:
         UsageError: there is no such file.
-        LogDamagedError: it holds something else.
+        LogDamagedError: the file holds something else.
     """
     path = Path(path)
     path = path / MODULES_FILE if path.is_dir() else path
     try:
-        stored = read_arrays(path)
-        return tuple(_module(stored, index) for index in _indices(stored))
+        return tuple(_modules(read_arrays(path)))
     except FileNotFoundError as error:
         raise UsageError(f"{path} does not exist: name a run's folder") from error
     except (OSError, ValueError, KeyError, TypeError, OverflowError, SystemError) as error:
         raise LogDamagedError(f"{path} holds no modules ({one_line(error)})") from error
 
 
-def _module(stored: Mapping[str, NDArray[Any]], index: int) -> Module:
-    values: dict[str, Any] = {}
-    for name in _FIELDS:
-        array, kinds = stored[_key(index, name)], _SCALARS.get(name, "fi")
-        if array.dtype.kind not in kinds:
-            raise ValueError(f"{name} is not of type {kinds}")
-        values[name] = array.item() if name in _SCALARS else array
-    values["frame_shape"] = tuple(map(int, values["frame_shape"].tolist()))
-    values["recipe"] = Recipe.from_json(values["recipe"]) if values["recipe"] else None
-    outputs, size = values["phi"].shape
-    shapes = {"mean": size, "band_mean": outputs, "band_sd": outputs, "eta": outputs}
-    for name, length in shapes.items():
-        if values[name].shape != (length,):
-            raise ValueError(f"{name} has shape {values[name].shape}")
-    return Module(**values)
-
-
-def _indices(stored: Mapping[str, NDArray[Any]]) -> list[int]:
-    """The modules' indices, of a file in which every name is that of a module's field.
-
-    A checksum protects the arrays' values, but nothing protects their names and number.
-    """
-    fields: dict[int, set[str]] = {}
-    for name in stored:
-        found = _NAME.fullmatch(name)
-        if found is None:
-            raise ValueError(f"{name[:40]!r} is nothing of a module")
-        fields.setdefault(int(found[1]), set()).add(found[2])
-    indices = sorted(fields)
-    if indices != list(range(1, len(indices) + 1)):
-        raise ValueError(f"there are modules {indices}, one is missing")
-    for found_fields in fields.values():
-        if other := sorted(found_fields.symmetric_difference(_FIELDS)):
-            raise ValueError(f"{other[0][:40]!r} is missing, or nothing of a module")
-    if any(int(stored[_key(index, "index")]) != index for index in indices):
-        raise ValueError("the numbers of modules are mixed up")
-    return indices
+def _modules(stored: Mapping[str, NDArray[Any]]) -> Iterator[Module]:
+    """Yield the modules of a file; a checksum protects its arrays, but not their names."""
+    indices = range(1, len(stored) // len(_FIELDS) + 1)
+    if stored.keys() != {_key(index, name) for index in indices for name in _FIELDS}:
+        raise ValueError(f"its arrays are not those of modules 1 to {len(indices)}")
+    for index in indices:
+        values: dict[str, Any] = {}
+        for name in _FIELDS:
+            array, kinds = stored[_key(index, name)], _SCALARS.get(name, "fi")
+            if array.dtype.kind not in kinds:
+                raise ValueError(f"{name} is not of type {kinds}")
+            values[name] = array.item() if name in _SCALARS else array
+        if values["index"] != index:
+            raise ValueError(f"module {index} is numbered {values['index']}")
+        values["frame_shape"] = tuple(map(int, values["frame_shape"].tolist()))
+        values["recipe"] = Recipe.from_json(values["recipe"]) if values["recipe"] else None
+        outputs, size = values["phi"].shape
+        lengths = {"mean": size, "band_mean": outputs, "band_sd": outputs, "eta": outputs}
+        for name, length in lengths.items():
+            if values[name].shape != (length,):
+                raise ValueError(f"{name} has shape {values[name].shape}")
+        yield Module(**values)
 
 
 def _key(index: int, name: str) -> str:
@@ -113,10 +95,10 @@ def _key(index: int, name: str) -> str:
 
 
 class SlowFeatures:
-    """Slow features of frames, as a frozen module gives them.
+    """Transformer that computes the slow features of frames with a frozen module.
 
-    It comes fitted. In a pipeline that is to be fitted as a whole, put it into
-    scikit-learn's `FrozenEstimator`.
+    It is fitted already. In a pipeline that is fitted as a whole, put it into scikit-learn's
+    `FrozenEstimator`.
 
     Args:
         module: the frozen module.
@@ -133,11 +115,11 @@ class SlowFeatures:
 
     @classmethod
     def load(cls, path: str | Path) -> tuple[Self, ...]:
-        """A transformer for each module of modules.npz, or of a run's folder, in order.
+        """Return a transformer for each module of modules.npz, or of a run's folder, in order.
 
         Raises:
             UsageError: there is no such file.
-            LogDamagedError: it holds something else.
+            LogDamagedError: the file holds something else.
         """
         return tuple(cls(module) for module in load_modules(Path(path)))
 
@@ -158,18 +140,18 @@ class SlowFeatures:
         return self.module.mean
 
     def transform(self, X: Any) -> FloatArray:
-        """Outputs of the module on frames, y = phi (x - mean).
+        """Return the outputs of the module on frames, y = phi (x - mean).
 
         Args:
-            X: (n, *frame_shape), the shape of a frame that it learned from, or these as rows
-                (n, I); uint8 count 1/255 each where it learned from pixels. They are expanded as
-                they were for the learner.
+            X: (n, *frame_shape) frames of the shape that the module learned from, or these as
+                rows (n, I). uint8 values are divided by 255 if it learned from pixels. Frames are
+                expanded as they were for the learner.
 
         Returns:
             (n, J).
 
         Raises:
-            UsageError: these are no frames as the module learned from.
+            UsageError: the shape or type is not that of the module's frames.
         """
         return self.module.transform(X)
 
@@ -185,17 +167,11 @@ class SlowFeatures:
         )
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Its parameters, as scikit-learn asks for them."""
+        """Return the parameters, as scikit-learn's estimators do."""
         return {"module": self.module}
 
     def set_params(self, **params: Any) -> Self:
-        """Change what it was made with.
-
-        Raises:
-            UsageError: there is no such parameter.
-        """
-        if unknown := set(params) - {"module"}:
-            raise UsageError(f"no parameter {', '.join(sorted(unknown))}: there is module")
+        """Set the module, as scikit-learn's estimators set their parameters."""
         self.module = params.get("module", self.module)
         return self
 

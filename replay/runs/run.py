@@ -1,14 +1,12 @@
-"""A run as a whole: what it left behind, in short, and the closing record that proves it."""
+"""A run on disk, its outline, and the rules by which its learner saved modules."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,36 +15,26 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from cdmisfa.modules import Module
-from recorder.images.framing import Recipe
 from replay.runs.columns import Blocks, SignalColumns, has_values, whole_signals
-from replay.runs.folders import MODULES_FILE, read_run_json, run_log
+from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.modules import load_modules
-from replay.storage.identity import file_sha256
 
 LINES = (
     *("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsilon"),
     *("change", "tested", "fitted", "learning_error", "interest", "typical", "regret"),
 )
-"""Signals whose values an outline keeps for every iteration, to choose ranges from."""
-
-_FILES: Final = ("files", "views")
-"""Keys under which sources list their files, each as a table."""
-
-_WHOLE: Final = "sha256"
-_HASHES: Final = {_WHOLE, "sample_sha256"}
-_KNOWN: Final = {*_HASHES, "bytes"}
-"""What may be stated of a file, before all of it was read or after."""
+"""Signals whose values an outline holds for every iteration, to choose ranges of plots from."""
 
 
 class Run:
-    """A run on disk, of which is read what is asked for.
+    """A run on disk; each part is read when it is asked for.
 
     Args:
         path: the run's folder, or its log.
 
     Raises:
-        UsageError: there is no such run, or it is of another version of the signals.
+        UsageError: there is no such run, or it has another version of the signals.
         LogDamagedError: its log cannot be read, here or in any later access.
     """
 
@@ -62,40 +50,28 @@ class Run:
 
     @cached_property
     def result(self) -> Mapping[str, Any] | None:
-        """The document of `learn --json`; None where the run was broken off."""
+        """The document that `learn --json` prints; None if the run did not finish."""
         return read_run_json(self.log.parent).get("result")
 
     @cached_property
     def modules(self) -> tuple[Module, ...]:
-        """Its modules, in order.
+        """Modules in the order of learning.
 
         Raises:
             LogDamagedError: the modules are of other streams, or cannot be read.
         """
-        found = load_modules(self.log.parent)
-        names = self.streams
-        if any(module.stream_index >= len(names) for module in found):
+        modules, names = load_modules(self.log.parent), self.streams
+        if any(module.stream_index >= len(names) for module in modules):
             raise LogDamagedError(f"{self.log.parent} holds modules of streams it does not have")
         shape = self.header.spec.frame_shape
         return tuple(
-            replace(
-                module,
-                stream=names[module.stream_index],
-                frame_shape=shape,
-                recipe=module.recipe or self.recipe(module.stream_index),
-            )
-            for module in found
+            replace(module, stream=names[module.stream_index], frame_shape=shape)
+            for module in modules
         )
-
-    def recipe(self, stream: int = 0) -> Recipe:
-        """What became of the raw pictures of a stream."""
-        stated = self.header.manifest.get("source")
-        shape = self.header.spec.frame_shape
-        return Recipe.of(stated if isinstance(stated, Mapping) else {}, shape, stream)
 
 
 class _Signals(Mapping[str, "NDArray[Any]"]):
-    """A run's signals by name, (iterations, *dims) each; NaN for modules not yet there."""
+    """Signals of a run by name, (iterations, *dims) each; NaN for modules not yet learned."""
 
     def __init__(self, log: Path, header: RunHeader) -> None:
         self._log = log
@@ -118,7 +94,7 @@ class _Signals(Mapping[str, "NDArray[Any]"]):
 
 @dataclass(frozen=True, slots=True)
 class Save:
-    """Signals of the iteration at whose end a module was saved, by their names."""
+    """Signals of the iteration at whose end a module was saved."""
 
     module: int
     stream: int
@@ -128,14 +104,23 @@ class Save:
     eta: tuple[float, ...]
     eta_dot: tuple[float, ...]
 
+    @classmethod
+    def of(cls, columns: SignalColumns, row: int) -> Save:
+        """Return the save that a row of the records is about."""
+        values = {f.name: columns[f.name][row].tolist() for f in fields(cls)}
+        values |= {k: tuple(v) for k, v in values.items() if isinstance(v, list)}
+        return cls(**values)
+
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """The blocks in which one abstraction was learned.
+    """Blocks in which one abstraction was learned.
 
     Attributes:
-        novel: how many of them the gate let through.
-        novel_of: (S,) how many of these were of each stream.
+        module: number of the abstraction.
+        blocks: number of its blocks.
+        novel: number of blocks that the gate let through.
+        novel_of: (S,) number of these blocks for each stream.
     """
 
     module: int
@@ -146,21 +131,22 @@ class Phase:
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """A run in short.
+    """Outline of a run.
 
     Attributes:
-        iterations: number of records; `frames` those watched.
-        blocks: of all records.
-        end: the frame after the last one; there may be more before it than were watched.
+        iterations: number of records.
+        frames: number of attended frames.
+        blocks: blocks of all records.
+        end: frame after the last record; the source may have had more frames than were attended.
         tau: frames of a block.
-        outputs: of an abstraction.
-        modules: most frozen modules in any iteration.
-        visits: (S,) frames each stream was watched.
-        saved: the saves, in order.
-        last: the phase since the last save.
-        lines: for each name of `LINES` its values, (n,) or flattened.
+        outputs: outputs of an abstraction.
+        modules: largest number of frozen modules in any iteration.
+        visits: (S,) attended frames of each stream.
+        saved: saves in order.
+        last: phase since the last save.
+        lines: values of each signal in `LINES`, (n,) or flattened.
         told: names of the signals that have a value anywhere in the run.
-        states: (S,) what became of each stream, by codes as in the signal `state`.
+        states: (S,) final state of each stream, as codes of the signal `state`.
     """
 
     header: RunHeader
@@ -179,186 +165,120 @@ class Outline:
     states: tuple[int, ...]
 
     def streams(self, most: int) -> list[int]:
-        """The most watched streams, at most so many, in their own order."""
+        """Return the indices of the most attended streams, at most `most`, in ascending order."""
         ranked = np.argsort(-self.visits, kind="stable")[:most]
         return sorted(int(s) for s in ranked)
 
     def names(self) -> tuple[str, ...]:
-        """Names of the streams."""
+        """Return the names of the streams."""
         return self.header.spec.streams
 
 
 class Tally:
-    """Makes an outline of a run's records, as they come."""
+    """Builds the outline of a run from its records, in batches."""
 
     def __init__(self, header: RunHeader) -> None:
         self.header = header
-        self._blocks: list[Blocks] = []
-        self._lines: dict[str, list[FloatArray]] = {name: [] for name in LINES}
-        self._phase: dict[str, list[NDArray[Any]]] = {"module": [], "novel": []}
+        self._values: dict[str, list[NDArray[Any]]] = {
+            name: [] for name in ("t", "iteration", "stream", "module", "novel", *LINES)
+        }
         self._saved: list[Save] = []
         self._modules = self._tau = self._outputs = 0
         self._told: set[str] = set()
         self._states: tuple[int, ...] = (NO_STATE,) * len(header.spec.streams)
 
     def add(self, columns: SignalColumns) -> None:
-        """Take the next records in."""
+        """Add the next records."""
         _, self._tau, self._outputs = columns["y"].shape
-        self._blocks.append(Blocks.of(columns))
-        for name, parts in self._lines.items():
-            parts.append(columns[name].reshape(-1))
-        for name, parts in self._phase.items():
-            parts.append(columns[name].copy())
+        for name, parts in self._values.items():
+            parts.append(columns[name].reshape(-1).copy())  # a view would hold the whole batch
         self._modules = max(self._modules, columns["y_frozen"].shape[1])
-        self._saved += [_save(columns, i) for i in np.flatnonzero(columns["saved"]).tolist()]
+        self._saved += [Save.of(columns, row) for row in np.flatnonzero(columns["saved"]).tolist()]
         unsure = SIGNALS.keys() - self._told
         self._told |= {name for name in unsure if has_values(name, columns[name])}
         self._states = tuple(columns["state"][-1].tolist())
 
     def outline(self) -> Outline:
-        """The outline of all records so far."""
-        blocks, streams = Blocks.concatenated(self._blocks), len(self._states)
-        visits = self._tau * np.bincount(blocks.streams, minlength=streams)
+        """Return the outline of all records so far."""
+        values: dict[str, Any] = {
+            name: np.concatenate([np.empty(0, SIGNALS[name].dtype), *parts])
+            for name, parts in self._values.items()
+        }
+        blocks = Blocks(values["t"], values["iteration"], values["stream"])
+        streams, n = len(self._states), len(blocks.starts)
         last = None
-        if len(blocks.starts):
-            module, novel = (np.concatenate(parts) for parts in self._phase.values())
-            own = module == module[-1]
-            through = own & novel.astype(bool)
-            novel_of = np.bincount(blocks.streams[through], minlength=streams)
-            last = Phase(int(module[-1]), int(own.sum()), int(through.sum()), novel_of)
+        if n:
+            module = values["module"]
+            in_phase = module == module[-1]
+            novel = in_phase & values["novel"].astype(bool)
+            novel_of = np.bincount(blocks.streams[novel], minlength=streams)
+            last = Phase(int(module[-1]), int(in_phase.sum()), int(novel.sum()), novel_of)
         return Outline(
             header=self.header,
-            iterations=len(blocks.starts),
-            frames=int(visits.sum()),
+            iterations=n,
+            frames=n * self._tau,
             blocks=blocks,
-            end=int(blocks.starts[-1]) + self._tau if len(blocks.starts) else 0,
+            end=int(blocks.starts[-1]) + self._tau if n else 0,
             tau=self._tau,
             outputs=self._outputs,
             modules=self._modules,
-            visits=visits,
+            visits=self._tau * np.bincount(blocks.streams, minlength=streams),
             saved=tuple(self._saved),
             last=last,
-            lines={
-                name: np.concatenate([np.empty(0), *parts]) for name, parts in self._lines.items()
-            },
+            lines={name: values[name] for name in LINES},
             told=frozenset(self._told),
             states=self._states,
         )
 
 
-def _save(columns: SignalColumns, row: int) -> Save:
-    found = ((field.name, columns[field.name][row].tolist()) for field in fields(Save))
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in found}
-    return Save(**values)
-
-
 def read_outline(path: Path) -> Outline:
-    """Read a run through once; see `read_batches`."""
+    """Read the outline of a run; see `read_batches` for what it raises."""
     tally = Tally(read_header(path))
     for columns in read_columns(path, tally.header):
         tally.add(columns)
     return tally.outline()
 
 
-def final_record(
-    folder: Path, document: Mapping[str, Any], signals: str, *, view: bool
-) -> dict[str, str]:
-    """The closing record of a run: hashes of signals and files, of a folder with its modules.
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Condition for saving a module: a signal must be above or below a threshold.
 
-    Args:
-        folder: of the run.
-        document: what its run.json states.
-        signals: the SHA-256 of its signals.
-        view: whether it has a view, too.
-    """
-    return {
-        "signals_sha256": signals,
-        "modules_sha256": file_sha256(folder / MODULES_FILE),
-        "facts_sha256": facts_sha256(document),
-        "view": json.dumps(view),
-    }
-
-
-def facts_sha256(document: Mapping[str, Any]) -> str:
-    """SHA-256 of a run.json, but for where the run lies and the command."""
-    facts = {key: value for key, value in document.items() if key != "command"}
-    if isinstance(result := facts.get("result"), Mapping):
-        facts["result"] = {key: value for key, value in result.items() if key != "run"}
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-
-
-def stated_source(log: Path) -> Any:
-    """The source of a run as its log states it, with hashes of large files from run.json.
-
-    Args:
-        log: of the run.
-
-    Raises:
-        UsageError: it is no run's log.
-        LogDamagedError: it cannot be read.
+    Attributes:
+        signal: name of the signal.
+        symbol: its symbol in formulas.
+        threshold: value that it must reach.
+        side: side of the threshold on which the rule holds.
     """
 
-    def ended(file: Mapping[str, Any], at_end: Mapping[str, Any]) -> Mapping[str, Any]:
-        large = "sample_sha256" in file and _WHOLE in at_end
-        return {**file, _WHOLE: at_end[_WHOLE]} if large else file
+    signal: str
+    symbol: str
+    threshold: float
+    side: Literal["above", "below"]
 
-    stated = read_header(log).manifest.get("source")
-    return _of_each(stated, read_run_json(log.parent).get("source"), ended)
+    @property
+    def ratio(self) -> str:
+        """Formula of the ratio that `met` computes."""
+        if self.side == "below":
+            return f"{self.threshold:g} / {self.symbol}"
+        return f"{self.symbol} / {self.threshold:g}"
 
-
-def states_whole(source: Any) -> bool:
-    """Whether a source states the SHA-256 of all of a file."""
-    return any(_WHOLE in file for key in _FILES for file in _tables(source, key))
-
-
-def known_to_both(one: Any, other: Any) -> tuple[Any, Any]:
-    """Two sources without what only one of them states of a file."""
-
-    def known(file: Mapping[str, Any], to: Mapping[str, Any]) -> Mapping[str, Any]:
-        shared = file.keys() & to.keys()
-        left_out = _KNOWN - shared if shared & _HASHES else set()
-        return {key: value for key, value in file.items() if key not in left_out}
-
-    return _of_each(one, other, known), _of_each(other, one, known)
+    def met(self, columns: SignalColumns) -> FloatArray:
+        """Return (n,) values of the ratio, above 1 where the rule holds for every output."""
+        values = np.abs(columns[self.signal].astype(np.float64).reshape(len(columns), -1))
+        ratios = values / self.threshold
+        with np.errstate(divide="ignore"):
+            met = 1 / ratios if self.side == "below" else ratios
+        return np.asarray(met.min(axis=1))
 
 
-def other_files(one: Any, another: Any) -> list[str]:
-    """Names of the files of a source that are not those of another, by what both know of them.
-
-    Where another has more or fewer, of those that it lacks.
-    """
-    found: list[str] = []
-    for key in _FILES:
-        own, others = _tables(one, key), _tables(another, key)
-        if len(own) == len(others):
-            found += [
-                str(file.get("file"))
-                for file, like in zip(own, others, strict=True)
-                if any(file[known] != like[known] for known in _HASHES & file.keys() & like.keys())
-            ]
-        elif others:
-            there = {file.get("file") for file in others}
-            found += [str(file.get("file")) for file in own if file.get("file") not in there]
-    return found
-
-
-def _of_each(
-    one: Any,
-    other: Any,
-    change: Callable[[Mapping[str, Any], Mapping[str, Any]], Mapping[str, Any]],
-) -> Any:
-    """A source, with each of its files changed by what another says of the same one."""
-    found = one
-    for key in _FILES:
-        own, others = _tables(one, key), _tables(other, key)
-        if own and len(own) == len(others):
-            changed = [change(file, like) for file, like in zip(own, others, strict=True)]
-            found = {**found, key: changed}
-    return found
-
-
-def _tables(source: Any, key: str) -> list[Mapping[str, Any]]:
-    files = source.get(key) if isinstance(source, Mapping) else None
-    if isinstance(files, list) and all(isinstance(file, Mapping) for file in files):
-        return files
-    return []
+def rules_of(header: RunHeader) -> list[Rule]:
+    """Return the rules of a CD-MISFA learner whose thresholds the header states."""
+    if header.by_progress:
+        return []
+    error = ("roc_error", "clustering error") if header.clusters else ("eta_dot", "|η̇|")
+    rules = [
+        Rule(*error, header.number("roc_error" if header.clusters else "delta") or 0, "below"),
+        Rule("share", "share", header.number("novel_share") or 0, "above"),
+        Rule("variance", "variance", header.number("min_variance") or 0, "above"),
+    ]
+    return [rule for rule in rules if rule.threshold]

@@ -22,8 +22,7 @@ from cdmisfa.core.signals import SIGNALS
 from replay.palette import GREY, Colour, colour, faint, packed_all, pale
 from replay.runs.columns import Blocks, SignalColumns, has_values
 from replay.runs.log import Batch, RunHeader
-from replay.runs.rules import rules_of
-from replay.runs.run import Outline
+from replay.runs.run import Outline, rules_of
 from replay.view.columns import TIMELINE_SIGNALS, Column, Target, power_of_ten
 from replay.view.labels import label, line_labels, part
 from replay.view.lanes import Lanes

@@ -34,11 +34,11 @@ from recorder.images.messages import MessageKind, image_decoder
 from recorder.images.videos import VideoPackets
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
-from replay.runs.codec import decode_matrix, decode_signals, encode_matrix, encode_signals
+from replay.runs.codec import decode_matrices, decode_signals, encode_matrix, encode_signals
 from replay.runs.folders import RUN_JSON, read_run_json
 from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.modules import load_modules, save_modules
-from replay.runs.run import facts_sha256
+from replay.runs.provenance import facts_sha256
 from tools.torture.mutations import BYTES, TEXT
 
 from .oracle import BrokenPromise
@@ -229,7 +229,7 @@ DECODERS: Mapping[str, Decoder] = {
     "mp4": Decoder(_cameras, _written(".mp4", _write_video), "a.mp4"),
     "npz": Decoder(load_modules, _written(".npz", _write_modules), "modules.npz"),
     "signals": Decoder(lambda p: decode_signals(p.read_bytes()), lambda: _of_a_run()[:1]),
-    "matrix": Decoder(lambda p: decode_matrix(p.read_bytes()), lambda: _of_a_run()[1:2]),
+    "matrix": Decoder(lambda p: list(decode_matrices([p.read_bytes()])), lambda: _of_a_run()[1:2]),
     "keyframe": Decoder(lambda p: decode_keyframe(p.read_bytes()), lambda: _of_a_run()[2:]),
     "preset": Decoder(_preset, _presets, "a.toml", text=True),
     "run.json": Decoder(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from replay.runs.run import facts_sha256
+from replay.runs.provenance import facts_sha256
 
 from .cases import Defect, Job
 from .commands import here, judge, must

@@ -101,7 +101,7 @@ def compare_command(
     """
     if len(runs) < 2:
         raise click.UsageError("name two runs, or more")
-    from replay.runs.compare import differing_signals, side_by_side, signals_of
+    from replay.runs.compare import side_by_side
 
     rows = side_by_side(runs)
     if save is not None:
@@ -109,32 +109,24 @@ def compare_command(
 
         build_overlay(runs, rows, save, force=force)
     different = [row.difference for row in rows if row.difference is not None]
-    at = different[0].iteration if different and len(runs) == 2 else -1
-    first, second = ({}, {}) if at < 0 else (signals_of(runs[0], at), signals_of(runs[1], at))
     if as_json:
         print_document(
             identical=not different,
             first_difference=different[0].as_json() if different else None,
-            signals={name: [first[name], second[name]] for name in first if name in second},
+            signals=different[0].signals if different and len(runs) == 2 else {},
             runs=[row.as_json() for row in rows],
             view=save,
         )
     else:
-        _print_comparison(rows, at, differing_signals(first, second))
+        _print_comparison(rows)
     if save is not None and not as_json:
         tell(f"view {save}    look at it: cdmisfa view {quoted(save)}")
     if different and len(runs) == 2:
         ctx.exit(NotReproducedError.exit_code)
 
 
-def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[str]]) -> None:
-    """Print what runs came to, and where they differ.
-
-    Args:
-        rows: of the runs.
-        at: the iteration at which two of them first differ.
-        signals: those that differ there.
-    """
+def _print_comparison(rows: Sequence[Row]) -> None:
+    """Print the outcome of each run, and where two runs differ."""
     from replay.runs.compare import HEAD, differing_outcomes
 
     one, *others = rows
@@ -150,9 +142,9 @@ def _print_comparison(rows: Sequence[Row], at: int, signals: Sequence[Sequence[s
             print_line(f"first difference: {other.difference}")
     for explanation in filter(None, (row.explanation() for row in rows)):
         print_text(explanation)
-    if signals:
-        print_line(f"signals of iteration {at} that differ:")
-        print_table(("signal", *both), signals)
+    if len(others) == 1 and other.difference and other.difference.signal:
+        print_line(f"signals of iteration {other.difference.iteration} that differ:")
+        print_table(("signal", *both), other.difference.differing_signals())
 
 
 @click.command("export")
