@@ -144,13 +144,13 @@ def formats() -> dict[str, int]:
     from cdmisfa.kernels import ARITHMETIC
     from recorder.log import messages
     from replay.corpus import rows
-    from replay.integrity import info
+    from replay.integrity import report
 
     return {
         "arithmetic": ARITHMETIC,
         "index of logs": rows.VERSION,
         "JSON documents": printing.SCHEMA,
-        "JSON of info, verify and recover": info.SCHEMA,
+        "JSON of info, verify and recover": report.SCHEMA,
         "recordings": messages.SCHEMA_VERSION,
         "signals": signals.SCHEMA_VERSION,
     }

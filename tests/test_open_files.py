@@ -27,7 +27,7 @@ from recorder.mcap import store
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import FileStore, OnePass
 from recorder.recording import RecordingStoppedError, record, record_scene, recorded
-from replay.integrity.mending import MendedStore
+from replay.integrity.recover import RepairedStore
 from replay.integrity.verify import check_log
 from replay.recordings.source import RecordedSource
 
@@ -106,7 +106,7 @@ def test_a_file_that_was_replaced_is_not_read_on(files: list[Path], there: bool)
         lambda store: list(store.blocks(0, store.size)),
         lambda store: store.crc(0, store.size),
         lambda store: OnePass(store).pass_to(6),
-        lambda store: MendedStore(store).read(1, 5),
+        lambda store: RepairedStore(store).read(1, 5),
     ],
 )
 @pytest.mark.parametrize("left", [0, 3])

@@ -214,7 +214,7 @@ def opened_log(
 
 def _left_undone(run: Path, source: FrameSource, *, view: bool) -> str:
     """What an interrupt leaves of a run, and how to go on."""
-    from replay.integrity.passes import view_again
+    from replay.integrity.verify import view_again
 
     if (run / RUN_FILE).is_file():
         but = "" if not view or (run / VIEW_FILE).is_file() else " but its view: "

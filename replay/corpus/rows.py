@@ -20,8 +20,8 @@ from replay.arrays import are_arrays
 from replay.camera_logs.alignment import missing
 from replay.camera_logs.opening import identity_of, image_topics, only_foreign, open_images
 from replay.corpus.finding import Found, state_of_log
-from replay.integrity.info import ChannelInfo, LogInfo, describe_log, describe_reader
-from replay.integrity.state import failed_state
+from replay.integrity.info import describe_log, describe_reader
+from replay.integrity.report import ChannelInfo, LogReport, failed_state
 from replay.storage.identity import Identity, LogIdentity
 from replay.storage.location import is_url, location
 
@@ -171,7 +171,7 @@ def _stream(channel: ChannelInfo, view: Mapping[str, str]) -> dict[str, Any]:
     return found
 
 
-def _described(place: Path, deep: bool) -> tuple[LogInfo, str, list[dict[str, Any]]]:
+def _described(place: Path, deep: bool) -> tuple[LogReport, str, list[dict[str, Any]]]:
     """Return what a log is, its identity, and what the images of each channel show."""
     if only_foreign(place) or are_arrays([place]):
         info, sha256 = describe_log(place, decode=deep), _hash_of(identity_of(place, ()))
@@ -217,7 +217,7 @@ def _configuration(stated: Mapping[str, str]) -> str | None:
     return text if values and len(text) <= MOST_TEXT else None
 
 
-def _log_of(path: str, info: LogInfo) -> str:
+def _log_of(path: str, info: LogReport) -> str:
     """What is opened as one: the folder of a recording or a run, any other log itself."""
     if info.kind == "foreign":
         return path

@@ -1,165 +1,53 @@
-"""What is in a log: channels, times, checksums, and whether it is whole."""
+"""Describe logs: channels, times, checksums, and whether they are whole."""
 
 from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, TypeVar
 
+import numpy as np
 from mcap.records import Channel
+from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
+from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import Problem
+from recorder.mcap.records import MalformedRecord, Problem, Segment
 from replay.arrays import are_arrays
 from replay.camera_logs.opening import channels_of, log_format, only_foreign
 from replay.camera_logs.pictures import FolderImages
-from replay.integrity.counting import count_messages, read_once
-from replay.integrity.learned import (
-    ModuleInfo,
-    RunInfo,
-    held_out_of,
-    modules_of,
-    result_of,
-    run_folder,
-)
-from replay.integrity.state import (
+from replay.inputs import locations
+from replay.integrity.learned import run_facts
+from replay.integrity.report import (
+    ChannelInfo,
     Crc,
+    Kind,
+    LogReport,
+    SizeInfo,
     State,
-    crc_of,
-    failed_state,
-    located,
-    state_of,
-    worst,
+    combined,
+    failed,
 )
 from replay.runs.folders import RUN_METADATA
-from replay.runs.log import SIGNALS_TOPIC
 from replay.storage.arrays import load_numbers
 from replay.storage.opening import log_files
 
-SCHEMA: Final = 1
-"""Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
 CHECK_BYTES: Final = 1024 * 1024 * 1024
-"""Logs with more bytes, decompressed or not, are described by their index, not decoded."""
+"""Bytes of a log, decompressed or not, that `info` decodes; it reads the index of larger logs."""
 
-SIZES: Final = ("stored", "size")
-"""Bytes of a part of a log, as they lie there and decompressed."""
-
-Kind = Literal["recording", "run", "foreign"]
+Times = NDArray[np.uint64]
+Result = TypeVar("Result")
 
 
-@dataclass(frozen=True, slots=True)
-class ChannelInfo:
-    """A channel of a log; its times are log times in nanoseconds."""
-
-    topic: str
-    encoding: str
-    schema: str
-    messages: int
-    start_ns: int | None
-    end_ns: int | None
-    file: str
-
-    @property
-    def rate(self) -> float | None:
-        """Messages a second between the first and the last; None where that takes no time."""
-        if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
-            return None
-        return (self.messages - 1) * 1e9 / (self.end_ns - self.start_ns)
-
-
-@dataclass(frozen=True, slots=True)
-class SizeInfo:
-    """How much room a log takes.
-
-    Attributes:
-        file: bytes of all of it.
-        stored: bytes of its messages as they lie there, and of the records beside them.
-        decompressed: those bytes decompressed.
-        compression: how many chunks are compressed by which algorithm, "none" among them.
-    """
-
-    file: int = 0
-    stored: int = 0
-    decompressed: int = 0
-    compression: Mapping[str, int] = field(default_factory=dict)
-
-    def __add__(self, other: SizeInfo) -> SizeInfo:
-        return SizeInfo(
-            self.file + other.file,
-            self.stored + other.stored,
-            self.decompressed + other.decompressed,
-            dict(Counter(self.compression) + Counter(other.compression)),
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class LogInfo:
-    """What is in a log, or in all logs of a folder.
-
-    Attributes:
-        kind: what the logs are; "foreign" where they are of several kinds.
-        chunks: how many there are.
-        complete: no file is cut short.
-        crc: what the checksums amount to.
-        metadata: of each file by its name, or its path where others share that, each record by
-            its own name.
-        seed: the one that all files name, if they do.
-        ended: why a run ended, where its folder says so.
-        modules: of a run, where they lie in its folder.
-        run: how it was learned, where it is a folder.
-        held_out: how slow they are on frames that were held out, where its folder says so.
-        state: the worst of the files; "unchecked" where only `check_log` reads what is in them.
-        notes: what is no problem, and what nothing proves.
-        size: in bytes.
-        library: what wrote the file, where it says so; "" of several that differ.
-        files: each file by itself.
-    """
-
-    path: str
-    kind: Kind
-    channels: tuple[ChannelInfo, ...]
-    chunks: int
-    complete: bool
-    crc: Crc
-    problems: tuple[Problem, ...]
-    metadata: Mapping[str, Mapping[str, Mapping[str, str]]]
-    seed: int | None = None
-    ended: str | None = None
-    modules: tuple[ModuleInfo, ...] = ()
-    run: RunInfo | None = None
-    held_out: Mapping[str, Any] | None = None
-    state: State = "whole"
-    notes: tuple[str, ...] = ()
-    size: SizeInfo = SizeInfo()
-    library: str = ""
-    files: tuple[LogInfo, ...] = ()
-
-    @property
-    def messages(self) -> int:
-        """How many there are on all channels."""
-        return sum(c.messages for c in self.channels)
-
-    @property
-    def span(self) -> tuple[int, int] | None:
-        """Log times of the first and of the last message, nanoseconds."""
-        starts = [c.start_ns for c in self.channels if c.start_ns is not None]
-        ends = [c.end_ns for c in self.channels if c.end_ns is not None]
-        return (min(starts), max(ends)) if starts and ends else None
-
-    def as_json(self) -> dict[str, Any]:
-        """The description as JSON values."""
-        return {"schema": SCHEMA, **asdict(self)}
-
-
-def describe(*words: str | Path) -> LogInfo:
-    """Describe a recording's or run's folder, any MCAP file, or camera logs; several as one.
+def describe(*words: str | Path) -> LogReport:
+    """Describe recordings, runs, MCAP files and camera logs; several as one.
 
     Torn and damaged files are described as far as they can be read. Of several, one that
     cannot be read is described as such.
@@ -168,77 +56,67 @@ def describe(*words: str | Path) -> LogInfo:
         UsageError: no such log.
         LogDamagedError: not an MCAP file, or a camera log that cannot be read.
     """
-    named, refused = located(words)
-    alone = len(words) == len(named) == 1
-    files = [info for place in named for info in _describe_place(place, alone=alone)]
-    files += [_unread(word, error) for word, error in refused]
-    kinds, states = {f.kind for f in files if f.channels or f.metadata}, {f.crc for f in files}
-    by_weight: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
-    named_alike = Counter(name for f in files for name in f.metadata)
-    metadata = {
-        name if named_alike[name] == 1 else f.path: records
-        for f in files
-        for name, records in f.metadata.items()
-    }
-    run = run_folder(named[0]) if len(named) == 1 else None
-    result = {} if run is None else result_of(run)
-    channels = tuple(c for f in files for c in f.channels)
-    libraries = {f.library for f in files}
-    records = [values for found in metadata.values() for values in found.values()]
-    return LogInfo(
-        path=" ".join([*map(str, named), *(word for word, _ in refused)]),
-        kind=kinds.pop() if len(kinds) == 1 else "foreign",
-        channels=channels,
-        chunks=sum(f.chunks for f in files),
-        complete=all(f.complete for f in files),
-        crc=next(state for state in by_weight if state in states),
-        problems=tuple(p for f in files for p in f.problems),
-        metadata=metadata,
-        seed=_seed(records),
-        ended=None if result.get("ended") is None else str(result["ended"]),
-        held_out=held_out_of(result),
-        modules=() if run is None else modules_of(run),
-        run=None if run is None else RunInfo.of(run, result, _iterations(channels)),
-        state=worst(f.state for f in files),
-        notes=tuple(note for f in files for note in f.notes),
-        size=sum((f.size for f in files), SizeInfo()),
-        library=libraries.pop() if len(libraries) == 1 else "",
-        files=tuple(files),
-    )
+    report = report_all(words, _describe_place)
+    facts = {} if len(words) > 1 else run_facts(Path(report.path), report.channels)
+    return replace(report, **facts)
 
 
-def _iterations(channels: Sequence[ChannelInfo]) -> int:
-    """Iterations of a run whose log has these channels: the records of its signals."""
-    return sum(c.messages for c in channels if c.topic == SIGNALS_TOPIC)
+def report_all(
+    words: Sequence[str | Path], read: Callable[[Path, bool], Iterable[LogReport]]
+) -> LogReport:
+    """Report on the logs that words name, so that one broken log does not hide the others.
+
+    Args:
+        words: paths, patterns or URLs.
+        read: returns the reports on a place, which is the only one or not.
+
+    Raises:
+        CdmisfaError: the only log cannot be read.
+    """
+    places: list[Path] = []
+    reports: list[LogReport] = []
+    failures: list[LogReport] = []
+    for word in words:
+        try:
+            places += locations([word])
+        except CdmisfaError as error:
+            if len(words) == 1:
+                raise
+            failures.append(failed(word, error))
+    alone = len(words) == len(places) == 1
+    for place in places:
+        try:
+            reports += read(place, alone)
+        except CdmisfaError as error:
+            if alone:
+                raise
+            reports.append(failed(place, error))
+    path = " ".join([*map(str, places), *(report.path for report in failures)])
+    return combined(path, reports + failures)
 
 
-def _describe_place(place: Path, *, alone: bool) -> Iterator[LogInfo]:
-    """Describe the logs at a place; of several one that cannot be read is described as such."""
-    logs: list[Path] = [place]
-    try:
-        if not only_foreign(place) and not are_arrays([place]):
-            logs = log_files(place)
-    except CdmisfaError as error:
-        if alone:
-            raise
-        yield _unread(place, error)
-        return
+def _describe_place(place: Path, alone: bool) -> Iterator[LogReport]:
+    """Describe the logs in a place, the only one or not."""
+    external = only_foreign(place) or are_arrays([place])
+    logs = [place] if external else log_files(place)
     for log in logs:
         try:
             yield describe_log(log)
         except CdmisfaError as error:
-            if alone and (len(logs) == 1 or not isinstance(error, LogDamagedError)):
+            if alone and len(logs) == 1:
                 raise
-            yield _unread(log, error)
+            yield failed(log, error)
 
 
-def describe_log(log: Path, *, decode: bool | None = None) -> LogInfo:
+def describe_log(log: Path, *, decode: bool | None = None) -> LogReport:
     """Describe a file or a folder that is one log; raises as `describe`.
 
-    What is in it is decoded, only its summary is read, or as much as `CHECK_BYTES` says.
+    Args:
+        log: the file or the folder.
+        decode: decode the content, or read its summary only; by default as its size allows.
     """
     if only_foreign(log):
-        return _describe_foreign(log, 0 if decode is False else CHECK_BYTES)
+        return _describe_external(log, 0 if decode is False else CHECK_BYTES)
     if are_arrays([log]):
         return _describe_arrays(log)
     if decode or (decode is None and log.stat().st_size <= CHECK_BYTES):
@@ -247,99 +125,125 @@ def describe_log(log: Path, *, decode: bool | None = None) -> LogInfo:
         return describe_reader(reader, decode=False)
 
 
-def _unread(place: str | Path, error: CdmisfaError) -> LogInfo:
-    crc, state = failed_state(error)
-    wrong = (as_problem(place, error),)
-    return LogInfo(str(place), "foreign", (), 0, False, crc, wrong, {}, state=state)
+def read_once(path: Path, work: Callable[[LogReader], Result]) -> Result:
+    """Apply a function to the reader of a log and read each byte once if the log is whole.
+
+    Args:
+        path: the log.
+        work: reads the log with `LogReader.one_pass`; may raise a CdmisfaError.
+
+    Raises:
+        CdmisfaError: it is no log, or raised by `work`.
+    """
+    with contextlib.suppress(CdmisfaError), LogReader(path, check="pass") as reader:
+        result = work(reader)
+        if not reader.problems:
+            return result
+    # The strict pass stopped at the first damage: read again and list all of it.
+    with LogReader(path, salvage=True, check="pass") as reader:
+        return work(reader)
 
 
-def _describe_foreign(place: Path, most: int) -> LogInfo:
-    """Describe a log that is in no MCAP file; of pictures up to `most` bytes are checked."""
-    known = channels_of(place)
-    channels = [
-        ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
-        for c in known
-    ]
-    missing = tuple(Problem(str(place), c.missing) for c in known if c.missing)
+def _describe_external(place: Path, most: int) -> LogReport:
+    """Describe a log in another format than MCAP; check up to `most` bytes of its images."""
+    channels = channels_of(place)
+    missing = tuple(Problem(str(place), c.missing) for c in channels if c.missing)
     broken = None
     if most and log_format(place) == "pictures":
-        with contextlib.closing(FolderImages(place, None)) as pictures:
-            broken = pictures.broken(most)
+        with contextlib.closing(FolderImages(place, None)) as images:
+            broken = images.broken(most)
+    crc: Crc = "absent" if broken is None else "bad" if broken else "ok"
     state: State = "damaged" if broken else "unchecked" if broken is None else "whole"
-    return LogInfo(
+    return LogReport(
         path=str(place),
-        kind="foreign",
-        channels=tuple(channels),
-        chunks=0,
+        channels=tuple(
+            ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
+            for c in channels
+        ),
         complete=not missing,
-        crc="absent" if broken is None else "bad" if broken else "ok",
+        crc=crc,
         problems=(*missing, *(broken or ())),
-        metadata={},
         state="cut short" if missing else state,
-        size=SizeInfo(_bytes_of(place)),
-        notes=tuple(dict.fromkeys(line for c in known for line in c.remarks)),
+        size=_size_of(place),
+        notes=tuple(dict.fromkeys(line for c in channels for line in c.remarks)),
     )
 
 
-def _describe_arrays(place: Path) -> LogInfo:
-    """What `numpy` saved: to open it is to find that it is all there."""
+def _describe_arrays(place: Path) -> LogReport:
+    """Describe a file of NumPy's arrays; it is whole if it can be loaded."""
     channels = []
     for name, array in load_numbers(place).items():
         shape = "x".join(map(str, array.shape[1:]))
-        kind = f"{array.dtype} {shape}".rstrip()
         rows = len(array) if array.ndim else 1
+        kind = f"{array.dtype} {shape}".rstrip()
         channels.append(ChannelInfo(name, "numpy", kind, rows, None, None, place.name))
-    about: Any = {"complete": True, "crc": "absent", "problems": (), "metadata": {}}
-    size = SizeInfo(_bytes_of(place))
-    return LogInfo(str(place), "foreign", tuple(channels), 0, size=size, **about)
+    return LogReport(str(place), channels=tuple(channels), size=_size_of(place))
 
 
-def _bytes_of(place: Path) -> int:
-    """Bytes of a file, or of all files in a folder."""
+def _size_of(place: Path) -> SizeInfo:
+    """Return the bytes of a file, or of all files in a folder."""
     files = [place] if place.is_file() else place.rglob("*")
-    return sum(path.stat().st_size for path in files if path.is_file())
+    return SizeInfo(sum(path.stat().st_size for path in files if path.is_file()))
 
 
-def describe_reader(reader: LogReader, *, decode: bool | None = None) -> LogInfo:
-    """Describe an MCAP file."""
+def describe_reader(reader: LogReader, *, decode: bool | None = None) -> LogReport:
+    """Describe an MCAP file; by default decode it if its size allows."""
     if decode is None:
         decode = sum(s.size for s in reader.segments) <= CHECK_BYTES
-    counts, channels = count_messages(reader, decode=decode), []
+    counts = count_decoded(reader) if decode else _count_by_index(reader)
+    report = report_on(reader, counts)
+    if not decode:
+        return replace(report, crc="unchecked", state=_unchecked(report.state))
+    # Chunks may be whole and the images of other writers in them broken: only verify decodes these.
+    images = any(schema.name in SCHEMAS for schema in reader.schemas.values())
+    if report.kind == "foreign" and images:
+        return replace(report, state=_unchecked(report.state))
+    return report
+
+
+def _unchecked(state: State) -> State:
+    return "unchecked" if state == "whole" else state
+
+
+def report_on(reader: LogReader, counts: Mapping[int, ChannelCount]) -> LogReport:
+    """Report on an MCAP file that was decoded, with the messages of each channel."""
     name = reader.path.name
-    for number, found in sorted(counts.items()):
+    channels = []
+    for number, count in sorted(counts.items()):
         undefined = Channel(number, f"(channel {number}, never defined)", "", {}, 0)
         channel = reader.channels.get(number, undefined)
         schema = reader.schemas.get(channel.schema_id)
-        kind, times = schema.name if schema else "", (found.start, found.end)
-        entry = (channel.topic, channel.message_encoding, kind, found.messages, *times, name)
-        channels.append(ChannelInfo(*entry))
+        kind = schema.name if schema else ""
+        entry = (channel.topic, channel.message_encoding, kind, count.messages)
+        channels.append(ChannelInfo(*entry, count.start, count.end, name))
+    segments = reader.segments
     metadata = {m.name: m.metadata for m in reader.metadata}
-    state = state_of(reader)
-    if state == "whole" and not (decode and _all_checked(reader)):
-        state = "unchecked"
-    stored, decompressed = (sum(getattr(s, n) for s in reader.segments) for n in SIZES)
-    compression = Counter(s.compression or "none" for s in reader.segments if s.chunked)
-    return LogInfo(
+    state: State = "damaged" if reader.problems else "cut short" if reader.missing else "whole"
+    crc: Crc = "ok" if state == "whole" else "unchecked"
+    if reader.problems:
+        crc = "bad"
+    elif reader.crc_absent():
+        crc = "absent"
+    return LogReport(
         path=str(reader.path),
         kind=kind_of(reader),
         channels=tuple(channels),
-        chunks=sum(s.chunked for s in reader.segments),
+        chunks=sum(s.chunked for s in segments),
         complete=reader.complete,
-        crc=crc_of(reader) if decode else "unchecked",
+        crc=crc,
         problems=problems_of(reader),
         metadata={name: metadata},
         seed=_seed([*metadata.values()]),
         state=state,
         notes=tuple(reader.unproven()),
-        size=SizeInfo(reader.size, stored, decompressed, dict(compression)),
+        size=SizeInfo(
+            reader.size,
+            sum(s.stored for s in segments),
+            sum(s.size for s in segments),
+            dict(Counter(s.compression or "none" for s in segments if s.chunked)),
+        ),
         library=reader.library,
     )
-
-
-def _all_checked(reader: LogReader) -> bool:
-    """Whether checksums are all there is to check; images of others may be broken within."""
-    images = any(schema.name in SCHEMAS for schema in reader.schemas.values())
-    return kind_of(reader) != "foreign" or not images
 
 
 def kind_of(reader: LogReader) -> Kind:
@@ -350,22 +254,103 @@ def kind_of(reader: LogReader) -> Kind:
     return "run" if RUN_METADATA in names else "foreign"
 
 
-def as_problem(path: str | Path, error: CdmisfaError) -> Problem:
-    """An error as a problem of the file that it names."""
-    return Problem(str(path), str(error).removeprefix(f"{path}: "))
-
-
 def problems_of(reader: LogReader) -> tuple[Problem, ...]:
-    """What was found to be wrong so far, and what is missing at the end."""
-    found = [Problem(f"{reader.path}: {p.where}", p.what) for p in reader.problems]
-    return (*found, *([Problem(str(reader.path), reader.missing)] if reader.missing else ()))
+    """Return the damage that the reader has found, and what is missing at the end."""
+    problems = [Problem(f"{reader.path}: {p.where}", p.what) for p in reader.problems]
+    missing = [Problem(str(reader.path), reader.missing)] if reader.missing else []
+    return (*problems, *missing)
 
 
 def _seed(records: Sequence[Mapping[str, str]]) -> int | None:
-    """The one seed that all metadata names."""
+    """Return the one seed that all metadata states; anybody may have written the metadata."""
     seeds: set[int] = set()
     for values in records:
         with contextlib.suppress(ValueError, TypeError, AttributeError):
             manifest = parse_json(values.get("manifest", "{}"))
             seeds.add(int(values.get("seed", manifest.get("seed"))))
     return seeds.pop() if len(seeds) == 1 else None
+
+
+# Messages of each channel
+
+
+@dataclass(slots=True)
+class ChannelCount:
+    """Number of messages on a channel, and their range of log times in nanoseconds."""
+
+    messages: int = 0
+    start: int | None = None
+    end: int | None = None
+
+    def add(self, times: Times) -> None:
+        """Add messages by their log times, (n,) nanoseconds."""
+        self.messages += len(times)
+        self.widen(times)
+
+    def widen(self, times: Times) -> None:
+        """Widen the range by log times, (n,) nanoseconds."""
+        if len(times):
+            low, high = int(times.min()), int(times.max())
+            self.start = low if self.start is None else min(self.start, low)
+            self.end = high if self.end is None else max(self.end, high)
+
+
+def count_decoded(
+    reader: LogReader, each: Callable[[Segment], None] = lambda segment: None
+) -> dict[int, ChannelCount]:
+    """Decode every chunk of a log, which finds all damage, and count the messages.
+
+    Args:
+        reader: of the log, which is read in one pass.
+        each: called with every chunk after it was decoded, in file order.
+    """
+    counts = {number: ChannelCount() for number in reader.channels}
+    for segment, table in reader.one_pass():
+        each(segment)
+        for number in () if table is None else np.unique(table.channel).tolist():
+            counts.setdefault(number, ChannelCount()).add(_times_in(table, number))
+    return counts
+
+
+def _count_by_index(reader: LogReader) -> dict[int, ChannelCount]:
+    """Count the messages by the indexes of chunks and read as few of them as possible.
+
+    A channel starts in one of the chunks that start before any known message of it.
+    """
+    counts = {number: ChannelCount() for number in reader.channels}
+    chunks: dict[int, list[Segment]] = {}
+    for segment in reader.segments:
+        in_chunk = segment.channel_counts()
+        if in_chunk is None:
+            table = reader.table(segment)
+            in_chunk = {} if table is None else Counter(table.channel.tolist())
+        for number, count in in_chunk.items():
+            if count:
+                chunks.setdefault(number, []).append(segment)
+                counts.setdefault(number, ChannelCount()).messages += count
+    for number, segments in chunks.items():
+        channel = counts[number]
+        for segment in sorted(segments, key=lambda s: s.start):
+            if channel.start is not None and segment.start >= channel.start:
+                break
+            channel.widen(_times_of(reader, segment, number))
+        for segment in sorted(segments, key=lambda s: s.end, reverse=True):
+            if channel.end is not None and segment.end <= channel.end:
+                break
+            channel.widen(_times_of(reader, segment, number))
+    return counts
+
+
+def _times_of(reader: LogReader, segment: Segment, number: int) -> Times:
+    """Return the log times of a channel's messages in a chunk, by its message index if any."""
+    if not segment.indexes:
+        return _times_in(reader.table(segment), number)
+    try:
+        pairs = reader.index(segment)
+    except MalformedRecord as error:
+        raise LogDamagedError(f"{reader.path}: {segment.name}: {error}") from None
+    return np.concatenate([own[:, 0] for channel, own in pairs if channel == number])
+
+
+def _times_in(table: MessageTable | None, number: int) -> Times:
+    return np.empty(0, np.uint64) if table is None else table.log_time[table.channel == number]

@@ -1,23 +1,27 @@
-"""What was learned in a run, as its folder says: by which learner, of which streams, and how slow.
+"""Read from a run's folder what was learned: by which learner, from which streams, how slow.
 
-Files of a run may come from anywhere: what is none of it is left out.
+The files of a run may come from anywhere: fields that make no sense are left out.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.signals import STATES
 from cdmisfa.modules import Module
+from replay.integrity.report import ChannelInfo
 from replay.runs.folders import RUN_FILE, read_run_json, run_log
-from replay.runs.log import read_header
+from replay.runs.log import SIGNALS_TOPIC, read_header
 from replay.runs.modules import load_modules
+
+_NO_SENSE: Final = (LookupError, TypeError, ValueError, AttributeError)
+"""Errors of reading fields of a document whose structure is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +42,7 @@ class ModuleInfo:
 
     @classmethod
     def of(cls, module: Module) -> ModuleInfo:
-        """A module in short."""
+        """Return a module in short."""
         slowness, slow, policy = (
             tuple(m.tolist()) for m in (module.eta, module.slow, module.policy)
         )
@@ -51,10 +55,10 @@ class RunInfo:
 
     Attributes:
         algorithm: name of its learner.
-        streams: names of what it learned from.
+        streams: names of the streams it learned from.
         tau: frames of an iteration.
-        iterations: that are in its log.
-        outcomes: what became of each stream, where its learner says so: its `stream`, `state`,
+        iterations: number of iterations in its log.
+        outcomes: outcome of each stream, if its learner reports them: its `stream`, `state`,
             `module`, `blocks`, `slowness` and `why`.
     """
 
@@ -64,71 +68,62 @@ class RunInfo:
     iterations: int
     outcomes: tuple[Mapping[str, Any], ...]
 
-    @classmethod
-    def of(cls, run: Path, result: Mapping[str, Any], iterations: int) -> RunInfo | None:
-        """How the run in a folder was learned; None where its log does not say.
 
-        Args:
-            run: the folder.
-            result: see `result_of`.
-            iterations: in its log.
-        """
-        with contextlib.suppress(CdmisfaError, TypeError, ValueError):
-            header = read_header(run)
-            told, tau = (header.setting("learner", key) for key in ("algorithm", "tau"))
-            outcomes = tuple(_outcomes(result))
-            return cls(str(told), header.spec.streams, int(tau), iterations, outcomes)
-        return None
+def run_facts(place: Path, channels: Sequence[ChannelInfo]) -> dict[str, Any]:
+    """Return the fields of a report on what a run learned; none where a place is no run.
 
-
-def run_folder(place: Path) -> Path | None:
-    """The folder of the run that a place is, if it is one."""
-    with contextlib.suppress(CdmisfaError):
+    Args:
+        place: the folder of the run, or its log.
+        channels: of its log.
+    """
+    try:
         log = run_log(place)
-        return log.parent if log.name.startswith(RUN_FILE) else None
-    return None
-
-
-def result_of(run: Path) -> Mapping[str, Any]:
-    """What run.json says that a run came to; nothing where it does not say."""
-    result = read_run_json(run).get("result")
-    return result if isinstance(result, Mapping) else {}
-
-
-def modules_of(run: Path) -> tuple[ModuleInfo, ...]:
-    """The modules in a run's folder; none where their file cannot be read."""
+    except CdmisfaError:
+        return {}
+    if not log.name.startswith(RUN_FILE):
+        return {}
+    folder, facts = log.parent, dict[str, Any]()
+    result = read_run_json(folder).get("result")
+    result = result if isinstance(result, Mapping) else {}
     with contextlib.suppress(CdmisfaError):
-        return tuple(map(ModuleInfo.of, load_modules(run)))
-    return ()
+        facts["modules"] = tuple(map(ModuleInfo.of, load_modules(folder)))
+    if result.get("ended") is not None:
+        facts["ended"] = str(result["ended"])
+    with contextlib.suppress(*_NO_SENSE):
+        facts["held_out"] = _held_out(result["held_out"])
+    outcomes: list[Mapping[str, Any]] = []
+    with contextlib.suppress(*_NO_SENSE):
+        for stated in result["streams"]:
+            outcomes.append(_outcome(stated))
+    with contextlib.suppress(CdmisfaError, TypeError, ValueError):
+        header = read_header(folder)
+        algorithm, tau = (header.setting("learner", key) for key in ("algorithm", "tau"))
+        count = sum(c.messages for c in channels if c.topic == SIGNALS_TOPIC)
+        streams = header.spec.streams
+        facts["run"] = RunInfo(str(algorithm), streams, int(tau), count, tuple(outcomes))
+    return facts
 
 
-def held_out_of(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """How slow modules are on frames that were held out, as a result says."""
-    with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):
-        found = result["held_out"]
-        numbers = ("slowness", "of_batch")
-        return {
-            **{key: [int(t) for t in found[key]][:2] for key in ("frames", "fitted")},
-            "modules": [
-                {"module": int(one["module"]), "stream": str(one["stream"])}
-                | {key: [math.nan if v is None else float(v) for v in one[key]] for key in numbers}
-                for one in found["modules"]
-            ],
-        }
-    return None
+def _held_out(stated: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the slowness of modules on held-out frames, as a result states it."""
+    numbers = ("slowness", "of_batch")
+    return {
+        **{key: [int(t) for t in stated[key]][:2] for key in ("frames", "fitted")},
+        "modules": [
+            {"module": int(entry["module"]), "stream": str(entry["stream"])}
+            | {key: [math.nan if v is None else float(v) for v in entry[key]] for key in numbers}
+            for entry in stated["modules"]
+        ],
+    }
 
 
-def _outcomes(result: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """What became of each stream, as a result says."""
-    with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):
-        for one in result["streams"]:
-            if one["state"] not in STATES:
-                return
-            yield {
-                "stream": str(one["stream"]),
-                "state": one["state"],
-                "module": None if one["module"] is None else int(one["module"]),
-                "blocks": int(one["blocks"]),
-                "slowness": None if one["slowness"] is None else float(one["slowness"]),
-                "why": str(one["why"]),
-            }
+def _outcome(stated: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the outcome of a stream, as a result states it; a state that is none is refused."""
+    return {
+        "stream": str(stated["stream"]),
+        "state": STATES[STATES.index(stated["state"])],
+        "module": None if stated["module"] is None else int(stated["module"]),
+        "blocks": int(stated["blocks"]),
+        "slowness": None if stated["slowness"] is None else float(stated["slowness"]),
+        "why": str(stated["why"]),
+    }

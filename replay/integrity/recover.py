@@ -1,11 +1,15 @@
-"""Saving what can be read of a damaged log as a whole one."""
+"""Recover a damaged log: repair what it states twice, and write what can be read as a whole log.
+
+The head of a chunk is also in the summary, and its message indexes follow from its messages. The
+checksum over all data shows whether anything else was wrong.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import struct
-from collections.abc import Iterator
+from bisect import bisect_right
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -15,24 +19,31 @@ import numpy as np
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.files import make_folder, refuse_unless
 from recorder.log.logfile import LogFile
-from recorder.mcap.chunks import UNUSED
+from recorder.mcap.chunks import UNUSED, MessageTable, check_size, decompressed, walked_table
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import Problem
-from recorder.mcap.store import PARTIAL, FileStore
+from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segment, crc32
+from recorder.mcap.store import PARTIAL, FileStore, Store
+from recorder.mcap.walk import LogStructure
 from replay.camera_logs.opening import only_foreign
-from replay.integrity.counting import ChannelCount
-from replay.integrity.info import SCHEMA, problems_of
-from replay.integrity.mending import mended
+from replay.integrity.info import ChannelCount, problems_of
+from replay.integrity.report import SCHEMA
 from replay.storage.location import location
 from replay.storage.opening import log_files
 
 _HASHED: Final = struct.Struct("<HIQQ")
-"""Of a message, before its payload: channel, sequence, log time, publish time."""
+"""Fields of a message that are hashed before its payload: channel, sequence, log, publish time."""
+_MOST_CHANNELS: Final = 64
+"""Most channels of a chunk whose indexes are repaired: each is compared with each."""
+_ALIKE: Final = 0.5
+"""Share of equal bytes at which bytes are taken for a damaged copy of an index; chance gives 1/256
+plus the zeros of small numbers."""
+_MOST_BYTES: Final = 64 * 1024 * 1024
+"""Most bytes that are repaired, because they are held in memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelRecovery:
-    """What was saved of a channel; `lost` is None where nothing tells how much."""
+    """Numbers of messages saved and lost on a channel; `lost` is None where nothing tells."""
 
     topic: str
     kept: int
@@ -44,13 +55,13 @@ class ChannelRecovery:
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What was saved of a log, or of all logs of a folder.
+    """Result of recovering a log, or all logs of a folder.
 
     Attributes:
         out: the log or folder that was written.
-        lost: what could not be saved.
-        mended: what was damaged and is made again from what else the log says: nothing is lost.
-        unverified: messages saved of a cut chunk, whose checksum cannot be checked.
+        lost: damage that cost something.
+        mended: damage that was repaired from other parts of the log, and cost nothing.
+        unverified: messages saved from a cut chunk, whose checksum cannot be checked.
     """
 
     out: str
@@ -65,16 +76,16 @@ class Recovery:
         return not self.lost
 
     def as_json(self) -> dict[str, Any]:
-        """What was saved as JSON values."""
-        found = asdict(self)
-        return {"schema": SCHEMA, "out": found.pop("out"), "complete": self.complete, **found}
+        """Return the result as JSON values."""
+        values = asdict(self)
+        return {"schema": SCHEMA, "out": values.pop("out"), "complete": self.complete, **values}
 
 
 def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Recovery:
     """Write a complete, indexed log of everything in `src` that is readable.
 
     The new file is read again, with its checksums, and compared before this returns.
-    Of a folder each log is recovered into the folder `dst`.
+    Each log of a folder is recovered into the folder `dst`.
 
     Raises:
         UsageError: no such log, one of another kind than MCAP, or the output exists and `force` is
@@ -88,81 +99,60 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
             f"{src} is no MCAP file, and others are not recovered: learn and convert pass over "
             "broken images of them with --salvage"
         )
-    files = log_files(src)
-    targets = [dst]
-    if src.is_dir():
-        if dst.exists() and not dst.is_dir():
-            raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
-        targets = [dst / file.name.removesuffix(PARTIAL) for file in files]
-    else:
+    files, alone = log_files(src), not src.is_dir()
+    if alone:
         refuse_unless(dst, "the log is an MCAP file", ".mcap", "")
-    try:
-        make_folder(dst if src.is_dir() else dst.parent)
-    except OSError as error:
-        raise UsageError(f"{dst}: {error.strerror}") from None
+    targets = [dst if alone else dst / file.name.removesuffix(PARTIAL) for file in files]
+    make_folder(dst.parent if alone else dst)
     for file, target in zip(files, targets, strict=True):
         if target.exists() and file.samefile(target):
             raise UsageError(f"{target}: cannot be recovered into itself, name another file")
-    alone = not src.is_dir()  # of a folder, other logs may hold something
-    found = [_recover_file(f, t, force, alone) for f, t in zip(files, targets, strict=True)]
+    results = [_recover_file(f, t, force, alone) for f, t in zip(files, targets, strict=True)]
     return Recovery(
         out=str(dst),
-        channels=tuple(c for one in found for c in one.channels),
-        lost=tuple(p for one in found for p in one.lost),
-        mended=tuple(p for one in found for p in one.mended),
-        unverified=sum(one.unverified for one in found),
+        channels=tuple(c for result in results for c in result.channels),
+        lost=tuple(p for result in results for p in result.lost),
+        mended=tuple(p for result in results for p in result.mended),
+        unverified=sum(result.unverified for result in results),
     )
 
 
 def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
-    with _opened(src) as (reader, right):
-        found = reader.channels or reader.metadata or reader.attachments
-        if alone and reader.missing and not found:
+    with ExitStack() as stack:
+        reader = stack.enter_context(LogReader(src, salvage=True))
+        repaired: list[Problem] = []
+        if reader.problems:
+            store = repair(FileStore(src))
+            repaired = [Problem(f"{src}: {p.where}", p.what) for p in store.repaired]
+            reader = stack.enter_context(LogReader(store, salvage=True))
+        content = reader.channels or reader.metadata or reader.attachments
+        if alone and reader.missing and not content:  # in a folder, other logs may hold something
             raise LogDamagedError(f"{src}: nothing in it can be saved, and nothing was written")
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
             digest, kept, unverified = _copy(reader, log)
         _compare(dst, len(reader.metadata), digest)
-        channels, lost = [], _lost_messages(reader, kept)
-        for number, channel in sorted(reader.channels.items()):
-            count = kept[number]
-            counts = count.messages, lost[number], count.start, count.end
-            channels.append(ChannelRecovery(channel.topic, *counts, dst.name))
-        return Recovery(str(dst), tuple(channels), _lost(reader), right, unverified)
-
-
-@contextlib.contextmanager
-def _opened(src: Path) -> Iterator[tuple[LogReader, tuple[Problem, ...]]]:
-    """A log, where it is damaged with what can be made right of it, and what that was."""
-    with LogReader(src, salvage=True) as reader:
-        if not reader.problems:
-            yield reader, ()
-            return
-    store = mended(FileStore(src))
-    with LogReader(store, salvage=True) as reader:
-        yield reader, tuple(Problem(f"{src}: {p.where}", p.what) for p in store.mended)
-
-
-def _lost(reader: LogReader) -> tuple[Problem, ...]:
-    """What is wrong with a log, but for what only says where the messages are that are there."""
-    found = [problem for problem in problems_of(reader) if not problem.what.endswith(UNUSED)]
-    data = f"{reader.path}: data section"
-    if reader.data_complete:
-        index = {str(reader.path), *(f"{reader.path}: {part}" for part in ("summary", "footer"))}
-        found = [problem for problem in found if problem.where not in index]
-        proven = all(segment.crc for segment in reader.segments if segment.size)
-        if proven and {problem.where for problem in found} == {data}:
-            what = "damaged between the chunks: every message is there, metadata may be wrong"
-            found = [Problem(data, f"its CRC does not match: {what}")]
-    return tuple(found)
+        lost = _lost_messages(reader, kept)
+        channels = tuple(
+            ChannelRecovery(
+                channel.topic,
+                kept[number].messages,
+                lost[number],
+                kept[number].start,
+                kept[number].end,
+                dst.name,
+            )
+            for number, channel in sorted(reader.channels.items())
+        )
+        return Recovery(str(dst), channels, _lost(reader), tuple(repaired), unverified)
 
 
 def _copy(reader: LogReader, log: LogFile) -> tuple[str, dict[int, ChannelCount], int]:
     """Write what is readable.
 
     Returns:
-        A digest of all messages, what is kept of each channel, and how many messages no checksum
-        proves.
+        A digest of all messages, the messages kept of each channel, and how many messages no
+        checksum proves.
     """
     for record in reader.metadata:
         log.add_metadata(record.name, record.metadata)
@@ -193,6 +183,7 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[str, dict[int, ChannelCount]
     digest, unverified = hashlib.sha256(), 0
     for segment, table in reader.tables():
         add_channels()  # the summary may lack channels that are defined in a chunk
+        # The CRC of a cut chunk is that of all its records, of which the last are not there.
         unverified += len(table) if segment.cut and segment.crc else 0
         for number, sequence, log_time, published, data in table.rows():
             if number in written:
@@ -204,8 +195,37 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[str, dict[int, ChannelCount]
     return digest.hexdigest(), kept, unverified
 
 
+def _compare(path: Path, metadata: int, digest: str) -> None:
+    """Read the new log with every checksum and compare it with what was written."""
+    reread = hashlib.sha256()
+    with LogReader(path) as reader:
+        for _, table in reader.tables():
+            for number, sequence, log_time, published, data in table.rows():
+                reread.update(_HASHED.pack(number, sequence, log_time, published))
+                reread.update(data)
+        whole = not (reader.missing or reader.problems) and len(reader.metadata) == metadata
+    if not whole or reread.hexdigest() != digest:
+        raise LogDamagedError(f"{path}: differs from what was recovered; check the disk")
+
+
+def _lost(reader: LogReader) -> tuple[Problem, ...]:
+    """Return the damage of a log, without damaged indexes of messages that are all there."""
+    problems = [problem for problem in problems_of(reader) if not problem.what.endswith(UNUSED)]
+    data = f"{reader.path}: data section"
+    if reader.data_complete:
+        # Summary and footer only repeat what the data says, and are written again.
+        index = {str(reader.path), *(f"{reader.path}: {part}" for part in ("summary", "footer"))}
+        problems = [problem for problem in problems if problem.where not in index]
+        proven = all(segment.crc for segment in reader.segments if segment.size)
+        if proven and {problem.where for problem in problems} == {data}:
+            # Every chunk matches its own CRC: the changed byte is in a record between them.
+            what = "damaged between the chunks: every message is there, metadata may be wrong"
+            problems = [Problem(data, f"its CRC does not match: {what}")]
+    return tuple(problems)
+
+
 def _lost_messages(reader: LogReader, kept: dict[int, ChannelCount]) -> dict[int, int | None]:
-    """How many messages are gone: by the writer's statistics, else by the index of each chunk."""
+    """Count lost messages by the writer's statistics, else by the index of each lost chunk."""
     stated = reader.statistics
     if stated is not None:
         return {n: max(stated.channel_message_counts.get(n, 0) - kept[n].messages, 0) for n in kept}
@@ -215,15 +235,99 @@ def _lost_messages(reader: LogReader, kept: dict[int, ChannelCount]) -> dict[int
     return {n: sum(c.get(n, 0) for c in counts if c is not None) for n in kept}
 
 
-def _compare(path: Path, metadata: int, digest: str) -> None:
-    """Read the new log with every checksum and compare it with what was written."""
-    found = hashlib.sha256()
-    with LogReader(path) as reader:
-        for _, table in reader.tables():
-            for number, sequence, log_time, published, data in table.rows():
-                found.update(_HASHED.pack(number, sequence, log_time, published))
-                found.update(data)
-        if reader.missing or reader.problems or len(reader.metadata) != metadata:
-            raise LogDamagedError(f"{path}: the recovered log is not whole; check the disk")
-    if found.hexdigest() != digest:
-        raise LogDamagedError(f"{path}: differs from what was recovered; check the disk")
+# Repair of heads and indexes of chunks
+
+
+class RepairedStore(Store):
+    """A log with some bytes replaced; `repaired` lists what was wrong."""
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store.path, store.size)
+        self.repaired: list[Problem] = []
+        self._store = store
+        self._places: list[int] = []
+        self._parts: list[bytes] = []
+
+    def put(self, at: int, right: bytes, where: str, what: str) -> None:
+        """Replace the bytes at a place, behind those of the last call, where they differ."""
+        present = self._store.read(at, len(right))
+        if self._places and at < self._places[-1] + len(self._parts[-1]):
+            return
+        if present == right or len(present) < len(right):
+            return
+        if sum(map(len, self._parts)) + len(right) > _MOST_BYTES:
+            return
+        self._places.append(at)
+        self._parts.append(right)
+        self.repaired.append(Problem(where, what))
+        self._window = b""  # it may hold the bytes before the repair
+
+    def read_at(self, offset: int, count: int) -> bytes:
+        data = bytearray(self._store.read_at(offset, count))
+        stop = offset + len(data)
+        first = max(bisect_right(self._places, offset) - 1, 0)
+        last = bisect_right(self._places, stop)
+        for place, part in zip(self._places[first:last], self._parts[first:last], strict=True):
+            low, high = max(place, offset), min(place + len(part), stop)
+            if low < high:
+                data[low - offset : high - offset] = part[low - place : high - place]
+        return bytes(data)
+
+    def close(self) -> None:
+        self._store.close()
+
+
+def repair(file: Store) -> RepairedStore:
+    """Return a damaged log with the heads and message indexes of its chunks repaired."""
+    store = RepairedStore(file)
+    structure = LogStructure(file, lambda *_: None, resync=True)
+    stated = structure.summary.sound_chunks() if structure.summary else []
+    chunks = stated or [segment for segment in structure.segments if segment.chunked]
+    ends = [chunk.offset for chunk in chunks[1:]] + [structure.data_end or file.size]
+    for chunk, end in zip(chunks, ends, strict=False):
+        try:
+            if chunk.stated:  # the summary says everything of a chunk's head but its CRC
+                crc_at = chunk.offset + CHUNK_HEADER.size - 4
+                chunk.crc = int.from_bytes(store.read(crc_at, 4), "little")
+                what = "its first bytes were damaged, and are made again from the summary"
+                store.put(chunk.offset, chunk.head(chunk.crc), chunk.name, what)
+            table = _checked_table(store, chunk)
+        except MalformedRecord:
+            continue  # the damage is in the chunk's own data, which nothing repeats
+        what = "its message index was damaged, and is made again from its messages"
+        store.put(chunk.data_end, _indexes(store, chunk, end, table), chunk.name, what)
+    return store
+
+
+def _checked_table(store: Store, chunk: Segment) -> MessageTable:
+    """Decode the messages of a chunk whose CRC matches."""
+    check_size(chunk.compression, chunk.size)
+    stored = np.frombuffer(store.read(chunk.data_offset, chunk.stored), np.uint8)
+    raw = decompressed(stored, chunk.compression, chunk.size)
+    if not chunk.crc or crc32(raw.data) != chunk.crc:
+        raise MalformedRecord("no CRC that matches")
+    return walked_table(raw)[0]
+
+
+def _indexes(store: Store, chunk: Segment, end: int, table: MessageTable) -> bytes:
+    """Make the message indexes of a chunk again, in their order in the file before place `end`.
+
+    The order is not known: the index that is most like the bytes at a place was there.
+    """
+    left = [table.index(number) for number in np.unique(table.channel).tolist()]
+    if len(left) > _MOST_CHANNELS or sum(map(len, left)) > end - chunk.data_end:
+        return b""
+    made = b""
+    while left:
+        there = np.frombuffer(store.read(chunk.data_end + len(made), max(map(len, left))), np.uint8)
+        alike = [_alike(there[: len(index)], index) for index in left]
+        best = int(np.argmax(alike))
+        if alike[best] < _ALIKE and not chunk.stated:
+            return b""  # a chunk without indexes, as far as anything tells
+        made += left.pop(best)
+    return made
+
+
+def _alike(there: np.ndarray, index: bytes) -> float:
+    """Return the share of an index's bytes that are at a place."""
+    return float((there == np.frombuffer(index, np.uint8)[: len(there)]).mean())

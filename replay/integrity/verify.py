@@ -1,17 +1,27 @@
-"""Is a log whole: every checksum, every length, and every frame in every view."""
+"""Verify that logs are whole: every checksum, every length, and every frame in every view."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+import json
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.signals import SignalsHash
+from cdmisfa.core.untrusted import read_regular
+from recorder.images.messages import Decoder
+from recorder.images.options import IMAGES
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
-from recorder.mcap.records import MalformedRecord, Problem
+from recorder.mcap.records import Problem, Segment
+from replay.camera_logs.mcap_log import channels_on, topics_in
 from replay.camera_logs.opening import (
     channels_of,
     image_topics,
@@ -19,83 +29,32 @@ from replay.camera_logs.opening import (
     only_foreign,
     open_images,
 )
-from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.stream import explained, sorted_times
 from replay.camera_logs.table import table_notes
-from replay.integrity.counting import count_messages, read_once
-from replay.integrity.info import SCHEMA, as_problem, kind_of, problems_of
-from replay.integrity.passes import ImagesPass, RunPass, ViewPass
-from replay.integrity.state import Crc, State, crc_of, failed_state, located, state_of, worst
+from replay.integrity.info import count_decoded, kind_of, read_once, report_all, report_on
+from replay.integrity.report import LogReport, State, as_problem, combined, failed
 from replay.recordings.source import RecordedSource
+from replay.recordings.view_file import ViewFile
+from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
+from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, header_in
+from replay.runs.modules import load_modules
+from replay.runs.provenance import facts_sha256
+from replay.storage.arrays import MAX_BYTES
 from replay.storage.location import location
 from replay.storage.opening import log_files
 
 
-@dataclass(frozen=True, slots=True)
-class FileCheck:
-    """One log: its checksums, "absent" where nothing protects its messages, and its state."""
-
-    file: str
-    crc: Crc
-    state: State
-
-
-@dataclass(frozen=True, slots=True)
-class LogCheck:
-    """Whether a log, or all logs of a folder, are whole; `notes` are no problems."""
-
-    problems: tuple[Problem, ...]
-    files: tuple[FileCheck, ...]
-    notes: tuple[str, ...] = ()
-
-    @property
-    def ok(self) -> bool:
-        """Whether nothing is wrong."""
-        return not self.problems
-
-    @property
-    def state(self) -> State:
-        """The worst of the files; "damaged" where these are whole, and hold what they must not."""
-        found = worst(file.state for file in self.files)
-        refused = {file.file for file in self.files if file.state == "not read"}
-        wrong = any(problem.where not in refused for problem in self.problems)
-        return "damaged" if wrong and found in ("whole", "not read") else found
-
-    def as_json(self) -> dict[str, Any]:
-        """What was found as JSON values."""
-        return {"schema": SCHEMA, "ok": self.ok, "state": self.state, **asdict(self)}
-
-
-def check_logs(*words: str | Path) -> LogCheck:
+def check_logs(*words: str | Path) -> LogReport:
     """Check several logs, each by itself; see `check_log`, which raises where there is one."""
-    named, refused = located(words)
-    checks = []
-    for place in named:
-        try:
-            checks.append(check_log(place))
-        except CdmisfaError as error:
-            if len(words) == len(named) == 1:
-                raise
-            checks.append(_unread(place, error))
-    checks += [_unread(word, error) for word, error in refused]
-    return LogCheck(
-        tuple(problem for check in checks for problem in check.problems),
-        tuple(file for check in checks for file in check.files),
-        tuple(note for check in checks for note in check.notes),
-    )
+    return report_all(words, lambda place, alone: [check_log(place)])
 
 
-def _unread(place: str | Path, error: CdmisfaError) -> LogCheck:
-    return LogCheck((as_problem(place, error),), (FileCheck(str(place), *failed_state(error)),))
-
-
-def check_log(path: str | Path) -> LogCheck:
+def check_log(path: str | Path) -> LogReport:
     """Check a log, or all logs of a folder, by decoding everything in them, in one pass of each.
 
-    Of a run also: its signals and, in its folder, the files beside its log are those that its
-    final record states. Of a recording also: each view has every frame once; of a folder, that
-    the views have the same frames and none is missing.
-
-    Of a camera log every image is decoded.
+    A run is compared with its final record: its signals and, in its folder, the files beside its
+    log. Each view of a recording must have every frame once; in a folder, the views must have the
+    same frames and none may be missing. Every image of a camera log is decoded.
 
     Raises:
         UsageError: no such log.
@@ -103,148 +62,256 @@ def check_log(path: str | Path) -> LogCheck:
     """
     place = location(path)
     if only_foreign(place):
-        return _check_images(place)
-    problems: list[Problem] = []
-    files: list[FileCheck] = []
-    views: list[ViewPass] = []
-    notes: list[str] = []
+        return combined(str(place), [_check_external(place)])
+    reports: list[LogReport] = []
+    views: list[_ViewContent] = []
     for file in log_files(place):
-        checked, found, passed = _check_file(file, beside=place.is_dir())
-        problems += found
-        files.append(checked)
-        if checked.crc == "absent":
-            notes.append(f"{file}: {NO_CHECKSUMS}")
-        if isinstance(passed, ViewPass):
-            views.append(passed)
-        elif isinstance(passed, RunPass) and not found:
-            problems += passed.problems()
-            notes += passed.notes()
-        elif passed is None and not found:
-            told = _check_topics(file, image_topics(file))
-            problems += told.problems
-            notes += told.notes
-    if views:
-        problems += _check_views(views, alone=place.is_file())
-    return LogCheck(tuple(dict.fromkeys(problems)), tuple(files), tuple(dict.fromkeys(notes)))
+        report, content = _check_file(file, beside=place.is_dir())
+        reports.append(report)
+        if isinstance(content, _ViewContent):
+            views.append(content)
+    problems = _check_views(views, alone=place.is_file()) if views else ()
+    return combined(str(place), reports, problems)
 
 
-def _check_images(path: Path) -> LogCheck:
-    """Decode every image of a camera log that has no checksums."""
+def _check_file(path: Path, *, beside: bool) -> tuple[LogReport, _Content | None]:
+    """Check an MCAP file, and the files beside it if it is the log of a run."""
     try:
-        kind = log_format(path)
-        notes = table_notes(path) if kind == "table" else []
-        if kind == "bag":
-            notes = [f"{path}: a ROS bag has no checksums, changed bytes may go unnoticed"]
-        channels = channels_of(path, whole=True)
+        report, content = read_once(path, lambda reader: _check_content(path, reader, beside))
     except LogDamagedError as error:
-        return LogCheck((as_problem(path, error),), (FileCheck(str(path), "absent", "damaged"),))
-    found = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
-    files = found.files
-    if kind == "pictures" and channels[0].encoding == "png":
-        files = (replace(files[0], crc="bad" if found.problems else "ok"),)
-    return replace(found, files=files, notes=(*notes, *found.notes))
+        return failed(path, error), None
+    if report.problems:
+        return report, content
+    if isinstance(content, _RunContent):
+        notes = (*report.notes, *content.notes())
+        report = replace(report, problems=tuple(content.problems()), notes=notes)
+    elif content is None:
+        # The pass above failed at an image and not at a checksum: list all broken images.
+        images = _check_topics(path, image_topics(path))
+        notes = (*report.notes, *images.notes)
+        report = replace(report, problems=images.problems, notes=notes)
+    return report, content
 
 
-def _check_topics(path: Path, topics: Iterable[str]) -> LogCheck:
-    """Decode every image on some topics of a camera log."""
-    problems: list[Problem] = []
-    missing: dict[str, None] = {}
-    notes: dict[str, None] = {}
-    for topic in topics:
-        try:
-            with contextlib.closing(open_images(path, topic)) as images:
-                problems += _broken(images)
-                missing |= dict.fromkeys([images.missing] if images.missing else [])
-                notes |= dict.fromkeys((*images.remarks, *images.warnings))
-        except LogDamagedError as error:
-            problems.append(as_problem(path, error))
-        except UsageError as error:  # it needs an option, or what is not installed
-            said = str(error).removeprefix(f"{path}: ")
-            notes[f"{path}: {topic} is not decoded: {said}"] = None
-    state: State = "damaged" if problems else "cut short" if missing else "whole"
-    problems += [Problem(str(path), what) for what in missing]
-    told = (note for note in notes if note.removeprefix(f"{path}: ") not in missing)
-    return LogCheck(tuple(problems), (FileCheck(str(path), "absent", state),), tuple(told))
-
-
-def _broken(images: ImageStream) -> Iterator[Problem]:
-    for row in range(images.count):
-        try:
-            images.image(row)
-        except (MalformedRecord, LogDamagedError) as error:
-            yield Problem(images.where(row), str(error))
-
-
-Pass = ViewPass | RunPass | ImagesPass
-Checked = tuple[FileCheck, list[Problem], Pass | None]
-
-
-def _check_file(path: Path, *, beside: bool) -> Checked:
-    try:
-        return read_once(path, lambda reader: _checked(path, reader, beside=beside))
-    except LogDamagedError as error:
-        return FileCheck(str(path), "bad", "damaged"), [as_problem(path, error)], None
-
-
-def _checked(path: Path, reader: LogReader, *, beside: bool) -> Checked:
-    passed = _pass_of(path, reader, beside)
-    counts = count_messages(reader, decode=True, told=passed.add if passed else lambda _: None)
-    if passed:
-        passed.finish()
-    wrong = [
-        f"holds messages of channel {number}, never defined"
+def _check_content(
+    path: Path, reader: LogReader, beside: bool
+) -> tuple[LogReport, _Content | None]:
+    """Decode every chunk of an MCAP file and check what they hold on the way."""
+    content = _content_of(path, reader, beside)
+    counts = count_decoded(reader, content.add if content else lambda segment: None)
+    if content:
+        content.finish()
+    problems = [
+        Problem(str(path), f"holds messages of channel {number}, never defined")
         for number in counts.keys() - reader.channels.keys()
     ]
-    there = sum(channel.messages for channel in counts.values())
-    stated = reader.statistics.message_count if reader.statistics else there
-    if stated != there and not reader.problems:
-        wrong.append(f"its summary states {stated} messages, there are {there}")
-    problems = [Problem(str(path), what) for what in wrong]
-    checked = FileCheck(str(path), crc_of(reader), state_of(reader))
-    return checked, [*problems, *problems_of(reader)], passed
+    messages = sum(channel.messages for channel in counts.values())
+    stated = reader.statistics.message_count if reader.statistics else messages
+    if stated != messages and not reader.problems:
+        what = f"its summary states {stated} messages, there are {messages}"
+        problems.append(Problem(str(path), what))
+    report = report_on(reader, counts)
+    notes = (f"{path}: {NO_CHECKSUMS}",) if report.crc == "absent" else ()
+    return replace(report, problems=(*problems, *report.problems), notes=notes), content
 
 
-def _pass_of(path: Path, reader: LogReader, beside: bool) -> Pass | None:
-    """Return the check of a log's content while it is decoded; None if images are checked later."""
+def _content_of(path: Path, reader: LogReader, beside: bool) -> _Content | None:
+    """Return the check of a log's content; None if its images are to be checked later."""
     kind = kind_of(reader)
     if kind == "run" and reader.complete:
-        return RunPass(path, reader, beside=beside)
+        return _RunContent(path, reader, beside=beside)
     if kind == "recording":
-        return ViewPass(path, reader)
-    return None if reader.salvage else ImagesPass(path, reader)
+        return _ViewContent(path, reader)
+    return None if reader.salvage else _ImageContent(path, reader)
 
 
-def _check_views(passes: list[ViewPass], *, alone: bool) -> Iterator[Problem]:
-    folder = str(passes[0].path.parent)
-    streams: set[str] = set()
-    names: set[str] = set()
-    numbers: set[int] = set()
-    count = 0
-    for checked in passes:
-        if checked.view is not None:
-            facts = checked.view.facts
-            names.add(facts.view)
-            streams |= set(filter(None, facts.streams))
-            numbers.add(facts.stream_index)
-            count = max(count, facts.stream_count)
-            edges = [(0, facts.first_frame), *checked.view.ranges]
-            for (_, end), (start, _) in itertools.pairwise(edges):
-                if start > end and not facts.gaps:
-                    yield Problem(str(checked.path), f"frames {end} to {start - 1} are missing")
-        if checked.error is not None:
-            yield as_problem(checked.path, checked.error)
-    for name in () if alone else sorted(streams - names):
-        yield Problem(folder, f"the view {name!r} of the recording has no file")
-    if absent := set() if alone else set(range(count)) - numbers:
-        what = f"of the recording's views 0 to {count - 1} {len(absent)} have no file, the first is"
-        yield Problem(folder, f"{what} {min(absent)}")
-    if any(checked.error is not None for checked in passes):
-        return
-    views = [checked.view for checked in passes if checked.view is not None]
+class _Content:
+    """Check the content of a log while its chunks are decoded.
+
+    Attributes:
+        path: the log.
+        error: the error at which the check ended.
+    """
+
+    def __init__(self, path: Path, reader: LogReader) -> None:
+        self.path, self.reader = path, reader
+        self.error: CdmisfaError | None = None
+
+    def add(self, segment: Segment) -> None:
+        """Check the next chunk of the log."""
+
+    def finish(self) -> None:
+        """Check the whole, after the last chunk."""
+
+    def attempt(self, step: Callable[..., None], *arguments: Any) -> None:
+        """Take a step of the check unless it has ended, and keep its error."""
+        if self.error is None:
+            try:
+                step(*arguments)
+            except CdmisfaError as error:
+                self.error = error
+
+
+class _ImageContent(_Content):
+    """Decode the images of an external log; a broken one raises, and the log is read again."""
+
+    def __init__(self, path: Path, reader: LogReader) -> None:
+        super().__init__(path, reader)
+        self._decoders: dict[int, Decoder] = {}
+        for topic in topics_in(reader, IMAGES):
+            channels, decode = channels_on(reader, topic, IMAGES)
+            self._decoders |= dict.fromkeys((channel.id for channel in channels), decode)
+
+    def add(self, segment: Segment) -> None:
+        table = self.reader.table(segment)
+        assert table is not None
+        rows = np.flatnonzero(np.isin(table.channel, list(self._decoders)))
+        if len(rows):
+            sorted_times(str(self.path), np.sort(table.log_time[rows]))
+        with explained(self.path, "its decoder", held=table.data.nbytes):
+            for row in rows.tolist():
+                self._decoders[int(table.channel[row])](table.view(row))
+
+
+class _ViewContent(_Content):
+    """Check every frame of one file of a recording."""
+
+    def __init__(self, path: Path, reader: LogReader) -> None:
+        super().__init__(path, reader)
+        self.view: ViewFile | None = None
+        self.attempt(self._open)
+
+    def add(self, segment: Segment) -> None:
+        if self.view is not None:
+            self.attempt(self.view.check_chunk, segment)
+
+    def finish(self) -> None:
+        if self.view is not None:
+            self.view.finish()
+
+    def _open(self) -> None:
+        self.view = ViewFile(self.path, reader=self.reader)
+
+
+class _RunContent(_Content):
+    """Compare a run with the record that it states of itself.
+
+    Args:
+        path: log of the run, whole.
+        reader: of the log.
+        beside: also check the files beside it.
+    """
+
+    def __init__(self, path: Path, reader: LogReader, *, beside: bool) -> None:
+        super().__init__(path, reader)
+        records = (r.metadata for r in reader.metadata if r.name == FINAL_METADATA)
+        self._final = next(records, None)
+        self._folder = path.parent if beside else None
+        self._document = read_run_json(path.parent) if beside else {}
+        result = self._document.get("result") if self._final is None else self._final
+        self._stated = result.get("signals_sha256") if isinstance(result, Mapping) else None
+        self._hash, self._next = SignalsHash(), 0
+        self._batches: BatchReader | None = None
+        self._problems: list[Problem] = []
+        self.attempt(self._open)
+
+    def add(self, segment: Segment) -> None:
+        self.attempt(self._add, segment)
+
+    def finish(self) -> None:
+        self.attempt(self._finish)
+
+    def problems(self) -> Iterator[Problem]:
+        """Yield where a run whose log is whole contradicts itself."""
+        yield from self._problems
+        if self.error is not None:
+            yield as_problem(self.path, self.error)
+        if self._final is None or self._folder is None:
+            return
+        facts = self._folder / RUN_JSON
+        if not self._document:
+            yield Problem(str(facts), "is missing, empty or no JSON")
+        elif facts_sha256(self._document) != self._final.get("facts_sha256"):
+            yield Problem(str(facts), "states something else than the run's final record")
+        yield from _check_modules(self._folder / MODULES_FILE, self._final.get("modules_sha256"))
+        view = self._folder / VIEW_FILE
+        if self._final.get("view") == json.dumps(True) and not view.is_file():
+            yield Problem(str(view), f"is missing; {view_again(self._folder)}")
+
+    def notes(self) -> Iterator[str]:
+        """Yield the files that nothing proves."""
+        if self._folder is not None and (view := self._folder / VIEW_FILE).is_file():
+            yield f"{view} is not checked: {view_again(self._folder)}"
+        if self._final is None:
+            yield f"{self.path} holds no final record: nothing proves what is beside it"
+
+    def _open(self) -> None:
+        header, topics = header_in(self.reader), (SIGNALS_TOPIC,)
+        if self._stated is not None:
+            self._batches = BatchReader(self.path, header, self.reader.channels, topics=topics)
+
+    def _add(self, segment: Segment) -> None:
+        table = self.reader.table(segment)
+        if self._batches is not None and table is not None:
+            for batch in self._batches.take(table):
+                self._add_signals(batch)
+
+    def _finish(self) -> None:
+        if self._batches is None:
+            return
+        self._add_signals(self._batches.rest())
+        if self._hash.hexdigest() != self._stated:
+            what = f"its {self._hash.count} iterations are not those that the run had"
+            self._problems.append(Problem(str(self.path), what))
+
+    def _add_signals(self, batch: Batch) -> None:
+        for signals in (record for columns in batch.signals for record in columns.records()):
+            if signals.iteration != self._next:
+                what = f"iterations {self._next} to {signals.iteration - 1} are missing"
+                self._problems.append(Problem(str(self.path), what))
+            self._next = signals.iteration + 1
+            self._hash.add(signals)
+
+
+def view_again(run: Path) -> str:
+    """Return the command that builds the view of a run, which holds nothing beyond its log."""
+    command = ("cdmisfa", "view", str(run), "--save", str(run / VIEW_FILE), "--force")
+    return f"make it again with {shlex.join(command)}"
+
+
+def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
     try:
-        source = RecordedSource([v.path for v in views], salvage=True, opened=views)
+        if not path.is_file():
+            yield Problem(str(path), "is missing")
+        elif hashlib.sha256(read_regular(path, MAX_BYTES)).hexdigest() != stated:
+            yield Problem(str(path), "holds something else than the run's final record states")
+        else:
+            load_modules(path)
+    except CdmisfaError as error:
+        yield as_problem(path, error)
+
+
+def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Problem]:
+    """Yield missing frames and views of a recording, of which one file was checked or all."""
+    folder = str(contents[0].path.parent)
+    views = [content.view for content in contents if content.view is not None]
+    for content in contents:
+        if content.view is not None and not content.view.facts.gaps:
+            edges = [(0, content.view.facts.first_frame), *content.view.ranges]
+            for (_, end), (start, _) in itertools.pairwise(edges):
+                if start > end:
+                    what = f"frames {end} to {start - 1} are missing"
+                    yield Problem(str(content.path), what)
+        if content.error is not None:
+            yield as_problem(content.path, content.error)
+    if not alone:
+        yield from _missing_views(folder, views)
+    if any(content.error is not None for content in contents):
+        return
+    try:
+        source = RecordedSource([view.path for view in views], salvage=True, opened=views)
     except LogDamagedError as error:
-        yield replace(as_problem(passes[0].path, error), where=folder)
+        yield replace(as_problem(views[0].path, error), where=folder)
         return
     with contextlib.closing(source):
         if source.gaps:
@@ -255,3 +322,60 @@ def _check_views(passes: list[ViewPass], *, alone: bool) -> Iterator[Problem]:
             if end > shortest:
                 what = f"the view {name!r} ends before frame {end}, another before {shortest}"
                 yield Problem(folder, what)
+
+
+def _missing_views(folder: str, views: list[ViewFile]) -> Iterator[Problem]:
+    """Yield the views of a recording that have no file, by their names or, if many, numbers."""
+    facts = [view.facts for view in views]
+    streams = {name for stated in facts for name in stated.streams if name}
+    for name in sorted(streams - {stated.view for stated in facts}):
+        yield Problem(folder, f"the view {name!r} of the recording has no file")
+    count = max((stated.stream_count for stated in facts), default=0)
+    if absent := set(range(count)) - {stated.stream_index for stated in facts}:
+        what = f"of the recording's views 0 to {count - 1} {len(absent)} have no file, the first is"
+        yield Problem(folder, f"{what} {min(absent)}")
+
+
+# Camera logs
+
+
+def _check_external(path: Path) -> LogReport:
+    """Decode every image of a camera log without checksums."""
+    try:
+        kind = log_format(path)
+        notes = table_notes(path) if kind == "table" else []
+        if kind == "bag":
+            notes = [f"{path}: a ROS bag has no checksums, changed bytes may go unnoticed"]
+        channels = channels_of(path, whole=True)
+    except LogDamagedError as error:
+        return replace(failed(path, error), crc="absent")
+    report = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
+    if kind == "pictures" and channels[0].encoding == "png":  # PNG has checksums of its own
+        report = replace(report, crc="ok" if report.ok else "bad")
+    return replace(report, notes=(*notes, *report.notes))
+
+
+def _check_topics(path: Path, topics: Iterable[str]) -> LogReport:
+    """Decode every image on some topics of a camera log."""
+    problems: list[Problem] = []
+    missing: dict[str, None] = {}
+    notes: dict[str, None] = {}
+    for topic in topics:
+        try:
+            with contextlib.closing(open_images(path, topic)) as images:
+                for row in range(images.count):
+                    try:
+                        images.image(row)
+                    except LogDamagedError as error:
+                        problems.append(Problem(images.where(row), str(error)))
+                missing |= dict.fromkeys([images.missing] if images.missing else [])
+                notes |= dict.fromkeys((*images.remarks, *images.warnings))
+        except LogDamagedError as error:
+            problems.append(as_problem(path, error))
+        except UsageError as error:  # it needs an option, or a package that is not installed
+            reason = str(error).removeprefix(f"{path}: ")
+            notes[f"{path}: {topic} is not decoded: {reason}"] = None
+    state: State = "damaged" if problems else "cut short" if missing else "whole"
+    problems += [Problem(str(path), what) for what in missing]
+    remarks = tuple(note for note in notes if note.removeprefix(f"{path}: ") not in missing)
+    return LogReport(str(path), problems=tuple(problems), state=state, notes=remarks)

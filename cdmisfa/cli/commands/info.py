@@ -20,8 +20,8 @@ from cdmisfa.cli.printing import (
 from cdmisfa.core.names import counted
 
 if TYPE_CHECKING:
-    from replay.integrity.info import ChannelInfo, LogInfo, SizeInfo
     from replay.integrity.learned import RunInfo
+    from replay.integrity.report import ChannelInfo, LogReport, SizeInfo
 
 MOST_NAMED = 8
 """Streams of a run that are named."""
@@ -41,7 +41,7 @@ def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> No
     in logs of others, videos, bags, tables, all above 1 GiB, is called unchecked.
     """
     from replay.integrity.info import describe
-    from replay.integrity.state import EXIT_CODES
+    from replay.integrity.report import EXIT_CODES
 
     found = describe(*path)
     if as_json:
@@ -51,7 +51,7 @@ def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> No
     ctx.exit(EXIT_CODES[found.state])
 
 
-def _print_info(found: LogInfo) -> None:
+def _print_info(found: LogReport) -> None:
     together = all(file.path.startswith(found.path) for file in found.files)
     for each in [found] if together else found.files:
         print_line(f"{each.path}: {', '.join(_words_of(each))}")
@@ -64,7 +64,7 @@ def _print_info(found: LogInfo) -> None:
     _print_channels(found.channels)
 
 
-def _words_of(found: LogInfo) -> Iterator[str]:
+def _words_of(found: LogReport) -> Iterator[str]:
     """What a log is, and in which state."""
     if found.state == "not read":
         yield found.state
@@ -75,7 +75,7 @@ def _words_of(found: LogInfo) -> Iterator[str]:
         yield f"seed {found.seed}"
 
 
-def _print_run(found: LogInfo, run: RunInfo) -> None:
+def _print_run(found: LogReport, run: RunInfo) -> None:
     """Print what was learned, by which learner, and why it ended."""
     from cdmisfa.experiments.loop import ENDINGS
 
@@ -97,7 +97,7 @@ def _print_run(found: LogInfo, run: RunInfo) -> None:
         print_line(f"ended after {done}: {ENDINGS.get(found.ended, found.ended)}")
 
 
-def _times(found: LogInfo) -> Iterator[str]:
+def _times(found: LogReport) -> Iterator[str]:
     """How much there is, and from when to when."""
     if found.span is None:
         return

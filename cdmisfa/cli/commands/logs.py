@@ -37,12 +37,12 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
     as 'logs/*.mcap', or a URL. Exits with 3 when anything is wrong, else with 2 when one of
     several is no log.
     """
-    from replay.integrity.state import EXIT_CODES
+    from replay.integrity.report import EXIT_CODES
     from replay.integrity.verify import check_logs
 
     found = check_logs(*path)
     if as_json:
-        print_json(found.as_json())
+        print_json(found.check_json())
     else:
         if found.problems:
             print_table(("where", "what"), [(p.where, p.what) for p in found.problems])

@@ -1,0 +1,219 @@
+"""Report on logs: the content, problems and state of each, and of several together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from recorder.mcap.records import Problem
+
+if TYPE_CHECKING:
+    from replay.integrity.learned import ModuleInfo, RunInfo
+
+SCHEMA: Final = 1
+"""Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
+
+Kind = Literal["recording", "run", "foreign"]
+Crc = Literal["ok", "absent", "bad", "unchecked"]
+State = Literal["whole", "unchecked", "not read", "cut short", "damaged"]
+"""Unchecked: no problem was found, but not everything was read. Not read: not a readable log."""
+
+EXIT_CODES: Final[Mapping[State, int]] = {
+    "whole": 0,
+    "unchecked": 0,
+    "not read": UsageError.exit_code,
+    "cut short": LogDamagedError.exit_code,
+    "damaged": LogDamagedError.exit_code,
+}
+"""Exit code of `info` and `verify` for each state; the best state is first."""
+
+_CRCS: Final[tuple[Crc, ...]] = ("ok", "absent", "unchecked", "bad")
+"""The best state of checksums is first."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelInfo:
+    """A channel of a log; its times are log times in nanoseconds."""
+
+    topic: str
+    encoding: str
+    schema: str
+    messages: int
+    start_ns: int | None
+    end_ns: int | None
+    file: str
+
+    @property
+    def rate(self) -> float | None:
+        """Messages a second between the first and the last; None without a duration."""
+        if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
+            return None
+        return (self.messages - 1) * 1e9 / (self.end_ns - self.start_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class SizeInfo:
+    """Size of a log.
+
+    Attributes:
+        file: bytes of the file.
+        stored: bytes of its messages as stored, with the records beside them.
+        decompressed: the same bytes decompressed.
+        compression: number of chunks by compression; "none" is one of them.
+    """
+
+    file: int = 0
+    stored: int = 0
+    decompressed: int = 0
+    compression: Mapping[str, int] = field(default_factory=dict)
+
+    def __add__(self, other: SizeInfo) -> SizeInfo:
+        return SizeInfo(
+            self.file + other.file,
+            self.stored + other.stored,
+            self.decompressed + other.decompressed,
+            dict(Counter(self.compression) + Counter(other.compression)),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LogReport:
+    """The report of `info` or `verify` on one log, or on several logs together.
+
+    Attributes:
+        kind: kind of the logs; "foreign" if they are of several kinds.
+        chunks: number of chunks.
+        complete: no file is cut short.
+        crc: result of the checksums.
+        metadata: metadata records by file name (by path if names repeat) and record name.
+        seed: the seed that all files state, if it is one.
+        ended: why the run in a folder ended.
+        modules: modules of the run in a folder.
+        run: how the run in a folder was learned.
+        held_out: slowness of its modules on held-out frames.
+        state: the worst state of the files.
+        notes: remarks that are no problems.
+        size: bytes.
+        library: writer of the file; "" for several writers.
+        files: report on each file.
+    """
+
+    path: str
+    kind: Kind = "foreign"
+    channels: tuple[ChannelInfo, ...] = ()
+    chunks: int = 0
+    complete: bool = True
+    crc: Crc = "absent"
+    problems: tuple[Problem, ...] = ()
+    metadata: Mapping[str, Mapping[str, Mapping[str, str]]] = field(default_factory=dict)
+    seed: int | None = None
+    ended: str | None = None
+    modules: tuple[ModuleInfo, ...] = ()
+    run: RunInfo | None = None
+    held_out: Mapping[str, Any] | None = None
+    state: State = "whole"
+    notes: tuple[str, ...] = ()
+    size: SizeInfo = SizeInfo()
+    library: str = ""
+    files: tuple[LogReport, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is no problem."""
+        return not self.problems
+
+    @property
+    def messages(self) -> int:
+        """Number of messages on all channels."""
+        return sum(c.messages for c in self.channels)
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """Log times of the first and of the last message, nanoseconds."""
+        starts = [c.start_ns for c in self.channels if c.start_ns is not None]
+        ends = [c.end_ns for c in self.channels if c.end_ns is not None]
+        return (min(starts), max(ends)) if starts and ends else None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the report of `info` as JSON values."""
+        return {"schema": SCHEMA, **asdict(self)}
+
+    def check_json(self) -> dict[str, Any]:
+        """Return the report of `verify` as JSON values."""
+        return {
+            "schema": SCHEMA,
+            "ok": self.ok,
+            "state": self.state,
+            "problems": [asdict(problem) for problem in self.problems],
+            "files": [{"file": f.path, "crc": f.crc, "state": f.state} for f in self.files],
+            "notes": self.notes,
+        }
+
+
+def combined(
+    path: str,
+    reports: Sequence[LogReport],
+    problems: Iterable[Problem] = (),
+    notes: Iterable[str] = (),
+) -> LogReport:
+    """Return one report on the files of several reports.
+
+    Args:
+        path: the logs, as the user named them.
+        reports: one report or more.
+        problems: further problems, of the files together.
+        notes: further notes.
+    """
+    files = [file for report in reports for file in report.files or (report,)]
+    problems = (*(p for report in reports for p in report.problems), *problems)
+    notes = (*(note for report in reports for note in report.notes), *notes)
+    kinds = {f.kind for f in files if f.channels or f.metadata}
+    names = Counter(name for f in files for name in f.metadata)
+    libraries = {f.library for f in files}
+    seeds = {f.seed for f in files if f.seed is not None}
+    state = max((f.state for f in files), key=list(EXIT_CODES).index)
+    unread = {f.path for f in files if f.state == "not read"}
+    if state in ("whole", "not read") and any(p.where not in unread for p in problems):
+        state = "damaged"  # whole files that contradict one another, or the run they belong to
+    return LogReport(
+        path=path,
+        kind=kinds.pop() if len(kinds) == 1 else "foreign",
+        channels=tuple(c for f in files for c in f.channels),
+        chunks=sum(f.chunks for f in files),
+        complete=all(f.complete for f in files),
+        crc=max((f.crc for f in files), key=_CRCS.index),
+        problems=tuple(dict.fromkeys(problems)),
+        metadata={
+            name if names[name] == 1 else f.path: records
+            for f in files
+            for name, records in f.metadata.items()
+        },
+        seed=seeds.pop() if len(seeds) == 1 else None,
+        state=state,
+        notes=tuple(dict.fromkeys(notes)),
+        size=sum((f.size for f in files), SizeInfo()),
+        library=libraries.pop() if len(libraries) == 1 else "",
+        files=tuple(files),
+    )
+
+
+def failed(place: str | Path, error: CdmisfaError) -> LogReport:
+    """Report on a log that cannot be read."""
+    crc, state = failed_state(error)
+    problem = as_problem(place, error)
+    return LogReport(str(place), complete=False, crc=crc, problems=(problem,), state=state)
+
+
+def failed_state(error: CdmisfaError) -> tuple[Crc, State]:
+    """Return the checksums and the state of a log that ended in an error."""
+    damaged = isinstance(error, LogDamagedError)
+    return ("bad", "damaged") if damaged else ("unchecked", "not read")
+
+
+def as_problem(path: str | Path, error: CdmisfaError) -> Problem:
+    """Return an error as a problem of the file that it names."""
+    return Problem(str(path), str(error).removeprefix(f"{path}: "))
