@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
 from cdmisfa.core.clock import RECORDED_FPS, START_NS
-from cdmisfa.core.config import in_range
+from cdmisfa.core.config import Section, key
 from cdmisfa.core.errors import UsageError
 
 Compression = Literal["zstd", "lz4", "none"]
@@ -21,7 +21,7 @@ _SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
 @dataclass(frozen=True, slots=True)
-class SceneConfig:
+class SceneConfig(Section):
     """What every scene can be told; each adds its own keys.
 
     Attributes:
@@ -29,16 +29,13 @@ class SceneConfig:
         seed: of what moves in it; None is "as the run's seed".
     """
 
+    prefix: ClassVar[str] = "scene"
     kind: str = ""
-    seed: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.seed is not None and self.seed < 0:
-            raise UsageError(f"scene.seed is {self.seed}: it must be 0 or above")
+    seed: int | None = key(None, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class RecordConfig:
+class RecordConfig(Section):
     """How frames become a log (keys `record.*`).
 
     Attributes:
@@ -49,15 +46,11 @@ class RecordConfig:
         chunk_size: most bytes of a chunk before compression.
     """
 
-    fps: float = 50.0
-    start_ns: int = START_NS
+    prefix: ClassVar[str] = "record"
+    fps: float = key(50.0, *RECORDED_FPS)
+    start_ns: int = key(START_NS, 0, 2**62)
     compression: Compression = "zstd"
-    chunk_size: int = 1024 * 1024
-
-    def __post_init__(self) -> None:
-        in_range(self, "record", *RECORDED_FPS, "fps")
-        in_range(self, "record", 0, 2**62, "start_ns")
-        in_range(self, "record", 1024, 2**27, "chunk_size")
+    chunk_size: int = key(1024 * 1024, 1024, 2**27)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,10 +104,7 @@ def check_view_names(names: tuple[str, ...], key: str) -> None:
     Raises:
         UsageError: at the first such name.
     """
-    if not names:
-        raise UsageError(f"{key} is empty: name at least one")
-    if len(set(names)) != len(names):
-        raise UsageError(f"{key} names one twice: {', '.join(names)}")
-    for name in names:
-        if not (name.isidentifier() and name.isascii() and len(name) <= 64):
-            raise UsageError(f"{key} has {name!r}: use letters, digits and _")
+    plain = all(name.isidentifier() and name.isascii() and len(name) <= 64 for name in names)
+    if not names or not plain or len(set(names)) != len(names):
+        given = ", ".join(map(repr, names))
+        raise UsageError(f"{key} is {given}: name each view once, by letters, digits and _")

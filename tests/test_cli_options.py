@@ -86,13 +86,13 @@ def test_the_words_of_settings_are_read_as_these_settings() -> None:
         ({"rate": -5.0}, "--rate is -5.0"),
         ({"rate": 1e12}, "--rate is 1e12|--rate is 1000000000000.0"),
         ({"rate": []}, r"--rate is \[\]"),
-        ({"size": (0, 4)}, r"--size is \(0, 4\): give height and width above 0"),
-        ({"size": "x"}, "--size is x"),
+        ({"size": (0, 4)}, r"--size is \(0, 4\): it must be in \[1, inf\)"),
+        ({"size": "x"}, "--size is 'x'"),
         ({"start": float("inf")}, "--start is inf"),
         ({"end": "late"}, "--end is 'late'"),
         ({"range": (5, -5)}, r"input.range is \(5.0, -5.0\)"),
         ({"holdout": 0.95}, r"input.holdout is 0.95: it must be in \[0, 0.9\]"),
-        ({"color": "red"}, "--color is red: give on, off or auto"),
+        ({"color": "red"}, "--color is 'red'"),
     ],
 )
 def test_settings_of_a_log_or_a_caller_are_checked_like_typed_ones(

@@ -57,7 +57,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn oscillatory --loop --salvage": ("is a scene: --loop and --salvage are for logs",),
     "view RUN --topic /a --save v.rrd": ("is a run: --topic is for logs",),
     "sweep oscillatory -o x --seeds 1,4,0:2": ("--seeds 1,4,0:2: 1 stands there twice",),
-    "learn oscillatory --set learner.beta=foo": ("'foo': it must be a number, or auto",),
+    "learn oscillatory --set learner.beta=foo": ("'foo': it must be a number or auto",),
     "learn oscillatory --seed abc": ("'--seed': 'abc' is not a valid integer",),
     "record oscillatory -o x --rate abc": ("'abc' is not a valid float",),
     "learn oscillatory --resume -o RUN --algorithm progress": (
@@ -135,7 +135,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn nothing.mcap --start 1:2:3:4": ("--start",),
     "learn nothing.mcap --set input.range=3,1": ("input.range",),
     "learn nothing.mcap --set input.hold=-1": ("input.hold",),
-    "learn nothing.mcap --set input.fit=cut": ("input.fit is cut: choose one of crop",),
+    "learn nothing.mcap --set input.fit=cut": ("input.fit is 'cut': it must be one of crop",),
     # a grid is checked before anything runs, and live streams are recorded first
     "sweep oscillatory --seeds 0 -o s --grid learner.sigm=1": ("did you mean learner.sigma",),
     "sweep oscillatory --seeds 0 -o s --grid learner.tau=40,many": ("learner.tau",),

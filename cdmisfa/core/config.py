@@ -1,11 +1,14 @@
-"""Configuration: strict frozen dataclasses, filled from TOML presets and `--set` words.
+"""Configuration: frozen dataclasses, filled from TOML presets and `--set` words.
 
-A key that does not exist is an error that names the nearest one that does. Each package owns the
-dataclass of its own section (`learner` here, `scene` and `record` in `recorder`); this fills any.
+Each package owns the dataclass of its own section: `learner` here and in `agents.progress`,
+`record` and `scene` in `recorder`, `input` in `recorder.images`. A key states its type, its default
+and the range of its values in one place, see `key`. `build` fills any section, and refuses a key
+that does not exist with the nearest one that does.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import math
@@ -13,43 +16,115 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
 from operator import index
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.core.untrusted import read_regular
 
-Section = TypeVar("Section")
+T = TypeVar("T")
 
 LN_2 = 0.6931471805599453
+
+# Largest whole number of a key: what a signed integer of 64 bits holds.
 LARGEST = 2**63 - 1
-"""Largest whole number a key takes."""
 
+# More whitening components than this would take minutes a frame.
 MAX_COMPONENTS = 1000
-"""More whitening components than this would take minutes a frame."""
 
+# A block of more frames than this does not fit into memory beside its images.
+MAX_TAU = 100_000
+
+# Largest preset in bytes: the time for keys of many parts grows with the square of their number.
 MAX_PRESET = 16 * 1024
-"""Largest preset, in bytes: keys of many parts take a time that grows with the square of them."""
 
+# Most characters of a value or key in an error.
 SHOWN = 120
-"""Most characters of a value or key that an error shows."""
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 3
 _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 8
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = SHOWN
 
-MAX_TAU = 100_000
-"""A block of more frames than this does not fit into memory beside its images."""
+
+def key(
+    default: Any,
+    low: float | str = -math.inf,
+    high: float | str = math.inf,
+    *,
+    above: bool = False,
+    rising: bool = False,
+    unstated: bool = False,
+) -> Any:
+    """Declare a key of a section.
+
+    Args:
+        default: the value where nothing is set.
+        low: least value, or the key of the same section that holds it; of a tuple, of each number.
+        high: the same for the largest value. Infinity is always refused.
+        above: `low` itself is refused.
+        rising: the numbers of the tuple must not fall.
+        unstated: `section_table` leaves the default out, so that recordings of scenes without the
+            key keep their bytes.
+    """
+    told = {"low": low, "high": high, "above": above, "rising": rising, "unstated": unstated}
+    return dataclasses.field(default=default, metadata=told)
 
 
 @dataclass(frozen=True, slots=True)
-class LearnerConfig:
+class Section:
+    """A table of configuration: every value has the type of its key and lies in its range."""
+
+    prefix: ClassVar[str] = ""
+
+    @classmethod
+    def key_name(cls, name: str) -> str:
+        """Return the name of a key as users write it."""
+        return f"{cls.prefix}.{name}"
+
+    def __post_init__(self) -> None:
+        """Convert and check all values.
+
+        Raises:
+            UsageError: a value does not fit; the message names the key.
+        """
+        hints, fields = _hints(type(self)), dataclasses.fields(self)
+        for field in fields:
+            value = getattr(self, field.name)
+            value = convert_value(value, hints[field.name], self.key_name(field.name))
+            object.__setattr__(self, field.name, value)
+        for field in fields:
+            if field.metadata and (wanted := self._misfit(field.name, field.metadata)):
+                value = _SHORT.repr(getattr(self, field.name))
+                raise UsageError(f"{self.key_name(field.name)} is {value}: it must be {wanted}")
+
+    def _misfit(self, name: str, rule: Mapping[str, Any]) -> str:
+        """Return what a value must be, or "" where it is."""
+        low, high = (
+            getattr(self, rule[bound]) if isinstance(rule[bound], str) else rule[bound]
+            for bound in ("low", "high")
+        )
+        value = getattr(self, name)
+        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
+        if rule["rising"] and list(numbers) != sorted(numbers):
+            return "two numbers, the smaller first"
+        if (low, high) == (-math.inf, math.inf):
+            return ""
+        for number in numbers:
+            enough = low < number if rule["above"] else low <= number
+            if not (enough and number <= high and number < math.inf):
+                first, last = "(" if rule["above"] else "[", "]" if high < math.inf else ")"
+                return f"in {first}{low:g}, {high:g}{last}"
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class LearnerConfig(Section):
     """Configuration of the paper's learners, 2.0 and 1.0 (keys `learner.*`).
 
     The defaults are those of the oscillatory experiment; the presets state the sources of values.
@@ -84,53 +159,34 @@ class LearnerConfig:
         roc_error: 1.0 only: error below which a module is saved, or knows a block.
     """
 
+    prefix: ClassVar[str] = "learner"
     algorithm: str = "2.0"
-    nu: float = 0.05
-    tau: int = 100
-    sigma: float = 0.0009
-    delta: float = 0.0006
-    beta: float | None = None
-    components: int = 5
-    outputs: int = 1
+    nu: float = key(0.05, 0, 1, above=True)
+    tau: int = key(100, 3, MAX_TAU)
+    sigma: float = key(0.0009, 0)
+    delta: float = key(0.0006, 0, above=True)
+    beta: float | None = key(None, 0)
+    components: int = key(5, 1, MAX_COMPONENTS)
+    outputs: int = key(1, 1, "components")
     expansion: str = "quadratic"
-    epsilon_start: float = 1.2
-    epsilon_decay: float = 0.999
-    epsilon_knee: float = 0.8
-    epsilon_tail_decay: float = 0.95
-    gamma: float = 0.99
-    mean_window: int = 1000
-    slowness_window: int = 600
-    eta_dot_window: int = 40
-    gate_window: int = 20
-    warm_up: int = 80
-    min_variance: float = 0.1
-    novel_share: float = 0.9
-    patience: int = 1000
-    alpha: float = 0.005
-    roc_centres: int = 10
-    roc_radius: float = 0.3
-    roc_memory: int = 40
-    roc_error: float = 0.1
-
-    def __post_init__(self) -> None:
-        from cdmisfa.core.expansion import EXPANSIONS  # with numpy: to name keys needs neither
-
-        convert_fields(self, "learner")
-        one_of(self, "learner", EXPANSIONS, "expansion")
-        positive(self, "learner", "nu", "delta", "epsilon_start", "mean_window", "slowness_window")
-        positive(self, "learner", "tau", "components", "outputs", "eta_dot_window", "gate_window")
-        positive(self, "learner", "patience", "roc_centres", "roc_radius", "roc_memory")
-        in_range(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance", "roc_error")
-        in_range(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
-        in_range(self, "learner", 0.0, 1.0, "nu")
-        in_range(self, "learner", 1e-6, 1.0, "alpha")
-        in_range(self, "learner", 0.0, math.inf, "epsilon_knee")
-        in_range(self, "learner", 1, MAX_COMPONENTS, "components")
-        in_range(self, "learner", 3, MAX_TAU, "tau")
-        in_range(self, "learner", 0.0, 0.999999, "gamma")
-        if self.beta is not None:
-            in_range(self, "learner", 0.0, math.inf, "beta")
-        outputs_within_components(self, "learner")
+    epsilon_start: float = key(1.2, 0, above=True)
+    epsilon_decay: float = key(0.999, 0, 1)
+    epsilon_knee: float = key(0.8, 0)
+    epsilon_tail_decay: float = key(0.95, 0, 1)
+    gamma: float = key(0.99, 0, 0.999999)
+    mean_window: int = key(1000, 1)
+    slowness_window: int = key(600, 1)
+    eta_dot_window: int = key(40, 1)
+    gate_window: int = key(20, 1)
+    warm_up: int = key(80, 0)
+    min_variance: float = key(0.1, 0)
+    novel_share: float = key(0.9, 0, 1)
+    patience: int = key(1000, 1)
+    alpha: float = key(0.005, 1e-6, 1)
+    roc_centres: int = key(10, 1)
+    roc_radius: float = key(0.3, 0, above=True)
+    roc_memory: int = key(40, 1)
+    roc_error: float = key(0.1, 0)
 
     def reward_beta(self, n_streams: int) -> float:
         """Weight of the expert reward: as set, or the paper's nu ln 2 / (2 (n-1)).
@@ -142,184 +198,148 @@ class LearnerConfig:
         return self.nu * LN_2 / (2.0 * max(n_streams - 1, 1))
 
 
-def convert_fields(section: Any, prefix: str) -> None:
-    """Give every field of a new dataclass its type, as `build` does; for `__post_init__`.
-
-    Raises:
-        UsageError: a value does not fit; it names the key.
-    """
-    for name, hint in _hints(type(section)).items():
-        value = convert_value(getattr(section, name), hint, f"{prefix}.{name}")
-        object.__setattr__(section, name, value)
-
-
 _hints: Any = cache(typing.get_type_hints)
 
 
-def positive(section: Any, prefix: str, *names: str) -> None:
-    """Refuse values that are not above zero and finite, naming the key.
-
-    Raises:
-        UsageError: at the first such value.
-    """
-    for name in names:
-        value = getattr(section, name)
-        if not (value > 0 and math.isfinite(value)):
-            raise UsageError(f"{prefix}.{name} is {value}: it must be above 0 and finite")
-
-
-def in_range(section: Any, prefix: str, low: float, high: float, *names: str) -> None:
-    """Refuse values outside [low, high], naming the key.
-
-    Raises:
-        UsageError: at the first such value.
-    """
-    for name in names:
-        value = getattr(section, name)
-        if not low <= value <= high or (value == math.inf):
-            raise UsageError(f"{prefix}.{name} is {value}: it must be in [{low:g}, {high:g}]")
-
-
-def one_of(section: Any, prefix: str, choices: Collection[str], *names: str) -> None:
-    """Refuse texts that are none of the choices, naming the key and the nearest choice.
-
-    Raises:
-        UsageError: at the first such value.
-    """
-    for name in names:
-        value = getattr(section, name)
-        if value not in choices:
-            raise UsageError(f"{prefix}.{name} is {value}: {did_you_mean(value, choices)}")
-
-
-def outputs_within_components(section: Any, prefix: str) -> None:
-    """Refuse a learner that is to give more slow features than it has components.
-
-    Raises:
-        UsageError: it has.
-    """
-    if section.outputs > section.components:
-        raise UsageError(
-            f"{prefix}.outputs is {section.outputs}, more than {prefix}.components "
-            f"{section.components}: lower the one, or raise the other"
-        )
-
-
 def presets() -> tuple[str, ...]:
-    """Names of the presets that come with the package."""
+    """Return the names of the presets that come with the package."""
     folder = resources.files("cdmisfa.presets")
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml")))
 
 
 def load_preset(name: str) -> dict[str, dict[str, Any]]:
-    """The sections of a preset, or of a TOML file where `name` ends in .toml.
+    """Return the sections of a preset, or of a TOML file where `name` ends in .toml.
 
     Raises:
         UsageError: no such preset or file, or it is not TOML.
     """
+    if name.endswith(".toml"):
+        data = read_regular(Path(name), MAX_PRESET)
+    elif name in presets():
+        data = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_bytes()
+    else:
+        raise UsageError(f"no preset {name[:40]!r}: {did_you_mean(name, presets())}")
     try:
-        if name.endswith(".toml"):
-            text = read_regular(Path(name), MAX_PRESET).decode("utf-8").replace("\r\n", "\n")
-        else:
-            if name not in presets():
-                raise UsageError(f"no preset {name[:40]!r}: {did_you_mean(name, presets())}")
-            text = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_text("utf-8")
-        document = copy.deepcopy(_parsed(text))
-    except ValueError as error:
-        raise UsageError(f"{name}: not TOML: {error}") from error
-    except RecursionError:
-        raise UsageError(f"{name}: not a preset: it is nested too deep") from None
-    for key, value in document.items():
-        if not isinstance(value, dict):
-            raise UsageError(f"{name}: {shown(key)} stands outside a [section]")
+        document = copy.deepcopy(_parsed(data.decode("utf-8").replace("\r\n", "\n")))
+        for section, table in document.items():
+            if not isinstance(table, dict):
+                raise ValueError(f"{shown(section)} stands outside a [section]")
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{name}: no preset, which is TOML: {error}") from None
     return document
 
 
-@lru_cache
-def _parsed(text: str) -> dict[str, Any]:
-    """A TOML document; once parsed it is known to every trial of a sweep."""
-    return tomllib.loads(text)
+# Every trial of a sweep reads the same preset.
+_parsed = lru_cache(tomllib.loads)
 
 
 def shown(value: Any) -> str:
-    """A value as an error shows it: a text as it is, others as Python writes them, all short."""
+    """Return a value as an error shows it: texts as they are, others as in Python, all short."""
     text = value if isinstance(value, str) else _SHORT.repr(value)
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
-def build(
-    cls: type[Section], prefix: str, *layers: Mapping[str, Any], base: Section | None = None
-) -> Section:
+def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Turn `section.key=value` words into sections of texts.
+
+    Raises:
+        UsageError: a word of another form.
+    """
+    sections: dict[str, dict[str, str]] = {}
+    for word in words:
+        path, equals, value = word.partition("=")
+        section, dot, name = path.strip().partition(".")
+        if not (equals and section and dot and name):
+            raise UsageError(
+                f"--set {shown(word)}: write it as section.key=value, as learner.nu=0.02"
+            )
+        sections.setdefault(section, {})[name] = value.strip()
+    return sections
+
+
+def build(cls: type[T], prefix: str, *layers: Mapping[str, Any], base: T | None = None) -> T:
     """Fill a section's dataclass from layers of values, the last one winning.
 
-    Values may be of the field's type or text of it (as given to `--set`); nested
+    Values may be of the key's type or text of it (as given to `--set`); nested
     dataclasses take tables or dotted names.
 
     Raises:
-        UsageError: an unknown key (with the nearest valid one) or a value of the wrong type.
+        UsageError: an unknown key (with the nearest valid one) or a value that does not fit.
     """
     hints = _hints(cls)
+    names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     nested: dict[str, list[Mapping[str, Any]]] = {}
     for layer in layers:
-        for key, value in layer.items():
-            name, dot, rest = key.partition(".")
-            if name not in hints:
-                hint = did_you_mean(name, hints, f"{prefix}.")
-                raise UsageError(f"unknown key {prefix}.{shown(key)}: {hint}")
-            if dataclasses.is_dataclass(hints[name]):
-                if not dot and not isinstance(value, Mapping):
-                    raise UsageError(f"{prefix}.{name} is a table: set one of its keys")
+        for path, value in layer.items():
+            name, dot, rest = path.partition(".")
+            table = name in names and dataclasses.is_dataclass(hints[name])
+            if name not in names or (dot and not table):
+                hint = did_you_mean(name, names, f"{prefix}.")
+                raise UsageError(f"unknown key {prefix}.{shown(path)}: {hint}")
+            if table:
                 nested.setdefault(name, []).append({rest: value} if dot else value)
-            elif dot:
-                raise UsageError(
-                    f"unknown key {prefix}.{shown(key)}: {prefix}.{name} has no keys of its own"
-                )
             else:
                 values[name] = convert_value(value, hints[name], f"{prefix}.{name}")
     for name, parts in nested.items():
-        values[name] = build(
-            hints[name], f"{prefix}.{name}", *parts, base=getattr(base or cls(), name)
-        )
+        if not all(isinstance(part, Mapping) for part in parts):
+            raise UsageError(f"{prefix}.{name} is a table: set one of its keys")
+        inner = getattr(base or cls(), name)
+        values[name] = build(hints[name], f"{prefix}.{name}", *parts, base=inner)
     return dataclasses.replace(base, **values) if base else cls(**values)  # type: ignore[type-var]
 
 
 def convert_value(value: Any, hint: Any, key: str) -> Any:
-    """A value, or its text, as the type of a field.
+    """Return a value, or its text, as the type of a key.
 
     Raises:
         UsageError: the value does not fit.
     """
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        if value in arguments:
-            return value
-        choices = ", ".join(str(a) for a in arguments)
-        raise UsageError(f"{key} is {shown(value)}: choose one of {choices}")
-    if origin is types.UnionType or origin is typing.Union:
-        if value is None or value == "auto" or (value == "none" and str not in arguments):
-            return None
-        try:
-            return convert_value(value, next(a for a in arguments if a is not types.NoneType), key)
-        except UsageError as error:
-            raise UsageError(f"{error}, or auto") from None
-    if origin is tuple:
-        parts = value.strip("()[] ").split(",") if isinstance(value, str) else value
-        if not isinstance(parts, list | tuple):
-            raise UsageError(f"{key} is {shown(value)}: it must be a list")
-        if isinstance(value, str):
-            parts = [part.strip() for part in parts if part.strip()]
-        inner = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(parts)
-        if len(inner) != len(parts):
-            raise UsageError(f"{key} is {shown(value)}: it must have {len(inner)} values")
-        return tuple(convert_value(p, h, key) for p, h in zip(parts, inner, strict=True))
-    if hint not in _SCALARS:
-        raise TypeError(f"{key}: fields of type {hint} cannot be configured")
-    words, scalar = _SCALARS[hint]
     try:
-        return scalar(value)
+        return _converted(value, hint)
     except (ValueError, TypeError, KeyError, OverflowError):
-        raise UsageError(f"{key} is {_SHORT.repr(value)}: it must be {words}") from None
+        shown_value = _SHORT.repr(value)
+        raise UsageError(f"{key} is {shown_value}: it must be {_words_of(hint)}") from None
+
+
+def _converted(value: Any, hint: Any) -> Any:
+    kind, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if kind is Literal:
+        return arguments[arguments.index(value)]
+    if kind in (types.UnionType, typing.Union):
+        if types.NoneType in arguments and (
+            value in (None, "auto") or (value == "none" and str not in arguments)
+        ):
+            return None
+        for argument in arguments:
+            with contextlib.suppress(ValueError, TypeError, KeyError):
+                return _converted(value, argument)  # no value converts to NoneType
+        raise ValueError
+    if kind is tuple:
+        parts = value
+        if isinstance(value, str):
+            parts = [part.strip() for part in value.strip("()[] ").split(",") if part.strip()]
+        if not isinstance(parts, list | tuple):
+            raise TypeError
+        inner = (arguments[0],) * len(parts) if arguments[-1] is Ellipsis else arguments
+        return tuple(_converted(part, h) for part, h in zip(parts, inner, strict=True))
+    if dataclasses.is_dataclass(hint):
+        return value
+    return _SCALARS[hint][1](value)
+
+
+def _words_of(hint: Any) -> str:
+    """Return what values of a type are, for an error."""
+    kind, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if kind is Literal:
+        return f"one of {', '.join(map(str, arguments))}"
+    if kind in (types.UnionType, typing.Union):
+        words = ["auto" if a is types.NoneType else _words_of(a) for a in arguments]
+        return " or ".join(words)
+    if kind is tuple:
+        many = "each" if arguments[-1] is Ellipsis else f"{len(arguments)} values, each"
+        return f"a list, {many} {_words_of(arguments[0])}"
+    return _SCALARS[hint][0]
 
 
 def _boolean(value: Any) -> bool:
@@ -348,43 +368,25 @@ def _text(value: Any) -> str:
     raise TypeError
 
 
+# For each type of a key: its words in errors, and its conversion from a value or text.
 _SCALARS: Mapping[Any, tuple[str, Callable[[Any], Any]]] = {
     bool: ("true or false", _boolean),
     int: ("a whole number", _whole),
     float: ("a number", _number),
     str: ("a text", _text),
 }
-"""For each type of a key: its words in errors, and its conversion from a value or text."""
 
 
 def section_table(section: Any) -> dict[str, Any]:
-    """A section as plain JSON values, nested sections as tables, `None` as "auto"."""
+    """Return a section as plain JSON values, nested sections as tables, `None` as "auto"."""
     table: dict[str, Any] = {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
-        if field.metadata.get("unsaid") and value == field.default:
-            continue  # recordings of scenes without it stay the same bytes
+        if field.metadata.get("unstated") and value == field.default:
+            continue
         if dataclasses.is_dataclass(value):
             table[field.name] = section_table(value)
         else:
             plain = list(value) if isinstance(value, tuple) else value
             table[field.name] = "auto" if value is None else plain
     return table
-
-
-def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Turn `section.key=value` words into sections of texts.
-
-    Raises:
-        UsageError: a word of another form.
-    """
-    sections: dict[str, dict[str, str]] = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        section, dot, name = key.strip().partition(".")
-        if not (equals and section and dot and name):
-            raise UsageError(
-                f"--set {shown(word)}: write it as section.key=value, as learner.nu=0.02"
-            )
-        sections.setdefault(section, {})[name] = value.strip()
-    return sections

@@ -41,7 +41,7 @@ def _pairs(size: int) -> tuple[NDArray[np.intp], ...]:
 
 
 EXPANSIONS: Registry[Expansion] = Registry(
-    "expansion",
+    "learner.expansion",
     {
         "none": Expansion(lambda n: n, lambda frames: frames),
         "quadratic": Expansion(lambda n: n + n * (n + 1) // 2, _inputs_and_products),

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-import typing
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal, cast
+from typing import Any, ClassVar, Final, Literal, cast
 
-from cdmisfa.core.config import build, convert_value, in_range
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.config import Section, build, key
 
 RECIPE: Final = (
     "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
@@ -63,7 +60,7 @@ OnLoss = Literal["reconnect", "wait", "end"]
 
 
 @dataclass(frozen=True, slots=True)
-class InputConfig:
+class InputConfig(Section):
     """Rare settings of how external logs and live streams are read (keys `input.*`).
 
     Attributes:
@@ -84,16 +81,17 @@ class InputConfig:
         stall: seconds without an image after which a live stream has stalled.
     """
 
+    prefix: ClassVar[str] = "input"
     fit: Fit = "crop"
-    range: Depth | None = None
+    range: Depth | None = key(None, rising=True)
     time: str | None = None
     stamp: Clock = "log"
     gaps: Gaps = "skip"
     centre: Centre = "run"
-    holdout: float | None = None
-    hold: float = 0.25
+    holdout: float | None = key(None, 0, 0.9)
+    hold: float = key(0.25, 0, 1e6)
     lost: OnLoss = "reconnect"
-    stall: float = 5.0
+    stall: float = key(5.0, 0.1, 1e6)
 
 
 OPTIONS: Final = {
@@ -129,44 +127,17 @@ class InputOptions(InputConfig):
 
     topics: tuple[str, ...] = ()
     fields: tuple[str, ...] = ()
-    size: Size | None = None
-    rate: float | None = None
-    start: float = 0.0
-    end: float | None = None
+    size: Size | None = key(None, 1)
+    rate: float | None = key(None, 1e-3, 1e6)
+    start: float = key(0.0, 0)
+    end: float | None = key(None, 0)
     align: Align | None = None
     color: Color = False
 
-    def __post_init__(self) -> None:
-        """Check values of logs and callers, too, which no option checked before.
-
-        Raises:
-            UsageError: a value that does not fit; it names the option or the key.
-        """
-        for field in fields(self):
-            value, name = getattr(self, field.name), field.name
-            if name != "color" and not (value is None and field.default is None):
-                value = convert_value(value, _HINTS[name], option_name(name))
-                object.__setattr__(self, name, value)
-        if self.color not in (False, True, "auto"):
-            raise UsageError(f"--color is {self.color}: give on, off or auto")
-        if self.size is not None and min(self.size) < 1:
-            raise UsageError(f"--size is {self.size}: give height and width above 0")
-        for name, low, high in (
-            ("start", 0.0, math.inf),
-            ("end", 0.0, math.inf),
-            ("rate", 1e-3, 1e6),
-        ):
-            value = getattr(self, name)
-            if value is not None and not (low <= value <= high and math.isfinite(value)):
-                raise UsageError(
-                    f"{option_name(name)} is {value}: it must be in [{low:g}, {high:.0f}]"
-                )
-        if self.range is not None and not self.range[0] < self.range[1]:
-            raise UsageError(f"input.range is {self.range}: write NEAR,FAR, the smaller first")
-        if self.holdout is not None:
-            in_range(self, "input", 0.0, 0.9, "holdout")
-        in_range(self, "input", 0.0, 1e6, "hold")
-        in_range(self, "input", 0.1, 1e6, "stall")
+    @classmethod
+    def key_name(cls, name: str) -> str:
+        """Return how the command line calls a setting: its option, or its key."""
+        return OPTIONS.get(name, f"{cls.prefix}.{name}")
 
     def chosen(self, names: Collection[str] | None = None) -> tuple[str, ...]:
         """Names of settings that are not the defaults, of all or of these."""
@@ -178,7 +149,7 @@ class InputOptions(InputConfig):
 
     def named(self, names: Collection[str] | None = None) -> list[str]:
         """The options and keys of `chosen`, as errors name them."""
-        return [option_name(name) for name in self.chosen(names)]
+        return [self.key_name(name) for name in self.chosen(names)]
 
     @property
     def external(self) -> bool:
@@ -219,22 +190,11 @@ class InputOptions(InputConfig):
         return [*words, *(word for key in self.settings() for word in ("--set", key))]
 
 
-def option_name(name: str) -> str:
-    """How the command line calls a setting: its option, or its key."""
-    return OPTIONS.get(name, f"input.{name}")
-
-
 def _written(value: Any) -> str:
     if isinstance(value, tuple):
         return f"{value[1]}x{value[0]}"
     return "on" if value is True else f"{value:g}" if isinstance(value, float) else str(value)
 
-
-_HINTS: Final = {
-    name: next((a for a in typing.get_args(hint) if type(None) in typing.get_args(hint)), hint)
-    for name, hint in typing.get_type_hints(InputOptions).items()
-}
-"""The types of settings, without None."""
 
 IMAGES: Final = InputOptions()
 """Images, and no numbers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -81,7 +81,7 @@ class OscillatoryConfig(SceneConfig):
         streams: names from `STREAMS`.
     """
 
-    kind: str = "oscillatory"
+    kind: Literal["oscillatory"] = "oscillatory"
     streams: tuple[str, ...] = ("x1", "x2", "x3")
 
     def __post_init__(self) -> None:

@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
-from cdmisfa.core.config import (
-    MAX_COMPONENTS,
-    MAX_TAU,
-    convert_fields,
-    in_range,
-    one_of,
-    outputs_within_components,
-    positive,
-)
-
-ATTENTIONS = ("novel", "progress", "random")
-"""Rules that choose the stream to watch, see `attention`."""
+from cdmisfa.core.config import MAX_COMPONENTS, MAX_TAU, Section, key
 
 
 @dataclass(frozen=True, slots=True)
-class ProgressConfig:
+class ProgressConfig(Section):
     """Everything the progress learner can be told; the defaults are those of `cameras`.
 
     No value depends on the units, the contrast or the noise of a camera.
@@ -45,34 +35,20 @@ class ProgressConfig:
         watch: blocks to watch on when every stream is decided, in case one changes.
     """
 
+    prefix: ClassVar[str] = "learner"
     algorithm: str = "progress"
-    tau: int = 40
-    components: int = 16
-    outputs: int = 8
+    tau: int = key(40, 3, MAX_TAU)
+    components: int = key(16, 1, MAX_COMPONENTS)
+    outputs: int = key(8, 1, "components")
     expansion: str | None = None
-    window: int = 8000
-    attention: str = "novel"
-    visit: int = 5
-    explore: float = 0.1
-    test_frames: int = 2000
-    settled: float = 0.03
-    agreement: float = 0.25
-    slow: float = 0.75
-    even: float = 0.85
-    looks: int = 2
-    watch: int = 0
-
-    def __post_init__(self) -> None:
-        convert_fields(self, "learner")
-        if self.expansion is not None:
-            from cdmisfa.core.expansion import EXPANSIONS  # the keys alone are told without numpy
-
-            one_of(self, "learner", EXPANSIONS, "expansion")
-        one_of(self, "learner", ATTENTIONS, "attention")
-        positive(self, "learner", "components", "outputs", "visit", "test_frames")
-        positive(self, "learner", "window", "settled", "agreement", "looks")
-        in_range(self, "learner", 0.0, 1.0, "explore", "slow", "even")
-        in_range(self, "learner", 0.0, float(2**62), "watch")
-        in_range(self, "learner", 1, MAX_COMPONENTS, "components")
-        in_range(self, "learner", 3, MAX_TAU, "tau")
-        outputs_within_components(self, "learner")
+    window: int = key(8000, 1)
+    attention: Literal["novel", "progress", "random"] = "novel"
+    visit: int = key(5, 1)
+    explore: float = key(0.1, 0, 1)
+    test_frames: int = key(2000, 1)
+    settled: float = key(0.03, 0, above=True)
+    agreement: float = key(0.25, 0, above=True)
+    slow: float = key(0.75, 0, 1)
+    even: float = key(0.85, 0, 1)
+    looks: int = key(2, 1)
+    watch: int = key(0, 0, 2**62)

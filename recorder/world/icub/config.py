@@ -7,27 +7,29 @@ coordinates: x to the robot's back, y to its left.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import ClassVar, Literal
 
-from cdmisfa.core.config import in_range, positive
+from cdmisfa.core.config import Section, key
 from cdmisfa.core.errors import UsageError
 from recorder.config import SceneConfig, check_view_names
 from recorder.world.icub.head import ROAM, SLOWEST_TURN
 
 Range = tuple[float, float]
 
+
+def place(low: float, high: float) -> Range:
+    """Declare a key of the least and the largest coordinate of an object, both within 1 km."""
+    default: Range = key((low, high), -1e3, 1e3, rising=True)
+    return default
+
+
 TABLE_FROM, TABLE_TO = (-0.95, -0.75), (-0.3, 0.75)
 """Corners of the table of a furnished room, and of that which pictures from outside show: the plain
 one fills every eye image, and would hide the robot's legs. Root frame, metres."""
 
 
-def later(default: Any) -> Any:
-    """Field of a key that the plain scene does not state."""
-    return field(default=default, metadata={"unsaid": True})
-
-
 @dataclass(frozen=True, slots=True)
-class TableConfig:
+class TableConfig(Section):
     """The plain table top; wide enough to fill every eye image (keys `scene.table.*`).
 
     Attributes:
@@ -37,19 +39,15 @@ class TableConfig:
         colour: red, green and blue, 0 to 1.
     """
 
+    prefix: ClassVar[str] = "scene.table"
     top: float = -0.05
-    half_size: float = 2.0
-    thickness: float = 0.03
-    colour: tuple[float, float, float] = (0.55, 0.5, 0.45)
-
-    def __post_init__(self) -> None:
-        positive(self, "scene.table", "half_size", "thickness")
-        if not all(0 <= part <= 1 for part in self.colour):
-            raise UsageError(f"scene.table.colour is {self.colour}: each part must be in [0, 1]")
+    half_size: float = key(2.0, 0, above=True)
+    thickness: float = key(0.03, 0, above=True)
+    colour: tuple[float, float, float] = key((0.55, 0.5, 0.45), 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
-class EyesConfig:
+class EyesConfig(Section):
     """The head and its two parallel eyes (keys `scene.eyes.*`).
 
     The eyes' places are iKin's for iCub v2.5, relative to the neck yaw joint. The angles are those
@@ -71,39 +69,35 @@ class EyesConfig:
         pitch: of the neck (degrees).
     """
 
+    prefix: ClassVar[str] = "scene.eyes"
     views: tuple[str, ...] = ("left", "center", "right")
     yaw: tuple[float, ...] = (45.0, 0.0, -45.0)
-    tilt: float = -34.0
-    vertical_fov: float = 38.0
-    width: int = 64
-    height: int = 48
+    tilt: float = key(-34.0, -89, 89)
+    vertical_fov: float = key(38.0, 1, 170)
+    width: int = key(64, 1, 4096)
+    height: int = key(48, 1, 4096)
     forward: float = 0.0509
     up: float = 0.08205
-    half_distance: float = 0.034
-    near: float = 0.1
-    far: float = 5.0
+    half_distance: float = key(0.034, 0, above=True)
+    near: float = key(0.1, 0, above=True)
+    far: float = key(5.0, "near", above=True)
     light: tuple[float, float, float] = (-0.3, 0.2, 1.0)
-    pitch: float = later(0.0)
+    pitch: float = key(0.0, -89, 89, unstated=True)
 
     def __post_init__(self) -> None:
-        positive(self, "scene.eyes", "near", "far", "half_distance")
-        in_range(self, "scene.eyes", 1.0, 170.0, "vertical_fov")
-        in_range(self, "scene.eyes", -89.0, 89.0, "tilt", "pitch")
-        in_range(self, "scene.eyes", 1, 4096, "width", "height")
+        Section.__post_init__(self)
         if len(self.views) != len(self.yaw):
             raise UsageError(
                 f"scene.eyes.yaw has {len(self.yaw)} angles for the {len(self.views)} views of "
                 "scene.eyes.views: give one for each"
             )
         check_view_names(self.views, "scene.eyes.views")
-        if self.near >= self.far:
-            raise UsageError(f"scene.eyes.near is {self.near}: it must be below scene.eyes.far")
         if not any(self.light):
             raise UsageError("scene.eyes.light is zero: it must be a direction")
 
 
 @dataclass(frozen=True, slots=True)
-class BoxConfig:
+class BoxConfig(Section):
     """Object 1: a box, x uniform, y toggling between two places (keys `scene.object1.*`).
 
     Attributes:
@@ -114,20 +108,16 @@ class BoxConfig:
         toggle_every: frames between changes of place.
     """
 
-    half_size: float = 0.05
-    grey: float = 0.1
-    x: Range = (-0.6, -0.4)
-    y: Range = (0.4, 0.6)
-    toggle_every: int = 10
-
-    def __post_init__(self) -> None:
-        positive(self, "scene.object1", "half_size", "toggle_every")
-        in_range(self, "scene.object1", 0.0, 1.0, "grey")
-        _range("scene.object1.x", self.x)
+    prefix: ClassVar[str] = "scene.object1"
+    half_size: float = key(0.05, 0, above=True)
+    grey: float = key(0.1, 0, 1)
+    x: Range = place(-0.6, -0.4)
+    y: tuple[float, float] = (0.4, 0.6)
+    toggle_every: int = key(10, 1)
 
 
 @dataclass(frozen=True, slots=True)
-class CylinderConfig:
+class CylinderConfig(Section):
     """Object 2: a cylinder, x and y uniform (keys `scene.object2.*`).
 
     Attributes:
@@ -138,21 +128,16 @@ class CylinderConfig:
         y: from and to (m).
     """
 
-    radius: float = 0.045
-    height: float = 0.09
-    grey: float = 0.25
-    x: Range = (-0.8, -0.6)
-    y: Range = (-0.1, 0.1)
-
-    def __post_init__(self) -> None:
-        positive(self, "scene.object2", "radius", "height")
-        in_range(self, "scene.object2", 0.0, 1.0, "grey")
-        _range("scene.object2.x", self.x)
-        _range("scene.object2.y", self.y)
+    prefix: ClassVar[str] = "scene.object2"
+    radius: float = key(0.045, 0, above=True)
+    height: float = key(0.09, 0, above=True)
+    grey: float = key(0.25, 0, 1)
+    x: Range = place(-0.8, -0.6)
+    y: Range = place(-0.1, 0.1)
 
 
 @dataclass(frozen=True, slots=True)
-class SphereConfig:
+class SphereConfig(Section):
     """Object 3: a sphere on a reflecting walk, y slow against x (keys `scene.object3.*`).
 
     Attributes:
@@ -164,19 +149,13 @@ class SphereConfig:
         step_y: the same of y (m).
     """
 
-    radius: float = 0.055
-    grey: float = 0.2
-    x: Range = (-0.58, -0.42)
-    y: Range = (-0.58, -0.42)
-    step_x: float = 0.06
-    step_y: float = 0.004
-
-    def __post_init__(self) -> None:
-        positive(self, "scene.object3", "radius")
-        in_range(self, "scene.object3", 0.0, 1.0, "grey")
-        in_range(self, "scene.object3", 0.0, 1e3, "step_x", "step_y")
-        _range("scene.object3.x", self.x)
-        _range("scene.object3.y", self.y)
+    prefix: ClassVar[str] = "scene.object3"
+    radius: float = key(0.055, 0, above=True)
+    grey: float = key(0.2, 0, 1)
+    x: Range = place(-0.58, -0.42)
+    y: Range = place(-0.58, -0.42)
+    step_x: float = key(0.06, 0, 1e3)
+    step_y: float = key(0.004, 0, 1e3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,32 +181,29 @@ class IcubConfig(SceneConfig):
         exposure: the eyes adapt to the light: all images of a view are as bright in the mean.
     """
 
-    kind: str = "icub"
+    kind: Literal["icub"] = "icub"
     robot: str = "iCubGazeboV2_5"
     eyes: EyesConfig = field(default_factory=EyesConfig)
     table: TableConfig = field(default_factory=TableConfig)
     object1: BoxConfig = field(default_factory=BoxConfig)
     object2: CylinderConfig = field(default_factory=CylinderConfig)
     object3: SphereConfig = field(default_factory=SphereConfig)
-    room: bool = later(False)
-    texture: bool = later(False)
-    shadow: float = later(0.0)
-    arms: bool = later(False)
-    blur: bool = later(False)
-    vignette: float = later(0.0)
-    noise: float = later(0.0)
-    color: bool = later(False)
-    physics: bool = later(False)
-    transit: float = later(0.0)
-    roam: bool = later(False)
-    drift: float = later(0.0)
-    exposure: bool = later(False)
+    room: bool = key(False, unstated=True)
+    texture: bool = key(False, unstated=True)
+    shadow: float = key(0.0, 0, 1, unstated=True)
+    arms: bool = key(False, unstated=True)
+    blur: bool = key(False, unstated=True)
+    vignette: float = key(0.0, 0, 1, unstated=True)
+    noise: float = key(0.0, 0, 64, unstated=True)
+    color: bool = key(False, unstated=True)
+    physics: bool = key(False, unstated=True)
+    transit: float = key(0.0, 0, 360, unstated=True)
+    roam: bool = key(False, unstated=True)
+    drift: float = key(0.0, 0, 1, unstated=True)
+    exposure: bool = key(False, unstated=True)
 
     def __post_init__(self) -> None:
         SceneConfig.__post_init__(self)
-        in_range(self, "scene", 0.0, 1.0, "shadow", "vignette", "drift")
-        in_range(self, "scene", 0.0, 64.0, "noise")
-        in_range(self, "scene", 0.0, 360.0, "transit")
         if 0 < self.transit < SLOWEST_TURN:
             raise UsageError(
                 f"scene.transit is {self.transit}: 0, or {SLOWEST_TURN} degrees a frame or more"
@@ -241,15 +217,10 @@ class IcubConfig(SceneConfig):
         return all(
             getattr(self, f.name) == f.default
             for f in fields(self)
-            if f.metadata and f.name != "transit"
+            if f.metadata.get("unstated") and f.name != "transit"
         )
 
     @property
     def views(self) -> tuple[str, ...]:
         """Names of all views."""
         return (*self.eyes.views, ROAM) if self.roam else self.eyes.views
-
-
-def _range(key: str, limits: Range) -> None:
-    if not -1e3 <= limits[0] <= limits[1] <= 1e3:
-        raise UsageError(f"{key} is {limits}: give the lower limit first, both within 1 km")
