@@ -7,14 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import PACKED, packed, raw
+from camera_files import PACKED, RAW, packed, raw
 from conftest import Cdmisfa
 from message_files import STEP, every, learned_alike, write_mcap
 from numpy.typing import NDArray
 from PIL import Image
 
 from recorder.images.framing import Framing
-from recorder.images.messages import image_decoder
+from recorder.images.messages import decoder_of
+from recorder.images.options import InputOptions
 from recorder.images.videos import frame_colors
 from replay.camera_logs.hue import hue_varies
 from replay.camera_logs.source import ForeignSource
@@ -35,7 +36,7 @@ def beside(images: np.ndarray) -> np.ndarray:
 
 
 def decoded(message: bytes) -> np.ndarray:
-    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
+    decode = decoder_of(RAW, InputOptions(color=True))
     assert decode is not None
     return decode(message)
 

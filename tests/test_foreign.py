@@ -23,7 +23,8 @@ from video_packets import cdr as ros2
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.compressed import compressed_image
-from recorder.images.messages import MessageKind, image_decoder, stated_format
+from recorder.images.messages import MessageKind, decoder_of, stated_format
+from recorder.images.options import InputOptions
 from recorder.images.pixels import DISTANCES, ENCODINGS, MalformedImage, raw_image, shrink
 from replay.camera_logs.source import ForeignSource
 
@@ -49,7 +50,7 @@ def ros1(*, height: int, width: int, encoding: str, big: int, step: int, data: b
 
 def shown(kind: tuple[str, str], message: bytes, **options: Any) -> np.ndarray:
     """What a decoder makes of a message of a kind."""
-    decoder = image_decoder(*kind, **options)
+    decoder = decoder_of(MessageKind(*kind), InputOptions(**options))
     assert decoder is not None
     return decoder(message)
 
@@ -124,9 +125,7 @@ def test_distances_are_shown_in_a_range(kind: tuple[str, str], encoding: str) ->
         values = np.round(np.nan_to_num(metres, posinf=0) * 1000).astype("<u2")
     step, data = 5 * values.itemsize, values.tobytes()
     made = RAW[kind](height=2, width=5, encoding=encoding, big=0, step=step, data=data)
-    np.testing.assert_array_equal(shown(kind, made, depth=(1.0, 2.0)), expected)
-    with pytest.raises(UsageError, match=r"input\.range: no distance is below 0"):
-        shown(kind, made, depth=(-1.0, 2.0))
+    np.testing.assert_array_equal(shown(kind, made, range=(1.0, 2.0)), expected)
     if encoding == "32FC1":
         with pytest.raises(UsageError, match=r"input\.range"):
             shown(kind, made)
@@ -174,7 +173,7 @@ def test_compressed_distances_are_shown_in_a_range() -> None:
     ):
         for kind, message in ros_compressed(form, data).items():
             assert stated_format(*kind, message) in DISTANCES
-            np.testing.assert_array_equal(shown(kind, message, depth=(1.0, 2.0)), expected)
+            np.testing.assert_array_equal(shown(kind, message, range=(1.0, 2.0)), expected)
             if form.startswith("16"):
                 high = (metres * 1000).astype(np.uint16) >> 8
                 np.testing.assert_array_equal(shown(kind, message), high)

@@ -124,15 +124,15 @@ def test_a_recording_of_a_log_keeps_its_recipe(cdmisfa: Cdmisfa, tmp_path: Path)
 @pytest.mark.parametrize(
     ("recipe", "given", "why"),
     [
-        (Recipe((8, 16)), np.zeros((4, 7, 20), np.uint8), "20x7 is smaller than the .* 16x8"),
+        (Recipe((8, 16)), np.zeros((4, 7, 20), np.uint8), "14x7 is smaller than 16x8"),
         (Recipe((8, 16), raw=(20, 40)), np.zeros((4, 40, 20), np.uint8), "20x40 .* 40x20: turn it"),
         (
             Recipe((8, 16)),
             np.full((4, 8, 16), 200.0),
             "hold 200: scale them to 0 to 1, or give uint8",
         ),
-        (Recipe((8, 16)), [b"nothing"], "a picture cannot be taken: .* broken"),
-        (Recipe((8, 16)), None, "one picture or none given"),
+        (Recipe((8, 16)), [b"nothing"], "an image cannot be taken: .* broken"),
+        (Recipe((8, 16)), None, "images of object .* given"),
         (
             Recipe((3,), fields=("a", "b")),
             np.zeros((4, 2)),

@@ -83,7 +83,7 @@ def test_a_video_is_shown_again_from_the_next_whole_picture(tmp_path: Path) -> N
         np.testing.assert_array_equal(frame, expected[last.get(row, row)], err_msg=str(row))
     with ForeignSource(path, size=SIZE) as source:
         source.seek(30)
-        with pytest.raises(LogDamagedError, match="its message is empty, without a picture"):
+        with pytest.raises(LogDamagedError, match="its message is empty, without an image"):
             source.take(0, 1)
 
 

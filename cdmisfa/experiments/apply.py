@@ -161,8 +161,6 @@ class Application:
         if not isinstance(source, ArrayLog) or not source.spec.images or not self.recipe.size:
             return source
         source.close()
-        for array in source.arrays.values():
-            self.recipe.refuse_turned((array.shape[1], array.shape[2]))
         made = self._with_recipe(inputs)
         taken: Any = {name: getattr(made, name) for name in TAKES}
         return open_logs(words, inputs=replace(inputs, **taken), **how)

@@ -1,7 +1,7 @@
-"""JPEG and PNG files, decoded by Pillow, and refused where they tell that they are damaged.
+"""Decode JPEG and PNG with Pillow, and reject what their formats show to be damaged.
 
-A PNG has checksums of all of it, of which Pillow checks few. A JPEG has none, but an end, and where
-it is of one scan its pixels end where its data do. Pillow silences what libjpeg says of both.
+A PNG has a checksum for each chunk, of which Pillow checks few. A JPEG has no checksums, but an end
+marker, and if it has one scan its pixels end where its data end. Pillow hides what libjpeg reports.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ImageOps
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -24,145 +24,104 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.pixels import MAX_PIXELS, MalformedImage, by_bands
 
+AT_ONCE: Final = 4_000_000
+"""Pixels of the largest image that is decoded in a thread, where no memory limit is possible."""
+
 _JPEG: Final = b"\xff\xd8"
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _MARKER: Final = re.compile(rb"\xff(?=[^\x00\xff])")
 _END: Final = 0xD9
 _RESTARTS: Final = range(0xD0, 0xD8)
 _ARITHMETIC: Final = b"\xff\xc9"
-"""Begins a JPEG of arithmetic coding, whose data may end before its pixels."""
+"""Marker of arithmetic coding, with which data may end before the pixels do."""
 
 _SCAN: Final = b"\xff\xda"
 _MOST_SCANNED: Final = 720_000_000
-"""Most pixels of all scans of a JPEG: 20 of the largest image; 10 are usual. A scan may have a few
-bytes, and takes as long as any."""
+"""Most pixels of all scans of a JPEG: 20 scans of the largest image; 10 are usual. A scan of a few
+bytes takes as long as any other."""
 
 _AHEAD: Final = b"\xff\x00" * 8
-"""Bits that stand for nothing; libjpeg reads up to 64 before it needs them."""
+"""Padding behind a scan: libjpeg reads up to 64 bits before it needs them."""
 
-_NO_END: Final = "its JPEG is damaged: it lacks its end marker"
 _LEFT: Final = 64
-"""Bytes before the end that may stand for nothing, too: some cameras leave a few."""
-
-
-AT_ONCE: Final = 4_000_000
-"""Most pixels of an image that is decoded beside others, without a limit to the memory it takes."""
+"""Bytes before the end marker that may hold no pixels: some cameras leave a few."""
 
 _WORDS: Final = ("I;16", "I;16B", "I")
-"""Pillow's modes of 16 bit."""
-
-_ORIENTATION: Final = 0x0112
-"""The tag of EXIF that says how a camera was held."""
-
-_TURNS: Final = (
-    *("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE"),
-    *("ROTATE_270", "TRANSVERSE", "ROTATE_90"),
-)
-"""What puts an image upright, by its orientation from 2 on; 1 is."""
+"""Pillow's modes for 16 bits."""
 
 
 def compressed_image(data: bytes, *, color: bool = False, most: int = MAX_PIXELS) -> ByteArray:
-    """The image in a JPEG or PNG, gray, (height, width) uint8.
+    """Decode a JPEG or PNG to gray, (height, width) uint8.
 
     Args:
         data: the file.
-        color: give what has colours as they are, (height, width, 3) red, green and blue.
-        most: its pixels at most; no more than `AT_ONCE` in several threads at once.
+        color: decode colours to red, green and blue, (height, width, 3).
+        most: the largest number of pixels; threads must not ask for more than `AT_ONCE`.
 
     Raises:
-        MalformedImage: it is neither, broken, or too large.
+        MalformedImage: the data are neither, broken, or too large.
     """
-    with _opened(data, most) as image:
+    with _decoded(data, most) as image:
         if image.mode in _WORDS:
             words = np.asarray(image)
             return by_bands(words, lambda part: (part.astype(np.int64) >> 8).clip(0, 255))
-        if image.mode not in ("L", "RGB"):
-            image = image.convert("RGB")
-        return np.array(image if color else image.convert("L"), np.uint8)
+        rgb = image if image.mode in ("L", "RGB") else image.convert("RGB")
+        return np.array(rgb if color else rgb.convert("L"), np.uint8)
 
 
 def compressed_words(data: bytes) -> NDArray[np.uint16]:
-    """Decode a PNG of 16 bit, as distances are packed in, into (height, width).
+    """Decode a PNG of 16 bits, in which ROS packs distances, to (height, width).
 
     Raises:
-        MalformedImage: it is none, broken, or too large.
+        MalformedImage: the data are no such PNG, broken, or too large.
     """
-    with _opened(data) as image:
+    with _decoded(data) as image:
         if image.mode not in _WORDS:
             raise MalformedImage(f"its distances are packed as {image.mode}, not in 16 bit")
         return np.asarray(image).astype(np.uint16)
 
 
 @contextmanager
-def _opened(data: bytes, most: int = MAX_PIXELS) -> Iterator[Image.Image]:
-    """Decode a JPEG or PNG, turned upright."""
-    limit = f"more than {BUDGET >> 20} MiB of memory, the limit"
+def _decoded(data: bytes, most: int = MAX_PIXELS) -> Iterator[ImageFile]:
+    """Decode a JPEG or PNG, turned upright by its EXIF, within the memory budget."""
     try:
         with nullcontext() if most <= AT_ONCE else budget():
-            file = open_picture(data)
-            if not 0 < file.width * file.height <= most:
-                raise MalformedImage(f"an image of {file.width}x{file.height} is not read")
-            # Of a progressive JPEG all coefficients are held until its end.
-            held = file.width * file.height * (2 * len(file.getbands()) + 4)
-            if file.info.get("progressive") and held > BUDGET:
-                raise MalformedImage(
-                    f"a progressive JPEG of {file.width}x{file.height} in {file.mode} takes {limit}"
-                )
-            load_picture(file, data)
-            image: Image.Image = file
-            if 2 <= (orientation := _orientation(image)) <= 8:
-                image = image.transpose(Image.Transpose[_TURNS[orientation - 2]])
+            jpeg = data.startswith(_JPEG)
+            image = JpegImageFile(io.BytesIO(data)) if jpeg else PngImageFile(io.BytesIO(data))
+            if not 0 < image.width * image.height <= most:
+                raise MalformedImage(f"an image of {image.width}x{image.height} is not read")
+            if isinstance(image, JpegImageFile):
+                _load_jpeg(image, data)
+            else:
+                _check_chunks(data)
+                image.load()
+            if "exif" in image.info:
+                _turn_upright(image)
             yield image
     except MalformedImage:
         raise
     except MemoryError:
-        raise MalformedImage(f"its JPEG or PNG takes {limit}") from None
+        raise MalformedImage(
+            f"its JPEG or PNG takes more than {BUDGET >> 20} MiB of memory, the limit"
+        ) from None
     except Exception as error:  # Pillow raises whatever its codecs raise
         raise MalformedImage(f"its JPEG or PNG is broken ({type(error).__name__})") from None
 
 
-def _orientation(image: Image.Image) -> int:
-    """EXIF's orientation, 1 to 8; 1, upright, where it is missing or broken."""
-    if "exif" not in image.info:
-        return 1
+def _turn_upright(image: ImageFile) -> None:
     try:
-        return int(image.getexif().get(_ORIENTATION, 1))
-    except Exception:  # Pillow raises whatever its parser raises; the picture may be whole
-        return 1
-
-
-def open_picture(data: bytes) -> ImageFile:
-    """Read the head of a JPEG or PNG; its pixels are for `load_picture`.
-
-    Raises:
-        MalformedImage: it is a damaged PNG.
-        Exception: whatever Pillow raises where it is neither, or broken.
-    """
-    if data.startswith(_JPEG):
-        return JpegImageFile(io.BytesIO(data))
-    image = PngImageFile(io.BytesIO(data))
-    _check_chunks(data)
-    return image
-
-
-def load_picture(image: ImageFile, data: bytes) -> None:
-    """Decode what `open_picture` opened.
-
-    Raises:
-        MalformedImage: it is a damaged JPEG.
-        Exception: whatever Pillow raises where it is broken.
-    """
-    if isinstance(image, JpegImageFile):
-        _load_jpeg(image, data)
-    else:
-        image.load()
+        ImageOps.exif_transpose(image, in_place=True)
+    except MemoryError:
+        raise
+    except Exception:
+        pass
 
 
 def check_png(data: bytes) -> bool:
-    """Check the checksums of a PNG without decoding it; false of a JPEG, which has none.
+    """Check the checksums of a PNG without decoding it; return False for a JPEG, which has none.
 
     Raises:
-        MalformedImage: it is damaged, or neither.
+        MalformedImage: the data are damaged, or neither.
     """
     if data.startswith(_JPEG):
         return False
@@ -186,40 +145,34 @@ def _check_chunks(data: bytes) -> None:
 
 
 def _load_jpeg(image: JpegImageFile, data: bytes) -> None:
-    """Decode a JPEG; where its pixels are in one scan, without its end, see `_Scan`."""
+    """Decode a JPEG; if its pixels are in one scan, without its end marker, see `_Scan`."""
     file = image.fp
     assert file is not None
     start = file.tell()
-    scans = image.info.get("progressive") or data[start - 4 - 2 * image.layers] != image.layers
-    if scans or data.find(_ARITHMETIC, 0, start) >= 0:
+    several = image.info.get("progressive") or data[start - 4 - 2 * image.layers] != image.layers
+    if several or data.find(_ARITHMETIC, 0, start) >= 0:
         if data.find(b"\xff\xd9", start) < 0:
-            raise MalformedImage(_NO_END)
+            raise MalformedImage("its JPEG is damaged: it lacks its end marker")
         if data.count(_SCAN, start) * image.width * image.height > _MOST_SCANNED:
             raise MalformedImage(f"a JPEG of {data.count(_SCAN)} scans is not read")
         image.load()
         return
-    image.fp = scan = _Scan(data, start, _end_of(data, start))
+    markers = ((m.start(), data[m.end()]) for m in _MARKER.finditer(data, start))
+    # FFmpeg does not number restart markers in order: any order is accepted.
+    end, kind = next((m for m in markers if m[1] not in _RESTARTS), (0, 0))
+    if kind != _END:
+        raise MalformedImage("its JPEG is damaged: its scan does not end with an end marker")
+    image.fp = scan = _Scan(data, start, end)
     image.load()
     if scan.tell() <= scan.most:
         raise MalformedImage("its JPEG is damaged: its pixels end before its data")
 
 
-def _end_of(data: bytes, start: int) -> int:
-    """Where the end marker is of a scan; restarts, as FFmpeg numbers them, are in any order."""
-    for found in _MARKER.finditer(data, start):
-        kind = data[found.end()]
-        if kind == _END:
-            return found.start()
-        if kind not in _RESTARTS:
-            raise MalformedImage(f"its JPEG is damaged: no marker {kind:02x} belongs there")
-    raise MalformedImage(_NO_END)
-
-
 class _Scan(io.BytesIO):
-    """A JPEG without its end, from where on libjpeg would make up the pixels that are missing.
+    """A JPEG without its end marker: libjpeg would invent all pixels that are missing before it.
 
-    What follows is enough for what it reads ahead. Pixels that need more are an error of Pillow's:
-    the file is truncated. Pixels that need less leave the last part, which is read by itself.
+    The padding is enough for what libjpeg reads ahead. If pixels need more, Pillow reports that
+    the file is truncated. If they need less, the last part is never read, as it is read alone.
 
     Args:
         data: the file.
@@ -235,6 +188,6 @@ class _Scan(io.BytesIO):
         self.most = max(end - _LEFT, start)
 
     def read(self, size: int | None = -1) -> bytes:
-        """The next bytes, up to the last part, or of it."""
+        """Read up to the last part, or from it."""
         before = self.most - self.tell()
         return super().read(min(size or before, before) if before > 0 else size)

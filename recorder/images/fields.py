@@ -1,4 +1,4 @@
-"""Numbers in a message: named by a path, and read as a vector."""
+"""Numbers in a message: a path names them, and they are read as a vector."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from recorder.images.options import Depth
 from recorder.images.pixels import MalformedImage
 
 MOST: Final = 100_000
-"""Most numbers that a message may give."""
+"""Most numbers of a message: more than any scan has."""
 
 EXACT: Final = 2.0**53
 """Up to here float64 holds every whole number."""
@@ -31,21 +31,19 @@ def is_path(text: str) -> bool:
 
 
 class Field:
-    """Where numbers stand in a message: `position`, `pose.position.x`, `ranges[0:100]`, `p[2].x`.
+    """A path to numbers in a message: `position`, `pose.position.x`, `ranges[0:100]`, `p[2].x`.
 
-    What follows a list or a part of one is taken of each of its members.
+    A name behind a list, or behind a part of one, is looked up in each of its members.
 
     Args:
         path: as the user wrote it.
-        plain: it is a name, whatever that is made of.
+        plain: the path is a name, whatever characters it has.
 
     Raises:
-        UsageError: it is no such path.
+        UsageError: the text is no path.
     """
 
     def __init__(self, path: str, *, plain: bool = False) -> None:
-        if not path:
-            raise UsageError("--field is empty: name a field of the messages")
         if not plain and not is_path(path):
             raise UsageError(
                 f"--field {path} is no field: write names with dots, an index or a part of "
@@ -56,94 +54,109 @@ class Field:
         self.first = str(self._steps[0])
 
     def numbers(self, message: Any) -> list[float]:
-        """The numbers at the path in a message; NaN where it is null.
+        """Return the numbers at the path in a message; NaN for null.
 
         Raises:
-            UsageError: there is no such field, or what is there is no number.
+            UsageError: the message has no such field, or no number there.
+            MalformedImage: a number or the nesting is too large.
         """
-        found: list[float] = []
-        _collect(self._value(message, self._steps), self.path, found)
-        return found
-
-    def _value(self, value: Any, steps: Sequence[_Step]) -> Any:
-        for place, step in enumerate(steps):
-            if value is None and not isinstance(step, slice):
-                return None
-            if isinstance(step, str) and _is_list(value):
-                return [self._value(member, steps[place:]) for member in value]
-            value = self._member(value, step)
-        return value
-
-    def _member(self, value: Any, step: _Step) -> Any:
-        if isinstance(step, str):
-            names = members(value)
-            if step not in names:
-                there = "it is no message"
-                if names or isinstance(value, Mapping):
-                    there = f"it has {', '.join(names) or 'no fields at all'}"
-                raise UsageError(f"--field {self.path}: there is no {step}, {there}")
-            return field_value(value, step)
-        if not _is_list(value):
-            raise UsageError(f"--field {self.path}: what the index is of is no list")
-        last = (step.stop or step.start + 1) if isinstance(step, slice) else step + 1
-        if last > len(value):
-            remedy = ", all of them are [0:]" if isinstance(step, slice) else ""
-            raise UsageError(f"--field {self.path}: there are {len(value)} members only{remedy}")
-        return value[step]
+        numbers: list[float] = []
+        try:
+            _collect(_value(message, self._steps), numbers)
+        except LookupError as error:
+            raise UsageError(f"--field {self.path}: {error.args[0]}") from None
+        except (OverflowError, RecursionError):
+            raise MalformedImage(f"--field {self.path} is of no size that is read") from None
+        return numbers
 
 
-def _step(found: re.Match[str]) -> _Step:
-    name, index, start, stop = found.groups()
+def _step(match: re.Match[str]) -> _Step:
+    name, index, start, stop = match.groups()
     if name is not None:
         return str(name)
     return int(index) if index is not None else slice(int(start or 0), int(stop) if stop else None)
 
 
+def _value(value: Any, steps: Sequence[_Step]) -> Any:
+    """Follow steps into a message; raise LookupError with words for the user."""
+    for place, step in enumerate(steps):
+        if value is None and not isinstance(step, slice):
+            return None
+        if isinstance(step, str):
+            if _is_list(value):
+                return [_value(member, steps[place:]) for member in value]
+            names = members(value)
+            if step not in names:
+                raise LookupError(f"there is no {step}, it has {', '.join(names) or 'no fields'}")
+            value = field_value(value, step)
+        elif not _is_list(value):
+            raise LookupError("an index is for a list only")
+        else:
+            last = (step.stop or step.start + 1) if isinstance(step, slice) else step + 1
+            if last > len(value):
+                raise LookupError(f"there are {len(value)} members only, all of them are [0:]")
+            value = value[step]
+    return value
+
+
+def _collect(value: Any, numbers: list[float]) -> None:
+    """Append all numbers of a value; raise LookupError with words for the user."""
+    if value is None:
+        numbers.append(np.nan)
+    elif isinstance(value, bool | int | float | np.generic):
+        numbers.append(float(value))
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        numbers += value.astype(np.float64).reshape(-1).tolist()
+    elif _is_list(value):
+        for member in value:
+            _collect(member, numbers)
+    else:
+        kind = "a text" if isinstance(value, str) else type(value).__name__
+        names = f": name one of {', '.join(members(value))}" if members(value) else ""
+        raise LookupError(f"it is no number but {kind}{names}")
+
+
 def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> FloatArray:
-    """The numbers of all fields of a message, one after the other, (I,) float64.
+    """Return the numbers of all fields of a message, one after the other, (I,) float64.
 
     Args:
-        fields: where they stand.
+        fields: paths to the numbers.
         message: decoded.
-        bounds: what they are kept in; what is no finite number becomes the first of them.
+        bounds: the range that numbers are kept in; those that are not finite become the first.
 
     Raises:
-        UsageError: a field is not there, or is no number, or one that is not finite, and there
-            are no bounds.
-        MalformedImage: a field is of no size that is read.
+        UsageError: a field is missing, is no number, or is not finite without bounds.
+        MalformedImage: a field is too large.
     """
-    found: list[float] = []
+    numbers: list[float] = []
     for field in fields:
-        try:
-            own = field.numbers(message)
-        except (OverflowError, RecursionError):
-            raise MalformedImage(f"--field {field.path} is of no size that is read") from None
-        if bounds is None and not np.isfinite(own).all():
-            place = int(np.flatnonzero(~np.isfinite(own))[0])
-            held = "NaN or null" if np.isnan(own[place]) else own[place]
+        part = field.numbers(message)
+        if bounds is None and not np.isfinite(part).all():
+            place = int(np.flatnonzero(~np.isfinite(part))[0])
+            value = "NaN or null" if np.isnan(part[place]) else part[place]
             raise UsageError(
-                f"--field {field.path} holds {held} at place {place}, which is no finite "
+                f"--field {field.path} holds {value} at place {place}, which is no finite "
                 "number: leave it out, or keep numbers in a range, as --set input.range=0.1,10"
             )
-        found += own
-    if not 0 < len(found) <= MOST:
-        raise UsageError(f"its fields hold {len(found)} numbers: choose from 1 to {MOST}")
-    return bounded(np.array(found, np.float64), bounds)
+        numbers += part
+    if not 0 < len(numbers) <= MOST:
+        raise UsageError(f"its fields hold {len(numbers)} numbers: choose from 1 to {MOST}")
+    return bounded(np.array(numbers, np.float64), bounds)
 
 
 def bounded(numbers: FloatArray, bounds: Depth | None) -> FloatArray:
-    """Numbers within bounds; those that are not finite become the first of them."""
+    """Keep numbers within bounds; those that are not finite become the first of them."""
     if bounds is None:
         return numbers
     return np.clip(np.where(np.isfinite(numbers), numbers, bounds[0]), *bounds)
 
 
 def rounded(fields: Sequence[str], numbers: FloatArray) -> str:
-    """A warning where float64 may round whole numbers, (I,); "" of others.
+    """Return a warning if float64 may have rounded whole numbers, or "".
 
     Args:
-        fields: what their fields are called.
-        numbers: of a message, finite.
+        fields: the names of the numbers' fields.
+        numbers: (I,) of a message, finite.
     """
     if not len(numbers) or np.abs(numbers).max() <= EXACT:
         return ""
@@ -153,7 +166,7 @@ def rounded(fields: Sequence[str], numbers: FloatArray) -> str:
 
 
 def members(value: Any) -> list[str]:
-    """The names of a message's fields, whatever library decoded it; none of other values."""
+    """Return the names of a message's fields, whichever library decoded it; none for others."""
     if isinstance(value, Mapping):
         return [str(name) for name in value]
     descriptor = getattr(value, "DESCRIPTOR", None)
@@ -163,7 +176,7 @@ def members(value: Any) -> list[str]:
 
 
 def field_value(value: Any, name: str) -> Any:
-    """The value of a field of a message, one of its `members`."""
+    """Return the value of a field of a message, one of its `members`."""
     return value[name] if isinstance(value, Mapping) else getattr(value, name)
 
 
@@ -171,20 +184,3 @@ def _is_list(value: Any) -> bool:
     if isinstance(value, str | bytes | Mapping):
         return False
     return isinstance(value, np.ndarray) or hasattr(value, "__getitem__")
-
-
-def _collect(value: Any, path: str, found: list[float]) -> None:
-    if value is None:
-        found.append(np.nan)
-    elif isinstance(value, bool | int | float | np.generic):
-        found.append(float(value))
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        found += value.astype(np.float64).reshape(-1).tolist()
-    elif _is_list(value):
-        for member in value:
-            _collect(member, path, found)
-    else:
-        names = members(value)
-        name = f"one of its fields: {', '.join(names)}" if names else "another"
-        kind = "a text" if isinstance(value, str) else type(value).__name__
-        raise UsageError(f"--field {path} is no number but {kind}: name {name}")

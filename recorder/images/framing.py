@@ -1,16 +1,20 @@
-"""How images become frames: their size, and what is cropped, padded or stretched."""
+"""How images, and numbers, become frames: size, crop, padding, colours.
+
+`Framing` is for the images of a log or a camera; a `Recipe` repeats it for raw images of a caller.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Final, Self, get_args
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.config import convert_value
 from cdmisfa.core.errors import UsageError, are_for
 from recorder.images.compressed import compressed_image
 from recorder.images.fields import bounded
@@ -18,7 +22,7 @@ from recorder.images.options import Centre, Depth, Fit, Size
 from recorder.images.pixels import MalformedImage, Shown, raw_image, shrink
 
 FRAME_PIXELS: Final = 48 * 128
-"""Most pixels of a frame where no size is given: those of the paper's."""
+"""Most pixels of a frame if no size is given: those of the paper's frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,23 +42,23 @@ class Framing:
     color: bool = False
 
     def frame(self, image: ByteArray) -> ByteArray:
-        """Make an image a frame; one of another size than the first may be smaller than a frame.
+        """Turn an image into a frame.
 
         Args:
             image: (height, width), or (height, width, 3) in colours.
 
         Raises:
-            UsageError: the image is smaller, as the first is.
+            TooSmallError: the image is smaller than a frame, as the first one is. Images of
+                another size than the first may be smaller: they are enlarged.
         """
         enlarge = size_of(image) != self.first
         if not self.color:
             return fitted(image, self.size, self.fit, enlarge=enlarge)
-        planes = [image] if image.ndim == 2 else [image[:, :, c].copy() for c in range(3)]
-        shown = [fitted(p, self.size, self.fit, enlarge=enlarge) for p in planes]
-        return np.hstack(shown if len(shown) == 3 else shown * 3)
+        planes = [image] * 3 if image.ndim == 2 else [image[:, :, c].copy() for c in range(3)]
+        return np.hstack([fitted(p, self.size, self.fit, enlarge=enlarge) for p in planes])
 
     def change(self, image: tuple[int, ...]) -> str:
-        """A warning about an image of another shape; "" of one like the first."""
+        """Return a warning about an image of another shape than the first, or ""."""
         size = image[0], image[1]
         if size == self.first:
             return ""
@@ -63,36 +67,38 @@ class Framing:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of a frame."""
+        """Shape of a frame."""
         return self.size[0], self.size[1] * (3 if self.color else 1)
 
     @property
     def lossy(self) -> str:
-        """How images of another ratio are made to fit; see `cut_or_added`."""
-        return cut_or_added(self.first, self.size, self.fit)
+        """What makes images of another aspect ratio fit, in words; "" for the same ratio."""
+        if self.fit == "crop":
+            inner = _largest_within(self.first, self.size)
+            return "" if inner == self.first else f"cropped to {_in_words(inner)}"
+        inner = _largest_within(self.size, self.first)
+        if inner == self.size:
+            return ""
+        return f"padded from {_in_words(inner)}" if self.fit == "pad" else "stretched"
 
     def __str__(self) -> str:
         """How an image becomes a frame, in words."""
-        shown = "" if self.first == self.size else f"shown as {_in_words(self.size)}"
-        return ", ".join(filter(None, [_in_words(self.first), self.lossy, shown]))
+        resized = "" if self.first == self.size else f"shown as {_in_words(self.size)}"
+        return ", ".join(filter(None, [_in_words(self.first), self.lossy, resized]))
 
 
 @dataclass(frozen=True, slots=True)
 class Vector:
-    """How the numbers of one stream become frames: as they are.
-
-    Attributes:
-        count: how many there are in each message.
-    """
+    """How the numbers of one stream, `count` a message, become frames: unchanged."""
 
     count: int
     lossy = ""
 
     def frame(self, numbers: Shown) -> Shown:
-        """The numbers of a message, (count,) float64.
+        """Return the numbers of a message, (count,) float64.
 
         Raises:
-            UsageError: it holds others.
+            UsageError: the message has another count of numbers.
         """
         if numbers.shape != self.shape:
             least = min(self.count, len(numbers))
@@ -103,12 +109,12 @@ class Vector:
         return numbers
 
     def change(self, numbers: tuple[int, ...]) -> str:
-        """Nothing: see `frame`."""
+        """Return "": a change is an error of `frame`."""
         return ""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of a frame."""
+        """Shape of a frame."""
         return (self.count,)
 
     def __str__(self) -> str:
@@ -119,40 +125,40 @@ class Vector:
 def framings(
     firsts: Sequence[Shown], size: Size | None, fit: Fit, *, color: bool = False
 ) -> Sequence[Framing | Vector]:
-    """How the images or numbers of streams become frames, all of one shape.
+    """Choose how the images or numbers of streams become frames, all of one shape.
 
     Args:
-        firsts: what each stream shows first.
+        firsts: the first image or numbers of each stream.
         size: (height, width) of a frame; None for the `default_size` of the first image.
         fit: see `fitted`.
         color: show red, green and blue beside one another.
 
     Raises:
-        UsageError: some show images and some numbers, or not as many.
+        UsageError: streams show images and numbers, or different counts of numbers.
     """
     if all(first.ndim > 1 for first in firsts):
         size = size or default_size(size_of(firsts[0]))
         return [Framing(size_of(first), size, fit, color) for first in firsts]
-    counts = [len(first) for first in firsts if first.ndim == 1]
-    if len(counts) < len(firsts) or len(set(counts)) > 1:
+    kinds = ["images" if first.ndim > 1 else str(Vector(len(first))) for first in firsts]
+    if len(set(kinds)) > 1:
         raise UsageError(
             "streams that are learned from together show frames of one shape, and these show "
-            + " and ".join(dict.fromkeys(_shown_in_words(first) for first in firsts))
+            + " and ".join(dict.fromkeys(kinds))
             + ": take as many numbers of each, as with --field position[0:6], or each apart"
         )
     given = {"--size": size is not None, "input.fit": fit != "crop", "--color": color}
-    if refused := [option for option, said in given.items() if said]:
+    if refused := [option for option, chosen in given.items() if chosen]:
         raise UsageError(f"numbers are taken as they are: {are_for(refused, 'images')}")
-    return [Vector(count) for count in counts]
+    return [Vector(len(first)) for first in firsts]
 
 
 def size_of(image: Shown) -> Size:
-    """The size of an image, (height, width)."""
+    """Return the size of an image, (height, width)."""
     return image.shape[0], image.shape[1]
 
 
 def default_size(image: Size) -> Size:
-    """An image's size divided by the least whole number that leaves `FRAME_PIXELS` or fewer."""
+    """Divide a size by the least whole number that leaves `FRAME_PIXELS` or fewer."""
     height, width = image
     divisor = 1
     while max(height // divisor, 1) * max(width // divisor, 1) > FRAME_PIXELS:
@@ -161,44 +167,28 @@ def default_size(image: Size) -> Size:
 
 
 def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> ByteArray:
-    """Make an image a frame.
+    """Turn a gray image into a frame.
 
     Args:
         image: (height, width) uint8.
         size: of the frame.
-        fit: where the ratio of the sides is another: "crop" cuts two sides, as much of each,
-            "pad" puts black at them, "stretch" changes the ratio.
-        enlarge: take a smaller image, too.
+        fit: for another aspect ratio: "crop" cuts two sides, as much of each, "pad" adds black
+            sides, "stretch" changes the ratio.
+        enlarge: accept a smaller image, too.
 
     Raises:
-        UsageError: the image is smaller.
+        TooSmallError: the image is smaller.
     """
     if image.shape == size:
         return image
-    whole = image.shape
     if fit == "crop":
         image = _middle(image, _largest_within(size_of(image), size))
     if fit != "pad":
-        return shrink(image, *size, enlarge=enlarge, whole=whole)
+        return shrink(image, *size, enlarge=enlarge)
     inner = _largest_within(size, size_of(image))
     frame = np.zeros(size, np.uint8)
     _middle(frame, inner)[:] = shrink(image, *inner, enlarge=enlarge)
     return frame
-
-
-def cut_or_added(image: Size, size: Size, fit: Fit) -> str:
-    """How an image of another ratio was made to fit, in words; "" of one of the same ratio."""
-    if fit == "crop":
-        height, width = _largest_within(image, size)
-        return "" if (height, width) == image else f"cropped to {width}x{height}"
-    height, width = _largest_within(size, image)
-    if (height, width) == size:
-        return ""
-    return f"padded from {width}x{height}" if fit == "pad" else "stretched"
-
-
-def _shown_in_words(shown: Shown) -> str:
-    return "images" if shown.ndim > 1 else str(Vector(len(shown)))
 
 
 def _in_words(size: Size) -> str:
@@ -206,7 +196,7 @@ def _in_words(size: Size) -> str:
 
 
 def _largest_within(outer: Size, ratio: Size) -> Size:
-    """The largest size within another that has the ratio of the sides of a third."""
+    """Return the largest size within `outer` that has the aspect ratio of another size."""
     if outer[0] * ratio[1] > outer[1] * ratio[0]:
         return max(round(outer[1] * ratio[0] / ratio[1]), 1), outer[1]
     return outer[0], max(round(outer[0] * ratio[1] / ratio[0]), 1)
@@ -222,26 +212,26 @@ _FORMATS = {("u1", 0): "mono8", ("u2", 0): "mono16", ("u1", 3): "rgb8", ("u1", 4
 
 _DISTANCES = {"u2": "16UC1", "f4": "32FC1", "f8": "32FC1"}
 
-_PICTURES = (
+_IMAGES = (
     "give (n, height, width) of uint8 or uint16, (n, height, width, 3) or 4 of uint8, or these of "
-    "bool, floats of 0 to 1, integers of 0 to 255, or a list of such pictures, or of the bytes of "
+    "bool, floats of 0 to 1, integers of 0 to 255, or a list of such images, or of the bytes of "
     "JPEG or PNG files"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a raw picture, or numbers, become a frame.
+    """How a raw image, or numbers, become a frame; a learned module carries it.
 
     Attributes:
         shape: of a frame, (height, width) or (values,).
-        fit: how a picture of another ratio of the sides becomes a frame: see `fitted`.
+        fit: how an image of another aspect ratio becomes a frame: see `fitted`.
         color: whether a frame shows red, green and blue beside one another.
-        range: distances in metres that are black and white, or what numbers are kept within.
-        fields: the numbers that were taken, by the names that they had.
-        pixels: the format of one colour a pixel that the source has, as bayer_rggb8; "" of others.
-        raw: (height, width) of the source's pictures; empty where it did not say.
-        centre: "episode" where frames lack the mean of their episode; see `centred`.
+        range: distances in metres that are black and white, or the range that numbers are kept in.
+        fields: the names of the numbers.
+        pixels: the source's Bayer format, as bayer_rggb8, or "".
+        raw: (height, width) of the source's images; empty if the source did not state it.
+        centre: "episode" if frames lack the mean of their episode; see `centred`.
     """
 
     shape: tuple[int, ...]
@@ -255,62 +245,45 @@ class Recipe:
 
     @classmethod
     def of(cls, described: Mapping[str, Any], shape: tuple[int, ...], stream: int = 0) -> Self:
-        """The recipe of a source, from what it states of itself.
+        """Return the recipe of a source, by its description.
 
         Args:
             described: see `FrameSource.describe`.
             shape: of its frames.
-            stream: whose numbers are meant.
+            stream: index of the stream whose numbers are meant.
         """
         bounds = described.get("range_metres") or described.get("range")
-        named = described.get("fields") or []
-        if named and isinstance(named[0], list):  # of each stream
-            named = named[stream]
+        names = described.get("fields") or []
+        if names and isinstance(names[0], list):  # a list for each stream
+            names = names[stream]
         return cls(
             tuple(shape),
             described.get("fit", "crop"),
             "color" in described,
             tuple(bounds) if bounds else None,
-            tuple(named),
+            tuple(names),
             centre=described.get("centre", "run"),
         )
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """The recipe in a text of what `as_json` gives.
+        """Return the recipe that `as_json` wrote.
 
         Raises:
-            ValueError: it is none.
+            ValueError: the text is no recipe.
         """
-        values = json.loads(text)
-        known = {field.name for field in fields(cls)}
-        if not isinstance(values, dict) or not values.keys() >= {"shape"}:
-            raise ValueError("a recipe has a shape")
-        own: Any = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in values.items()
-            if name in known
-        }
-        recipe = cls(**own)
-        bounds = recipe.range or ()
-        whole = (
-            isinstance(recipe.shape, tuple)
-            and isinstance(recipe.raw, tuple)
-            and len(recipe.raw) in (0, 2)
-            and all(type(side) is int and side > 0 for side in (*recipe.shape, *recipe.raw))
-            and recipe.fit in get_args(Fit)
-            and recipe.centre in get_args(Centre)
-            and isinstance(recipe.color, bool)
-            and (recipe.range is None or len(bounds) == 2)
-            and all(isinstance(bound, int | float) for bound in bounds)
-            and all(isinstance(name, str) for name in (*recipe.fields, recipe.pixels))
-        )
-        if not whole:
-            raise ValueError("a recipe holds something else in its place")
+        values, hints = json.loads(text), get_type_hints(cls)
+        try:
+            own = {k: convert_value(v, hints[k], k) for k, v in values.items() if k in hints}
+            recipe = cls(**own)
+        except (UsageError, AttributeError, TypeError) as error:
+            raise ValueError(f"it is no recipe: {error}") from None
+        if min((*recipe.shape, *recipe.raw), default=0) < 1 or len(recipe.raw) not in (0, 2):
+            raise ValueError("a recipe has sizes above 0")
         return recipe
 
     def as_json(self) -> dict[str, Any]:
-        """The recipe as JSON values; without `centre` where it says nothing."""
+        """Return the recipe as JSON values, without `centre` if it is the default."""
         stated = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
         if self.centre == "run":
             del stated["centre"]
@@ -318,103 +291,73 @@ class Recipe:
 
     @property
     def size(self) -> Size | None:
-        """(height, width) of the picture that a frame shows; None of numbers."""
+        """(height, width) of the image that a frame shows; None for numbers."""
         if len(self.shape) != 2:
             return None
         return self.shape[0], self.shape[1] // (3 if self.color else 1)
 
-    def refuse_turned(self, picture: Size) -> None:
-        """Refuse an array's picture that is upright where the source's lay, or lies.
+    def frames(self, images: Any) -> NDArray[Any]:
+        """Turn an iterable of n raw images into frames, (n, *shape); see `make_frame`.
 
-        Raises:
-            UsageError: it is.
-        """
-        height, width = picture
-        if self.raw and (height - width) * (self.raw[0] - self.raw[1]) < 0:
-            raise UsageError(
-                f"a picture of {width}x{height} given, and those learned from were of "
-                f"{self.raw[1]}x{self.raw[0]}: turn it, as by np.swapaxes(x, 0, 1), or crop it"
-            )
-
-    def frames(self, pictures: Any) -> NDArray[Any]:
-        """Raw pictures as frames; see `make_frame`. The mean of their episode stays in them.
-
-        Args:
-            pictures: an array with a first axis of n, or any iterable of n pictures.
-
-        Returns:
-            (n, *shape), uint8 of pictures and float64 of numbers.
-
-        Raises:
-            UsageError: these are no such pictures.
+        The mean of their episode stays in them.
         """
         if self.size is None:
-            return _numbers(pictures, self)
-        single = isinstance(pictures, bytes) or not isinstance(pictures, Iterable)
-        if single or (isinstance(pictures, np.ndarray) and pictures.ndim < 2):
-            raise UsageError(f"one picture or none given: {_PICTURES}")
-        made = [make_frame(picture, self) for picture in pictures]
-        return np.stack(made) if made else np.empty((0, *self.shape), np.uint8)
+            return _numbers(images, self)
+        several = images if isinstance(images, Iterable) else [images]
+        frames = [make_frame(image, self) for image in several]
+        return np.stack(frames) if frames else np.empty((0, *self.shape), np.uint8)
 
 
-def make_frame(picture: Any, recipe: Recipe) -> Shown:
-    """The frame that a raw picture, or numbers, become: what a learner learns from.
+def make_frame(image: Any, recipe: Recipe) -> Shown:
+    """Turn a raw image, or numbers, into the frame that a learner learned from.
 
-    Colours become gray, as a source makes them, or stay beside one another, 16 bit count by their
+    Colours become gray, as a source makes them, or stay beside one another, 16 bits count by their
     high byte, a Bayer pattern is taken apart, distances are shown from black to white; then the
-    picture is cut, padded or stretched, and its areas are averaged.
+    image is cut, padded or stretched, and its areas are averaged.
 
     Args:
-        picture: (height, width) uint8 or uint16, (height, width, 3) or 4 red, green, blue uint8,
+        image: (height, width) uint8 or uint16, (height, width, 3) or 4 red, green, blue uint8,
             distances as uint16 in millimetres or floats in metres, or the bytes of a JPEG or PNG,
-            which is turned as its EXIF says; of a recipe of numbers (values,) of any numbers.
-        recipe: what is made of it.
+            which is turned as its EXIF states; for a recipe of numbers (values,) of any type.
+        recipe: of the learned module.
 
     Returns:
-        The frame, of `recipe.shape`: uint8, or float64 where it is numbers.
+        The frame, of `recipe.shape`: uint8, or float64 for numbers.
 
     Raises:
-        UsageError: it is no such picture, smaller than a frame, or upright where the source's were
-            not.
+        UsageError: the image has another type, is smaller than a frame, or is upright if the
+            source's images were not.
     """
     if recipe.size is None:
-        row: Shown = _numbers([picture], recipe)[0]
-        return row
+        return np.asarray(_numbers([image], recipe)[0])
     try:
-        if isinstance(picture, bytes | bytearray | memoryview):
-            image = compressed_image(bytes(picture), color=recipe.color)
+        if isinstance(image, bytes | bytearray | memoryview):
+            pixels = compressed_image(bytes(image), color=recipe.color)
         else:
-            image = _image(np.asarray(picture), recipe)
+            pixels = _image(np.asarray(image), recipe)
     except MalformedImage as error:
-        raise UsageError(f"a picture cannot be taken: {error}") from None
-    size = image.shape[0], image.shape[1]
-    if size[0] < recipe.size[0] or size[1] < recipe.size[1]:
-        height, width = recipe.size
-        raise UsageError(
-            f"a picture of {size[1]}x{size[0]} is smaller than the frames that were learned from, "
-            f"{width}x{height}: give larger ones"
-        )
-    return Framing(size, recipe.size, recipe.fit, recipe.color).frame(image)
+        raise UsageError(f"an image cannot be taken: {error}") from None
+    return Framing(size_of(pixels), recipe.size, recipe.fit, recipe.color).frame(pixels)
 
 
-def pixels_of(pictures: NDArray[Any]) -> NDArray[Any]:
-    """Pictures as uint8 or uint16: truth as 0 and 255, floats of 0 to 1 as round(255 x).
+def pixels_of(images: NDArray[Any]) -> NDArray[Any]:
+    """Convert images to uint8 or uint16: booleans to 0 and 255, floats of 0 to 1 by round(255 x).
 
-    Whole numbers of 0 to 255 stay these, and others as they are.
+    Whole numbers of 0 to 255 keep their values, and all others are returned unchanged.
     """
-    if pictures.dtype == np.bool_:
-        return np.where(pictures, np.uint8(255), np.uint8(0))
-    most = {"f": 1, "i": 255, "u": 255}.get(pictures.dtype.kind, 0)
-    plain = pictures.dtype in (np.uint8, np.uint16) or not pictures.size
-    if plain or not most or not 0 <= pictures.min() <= pictures.max() <= most:
-        return pictures
-    if pictures.dtype.kind == "f":
-        pictures = np.rint(pictures * pictures.dtype.type(255))
-    return np.asarray(pictures, np.uint8)
+    if images.dtype == np.bool_:
+        return np.where(images, np.uint8(255), np.uint8(0))
+    most = {"f": 1, "i": 255, "u": 255}.get(images.dtype.kind, 0)
+    plain = images.dtype in (np.uint8, np.uint16) or not images.size
+    if plain or not most or not 0 <= images.min() <= images.max() <= most:
+        return images
+    if images.dtype.kind == "f":
+        images = np.rint(images * images.dtype.type(255))
+    return np.asarray(images, np.uint8)
 
 
 def _image(array: NDArray[Any], recipe: Recipe) -> Shown:
-    """A picture, gray (height, width), or (height, width, 3) in colours."""
+    """Return an image of an array, gray (height, width), or (height, width, 3) in colours."""
     if recipe.range is None:
         array = pixels_of(array)
     if array.ndim == 3 and array.shape[2] == 1:
@@ -426,20 +369,24 @@ def _image(array: NDArray[Any], recipe: Recipe) -> Shown:
     elif recipe.pixels and known in ("mono8", "mono16"):
         known = f"{recipe.pixels.rstrip('0123456789')}{known.removeprefix('mono')}"
     if known is None or array.ndim not in (2, 3):
-        raise UsageError(f"pictures of {array.dtype} {array.shape} given: {_PICTURES}")
+        raise UsageError(f"images of {array.dtype} {array.shape} given: {_IMAGES}")
     height, width = array.shape[:2]
-    recipe.refuse_turned((height, width))
+    if recipe.raw and (height - width) * (recipe.raw[0] - recipe.raw[1]) < 0:
+        raise UsageError(
+            f"an image of {width}x{height} given, and those learned from were of "
+            f"{recipe.raw[1]}x{recipe.raw[0]}: turn it, as by np.swapaxes(x, 0, 1), or crop it"
+        )
     little = "<f4" if known == "32FC1" else f"<{kind}"
     data = np.ascontiguousarray(array, little).tobytes()
     return raw_image(data, height, width, known, depth=recipe.range, color=recipe.color)
 
 
 def _numbers(rows: Any, recipe: Recipe) -> NDArray[np.float64]:
-    """Rows of numbers as frames, (n, values)."""
+    """Convert rows of numbers to frames, (n, values)."""
     count = recipe.shape[0]
     try:
         numbers = np.asarray(rows)
-    except ValueError:  # of several lengths
+    except ValueError:  # rows of several lengths
         numbers = np.asarray("")
     if numbers.ndim == 1 and recipe.shape == (1,):
         numbers = numbers[:, None]

@@ -1,4 +1,4 @@
-"""How images of cameras, live or stored, become frames, and external logs streams of them."""
+"""Input options: how external logs and live streams are read, and how images become frames."""
 
 from __future__ import annotations
 
@@ -8,28 +8,30 @@ from typing import Any, ClassVar, Final, Literal, cast
 
 from cdmisfa.core.config import Section, build, key
 
+# Recordings and runs state these texts: who reads one years later knows what its pixels are.
+
 RECIPE: Final = (
     "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
     "size: area average (Pillow BOX); turned as the EXIF of a JPEG or PNG says"
 )
-"""How any image becomes a frame, for the record."""
+"""States how images become frames."""
 
 VIDEO_RECIPE: Final = (
     f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
     "((Y - 16) * 510 + 219) // 438 where its range is limited, by the nearest quarter turns of its "
     "display matrix"
 )
-"""How a picture of a video becomes a frame, for the record."""
+"""States how images of videos become frames."""
 
 COLOR_RECIPE: Final = (
     "red, green and blue beside one another, each as gray is; of a Bayer pattern green is the mean "
     "of two; of a video by BT.709 or, where it states another or none, BT.601, in 16 bit whole "
     "numbers, with each chroma pixel repeated"
 )
-"""How any image becomes a frame in colours, for the record."""
+"""States how images become frames in colours."""
 
 NUMBERS_RECIPE: Final = "numbers as they are, float64"
-"""How numbers become a frame, for the record."""
+"""States how numbers become frames."""
 
 Size = tuple[int, int]
 """(height, width) in pixels."""
@@ -107,7 +109,7 @@ OPTIONS: Final = {
 """Options of the command line for the settings that are no keys `input.*`."""
 
 OF_EVERY_SOURCE: Final = ("centre", "holdout", "hold", "lost", "stall")
-"""Keys that do not make a recording of ours be read as an external log."""
+"""Keys that apply to our own recordings, too: these are not read as external logs for them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +142,7 @@ class InputOptions(InputConfig):
         return OPTIONS.get(name, f"{cls.prefix}.{name}")
 
     def chosen(self, names: Collection[str] | None = None) -> tuple[str, ...]:
-        """Names of settings that are not the defaults, of all or of these."""
+        """Return the names of the settings that are not the defaults, of all or of `names`."""
         return tuple(
             field.name
             for field in fields(self)
@@ -148,12 +150,12 @@ class InputOptions(InputConfig):
         )
 
     def named(self, names: Collection[str] | None = None) -> list[str]:
-        """The options and keys of `chosen`, as errors name them."""
+        """Return the options and keys of `chosen` settings, as errors name them."""
         return [self.key_name(name) for name in self.chosen(names)]
 
     @property
     def external(self) -> bool:
-        """Whether a setting is chosen with which a recording of ours is read as an external log."""
+        """Whether these settings have our own recordings read as external logs are."""
         return any(name not in OF_EVERY_SOURCE for name in self.chosen())
 
     @property
@@ -164,7 +166,7 @@ class InputOptions(InputConfig):
         )
 
     def configured(self, *layers: Mapping[str, Any]) -> InputOptions:
-        """The same options with keys `input.*` of layers of values, the last one winning.
+        """Return the same options with keys `input.*` of layers of values; the last one wins.
 
         Raises:
             UsageError: an unknown key, or a value that does not fit.
@@ -172,7 +174,7 @@ class InputOptions(InputConfig):
         return cast(InputOptions, build(InputConfig, "input", *layers, base=self))
 
     def settings(self) -> list[str]:
-        """The keys `input.*` that are not the defaults, as `--set` takes them."""
+        """Return the keys `input.*` that are not the defaults, as `--set` takes them."""
         chosen = ((name, getattr(self, name)) for name in self.chosen() if name not in OPTIONS)
         return [
             f"input.{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}"
@@ -180,20 +182,17 @@ class InputOptions(InputConfig):
         ]
 
     def words(self) -> list[str]:
-        """Words of a command line that give these settings; of defaults, none."""
+        """Return the words of a command line that give these settings; none for defaults."""
         words: list[str] = []
         for name in self.chosen(OPTIONS):
             value = getattr(self, name)
-            each: tuple[Any, ...] = value if name in ("topics", "fields") else (value,)
-            for one in each:
-                words += [OPTIONS[name], _written(one)]
+            if name == "size":
+                value = f"{value[1]}x{value[0]}"
+            elif isinstance(value, float):
+                value = f"{value:g}"
+            for part in value if isinstance(value, tuple) else (value,):
+                words += [OPTIONS[name], "on" if part is True else str(part)]
         return [*words, *(word for key in self.settings() for word in ("--set", key))]
-
-
-def _written(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"{value[1]}x{value[0]}"
-    return "on" if value is True else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 IMAGES: Final = InputOptions()

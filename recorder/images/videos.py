@@ -1,7 +1,7 @@
-"""Pictures of videos, decoded by PyAV (FFmpeg), as gray or coloured images.
+"""Images of videos, decoded by PyAV (FFmpeg), as gray or coloured images.
 
-Gray is the luma that a video stores, so that no colour conversion of FFmpeg, whose bits depend
-on the processor, comes between; only videos without luma are taken by their colours.
+Gray is the luma that a video stores, for the bits of FFmpeg's colour conversion depend on the
+processor. Only videos without luma are converted from their colours.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import BUDGET
 from recorder.images.pixels import MAX_PIXELS, MalformedImage, raw_image
 
-HELD: Final = 17
-"""Pictures that a decoder holds at most, where they are made from one another: 16 and its own."""
+_HELD: Final = 17
+"""Images that a decoder holds at most if they depend on one another: 16 and its own (H.264)."""
 
 _FULL_RANGE: Final = 2
 _LUMA: Final = ("yuv", "yuvj", "gray", "nv12", "nv21")
@@ -30,24 +30,24 @@ _WEIGHTS: Final = {
     True: (1.5748, -0.187324, -0.468124, 1.8556),
     False: (1.402, -0.344136, -0.714136, 1.772),
 }
-"""Of BT.709 and BT.601: red by Cr, green by Cb and by Cr, blue by Cb."""
+"""Weights of BT.709 and BT.601: red by Cr, green by Cb and by Cr, blue by Cb."""
 
 _UNIT: Final = re.compile(b"\0\0\1(.)", re.DOTALL)
-"""Where a unit of H.264 or H.265 begins, and the first byte of its header."""
+"""Start of a unit of H.264 or H.265, and the first byte of its header."""
 
 
 def frame_gray(frame: Any) -> ByteArray:
-    """The luma of a picture of PyAV, or the gray of its colours, upright, (height, width) uint8."""
+    """Return the luma of a frame of PyAV, or the gray of its colours, upright, (height, width)."""
     return _upright(_luma(frame), frame)
 
 
 def frame_colors(frame: Any) -> ByteArray:
-    """The colours of a picture of PyAV, upright, (height, width, 3) uint8; else its luma."""
+    """Return the colours of a frame of PyAV, upright, (height, width, 3), or else its luma."""
     return _upright(_colors(frame), frame)
 
 
 def _upright(pixels: ByteArray, frame: Any) -> ByteArray:
-    """Pixels turned by quarters, and mirrored, as the display matrix of their picture says.
+    """Turn pixels by quarters, and mirror them, as the display matrix of their frame states.
 
     Source: FFmpeg's libavutil/display.h. A point (x, y) is shown at (a x + c y, b x + d y).
     """
@@ -68,22 +68,40 @@ def _is_full(frame: Any) -> bool:
     return bool(stated or frame.format.name.startswith(("yuvj", "gray")))
 
 
-def _colors(frame: Any) -> ByteArray:
+def _is_planar(frame: Any, *names: str) -> bool:
+    """Whether the planes of a frame have a byte for each pixel, and names of formats."""
     form = frame.format
-    if form.name.startswith("gray"):
+    return bool(form.name.startswith(names) and form.components[0].bits == 8 and form.is_planar)
+
+
+def _plane(plane: Any, height: int, width: int) -> ByteArray:
+    return raw_image(memoryview(plane), height, width, "mono8", plane.line_size)
+
+
+def _luma(frame: Any) -> ByteArray:
+    if not _is_planar(frame, *_LUMA):
+        colors = frame.to_ndarray(format="rgb24")
+        return raw_image(colors.tobytes(), colors.shape[0], colors.shape[1], "rgb8")
+    luma = _plane(frame.planes[0], frame.height, frame.width)
+    if _is_full(frame):
+        return luma
+    return np.frombuffer(luma.tobytes().translate(_STRETCH), np.uint8).reshape(luma.shape)
+
+
+def _colors(frame: Any) -> ByteArray:
+    if frame.format.name.startswith("gray"):
         return _luma(frame)
-    luma_first = form.name.startswith("yuv") and len(form.components) >= 3
-    if not luma_first or form.components[0].bits != 8 or not form.is_planar:
-        colours: ByteArray = frame.to_ndarray(format="rgb24")
-        return colours
+    if not _is_planar(frame, "yuv") or len(frame.format.components) < 3:
+        return np.asarray(frame.to_ndarray(format="rgb24"))
     luma = _luma(frame).astype(np.int32) << 16
     height, width = luma.shape
     chroma = []
     for plane in frame.planes[1:3]:
-        values = raw_image(memoryview(plane), plane.height, plane.width, "mono8", plane.line_size)
+        values = _plane(plane, plane.height, plane.width)
         rows, columns = -(-height // plane.height), -(-width // plane.width)
         large = values.repeat(rows, axis=0).repeat(columns, axis=1)[:height, :width]
         chroma.append(large.astype(np.int32) - 128)
+    # Whole numbers of 16 bits after the point: the same bits on every processor.
     scale = (1 if _is_full(frame) else 255 / 224) * 65536
     weights = (round(weight * scale) for weight in _WEIGHTS[frame.colorspace == _BT709])
     red, green_cb, green_cr, blue = weights
@@ -92,53 +110,40 @@ def _colors(frame: Any) -> ByteArray:
     return np.stack([((c + 32768) >> 16).clip(0, 255).astype(np.uint8) for c in colors], axis=2)
 
 
-def _luma(frame: Any) -> ByteArray:
-    form = frame.format
-    if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
-        colours = frame.to_ndarray(format="rgb24")
-        height, width = colours.shape[:2]
-        return raw_image(colours.tobytes(), height, width, "rgb8")
-    plane = frame.planes[0]
-    luma = raw_image(memoryview(plane), frame.height, frame.width, "mono8", plane.line_size)
-    if _is_full(frame):
-        return luma
-    return np.frombuffer(luma.tobytes().translate(_STRETCH), np.uint8).reshape(luma.shape)
-
-
 class Packet(NamedTuple):
-    """One picture of a video: its data, and the name of its codec as the message has it."""
+    """The data of one image of a video, and the name of its codec as the message states it."""
 
     data: bytes
     codec: str
 
 
 class VideoPackets:
-    """The decoder of messages that hold one picture of a video each, called with them in order.
+    """The decoder of messages that hold one image of a video each, called with them in order.
 
-    Most pictures need those before them, back to one that `begins`.
+    Most images need those before them, back to one that `begins`.
 
     Args:
-        opened: what a message holds; raises MalformedImage.
-        color: give the colours; see `raw_image`.
+        opened: returns the packet of a message; raises MalformedImage.
+        color: return colours; see `raw_image`.
     """
 
     def __init__(
         self, opened: Callable[[bytes | memoryview], Packet], *, color: bool = False
     ) -> None:
         self._opened = opened
-        self._shown = frame_colors if color else frame_gray
+        self._pixels = frame_colors if color else frame_gray
         self._codec = ""
         self._context: Any = None
 
     def begins(self, message: bytes | memoryview) -> bool:
-        """Whether the picture of a message needs none before it.
+        """Whether the image of a message needs none before it.
 
         Raises:
-            MalformedImage: it is no such message, or of no codec that is read.
+            MalformedImage: the message is malformed, or its codec is not supported.
         """
-        packet = self._opened(message)
-        _, begins = _codec(packet.codec)
-        return bool(packet.data) and begins(packet.data)
+        data, codec = self._opened(message)
+        name = _codec(codec)
+        return bool(data) and _BEGINS[name](data)
 
     def forget(self) -> None:
         """Reset the decoder: the next message does not follow the last."""
@@ -146,46 +151,44 @@ class VideoPackets:
             self._context.flush_buffers()
 
     def __call__(self, message: bytes | memoryview) -> ByteArray:
-        """The picture of the next message, (height, width) uint8, or its colours.
+        """Decode the image of the next message, (height, width) uint8, or its colours.
 
         Raises:
-            MalformedImage: it cannot be decoded, or by itself shows no picture.
-            UsageError: PyAV is missing, or its pictures wait for later ones.
+            MalformedImage: the image cannot be decoded, or depends on one that is missing.
+            UsageError: PyAV is missing, or images depend on later ones.
         """
-        packet = self._opened(message)
-        if not packet.data:
-            raise MalformedImage("its message is empty, without a picture of its video")
+        data, codec = self._opened(message)
+        if not data:
+            raise MalformedImage("its message is empty, without an image of its video")
         av = pyav("a video in messages")
-        name, _ = _codec(packet.codec)
+        name = _codec(codec)
         if name != self._codec:
             self._codec, self._context = name, av.CodecContext.create(name, "r")
             self._context.thread_count = 1
             most = most_pixels(None, self._context.codec)
             self._context.options = {"err_detect": "explode", "max_pixels": str(most)}
         try:
-            frames = self._context.decode(av.Packet(packet.data))
+            frames = self._context.decode(av.Packet(data))
         except (OSError, ValueError, av.FFmpegError) as error:
             raise MalformedImage(f"its video is broken there ({type(error).__name__})") from None
         if not frames and self._context.has_b_frames:
             raise UsageError(
-                "a picture of its video waits for later ones (B-frames), which messages of one "
-                "picture each rule out: encode it without them, or take it as an .mp4 file"
+                "an image of its video waits for later ones (B-frames), which messages of one "
+                "image each rule out: encode it without them, or take it as an .mp4 file"
             )
-        if len(frames) > 1:
-            raise MalformedImage(f"its message holds {len(frames)} pictures of its video, not 1")
-        if not frames or frames[0].is_corrupt:
-            raise MalformedImage("a picture of its video is broken there, or one that it needs")
-        return self._shown(frames[0])
+        if len(frames) != 1 or frames[0].is_corrupt:
+            raise MalformedImage("an image of its video is broken there, or one that it needs")
+        return self._pixels(frames[0])
 
 
 def most_pixels(form: Any, codec: Any) -> int:
-    """Most pixels of a picture, so that those its decoder holds fit into the budget.
+    """Return the most pixels of an image with which all that a decoder holds fit the budget.
 
     Args:
-        form: PyAV's format of its pixels; None where it is not known yet.
+        form: PyAV's format of its pixels; None if it is not known yet.
         codec: PyAV's codec.
     """
-    held = 1 if codec.intra_only else HELD
+    held = 1 if codec.intra_only else _HELD
     bits = form.padded_bits_per_pixel if form is not None else 8
     return min(MAX_PIXELS, BUDGET * 8 // (held * bits))
 
@@ -194,7 +197,7 @@ def pyav(what: str) -> Any:
     """Import PyAV.
 
     Raises:
-        UsageError: it is missing.
+        UsageError: PyAV is not installed.
     """
     try:
         import av
@@ -204,55 +207,36 @@ def pyav(what: str) -> Any:
     return av
 
 
-def _codec(named: str) -> tuple[str, Callable[[bytes], bool]]:
-    """FFmpeg's name of a codec, by that of the message, as h265 or hevc_nvenc;yuv420p."""
-    name = named.partition(";")[0].lower()
-    for part, codec in _CODECS.items():
-        if part in name:
-            return codec
-    raise MalformedImage(f"a video in {named!r} is not read: h264, h265, vp9 and av1 are")
+_CODECS: Final = {
+    "264": "h264",
+    "265": "hevc",
+    "hevc": "hevc",
+    "vp9": "vp9",
+    "av1": "libdav1d",
+}
+"""FFmpeg's decoder by a part of a codec's name, which may be h265 or hevc_nvenc;yuv420p."""
 
 
-def _begins_h264(data: bytes) -> bool:
-    return any(unit[1][0] & 31 == 5 for unit in _UNIT.finditer(data))  # an IDR picture
-
-
-def _begins_h265(data: bytes) -> bool:
-    return any(16 <= unit[1][0] >> 1 & 63 < 24 for unit in _UNIT.finditer(data))  # an IRAP picture
+def _codec(stated: str) -> str:
+    for part, name in _CODECS.items():
+        if part in stated.partition(";")[0].lower():
+            return name
+    raise MalformedImage(f"a video in {stated!r} is not read: h264, h265, vp9 and av1 are")
 
 
 def _begins_vp9(data: bytes) -> bool:
+    """Whether a header states a key frame, and no frame that is shown again."""
     head = data[0]
     last = 1 if head >> 4 & 3 == 3 else 2  # the fourth profile has a bit more
-    # no frame shown again, and none that changes others
     return head >> 6 == 2 and head >> last & 3 == 0
 
 
-def _begins_av1(data: bytes) -> bool:
-    """Whether one of its units, before the first that states no size, is a sequence header."""
-    at = 0
-    while at < len(data):
-        kind, longer, sized = data[at] >> 3 & 15, data[at] >> 2 & 1, data[at] >> 1 & 1
-        if kind == 1:
-            return True
-        if not sized:
-            return False
-        at += 1 + longer
-        size = shift = 0
-        more = True
-        while more and at < len(data) and shift < 56:
-            size |= (data[at] & 127) << shift
-            more = data[at] > 127
-            shift, at = shift + 7, at + 1
-        at += size
-    return False
-
-
-_CODECS: Final = {
-    "264": ("h264", _begins_h264),
-    "265": ("hevc", _begins_h265),
-    "hevc": ("hevc", _begins_h265),
-    "vp9": ("vp9", _begins_vp9),
-    "av1": ("libdav1d", _begins_av1),
+_BEGINS: Final[dict[str, Callable[[bytes], bool]]] = {
+    # a unit of an IDR picture; one of an IRAP picture
+    "h264": lambda data: any(unit[1][0] & 31 == 5 for unit in _UNIT.finditer(data)),
+    "hevc": lambda data: any(16 <= unit[1][0] >> 1 & 63 < 24 for unit in _UNIT.finditer(data)),
+    "vp9": _begins_vp9,
+    # a sequence header, behind the delimiter that FFmpeg puts before each image
+    "libdav1d": lambda data: (data.removeprefix(b"\x12\0") or b"\0")[0] >> 3 & 15 == 1,
 }
-"""By a part of its name: FFmpeg's name of a codec, and whether a picture needs none before it."""
+"""By FFmpeg's decoder: whether the data of an image need no image before it."""

@@ -30,7 +30,8 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Keyframe
 from cdmisfa.experiments.sources import configure
-from recorder.images.messages import MessageKind, image_decoder
+from recorder.images.messages import MessageKind, decoder_of
+from recorder.images.options import IMAGES
 from recorder.images.videos import VideoPackets
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
@@ -105,14 +106,14 @@ def seeds(name: str) -> tuple[bytes, ...]:
 
 
 def _image(schema: str, encoding: str) -> Callable[[Path], object]:
-    decode = image_decoder(schema, encoding)
+    decode = decoder_of(MessageKind(schema, encoding), IMAGES)
     assert decode is not None
     return lambda path: decode(path.read_bytes())
 
 
 def _video_message(kind: MessageKind) -> Callable[[Path], object]:
     def read(path: Path) -> object:
-        decode = image_decoder(kind.schema, kind.encoding)
+        decode = decoder_of(kind, IMAGES)
         assert isinstance(decode, VideoPackets)
         return decode.begins(path.read_bytes()), decode(path.read_bytes())
 
