@@ -176,10 +176,9 @@ def test_the_page_of_learn_is_shown(browser: Any, cdmisfa: Cdmisfa, tmp_path: Pa
         "return [...document.querySelectorAll('h2')].map(e => e.textContent)"
     )
     assert titles == [
-        "Where it looked, and when it learned",
-        "Why it was saved here, and not there",
-        "What each module says",
-        "Can it be trusted?",
-        "What happened",
-        "What made it",
+        "Attention and saves",
+        "Rules for saving a module",
+        "Modules",
+        "Events",
+        "Origin and checks",
     ]

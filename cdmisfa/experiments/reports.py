@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.recompute import Recomputation
@@ -13,9 +12,6 @@ from cdmisfa.experiments.resume import read_command
 from recorder.images.options import OPTIONS, InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.runs.folders import REPORT_FILE, is_run, run_log, runs_in
-
-if TYPE_CHECKING:
-    from replay.report.trust import Proof
 
 
 def write_report(
@@ -57,7 +53,7 @@ def _page(paths: list[Path], runs: list[Path]) -> str:
     from replay.report.page import report_of_run, report_of_runs
 
     if len(paths) == 1 and runs:
-        return report_of_run(paths[0], proof_of(paths[0]))
+        return report_of_run(paths[0], _reproducible(paths[0]), command_again(paths[0]))
     if len(paths) == 1 and (found := runs_in(paths[0])):
         return report_of_runs(found, f"{paths[0].resolve().name}: {len(found)} runs")
     if others := [path for path in paths if path not in runs]:
@@ -72,28 +68,22 @@ def _is_run(path: Path) -> bool:
         return path.is_dir() and (path / "run.json").is_file()
 
 
-def proof_of(run: Path) -> Proof:
-    """Whether learning a run again can be expected to give the same bits; nothing is learned.
+def _reproducible(run: Path) -> str:
+    """Return whether learning a run again is expected to give the same bits.
 
-    Asked are the version of the arithmetic, whether its source is there, and whether that is what
-    the run learned from, as far as is known without reading all of it.
+    Nothing is learned. The check compares the version of the arithmetic, and the source as far as
+    that is possible without reading all of it.
     """
-    from replay.report.trust import Proof
-
-    again = command_again(run)
     try:
-        with Recomputation(Path(run), 0) as beginning:
-            beginning.source  # noqa: B018, it is opened when it is asked for
-            others = beginning.other_files()
+        with Recomputation(run, 0) as beginning:
+            beginning.source  # noqa: B018, opens the source
+            changed = beginning.other_files()
     except CdmisfaError as error:
         why = str(error.__cause__ if isinstance(error.__cause__, CdmisfaError) else error)
-        why = why.partition(": did you mean")[0]  # what else lies here is no news of the run
-        return Proof(False, f"It cannot be learned again here: {why}.", again)
-    if others:
-        return Proof(False, f"{', '.join(others)}: no longer what the run learned from.", again)
-    return Proof(
-        True, "What it learned from is there: learn it again, and compare every bit.", again
-    )
+        return f"no: {why.partition(': did you mean')[0]}"
+    if changed:
+        return f"no: {', '.join(changed)} changed since"
+    return "yes: its source is present and looks unchanged"
 
 
 PLAIN = (("seed", 0),)

@@ -1,92 +1,75 @@
-"""Plots as SVG that keeps its letters' size at every width, and pictures as data URIs."""
+"""Plots as SVG that is stretched to the width of a page, while its letters keep their size."""
 
 from __future__ import annotations
 
-import base64
-import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
-from replay.palette import CYCLE
 
 WIDE = 1000
-"""Units of a plot across: it is stretched to the width of the page."""
+"""Units across a plot: about one a pixel on a screen, so 0.1 is exact enough."""
 
-BINS = 500
-"""Places across a plot at which a curve has a least and a greatest value."""
+PLACES = 500
+"""Places across a plot at which a curve keeps its least and its greatest value.
+
+A curve of a million values so takes at most 1,000 points, about 12 kB.
+"""
 
 
 def number(value: float) -> str:
-    """A coordinate, as short as can be."""
+    """Return a coordinate with at most one decimal place."""
     return f"{value:.1f}".removesuffix(".0")
 
 
-def colour_class(stream: int) -> str:
-    """CSS class of a stream's colour."""
-    return f"c{stream % len(CYCLE)}"
-
-
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Axis:
-    """Values at places of a plot, [start, stop] on [0, size]; from the bottom up if turned.
-
-    Attributes:
-        log: by their logarithms; `start` is above 0.
-    """
+    """Places of values on an axis of some length, by their logarithms if `log`; see `Plot`."""
 
     start: float
     stop: float
     size: float
     log: bool = False
-    turned: bool = False
+    upward: bool = False
 
     def __call__(self, values: Any) -> FloatArray:
-        """Places of values, (n,)."""
-        low, high = self._scaled(self.start), self._scaled(self.stop)
-        part = (self._scaled(values) - low) / max(high - low, 1e-12)
-        return np.asarray(self.size * (1 - part if self.turned else part), dtype=np.float64)
-
-    def _scaled(self, values: Any) -> Any:
+        """Return the places of values, from 0 to `size` within the axis; from `size` if upward."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.log10(values) if self.log else np.asarray(values, dtype=np.float64)
+            low, high, at = (
+                np.log10(v) if self.log else np.asarray(v, dtype=np.float64)
+                for v in (self.start, self.stop, values)
+            )
+        part = (at - low) / max(high - low, 1e-12)
+        return np.asarray(self.size * (1 - part if self.upward else part), dtype=np.float64)
 
     def ticks(self, most: int) -> list[float]:
-        """Round values, some up to `most`."""
+        """Return at most `most` round values: 1, 2 or 5 times a power of ten."""
         if self.log:
-            return _powers(self.start, self.stop, most)
-        span = self.stop - self.start
-        if not span > 0:
+            powers = range(math.floor(math.log10(self.start)), math.ceil(math.log10(self.stop)) + 1)
+            for factors in ((1, 2, 5), (1, 3), (1,)):
+                found = [factor * 10.0**power for power in powers for factor in factors]
+                found = [value for value in found if self.start <= value <= self.stop]
+                if len(found) <= most:
+                    return found
+            return found[:: -(-len(found) // most)]
+        if not (span := self.stop - self.start) > 0:
             return [self.start]
         step = 10.0 ** math.floor(math.log10(span / most))
-        step *= next(m for m in (1, 2, 5, 10) if span / (step * m) <= most)
-        first = math.ceil(self.start / step - 1e-9)
-        return [round(k * step, 12) for k in range(first, math.floor(self.stop / step + 1e-9) + 1)]
+        step *= next(factor for factor in (1, 2, 5, 10) if span / (step * factor) <= most)
+        first, last = math.ceil(self.start / step - 1e-9), math.floor(self.stop / step + 1e-9)
+        return [round(k * step, 12) for k in range(first, last + 1)]
 
 
-def _powers(low: float, high: float, most: int) -> list[float]:
-    low, high = max(low, 1e-300), max(high, 1e-300)
-    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    for parts in ((1, 2, 5), (1, 3), (1,)):
-        found = [m * 10.0**p for p in range(first, last + 1) for m in parts]
-        found = [value for value in found if low <= value <= high]
-        if len(found) <= most:
-            return found
-    return found[:: -(-len(found) // most)]
+class Text(NamedTuple):
+    """Words at a place: percent across, pixels down."""
 
-
-@dataclass(slots=True)
-class Label:
-    """Words at a place of a plot, across in percent and down in pixels."""
-
-    x: str
-    y: str
+    x: float
+    y: float
     text: str
     anchor: str = "start"
     kind: str = ""
@@ -94,187 +77,97 @@ class Label:
 
 @dataclass(slots=True)
 class Plot:
-    """A plot: what it draws, in `WIDE` units across and pixels down, and words at places.
+    """Shapes, in `WIDE` units across and pixels down, with words and names beside them.
 
     Attributes:
-        about: what it shows, for who cannot see it.
-        names: left of it, in place of the ticks of an axis, each with the class of its colour.
-        frames: which pictures belong to places of it, if any.
+        about: description for readers who do not see the plot.
+        rows: names at its left, each with its CSS class; a plot without them has `ticks` there.
+        frames: key of the frames that are shown where the reader points; "" without any.
         most: ticks across.
     """
 
+    about: str
     x: Axis
     y: Axis
-    about: str
-    parts: list[str] = field(default_factory=list)
-    labels: list[Label] = field(default_factory=list)
-    ticks: list[Label] = field(default_factory=list)
-    names: list[tuple[str, str]] = field(default_factory=list)
+    rows: list[tuple[str, str]] = field(default_factory=list)
     frames: str = ""
     most: int = 8
+    shapes: list[Markup] = field(default_factory=list)
+    labels: list[Text] = field(default_factory=list)
+    ticks: list[Text] = field(default_factory=list)
 
     @property
-    def height(self) -> int:
-        """Pixels."""
-        return int(self.y.size)
+    def across(self) -> list[Text]:
+        """Ticks below the plot."""
+        places = [(value, float(self.x(value)) / WIDE * 100) for value in self.x.ticks(self.most)]
+        anchors = ("start" if x < 3 else "end" if x > 97 else "middle" for _, x in places)
+        return [
+            Text(x, 11, f"{value:,.10g}", anchor)
+            for (value, x), anchor in zip(places, anchors, strict=True)
+        ]
 
-    @property
-    def drawn(self) -> Markup:
-        """The inside of its SVG: made of numbers and classes alone."""
-        return Markup("".join(self.parts))
+    def path(self, kind: str, pieces: Iterable[str]) -> None:
+        """Add a path of a CSS class, unless it is empty."""
+        if d := "".join(pieces):
+            self.shapes.append(Markup('<path class="{}" d="{}"/>').format(kind, d))
 
-    @property
-    def across(self) -> list[Label]:
-        """Ticks below it."""
-        found = []
-        for value in self.x.ticks(self.most):
-            place = float(self.x(value)) / WIDE * 100
-            anchor = "start" if place < 3 else "end" if place > 97 else "middle"
-            found.append(Label(f"{number(place)}%", "11", f"{value:,.10g}", anchor))
-        return found
+    def boxes(self, kind: str, left: Any, right: Any, top: Any = 0, bottom: Any = None) -> None:
+        """Add rectangles between values of x, and between pixels from the top."""
+        bottom = self.y.size if bottom is None else bottom
+        edges = np.broadcast_arrays(self.x(left), self.x(right), top, bottom)
+        corners = zip(*([number(v) for v in edge.ravel().tolist()] for edge in edges), strict=True)
+        self.path(kind, (f"M{a} {c}H{b}V{d}H{a}z" for a, b, c, d in corners))
 
-    def add(self, tag: str, kind: str, **attributes: Any) -> None:
-        """An element of SVG, of a CSS class."""
-        words = (f' {name}="{value}"' for name, value in attributes.items())
-        self.parts.append(f'<{tag} class="{kind}"{"".join(words)}/>')
+    def marks(self, kind: str, at: Any) -> None:
+        """Add lines from top to bottom at values of x."""
+        places = self.x(at).ravel().tolist()
+        self.path(kind, (f"M{number(x)} 0v{number(self.y.size)}" for x in places))
 
-    def path(self, kind: str, d: str) -> None:
-        """A path; none where it is empty."""
-        if d:
-            self.add("path", kind, d=d)
-
-    def grid(self, most: int = 5, form: str = "g") -> None:
-        """Lines across at round values, with these left of them."""
+    def grid(self, most: int, form: str = "g") -> None:
+        """Add lines across at round values of y, with the values at the left."""
         for value in self.y.ticks(most):
             y = float(self.y(value))
-            self.path("grid", f"M0 {number(y)}h{WIDE}")
-            place = number(min(max(y + 4, 9), self.height))
+            self.path("grid", [f"M0 {number(y)}h{WIDE}"])
             text = f"{value:{form}}" if value else "0"
-            self.ticks.append(Label("100%", place, text, "end"))
+            self.ticks.append(Text(100, min(max(y + 4, 9), self.y.size), text, "end"))
 
-    def limit(self, value: float, text: str) -> None:
-        """A line across where something is decided."""
+    def limit(self, value: float) -> None:
+        """Add a dashed line across at a value of y."""
         y = float(self.y(value))
-        self.path("limit", f"M0 {number(y)}h{WIDE}")
-        if text:
-            above = y > 16
-            self.labels.append(
-                Label("100%", number(y - 4 if above else y + 12), text, "end", "back")
-            )
+        self.path("limit", [f"M0 {number(y)}h{WIDE}"])
+        self.labels.append(Text(100, y - 4 if y > 16 else y + 12, f"{value:g}", "end", "back"))
 
-    def marks(self, at: Iterable[float], kind: str = "saved") -> None:
-        """Lines down at places of x."""
-        self.path(kind, "".join(f"M{number(float(self.x(t)))} 0v{self.height}" for t in at))
+    def word(self, at: float, y: float, text: str) -> None:
+        """Add words right of a value of x, or left of it near the end of the plot."""
+        x = float(self.x(at)) / WIDE * 100
+        place, anchor = (x + 0.5, "start") if x < 88 else (x - 0.5, "end")
+        self.labels.append(Text(place, y, text, anchor, "back strong"))
 
-    def word(self, t: float, y: float, text: str, kind: str = "back", avoid: float = 84) -> None:
-        """Words right of a place, or left of it where the plot ends."""
-        place = float(self.x(t)) / WIDE * 100
-        right = place < avoid
-        self.labels.append(
-            Label(f"{number(place + (0.5 if right else -0.5))}%", number(y), text,
-                  "start" if right else "end", kind)
-        )  # fmt: skip
-
-    def line(
-        self, kind: str, t: FloatArray, values: FloatArray, parts: IntArray | None = None
-    ) -> None:
-        """A curve, from the least to the greatest of each place where many values are at one.
-
-        Args:
-            kind: its CSS class.
-            t: (n,) where.
-            values: (n,); it is broken where they are no numbers.
-            parts: (n,) numbers of its unbroken parts.
-        """
+    def curve(self, kind: str, at: Any, values: Any, parts: IntArray | None = None) -> None:
+        """Add a curve of (n,) values, broken at NaN and between parts of different numbers."""
         with np.errstate(invalid="ignore"):
-            known = np.isfinite(values) & ((values > 0) if self.y.log else True)
-        part = np.cumsum(~known, dtype=np.int64)
-        if parts is not None:
-            part += parts * (len(t) + 1)
-        x, y, part = self.x(t[known]), self.y(values[known]), part[known]
-        y = np.clip(y, 0, self.height)
-        kept = _extremes(x, y, part)
-        x, y, part = x[kept], y[kept], part[kept]
-        found = []
-        for piece in np.split(np.arange(len(x)), np.flatnonzero(np.diff(part)) + 1):
-            if len(piece) == 1:
-                found.append(_dot(x[piece[0]], y[piece[0]]))
-            elif len(piece):
-                pairs = zip(x[piece].tolist(), y[piece].tolist(), strict=True)
-                found.append("M" + "L".join(f"{number(a)} {number(b)}" for a, b in pairs))
-        self.path(f"line {kind}", "".join(found))
+            valid = np.isfinite(values) & ((values > 0) | (not self.y.log))
+        part = np.cumsum(~valid) + (0 if parts is None else parts * (len(valid) + 1))
+        x, y, part = self.x(at)[valid], self.y(values)[valid], part[valid]
+        # Of many values at one place only the least and the greatest can be seen.
+        place = np.minimum((x * (PLACES / WIDE)).astype(np.int64), PLACES - 1)
+        order = np.lexsort((y, place, part))
+        first = np.diff(place[order], prepend=-1) | np.diff(part[order], prepend=-1) != 0
+        kept = np.unique(np.concatenate([order[first], order[np.roll(first, -1)]]))
+        x, y, part = x[kept], np.clip(y[kept], 0, self.y.size), part[kept]
+        points = [f"{number(a)} {number(b)}" for a, b in zip(x.tolist(), y.tolist(), strict=True)]
+        begins = np.diff(part, prepend=-1) != 0
+        alone = begins & np.roll(begins, -1)  # a point between two gaps is a dot
+        self.path(
+            f"line {kind}",
+            (
+                ("M" if begins[i] else "L") + point + ("h0" if alone[i] else "")
+                for i, point in enumerate(points)
+            ),
+        )
 
-    def dots(self, kind: str, t: FloatArray, values: FloatArray) -> None:
-        """Points."""
-        known = np.isfinite(values)
-        places = zip(self.x(t[known]).tolist(), self.y(values[known]).tolist(), strict=True)
-        self.path(f"dots {kind}", "".join(_dot(x, y) for x, y in places))
-
-
-def _dot(x: float, y: float) -> str:
-    return f"M{number(x)} {number(y)}h0"
-
-
-def _extremes(x: FloatArray, y: FloatArray, part: IntArray) -> IntArray:
-    """Indices of the least and the greatest y at each place and in each part, in order."""
-    place = np.minimum((x * (BINS / WIDE)).astype(np.int64), BINS - 1)
-    starts = np.flatnonzero(np.diff(place, prepend=-1) | np.diff(part, prepend=part[:1] - 1))
-    stops = np.append(starts, len(x))[1:]
-    kept = [
-        a + k
-        for a, b in zip(starts.tolist(), stops.tolist(), strict=True)
-        for k in {int(np.argmin(y[a:b])), int(np.argmax(y[a:b]))}
-    ]
-    return np.array(sorted(kept), dtype=np.int64)
-
-
-def padded(
-    values: FloatArray, *, log: bool, also: Sequence[float | None] = ()
-) -> tuple[float, float]:
-    """A range that shows values and some limits, with a little room."""
-    known = values[np.isfinite(values) & ((values > 0) | (not log))]
-    every = [*([] if not len(known) else [float(known.min()), float(known.max())])]
-    every += [value for value in also if value is not None and (value > 0 or not log)]
-    low, high = (min(every), max(every)) if every else (0.1, 1.0)
-    if log:
-        return low / 1.25, high * 1.25
-    room = 0.06 * (high - low) or max(abs(high), 1.0) * 0.1
-    return low - room, high + room
-
-
-def data_uri(picture: NDArray[np.uint8], *, photo: bool) -> str:
-    """A picture, (height, width) or (height, width, 3), as a JPEG where it is a photo, or a PNG."""
-    from PIL import Image
-
-    data, kind = io.BytesIO(), "jpeg" if photo else "png"
-    image = Image.fromarray(np.ascontiguousarray(picture))
-    if photo:
-        image.save(data, "JPEG", quality=78)
-    else:
-        image.save(data, "PNG", optimize=True)
-    return f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}"
-
-
-def reduced(picture: NDArray[Any], most: int) -> NDArray[Any]:
-    """A picture of at most so many pixels across or down, by the mean of areas."""
-    step = -(-max(picture.shape[:2]) // most)
-    if step <= 1:
-        return picture
-    height, width = (size // step * step for size in picture.shape[:2])
-    cut = picture[:height, :width].astype(np.float64)
-    shape = (height // step, step, width // step, step, *picture.shape[2:])
-    found: NDArray[Any] = cut.reshape(shape).mean(axis=(1, 3))
-    return found.astype(picture.dtype) if picture.dtype == np.uint8 else found
-
-
-def sheet(pictures: Sequence[NDArray[np.uint8]], columns: int, gap: int = 0) -> NDArray[np.uint8]:
-    """Pictures (height, width) in rows of so many, white between them."""
-    height, width = pictures[0].shape
-    rows = -(-len(pictures) // columns)
-    columns = min(columns, len(pictures))
-    shape = rows * (height + gap) - gap, columns * (width + gap) - gap
-    found = np.full(shape, 255, np.uint8)
-    for k, picture in enumerate(pictures):
-        y, x = (height + gap) * (k // columns), (width + gap) * (k % columns)
-        found[y : y + height, x : x + width] = picture
-    return found
+    def dots(self, kind: str, at: Any, values: Any) -> None:
+        """Add a dot for each of (n,) values that is finite."""
+        valid = np.isfinite(values)
+        places = zip(self.x(at)[valid].tolist(), self.y(values)[valid].tolist(), strict=True)
+        self.path(f"dots {kind}", (f"M{number(x)} {number(y)}h0" for x, y in places))

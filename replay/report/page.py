@@ -1,4 +1,4 @@
-"""Reports as HTML: one file that asks no other for anything."""
+"""Reports of runs: one HTML file each, which opens in a browser without any other file."""
 
 from __future__ import annotations
 
@@ -12,71 +12,103 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from replay.palette import CYCLE
-from replay.palette import STATES as STATE_COLOURS
-from replay.report.content import run_content
-from replay.report.several import runs_content
-from replay.report.told import read_told
-from replay.report.trust import Proof
+from replay.palette import CYCLE, STATES
+from replay.report.data import RunData
+from replay.report.drawing import number
+from replay.report.figures import colour_class, curves, timeline
+from replay.report.run_page import command, run_content
+from replay.runs.compare import side_by_side
 
 MOST_BYTES = 2_000_000
-"""Of a page."""
+"""Size of a page that mail programs still send and phones still open."""
 
-DETAIL = (192, 96, 48, 24, 12)
-"""Frames that are kept of what was watched: fewer where the page would be too large."""
+FRAMES = (192, 96, 48, 24, 12)
+"""Watched frames to keep: fewer if the page would be too large."""
+
+CURVES = {
+    "learning_error": "Learning error of the watched stream",
+    "eta_dot": "Change of slowness |η̇| of the first output",
+    "tested": "Slowness of the watched stream on new frames",
+    "share": "Share of recent blocks that are novel and of the same stream",
+    "epsilon": "Probability of a random action ε",
+}
+"""Signals that the page of several runs draws over each other."""
+
+LOGARITHMIC = ("learning_error", "eta_dot", "tested")
+"""Those of them that fall over several powers of ten."""
+
+TIMELINES = 24
+"""Runs whose timelines are drawn: more make the page too large."""
 
 
-def report_of_run(path: Path, proof: Proof | None = None) -> str:
-    """The page of a run.
+def report_of_run(path: Path, reproducible: str = "not examined", again: str = "") -> str:
+    """Return the page of a run.
 
     Args:
         path: its folder, or its log.
-        proof: whether it can be learned again, where that was asked.
+        reproducible: whether learning it again is expected to give the same bits.
+        again: the command that learns it again.
 
     Raises:
         UsageError: there is no such run.
-        LogDamagedError: not even its head can be read.
+        LogDamagedError: not even its header can be read.
     """
     page = ""
-    for frames in DETAIL:
-        page = rendered(run_content(read_told(path, frames=frames), proof))
+    for frames in FRAMES:
+        page = _rendered(run_content(RunData(path, frames), reproducible, again))
         if len(page.encode()) < MOST_BYTES:
             break
     return page
 
 
-def report_of_runs(
-    paths: Sequence[Path],
-    title: str,
-) -> str:
-    """Return the page that compares runs.
-
-    Args:
-        paths: of the runs, the first of which the others are compared with.
-        title: of the page.
+def report_of_runs(paths: Sequence[Path], title: str) -> str:
+    """Return the page that compares runs with the first of them.
 
     Raises:
         UsageError: one is no run.
         LogDamagedError: one cannot be read.
     """
-    return rendered(runs_content(paths, title))
+    rows = side_by_side(paths)
+    outlines = [row.outline for row in rows]
+    plots = [
+        curves(name, outlines, about, log=name in LOGARITHMIC) for name, about in CURVES.items()
+    ]
+    return _rendered(
+        {
+            "kind": "runs",
+            "title": title,
+            "lead": f"{len(rows)} runs; identical to the first, bit for bit: "
+            f"{sum(row.difference is None for row in rows[1:])} of {len(rows) - 1}",
+            "rows": [(colour_class(place), *row.cells()) for place, row in enumerate(rows)],
+            "explained": [line for row in rows for line in row.explanation().splitlines()],
+            "curves": [plot for plot in plots if plot is not None],
+            "timelines": [
+                (row.name, timeline(row.outline), command("report", path))
+                for path, row in zip(paths[:TIMELINES], rows, strict=False)
+                if row.outline.iterations
+            ],
+            "compare": command("compare", *paths, "--save", "both.rrd") if len(paths) < 5 else "",
+            "frames": {},
+        }
+    )
 
 
-def rendered(content: Mapping[str, Any]) -> str:
-    """A page of the template that `kind` names."""
-    environment, style, script = _page()
-    template = environment.get_template("page.html")
+def _rendered(content: Mapping[str, Any]) -> str:
+    """Return a page: page.html around the template that `kind` names."""
+    environment, style, script = _templates()
     policy = (
         "default-src 'none'; img-src data:; "
         f"style-src 'sha256-{_digest(style)}'; script-src 'sha256-{_digest(script)}'; "
         "base-uri 'none'; form-action 'none'"
     )
-    return template.render(policy=policy, style=Markup(style), script=Markup(script), **content)
+    return environment.get_template("page.html").render(
+        policy=policy, style=Markup(style), script=Markup(script), **content
+    )
 
 
 @lru_cache
-def _page() -> tuple[Environment, str, str]:
-    """The templates, the style and the script of every page."""
+def _templates() -> tuple[Environment, str, str]:
+    """Return the templates, the style and the script of every page."""
     loader = PackageLoader("replay.report", ".")
     environment = Environment(
         loader=loader,
@@ -85,12 +117,14 @@ def _page() -> tuple[Environment, str, str]:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters |= {"number": number, "command": command, "thousands": "{:,}".format}
     style, script = (loader.get_source(environment, name)[0] for name in ("page.css", "page.js"))
-    colours = "".join(f".c{i}{{--c:#{r:02x}{g:02x}{b:02x}}}" for i, (r, g, b) in enumerate(CYCLE))
-    states = "".join(
-        f".state{i}{{--s:#{r:02x}{g:02x}{b:02x}}}" for i, (r, g, b) in enumerate(STATE_COLOURS)
-    )
-    return environment, f"{style}{colours}{states}", script
+    for kind, variable, colours in (("c", "--c", CYCLE), ("state", "--s", STATES)):
+        style += "".join(
+            f".{kind}{i}{{{variable}:#{r:02x}{g:02x}{b:02x}}}"
+            for i, (r, g, b) in enumerate(colours)
+        )
+    return environment, style, script
 
 
 def _digest(text: str) -> str:

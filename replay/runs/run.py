@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -23,8 +23,9 @@ from replay.runs.modules import load_modules
 LINES = (
     *("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsilon"),
     *("change", "tested", "fitted", "learning_error", "interest", "typical", "regret"),
+    *("module", "novel", "novel_blocks", "roc_error", "variance"),
 )
-"""Signals whose values an outline holds for every iteration, to choose ranges of plots from."""
+"""Signals whose values an outline holds for every iteration."""
 
 
 class Run:
@@ -147,6 +148,7 @@ class Outline:
         lines: values of each signal in `LINES`, (n,) or flattened.
         told: names of the signals that have a value anywhere in the run.
         states: (S,) final state of each stream, as codes of the signal `state`.
+        changes: (n, 3) block, stream and new code of every change of a state, ordered by block.
     """
 
     header: RunHeader
@@ -163,6 +165,7 @@ class Outline:
     lines: dict[str, FloatArray]
     told: frozenset[str]
     states: tuple[int, ...]
+    changes: IntArray = field(default_factory=lambda: np.empty((0, 3), np.int64))
 
     def streams(self, most: int) -> list[int]:
         """Return the indices of the most attended streams, at most `most`, in ascending order."""
@@ -180,12 +183,14 @@ class Tally:
     def __init__(self, header: RunHeader) -> None:
         self.header = header
         self._values: dict[str, list[NDArray[Any]]] = {
-            name: [] for name in ("t", "iteration", "stream", "module", "novel", *LINES)
+            name: [] for name in ("t", "iteration", "stream", *LINES)
         }
         self._saved: list[Save] = []
         self._modules = self._tau = self._outputs = 0
         self._told: set[str] = set()
         self._states: tuple[int, ...] = (NO_STATE,) * len(header.spec.streams)
+        self._changes = [np.empty((0, 3), np.int64)]
+        self._count = 0
 
     def add(self, columns: SignalColumns) -> None:
         """Add the next records."""
@@ -196,7 +201,11 @@ class Tally:
         self._saved += [Save.of(columns, row) for row in np.flatnonzero(columns["saved"]).tolist()]
         unsure = SIGNALS.keys() - self._told
         self._told |= {name for name in unsure if has_values(name, columns[name])}
+        rows, streams = np.nonzero(np.diff(columns["state"], axis=0, prepend=[self._states]))
+        codes = columns["state"][rows, streams]
+        self._changes.append(np.column_stack([self._count + rows, streams, codes]))
         self._states = tuple(columns["state"][-1].tolist())
+        self._count += len(columns)
 
     def outline(self) -> Outline:
         """Return the outline of all records so far."""
@@ -228,6 +237,7 @@ class Tally:
             lines={name: values[name] for name in LINES},
             told=frozenset(self._told),
             states=self._states,
+            changes=np.concatenate(self._changes),
         )
 
 

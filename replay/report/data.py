@@ -1,0 +1,175 @@
+"""What a report shows of a run, gathered in one pass over its log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.modules import Module
+from replay.following import Fit, OutputHistory
+from replay.outputs import OwnStream, Thinned
+from replay.runs.folders import read_run_json
+from replay.runs.log import (
+    EVENT_TOPIC,
+    SIGNALS_TOPIC,
+    TRUTH_TOPIC,
+    WATCHED_TOPIC,
+    Batch,
+    Event,
+    read_batches,
+)
+from replay.runs.run import Run, Tally
+
+TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
+
+MOST_OUTPUTS = 2000
+"""Frames on which a module's outputs are drawn and fitted: as many dots as a plot can show."""
+
+RECENT = 80
+"""Last frames of a stream on which all outputs of its module are drawn side by side."""
+
+VALUES = 200
+"""Last frames of a stream of numbers that its card shows."""
+
+MOST_MODULES = 40
+"""Modules whose outputs are computed: the time to read a run grows with their number."""
+
+MOST_EVENTS = 400
+"""Events that are listed: the first and the last of a run."""
+
+
+class ModuleData:
+    """A module and its outputs on the logged frames of its own stream, before and after its save.
+
+    Attributes:
+        frozen: the module.
+        stream: sums and extremes over all frames.
+        outputs: (n,) frames, (n, J) outputs and (n, D) truth, thinned; NaN where it is unknown.
+        frames: (n,) frames, (n, *frame_shape) values and (n,) first outputs, thinned further.
+        recent: (n,) frames and (n, J) outputs at the end.
+    """
+
+    def __init__(self, frozen: Module, spec: SourceSpec, frames: int) -> None:
+        self.frozen, self._spec = frozen, spec
+        self.stream = OwnStream(frozen, spec)
+        self.outputs, self.frames = Thinned(MOST_OUTPUTS), Thinned(frames)
+        self.recent: tuple[NDArray[Any], NDArray[Any]] = (
+            np.empty(0, np.int64),
+            np.empty((0, len(frozen.eta))),
+        )
+
+    def add(self, batch: Batch) -> None:
+        """Take the next batch of the log in."""
+        for t, frames, y in self.stream.take(batch):
+            truth = np.full((len(t), len(self._spec.truth)), np.nan)
+            for at, values in batch.truth if self._spec.truth else ():
+                row = np.minimum(np.searchsorted(at, t), len(at) - 1)
+                known = at[row] == t
+                truth[known] = values[row[known]]
+            self.outputs.add(t, y, truth)
+            self.frames.add(t, frames, y[:, 0])
+            self.recent = (
+                np.concatenate([self.recent[0], t])[-RECENT:],
+                np.concatenate([self.recent[1], y])[-RECENT:],
+            )
+
+    def fits(self) -> list[Fit]:
+        """Return which true quantities the first output follows, the best first."""
+        if not self._spec.truth or not self.outputs.columns:
+            return []
+        t, y, truth = self.outputs.columns
+        known = np.isfinite(truth).all(axis=1)
+        history = OutputHistory(
+            self.frozen.index, self.frozen.stream_index, t[known], y[known, 0], truth[known]
+        )
+        return history.fits(self._spec.truth)
+
+    def correlation(self, other: ModuleData) -> float:
+        """Return |r| of the first outputs of this module and another one, on this one's frames."""
+        if not self.frames.columns or len(self.frames.columns[0]) < 8:
+            return 0.0
+        _, frames, y = self.frames.columns
+        y_other = other.frozen.transform(frames)[:, 0]
+        if not (np.std(y) > 0 and np.std(y_other) > 0):
+            return 0.0
+        return float(abs(np.corrcoef(y, y_other)[0, 1]))
+
+
+class RunData:
+    """A run, read once with memory that does not grow with its length.
+
+    Args:
+        path: the run's folder, or its log.
+        frames: number of watched frames to keep.
+
+    Raises:
+        UsageError: there is no such run.
+        LogDamagedError: not even its header can be read.
+
+    Attributes:
+        document: its run.json; empty if there is none.
+        outline: its signals.
+        events: the first and the last.
+        modules: at most `MOST_MODULES`.
+        watched: (n,) frames and (n, *frame_shape) values, thinned.
+        last: the last image of each stream, or its last rows of numbers.
+        problems: damage and missing files, in words.
+    """
+
+    def __init__(self, path: Path, frames: int) -> None:
+        run = Run(path)
+        self.path, self.header, self.spec = run.log.parent, run.header, run.header.spec
+        self.document: Mapping[str, Any] = read_run_json(self.path)
+        self.problems: list[str] = []
+        modules: tuple[Module, ...] = ()
+        if not run.result:
+            self.problems.append(
+                "The run was interrupted or is still learning: it has no run.json. "
+                "cdmisfa learn --resume continues it."
+            )
+        try:
+            modules = run.modules[:MOST_MODULES]
+        except CdmisfaError as error:
+            if run.result:
+                self.problems.append(str(error))
+        few = min(max(frames // max(len(modules), 1), 24), 96)
+        self.modules = [ModuleData(module, self.spec, few) for module in modules]
+        self.watched, self.last = Thinned(frames), dict[int, NDArray[Any]]()
+        self.events: list[Event] = []
+        tally = Tally(self.header)
+        try:
+            for batch in read_batches(run.log, self.header, topics=TOPICS):
+                for columns in batch.signals:
+                    tally.add(columns)
+                self._add(batch)
+        except LogDamagedError as error:
+            self.problems.append(f"The log is damaged. This page shows what is readable: {error}")
+        self.outline = tally.outline()
+
+    def _add(self, batch: Batch) -> None:
+        self.events += batch.events
+        if len(self.events) > 2 * MOST_EVENTS:
+            del self.events[MOST_EVENTS // 2 : -MOST_EVENTS // 2]
+        for t, frames in batch.watched if len(batch.blocks.starts) else ():
+            self.watched.add(t, frames)
+            streams = batch.blocks.streams[batch.blocks.places(t)]
+            for s in np.unique(streams).tolist():
+                rows = frames[streams == s][-VALUES:]
+                if self.spec.images:
+                    self.last[s] = rows[-1].copy()
+                else:
+                    self.last[s] = np.concatenate([self.last.get(s, rows[:0]), rows])[-VALUES:]
+        for module in self.modules:
+            module.add(batch)
+
+    @property
+    def result(self) -> Mapping[str, Any]:
+        """The `result` of run.json; empty if the run was interrupted."""
+        result = self.document.get("result")
+        return result if isinstance(result, Mapping) else {}

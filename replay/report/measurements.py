@@ -1,0 +1,187 @@
+"""The rules by which a learner saves a module, measured in every iteration of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.signals import SIGNALS, STATES
+from replay.runs.run import Outline, Save, rules_of
+
+# The progress learner's constants: replay must not import `cdmisfa/agents/progress/judging.py`,
+# where they are explained; a test compares them.
+LIVELY = (0.5, 2.0)
+SLOW_AGAIN, STILL_GAINING, PASSED_ON, TURNING, FULL = 0.65, 0.1, 0.03, 4.0, 4.5
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """A measurement that must lie within limits for a module to be saved.
+
+    Attributes:
+        name: column head in a table.
+        about: description.
+        values: (n,) of each iteration; NaN where there is none.
+        low, high: the limits; None where there is none.
+        log: draw it on a logarithmic axis.
+        exact: (n,) where the rule holds, if it depends on more than the limits.
+    """
+
+    name: str
+    about: str
+    values: FloatArray
+    low: float | None = None
+    high: float | None = None
+    log: bool = False
+    exact: NDArray[np.bool_] | None = None
+
+    @property
+    def holds(self) -> NDArray[np.bool_]:
+        """(n,) where the rule holds; false where there is no value."""
+        if self.exact is not None:
+            return self.exact
+        low = -np.inf if self.low is None else self.low
+        high = np.inf if self.high is None else self.high
+        with np.errstate(invalid="ignore"):
+            return (self.values >= low) & (self.values < high) & np.isfinite(self.values)
+
+    @property
+    def decides(self) -> bool:
+        """Whether the rule has a limit; a measurement without limits is only drawn."""
+        return self.low is not None or self.high is not None
+
+
+def measurements_of(outline: Outline) -> list[Measurement]:
+    """Return the rules of a run's learner that its log has values of.
+
+    A fork's rules have its own limits, also in the iterations that it shares with its parent.
+    """
+    if not outline.iterations:
+        return []
+    rules = _progress_rules(outline) if outline.header.by_progress else _paper_rules(outline)
+    return [rule for rule in rules if np.isfinite(rule.values).any()]
+
+
+def _paper_rules(outline: Outline) -> list[Measurement]:
+    header, lines, rules = outline.header, outline.lines, list[Measurement]()
+    for rule in rules_of(header):
+        values = np.abs(lines[rule.signal].reshape(outline.iterations, -1))
+        below = rule.side == "below"
+        rules.append(
+            Measurement(
+                rule.symbol,
+                SIGNALS[rule.signal].about.rstrip("."),
+                values.max(axis=1) if below else values.min(axis=1),
+                low=None if below else rule.threshold,
+                high=rule.threshold if below else None,
+                log=rule.signal == "eta_dot",
+            )
+        )
+    if (window := header.number("eta_dot_window")) is not None:
+        # A module is saved only at the end of a novel block.
+        blocks = np.where(lines["novel"] == 1, lines["novel_blocks"], np.nan)
+        about = SIGNALS["novel_blocks"].about.rstrip(".")
+        rules.append(Measurement("novel blocks", about, blocks, low=window + 1))
+    return rules
+
+
+def _progress_rules(outline: Outline) -> list[Measurement]:
+    header, lines = outline.header, outline.lines
+    tested, fitted, typical = lines["tested"], lines["fitted"], lines["typical"]
+    change, regret, tests = lines["change"], lines["regret"], lines["novel_blocks"] - 1
+    frames, settled = header.number("test_frames"), header.number("settled")
+    window = None if frames is None else max(frames / max(outline.tau, 1), 1.0)
+    was_tested = np.isfinite(tested)
+    exact = {"regret": was_tested & ~(regret > STILL_GAINING)}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        disagreement = np.abs(np.log(tested / fitted))
+        gain, flatness = tested / typical, fitted / typical
+        if settled is not None and window is not None:
+            # As `mastered` in judging.py: the threshold grows with the windows of tests.
+            windows = tests / window
+            firm = change < settled * np.clip(windows / FULL, 0.0, 1.0) ** 2
+            turning = (windows >= FULL) & (change < TURNING * settled)
+            exact["change"] = was_tested & (firm | (turning & (np.abs(regret) < PASSED_ON)))
+    variance = lines["variance"].reshape(outline.iterations, -1)[:, 0]
+    rows: list[tuple[str, str, NDArray[Any], float | None, float | None]] = [
+        ("error", "Learning error: change + disagreement", lines["learning_error"], None, None),
+        ("change", "Change of the outputs with a block; the limit is lower after few tests, and "
+         "higher without recent gain", change, None, settled),
+        ("disagreement", "Disagreement |ln(tested / fitted)| of the slowness on new and old frames",
+         disagreement, None, header.number("agreement")),
+        ("variance", "Variance of the slowest output on new frames", variance, *LIVELY),
+        ("slow", "Slowness on new frames / typical slowness", gain, None, header.number("slow")),
+        ("slow before", "Slowness on old frames / typical slowness", flatness, None, SLOW_AGAIN),
+        ("regret", "Regret: log of the recent gain in slowness", regret, None, STILL_GAINING),
+        ("tests", "Tested blocks", tests, window, None),
+    ]  # fmt: skip
+    return [
+        Measurement(
+            name,
+            about,
+            np.where(was_tested, values, np.nan),
+            low,
+            high,
+            log=name in ("error", "change"),
+            exact=exact.get(name),
+        )
+        for name, about, values, low, high in rows
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """Blocks in which a module was learned, or a stream by the progress learner.
+
+    Attributes:
+        name: the module or the stream.
+        blocks: number of them.
+        shares: share of the blocks in which each rule held.
+        together: number of blocks in which all rules held.
+        save: of the module, if it was saved.
+        state: of a stream without a module, in words.
+    """
+
+    name: str
+    blocks: int
+    shares: tuple[float, ...]
+    together: int
+    save: Save | None
+    state: str
+
+
+def attempts(outline: Outline, rules: list[Measurement]) -> list[Attempt]:
+    """Return how often the rules that decide held for every module, saved or not."""
+    deciding = [rule for rule in rules if rule.decides]
+    if not deciding:
+        return []
+    groups: list[tuple[str, Any, Save | None, int]] = []
+    if outline.header.by_progress:
+        saves = {save.stream: save for save in outline.saved}
+        for s in outline.streams(len(outline.states)):
+            blocks = outline.blocks.streams == s
+            if s in saves:
+                blocks &= outline.blocks.iterations <= saves[s].iteration
+            groups.append((outline.names()[s], blocks, saves.get(s), outline.states[s]))
+    else:
+        saves = {save.module: save for save in outline.saved}
+        for module in np.unique(outline.lines["module"]).astype(int).tolist():
+            blocks = outline.lines["module"] == module
+            groups.append((f"module {module}", blocks, saves.get(module), -1))
+    together = np.all([rule.holds for rule in deciding], axis=0)
+    return [
+        Attempt(
+            name,
+            int(blocks.sum()),
+            tuple(float(rule.holds[blocks].mean()) for rule in deciding),
+            int(together[blocks].sum()),
+            save,
+            STATES[state].replace("_", " ") if state > 0 else "",
+        )
+        for name, blocks, save, state in groups
+        if blocks.any()
+    ]

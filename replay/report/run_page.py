@@ -1,0 +1,300 @@
+"""The measurements, plots and images on the page of one run: the variables of run.html."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from cdmisfa.core.signals import STATES
+from replay.report.data import ModuleData, RunData
+from replay.report.figures import (
+    FRAME,
+    THUMBNAIL,
+    bars,
+    colour_class,
+    data_uri,
+    frames_to_point_at,
+    numbers,
+    numbers_plot,
+    output_plot,
+    recent_plots,
+    reduced,
+    rule_plot,
+    saliency_image,
+    sheet,
+    timeline,
+    truth_plot,
+    weights_image,
+)
+from replay.report.measurements import Measurement, attempts, measurements_of
+
+CARDS, OPEN_CARDS = 64, 12
+"""Streams that have a card, the most watched, and those that are visible at once."""
+
+SECTIONS = 12
+"""Modules that have a section with images and plots; the table lists all."""
+
+MOST_FILES = 100
+"""Files of a source that are listed; run.json lists all."""
+
+OVERFITTED = 1.25
+"""Slowness on new frames over that on frames learned from, from which a table marks it: a module
+that has learned accidents of its frames is slower on them than on others."""
+
+ALIKE = 0.8
+"""Correlation from which a table marks two modules as alike: `SAME` of the progress learner."""
+
+
+def command(*words: object) -> str:
+    """Return a command of cdmisfa to copy into a shell."""
+    return shlex.join(["cdmisfa", *map(str, words)])
+
+
+def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
+    """Return the variables of run.html; see `report_of_run`."""
+    outline, rules = run.outline, measurements_of(run.outline)
+    frames: dict[str, dict[str, Any]] = {}
+    pointed = "timeline" if run.watched.columns else ""
+    lanes = timeline(outline, pointed) if outline.iterations else None
+    if lanes is not None and pointed:
+        t, values = run.watched.columns
+        texts = _watched_texts(run, rules, t)
+        frames[pointed] = frames_to_point_at(lanes, t, values, texts, images=run.spec.images)
+    return {
+        "kind": "run",
+        "title": run.path.resolve().name,
+        "lead": _lead(run),
+        "run": run,
+        "outline": outline,
+        "reproducible": reproducible,
+        "ended": _ended(run),
+        "attention": sorted(
+            zip(outline.visits.tolist(), run.spec.streams, strict=True), key=lambda row: -row[0]
+        ),
+        "cards": _cards(run),
+        "open_cards": OPEN_CARDS,
+        "timeline": lanes,
+        "states": [
+            (f"state{code}", STATES[code].replace("_", " "))
+            for code in sorted({code for *_, code in outline.changes.tolist() if code >= 0})
+        ],
+        "rules": [(rule, rule_plot(outline, rule, pointed)) for rule in rules],
+        "attempts": attempts(outline, rules),
+        "modules": [_module(run, module, frames) for module in run.modules],
+        "sections": SECTIONS,
+        "held_out": run.result.get("held_out"),
+        "origin": _origin(run, again),
+        "view": command("view", run.path),
+        "frames": frames,
+    }
+
+
+def _ended(run: RunData) -> str:
+    texts = [event.text for event in run.events if event.text.startswith("ended: ")]
+    if run.result and texts:
+        return texts[-1].removeprefix("ended: ")
+    return str(run.result.get("ended", "interrupted")).replace("_", " ")
+
+
+def _lead(run: RunData) -> str:
+    learned = len({save.stream for save in run.outline.saved})
+    lead = (
+        f"{learned} of {len(run.spec.streams)} streams learned, {run.outline.iterations:,} "
+        f"iterations, {run.outline.frames:,} frames"
+    )
+    fork = run.header.manifest.get("fork")
+    if isinstance(fork, Mapping):
+        lead += f". Fork of {fork.get('parent')} after {fork.get('at')} iterations"
+        changed = fork.get("changed")
+        for key, values in changed.items() if isinstance(changed, Mapping) else ():
+            lead += f"; {key}: {' → '.join(map(str, values))}"
+    return lead
+
+
+def _watched_texts(run: RunData, rules: Sequence[Measurement], t: Any) -> list[str]:
+    """Return the stream and the rules that held at each of (n,) frames."""
+    blocks = run.outline.blocks
+    deciding = [(rule.name, rule.holds) for rule in rules if rule.decides]
+    texts = []
+    for frame, row in zip(t.tolist(), blocks.places(t).tolist(), strict=True):
+        text = f"frame {frame:,}, iteration {blocks.iterations[row]:,}: "
+        text += run.spec.streams[blocks.streams[row]]
+        for word, kept in (("held", True), ("not", False)):
+            if names := [name for name, holds in deciding if holds[row] == kept]:
+                text += f"; {word}: {', '.join(names)}"
+        texts.append(text)
+    return texts
+
+
+def _cards(run: RunData) -> list[dict[str, Any]]:
+    """Return a card of each of the most watched streams; of many, those learned come first."""
+    outline = run.outline
+    outcomes = {
+        outcome["stream"]: outcome
+        for outcome in run.result.get("streams", ())
+        if isinstance(outcome, Mapping) and "stream" in outcome
+    }
+    learned = {save.stream for save in outline.saved}
+    streams = outline.streams(CARDS)
+    if len(streams) > OPEN_CARDS:
+        streams.sort(key=lambda s: (s not in learned, s))
+    cards = []
+    for place, s in enumerate(streams):
+        name, code = run.spec.streams[s], outline.states[s]
+        outcome = outcomes.get(name, {})
+        state = STATES[code] if code >= 0 else "learned" if s in learned else "not_learned"
+        notes = [
+            f"module {save.module}, slowness {save.eta[0]:.4f}"
+            for save in outline.saved
+            if save.stream == s
+        ]
+        if not notes and outcome.get("module"):
+            notes.append(f"module {outcome['module']}")
+        if outcome.get("why"):
+            notes.append(str(outcome["why"]))
+        image, plot, last = "", None, run.last.get(s) if place < 2 * OPEN_CARDS else None
+        if last is not None and run.spec.images:
+            image = data_uri(reduced(last, THUMBNAIL))
+        elif last is not None:
+            plot = numbers_plot(last, f"The last {len(last)} frames of {name}")
+        cards.append(
+            {
+                "name": name,
+                "colour": colour_class(s),
+                "image": image,
+                "plot": plot,
+                "state": state,
+                "notes": "; ".join(notes),
+                "frames": int(outline.visits[s]),
+                "share": int(outline.visits[s]) / max(outline.frames, 1),
+            }
+        )
+    return cards
+
+
+def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the measurements of a module, and for its section its images and plots."""
+    frozen, outline, images = module.frozen, run.outline, run.spec.images
+    save = next((save for save in outline.saved if save.module == frozen.index), None)
+    saved = outline.end if save is None else save.t + outline.tau
+    fits = module.fits()
+    found: dict[str, Any] = {
+        "frozen": frozen,
+        "colour": colour_class(frozen.stream_index),
+        "saved": saved,
+        "frames": module.stream.count,
+        "fits": fits,
+        "overfitting": _overfitting(run, frozen.iteration),
+        "overfitted": OVERFITTED,
+        "alike": max(
+            ((module.correlation(m), m.frozen.index) for m in run.modules if m is not module),
+            default=(0.0, 0),
+        ),
+        "most_alike": ALIKE,
+        "after": 0,
+        "plot": None,
+        "truth": truth_plot(module, fits[0]) if fits else None,
+        "recent": recent_plots(module),
+        "view": command("view", run.path, "--at", f"iteration {frozen.iteration}"),
+        **_weights(module, images=images),
+        "extremes": [],
+    }
+    if not module.outputs.columns:
+        return found
+    t, _, _ = module.outputs.columns
+    found["after"] = min(int((t >= saved).sum()) * module.outputs.step, module.stream.count)
+    key = f"module{frozen.index}"
+    found["plot"] = plot = output_plot(run, module, saved, key)
+    if frozen.index <= SECTIONS:
+        t, values, y = module.frames.columns
+        texts = [f"frame {k:,}: output {v:+.2f}" for k, v in zip(t.tolist(), y, strict=True)]
+        frames[key] = frames_to_point_at(plot, t, values, texts, images=images)
+    extremes = module.stream.sheet()
+    for title, picks in (
+        ("least", extremes.least), ("middle", extremes.middle), ("greatest", extremes.greatest)
+    ):  # fmt: skip
+        if picks:
+            small = [reduced(pick.frame, FRAME) for pick in picks] if images else []
+            found["extremes"].append(
+                {
+                    "title": title,
+                    "image": data_uri(sheet(small, len(small), 2)) if images else "",
+                    "picks": [(p.y, p.t, "" if images else numbers(p.frame)) for p in picks],
+                }
+            )
+    return found
+
+
+def _overfitting(run: RunData, iteration: int) -> float | None:
+    """Return slowness on new frames over that on old ones; None of the paper's learners."""
+    row = int(np.searchsorted(run.outline.blocks.iterations, iteration))
+    if row >= run.outline.iterations:
+        return None
+    tested, fitted = (float(run.outline.lines[name][row]) for name in ("tested", "fitted"))
+    return tested / fitted if np.isfinite(tested) and fitted > 0 else None
+
+
+def _weights(module: ModuleData, *, images: bool) -> dict[str, Any]:
+    """Return the weights of the first output and, of images, its saliency."""
+    stream, frozen = module.stream, module.frozen
+    weights, saliency = stream.weights(), stream.saliency()
+    if images and weights is not None and saliency is not None:
+        return {
+            "bars": None,
+            "weights": weights_image(weights),
+            "saliency": saliency_image(saliency, stream.mean) if stream.count else "",
+        }
+    kind = "expanded inputs" if weights is None else "numbers of a frame"
+    about = f"Weights of module {frozen.index} on {frozen.phi.shape[1]} {kind}"
+    return {"bars": bars(frozen.phi[0], about), "weights": "", "saliency": ""}
+
+
+def _origin(run: RunData, again: str) -> list[tuple[str, Any]]:
+    """Return where a run came from and the commands that check it, as rows of a table."""
+    document, manifest = run.document, run.header.manifest
+    source = document.get("source") or manifest.get("source")
+    source = source if isinstance(source, Mapping) else {}
+    rows: list[tuple[str, Any]] = [("check", command("check", run.path)), ("learn again", again)]
+    fork = manifest.get("fork")
+    if isinstance(fork, Mapping):
+        parent = os.path.normpath(run.path / str(fork.get("parent")))
+        rows.append(("compare with its parent", command("compare", parent, run.path)))
+    rows += [
+        ("algorithm", run.header.setting("learner", "algorithm")),
+        ("seed", manifest.get("seed")),
+        ("source", source.get("kind")),
+    ]
+    files = [
+        file
+        for key in ("files", "views")
+        if isinstance(source.get(key), list)
+        for file in source[key]
+        if isinstance(file, Mapping)
+    ]
+    for file in files[:MOST_FILES]:
+        digest = file.get("sha256") or file.get("sample_sha256")
+        rows.append((str(file.get("file", file.get("name"))), digest and f"SHA-256 {digest}"))
+    if len(files) > MOST_FILES:
+        rows.append(("further files", f"{len(files) - MOST_FILES:,}, listed in run.json"))
+    jumps = np.diff(run.outline.blocks.starts) - run.outline.tau
+    if (gaps := jumps[jumps > 0]).size:
+        rows.append(("gaps", f"{len(gaps)}, {int(gaps.sum()):,} frames that a stream lacks"))
+    alignment = source.get("alignment")
+    for name, counts in alignment.items() if isinstance(alignment, Mapping) else ():
+        rows.append((f"messages of {name}", _pairs(counts)))
+    return [
+        *rows,
+        ("SHA-256 of the signals", run.result.get("signals_sha256")),
+        ("arithmetic", f"version {run.header.arithmetic}"),
+        ("versions", _pairs(document.get("versions"))),
+        ("machine", _pairs(document.get("platform"))),
+    ]
+
+
+def _pairs(table: Any) -> str:
+    pairs = table.items() if isinstance(table, Mapping) else ()
+    return ", ".join(f"{key} {value}" for key, value in pairs)
