@@ -18,7 +18,8 @@ from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments import session
 from cdmisfa.experiments.loop import Keyframes
-from cdmisfa.experiments.resume import command_of
+from cdmisfa.experiments.resume import Recomputation
+from cdmisfa.experiments.run_folder import command_of
 from cdmisfa.experiments.sources import open_source
 from recorder.mcap.reader import LogReader
 from replay.runs.folders import run_log
@@ -111,13 +112,13 @@ def share(out: Path) -> tuple[int, float]:
 def moments(out: Path, iterations: int) -> list[float]:
     """Seconds of CPU to go to each of some moments, the least of three times."""
     chosen = np.random.default_rng(0).integers(0, iterations, MOMENTS).tolist()
-    session.Session.at(out, iterations - 1)  # imports what it needs
+    Recomputation.after(out, iterations - 1)  # imports what it needs
     return [min(_seconds(out, at) for _ in range(3)) for at in chosen]
 
 
 def _seconds(out: Path, at: int) -> float:
     begin = time.process_time()
-    session.Session.at(out, at)
+    Recomputation.after(out, at)
     return time.process_time() - begin
 
 

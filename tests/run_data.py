@@ -175,7 +175,7 @@ def write_run(
         writer.block(block, signals, having(phi))
         records.append(signals)
     writer.event(iterations * tau, iterations - 1, "stopped: the test is over")
-    writer.finish()
+    writer.close()
     return records
 
 

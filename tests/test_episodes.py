@@ -299,12 +299,7 @@ def backgrounds(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_centred_episodes_show_what_moves_before_backgrounds_that_change(
     cdmisfa: Cdmisfa, backgrounds: Path, tmp_path: Path
 ) -> None:
-    plain = cdmisfa("learn", backgrounds / "logs")
-    assert plain.code == 0
-    assert "no module was learned" in plain.out
-    assert (
-        "of its variance is between episodes, not within; --set input.centre=episode" in plain.err
-    )
+    assert "no module was learned" in cdmisfa("learn", backgrounds / "logs").out
     run = backgrounds / "run"
     (module,) = package.Run(run).modules
     assert module.recipe is not None

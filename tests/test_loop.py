@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from contracts.learners import CONFIG, SinkContract
@@ -12,7 +11,7 @@ from contracts.learners import CONFIG, SinkContract
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.cli.progress import Bar
 from cdmisfa.core.blocks import Block
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn_blocks
@@ -116,14 +115,6 @@ def test_less_than_a_block_is_not_enough() -> None:
     with pytest.raises(LogExhaustedError, match="the streams end after 39 frames"):
         learn_blocks(source, learner_for(source), (notes,))
     assert notes.told == []
-
-
-def test_what_is_no_source_and_no_learner_is_refused() -> None:
-    source = OscillatorySource()
-    given: Any
-    for given in ((learner_for(source), source), ("icub", learner_for(source)), (source, CONFIG)):
-        with pytest.raises(UsageError, match="takes a source that is open, then a learner"):
-            learn_blocks(*given)
 
 
 def test_asked_to_stop_while_it_waits_for_frames_it_is_interrupted() -> None:

@@ -20,6 +20,7 @@ from cdmisfa.cli import run
 from cdmisfa.core.errors import NotReproducedError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import ACTIONS
+from cdmisfa.experiments.resume import Recomputation, check_run
 from cdmisfa.experiments.session import Session
 from cdmisfa.experiments.sources import open_source
 from recorder.mcap.reader import LogReader
@@ -128,11 +129,11 @@ def test_any_moment_is_that_of_the_straight_run(
 @pytest.mark.parametrize("algorithm", OF)
 def test_a_run_is_what_it_says(place: Path, algorithm: str) -> None:
     for name in ("live", "loop-resumed"):
-        checked = Session.check(place / f"{algorithm}-{name}")
+        checked = check_run(place / f"{algorithm}-{name}")
         assert (checked.start, checked.stop, checked.difference) == (0, ENDS, None)
-    part = Session.check(place / f"{algorithm}-live", start=47, stop=71)
+    part = check_run(place / f"{algorithm}-live", start=47, stop=71)
     assert (part.start, part.stop, part.difference) == (40, 71, None)
-    recorded = Session.check(place / f"{algorithm}-live", [str(place / "log")], stop=30)
+    recorded = check_run(place / f"{algorithm}-live", [str(place / "log")], stop=30)
     assert recorded.difference is None
 
 
@@ -174,11 +175,11 @@ def test_a_run_that_lies_is_found_out(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
     cdmisfa("learn", "oscillatory", *words("2.0"), *LEARN, "-o", run, "--max-iterations", 30)
     lying(run, b'"seed": 3', b'"seed": 4')
     assert read_header(run).manifest["seed"] == 4
-    checked = Session.check(run)
+    checked = check_run(run)
     assert checked.difference is not None
     assert checked.difference.iteration <= 1
     with pytest.raises(NotReproducedError, match="learned again, iteration"):
-        Session.at(run, 20)
+        Recomputation.after(run, 20)
 
 
 def a_bit(state: LearnerState) -> LearnerState:
@@ -212,8 +213,8 @@ def test_a_keyframe_that_lies_is_found_out(
     ("asked", "why"),
     [
         (lambda run: Run(run).at(131), "holds 130 iterations"),
-        (lambda run: Session.check(run, stop=131), "holds 130 iterations"),
-        (lambda run: Session.check(run, start=20, stop=10), "from 20 to 10 there is nothing"),
+        (lambda run: check_run(run, stop=131), "holds 130 iterations"),
+        (lambda run: check_run(run, start=20, stop=10), "holds 20 iterations: choose a part"),
     ],
 )
 def test_a_moment_that_is_not_there_is_refused(
@@ -319,8 +320,8 @@ def test_forks_of_forks_are_resumed_and_checked(
     resumed = cdmisfa("learn", "--resume", "-o", two, "--max-iterations", 110, "--no-rerun")
     assert resumed.code == 0, resumed.err
     assert first_difference(two, straight) is None
-    assert Session.check(two).difference is None
-    assert Session.check(two, start=40, stop=100).difference is None
+    assert check_run(two).difference is None
+    assert check_run(two, start=40, stop=100).difference is None
     keyframe, found = read_keyframe(two, 52), first_difference(one, two)
     assert keyframe is not None
     assert found is not None

@@ -149,7 +149,7 @@ def test_a_run_that_ended_early_is_said_so(tmp_path):
     writer = RunWriter(tmp_path / "b", VECTOR, {})
     for signals, block in list(run_of(VECTOR, 8, seed=3))[:6]:
         writer.block(block, signals, having(np.zeros((1, 2))))
-    writer.finish()
+    writer.close()
     difference = first_difference(tmp_path / "a", tmp_path / "b")
     assert (
         str(difference) == "iteration 6: the first continues, the second ended after 6 iterations"

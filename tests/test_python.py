@@ -20,7 +20,7 @@ from waiting import python
 import cdmisfa
 from cdmisfa import Recording, Run, learn
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.experiments.recompute import check_run
+from cdmisfa.experiments.resume import check_run
 from recorder.images.options import InputOptions
 from replay.arrays import ArrayLog
 
@@ -171,35 +171,6 @@ def test_a_damaged_file_of_arrays_is_one_line(
     found = cdmisfa("learn", tmp_path / name)
     assert (found.code, found.err.count("\n")) == (3, 1), found.err
     assert f"{name} is no file of NumPy's arrays" in found.err
-
-
-@pytest.mark.parametrize("method", ["block", "event", "finish"])
-def test_a_sink_that_fails_is_let_go_and_learning_goes_on(method: str, tmp_path: Path) -> None:
-    class Board(cdmisfa.Sink):
-        asked = 0
-
-        def block(self, block: Any, signals: Any, learner: Any) -> None:
-            self._go("block")
-
-        def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-            self._go("event")
-
-        def finish(self) -> None:
-            self._go("finish")
-
-        def _go(self, called: str) -> None:
-            if called == method:
-                self.asked += 1
-                raise ConnectionError("the server went away")
-
-    board = Board()
-    with pytest.warns(RuntimeWarning, match="the sink Board failed .*: the server went away"):
-        run = learn(numbers(), tmp_path / "run", **FEW, sinks=[board])
-    plain = learn(numbers(), **FEW)
-    assert board.asked == 1
-    assert run.result["signals_sha256"] == plain.result["signals_sha256"]
-    (told,) = [event for event in run.events if "Board" in event.text]
-    assert told.level == "WARNING"
 
 
 def test_a_run_gives_what_its_log_holds(tmp_path: Path) -> None:

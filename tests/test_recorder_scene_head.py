@@ -11,7 +11,8 @@ import pytest
 
 from cdmisfa.core.config import LearnerConfig, section_table
 from cdmisfa.core.errors import UsageError
-from cdmisfa.experiments.session import Session, run
+from cdmisfa.experiments.resume import check_run
+from cdmisfa.experiments.session import run
 from recorder.config import RecordConfig
 from recorder.log.scenery import scenery_of, turned, turns_of
 from recorder.recording import record_scene
@@ -109,7 +110,7 @@ def test_a_switch_costs_the_same_frames_live_and_from_the_log(scene, tmp_path):
     assert 3 < switched.sum() < 21
     np.testing.assert_array_equal(lost, COST * switched)
     with contextlib.closing(RecordedSource(recording)) as source:
-        assert Session.check(tmp_path / "log", (str(recording),), start=11).holds
+        assert check_run(tmp_path / "log", (str(recording),), start=11).holds
         for stop in (7, 25):  # stopped, and resumed
             again = run(
                 source,

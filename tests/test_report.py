@@ -18,7 +18,8 @@ import cdmisfa as library
 from cdmisfa.agents.progress import judging
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments import reports
-from cdmisfa.experiments.reports import command_again, write_report
+from cdmisfa.experiments.reports import write_report
+from cdmisfa.experiments.run_folder import command_again
 from replay.report import measurements
 from replay.report.data import RunData
 from replay.report.measurements import attempts, measurements_of

@@ -22,8 +22,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import Keyframes
-from cdmisfa.experiments.resume import SET_ASIDE
-from cdmisfa.experiments.run_folder import RunResult
+from cdmisfa.experiments.run_folder import SET_ASIDE, RunResult
 from cdmisfa.experiments.session import run
 from recorder.config import RecordConfig
 from recorder.mcap.reader import LogReader
@@ -232,13 +231,6 @@ def test_a_changed_run_is_refused_and_left_alone(
     assert contents(out) == before
 
 
-def test_there_must_be_a_run_to_go_on_with(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no run to resume"):
-        go(OscillatorySource(), tmp_path, 10, resume=True)
-    with pytest.raises(UsageError, match="name its folder"):
-        go(OscillatorySource(), None, 10, resume=True)
-
-
 def test_a_source_that_cannot_go_back_is_refused_and_the_run_left_alone(tmp_path: Path) -> None:
     out = tmp_path / "run"
     go(OscillatorySource(), out, 30)
@@ -341,15 +333,6 @@ class TestWithoutItsSource:
         assert ended.json["signals_sha256"] == whole["signals_sha256"]
         more = ("--resume", "-o", tmp_path / "run", limit[0], limit[1] + 1, "--max-iterations", 12)
         assert cdmisfa("learn", *more, "--no-rerun", "--json").json["iterations"] > 9
-
-    def test_after_kill_9_too(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
-        run = tmp_path / "run"
-        cdmisfa("learn", "oscillatory", "-o", run, *self.WORDS[:2], "--max-iterations", 3)
-        (run / "run.json").unlink()
-        (run / "run.mcap").rename(run / "run.mcap.partial")
-        gone_on = cdmisfa("learn", "--resume", "-o", run, "--max-iterations", 5, "--json")
-        assert gone_on.json["iterations"] == 5
-        assert gone_on.json["frames"] == 125
 
     def test_a_run_that_does_not_say(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
         go(OscillatorySource(), tmp_path / "run", 3)

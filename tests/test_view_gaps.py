@@ -54,7 +54,7 @@ def shown(tmp_path_factory):
             name = IMAGE.streams[signals.stream]
             place = (signals.iteration, phi, signals.stream, name)
             modules.append(module_of(len(modules) + 1, *place))
-    writer.finish()
+    writer.close()
     save_modules(folder / "modules.npz", modules)
     build_view(folder, folder / "run.rrd", every=EVERY)
     return folder, records, View(folder / "run.rrd").rows

@@ -61,17 +61,7 @@ def machine() -> dict[str, str]:
         "system": platform.system(),
         "machine": platform.machine(),
         "libc": " ".join(platform.libc_ver()).strip(),
-        "cpu": _cpu(),
     }
-
-
-def _cpu() -> str:
-    """The processor's name, as Linux or Python tells it."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or "unknown"
 
 
 def as_text(document: Mapping[str, Any]) -> str:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.experiments.recompute import Recomputation
-from cdmisfa.experiments.resume import read_command
-from recorder.images.options import OPTIONS, InputOptions
+from cdmisfa.experiments.resume import Recomputation
+from cdmisfa.experiments.run_folder import command_again
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.runs.folders import REPORT_FILE, is_run, run_log, runs_in
 
@@ -84,26 +82,3 @@ def _reproducible(run: Path) -> str:
     if changed:
         return f"no: {', '.join(changed)} changed since"
     return "yes: its source is present and looks unchanged"
-
-
-PLAIN = (("seed", 0),)
-"""Options of a command that say what is so without them."""
-
-
-def command_again(run: Path) -> str:
-    """Return the shell command that starts a run again; "" where run.json does not hold it."""
-    try:
-        words, options = read_command(Path(run))
-    except CdmisfaError:
-        return ""
-    said = InputOptions(**{k: v for k, v in options.items() if k in OPTIONS}).words()
-    for name, value in options.items():
-        if name in OPTIONS or value in (None, False, ()) or (name, value) in PLAIN:
-            continue
-        flag = "--set" if name == "settings" else f"--{name.replace('_', '-')}"
-        if value is True:
-            said.append(flag)
-        else:
-            for one in value if isinstance(value, tuple) else (value,):
-                said += [flag, str(one)]
-    return shlex.join(["cdmisfa", "learn", *words, *said, "-o", "RUN"])

@@ -1,182 +1,107 @@
-"""What a run continues from: its command and its keyframes, or its parent where it is a fork."""
+"""Play a run again up to an iteration: put its learner at a keyframe, and learn on from there.
+
+A run is resumed, forked, inspected at an iteration and checked in this way.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cdmisfa.agents.learners import learner_entry, open_learner
-from cdmisfa.core.blocks import SeekableSource, SourceSpec
+from cdmisfa.core.blocks import SeekableSource, SourceSpec, description, turn_to
 from cdmisfa.core.config import build, parse_settings, section_table
-from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
-from cdmisfa.core.learning import Keyframe, Learner, LearnerState
-from cdmisfa.experiments.sources import configure, open_logs
-from recorder.cameras.words import is_live
-from recorder.config import RecordConfig
-from recorder.images.options import OF_EVERY_SOURCE, InputOptions
-from recorder.images.options import OPTIONS as INPUTS
-from recorder.log.files import found_path, partial_path, relative_path
-from recorder.world.scenes import SCENES, open_scene
-from replay.runs.compare import differences
-from replay.runs.folders import RUN_FILE
-from replay.runs.keyframes import read_keyframe
-from replay.runs.log import RunHeader, read_header
-from replay.runs.provenance import comparable, stated_source
-
-COMMAND = "command"
-"""Key of a manifest: the command that began the run, which may differ when it is resumed."""
-
-OPTIONS = (
-    "seed",
-    "preset",
-    "settings",
-    "algorithm",
-    *("loop", "salvage", "episodes"),
-    *INPUTS,
-    "max_iterations",
-    "max_modules",
+from cdmisfa.core.errors import (
+    LogDamagedError,
+    LogExhaustedError,
+    NotReproducedError,
+    UsageError,
+    one_line,
 )
-"""Options of a command that are kept with its run."""
+from cdmisfa.core.learning import Keyframe, Learner, LearnerState, arithmetic_of
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.run_folder import FORK, open_source_of
+from replay.runs.columns import SignalColumns, columns_of_records
+from replay.runs.compare import Difference, differences, differing, first_differing
+from replay.runs.folders import run_log
+from replay.runs.keyframes import arrays_of, read_keyframe, read_keyframes
+from replay.runs.log import RunHeader, read_columns, read_header
+from replay.runs.provenance import changed_files, stated_source
+from replay.stored import StoredSource
 
-SET_ASIDE = "run.before.mcap.partial"
-"""The log of a run that is being resumed, until the new one holds what is kept of it."""
+SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
+"""Facts that a source must have in common with the one that a run learned from."""
+
+FIXED = ("learner.algorithm", "learner.expansion", "learner.tau")
+"""Keys that a fork must not change: the meaning of the learner's memory depends on them."""
 
 
-def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
-    """The command that begins a run, as JSON values; paths are kept relative to its folder.
+@dataclass(frozen=True, slots=True)
+class ConfigSpan:
+    """The configuration and seed of a run's learner from an iteration on; each fork adds one.
 
-    Of the options of the command those in `OPTIONS` are kept.
+    Attributes:
+        changed: values before and now, by key, where they differ from the span before.
     """
-    kept = {name: options[name] for name in OPTIONS if name in options}
-    preset = kept.get("preset")
-    if preset is not None and preset.endswith(".toml"):
-        kept["preset"] = relative_path(preset, run)
-    names = [word for word in source if word in SCENES or is_live(word)]
-    words = [word if word in names else relative_path(word, run) for word in source]
-    return {"source": words, **kept}
+
+    start: int
+    config: Any
+    seed: int
+    changed: Mapping[str, Sequence[Any]]
 
 
-def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """The command that began a run: its source and its options.
-
-    Raises:
-        UsageError: there is no run, or it does not say.
-        LogDamagedError: its log cannot be read.
-    """
-    log = log_to_resume(run)
-    kept = read_header(log).manifest.get(COMMAND)
-    if not isinstance(kept, Mapping) or not isinstance(kept.get("source"), list):
-        raise UsageError(f"{run} does not say what it learns from: name its source")
-    source = [str(word) for word in kept["source"]]
-    options = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in kept.items()
-        if name in OPTIONS
-    }
-    preset = options.get("preset")
-    if preset is not None and str(preset).endswith(".toml"):
-        options["preset"] = found_path(str(preset), run)
-    return tuple(found_path(word, run) for word in source), options
-
-
-def command_of_fork(
-    parent: Path, source: Sequence[str], sections: Mapping[str, Any], settings: Sequence[str]
-) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """The command of a fork: that of its parent, with the settings of both."""
+def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, ...]:
+    """Return the configurations of a run, in order."""
     try:
-        words, options = read_command(parent)
-    except UsageError:
-        words, options = (), {}
-    world = sections.get("scene", {}).get("seed")
-    kept = () if world is None else (f"scene.seed={world}",)  # the world keeps the parent's seed
-    options["settings"] = (*options.get("settings", ()), *kept, *settings)
-    return tuple(source) or words, options
+        table, seed, fork = manifest["config"]["learner"], manifest["seed"], manifest.get(FORK)
+        config = build(learner_entry(table["algorithm"]).configuration, "learner", table)
+        if fork is None:
+            return (ConfigSpan(0, config, seed, {}),)
+        span = ConfigSpan(int(fork["at"]), config, seed, dict(fork["changed"]))
+        return (*config_history(log, fork["before"]), span)
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
+        raise LogDamagedError(f"{log} does not state how its learner was configured") from error
 
 
-def log_to_resume(run: Path) -> Path:
-    """The log of a run that was stopped, wherever it is.
+def fork_span(
+    learner: Learner, manifest: Mapping[str, Any], settings: Sequence[str], seed: int | None
+) -> ConfigSpan:
+    """Return the configuration of a fork.
 
-    Raises:
-        UsageError: there is none.
-    """
-    finished = run / RUN_FILE
-    for found in (run / SET_ASIDE, partial_path(finished), finished):
-        if found.is_file():
-            return found
-    raise UsageError(
-        f"{run} holds no {RUN_FILE}: there is no run to resume, begin one there with --force"
-    )
-
-
-def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
-    """Open what a run learned from: as it says, or what other words name.
+    Args:
+        learner: the parent's learner where the fork leaves it.
+        manifest: what the parent's log states.
+        settings: `learner.key=value` words, but for the keys in `FIXED`.
+        seed: the seed of the random choices from there on; None for the parent's.
 
     Raises:
-        UsageError: it does not say, or there is no such source.
+        UsageError: a setting cannot change.
     """
-    named, begun = tuple[str, ...](), dict[str, Any]()
-    try:
-        named, begun = read_command(run)
-    except UsageError:
-        if not words:
-            raise
-    as_begun = not words or words[0] in SCENES or bool(begun.get("episodes"))
-    words = tuple(words) or named
-    if is_live(words[0]):
-        raise UsageError(f"{words[0]} was live: name what learn --record wrote of it")
-    recorded = False
-    if not as_begun:
-        from replay.corpus.finding import may_be_corpus  # not needed to begin a run
-        from replay.inputs import is_recording
-
-        recorded = not may_be_corpus(words) and is_recording(words)
-    told = read_header(log_to_resume(run)).manifest.get("config", {})
-    if words[0] not in SCENES:
-        keys = told.get("input", {})
-        kept = {name: begun[name] for name in INPUTS if name in begun}
-        if recorded:
-            kept, keys = {}, {name: keys[name] for name in OF_EVERY_SOURCE if name in keys}
-        how: dict[str, Any] = {n: bool(begun.get(n)) for n in ("loop", "salvage", "episodes")}
-        return open_logs(words, inputs=InputOptions(**kept).configured(keys), **how)
-    if told.get("scene", {}).get("kind") != words[0]:
-        return configure(words[0], seed=begun.get("seed", 0)).open_scene()
-    scene = build(SCENES[words[0]].config, "scene", told["scene"])
-    return open_scene(words[0], scene, build(RecordConfig, "record", told.get("record", {})))
-
-
-FORK = "fork"
-"""Key of a manifest: from which run and iteration a fork continues, and its settings before."""
-
-KEPT = ("algorithm", "expansion", "tau")
-"""Keys of a learner on which what it learned depends, whatever the shapes of its memory."""
-
-
-def header_to_resume(run: Path) -> tuple[Path, RunHeader | None]:
-    """The log of a run that was stopped, and its header; None where it was killed before that.
-
-    Raises:
-        UsageError: there is no run, or it is of another version of the signals.
-        LogDamagedError: the log cannot be read.
-    """
-    log = log_to_resume(run)
-    try:
-        return log, read_header(log)
-    except (LogDamagedError, UsageError):
-        if log != partial_path(run / RUN_FILE):
-            raise
-        return log, None
+    table, words = manifest["config"]["learner"], parse_settings(settings)
+    kind = learner_entry(table["algorithm"]).configuration
+    config = build(kind, "learner", table, words.get("learner", {}))
+    before = section_table(build(kind, "learner", table))
+    found = differences(before, section_table(config))
+    changed = {f"learner.{key}": [then, now] for key, then, now in found}
+    fixed = [f"{section}.*" for section in words if section != "learner"]
+    if fixed := [*fixed, *(key for key in FIXED if key in changed)]:
+        raise UsageError(
+            f"{fixed[0]} stays as in the parent: a fork changes other keys learner.* alone"
+        )
+    if seed is not None and seed != manifest["seed"]:
+        changed["seed"] = [manifest["seed"], seed]
+    seed = int(manifest["seed"] if seed is None else seed)
+    return ConfigSpan(learner.iteration, config, seed, changed)
 
 
 def restore(learner: Learner, keyframe: Keyframe, spec: SourceSpec) -> None:
-    """Put a learner into the state of a keyframe, for a source of this spec.
-
-    Raises:
-        LogDamagedError: the keyframe is of another configuration.
-    """
+    """Put a learner into the state of a keyframe, for a source of this spec."""
     try:
         modules = (replace(m, frame_shape=spec.frame_shape) for m in keyframe.state.modules)
         learner.restore(replace(keyframe.state, modules=tuple(modules)))
@@ -185,158 +110,289 @@ def restore(learner: Learner, keyframe: Keyframe, spec: SourceSpec) -> None:
         raise LogDamagedError(f"{what} ({one_line(error)})") from error
 
 
-def restore_from(
-    log: Path, learner: Learner, source: Any, forked_at: int | None
-) -> Keyframe | None:
-    """Put learner and source to the newest keyframe of a log that can be read.
-
-    Args:
-        log: of the run that is to be resumed.
-        learner: of its configuration.
-        source: what it learns from.
-        forked_at: the iteration where a fork leaves its parent's log; None where it is no fork.
-
-    Returns:
-        The keyframe; None where the log has none, and the run begins anew.
-
-    Raises:
-        UsageError: a fork was cut before the iteration where it begins.
-    """
-    keyframe = read_keyframe(log)
-    if forked_at is not None and (keyframe is None or keyframe.iteration < forked_at):
-        raise UsageError(f"{log.parent} was cut before its fork: fork again with --force")
-    if keyframe is None:
-        return None
-    restore(learner, keyframe, source.spec)
-    source.seek(keyframe.t)
-    return keyframe
-
-
-def refuse_difference(
-    log: Path, header: RunHeader, spec: SourceSpec, manifest: Mapping[str, Any]
-) -> None:
-    """Refuse to resume with another configuration, seed or source, naming the first difference.
-
-    Raises:
-        UsageError: there is one.
-    """
-    source_then, source_now = comparable(stated_source(log), _json(manifest["source"]))
-    before = {
-        **header.manifest,
-        "source": source_then,
-        "spec": dataclasses.asdict(header.spec),
-        COMMAND: None,
-    }
-    now = {
-        **manifest,
-        "source": source_now,
-        "spec": dataclasses.asdict(spec),
-        COMMAND: None,
-    }
-    found = differences(_json(before), _json(now))
-    # another learner first: other keys and another arithmetic come of it
-    for key, old, new in sorted(found, key=lambda one: one[0] != "config.learner.algorithm"):
-        raise UsageError(
-            f"{log.parent} was made with {key.removeprefix('config.')} = {old}, not {new}: resume "
-            "with what it was made with, or choose another folder"
-        )
-
-
-def _json(value: Any) -> Any:
-    return json.loads(json.dumps(value))
-
-
-@dataclass(frozen=True, slots=True)
-class ConfigSpan:
-    """The configuration and seed of a run's learner from an iteration on; a fork begins one."""
-
-    start: int
-    config: Any
-    seed: int
-    reseeded: bool
-
-
-def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, ...]:
-    """The configurations of a run, in order.
-
-    Raises:
-        LogDamagedError: its manifest does not state them.
-    """
-    try:
-        table, seed, fork = manifest["config"]["learner"], manifest["seed"], manifest.get(FORK)
-        config = build(learner_entry(table["algorithm"]).configuration, "learner", table)
-        if fork is None:
-            return (ConfigSpan(0, config, seed, reseeded=False),)
-        before = config_history(log, fork["before"])
-        reseeded = seed != before[-1].seed
-        return (*before, ConfigSpan(int(fork["at"]), config, seed, reseeded))
-    except (LookupError, TypeError, ValueError, RecursionError) as error:
-        raise LogDamagedError(f"{log} does not say how its learner was configured") from error
-
-
 def reconfigured(learner: Learner, span: ConfigSpan, spec: SourceSpec) -> Learner:
-    """A learner in the state of another one, with another configuration.
-
-    Raises:
-        ValueError: what was learned does not fit the configuration.
-    """
+    """Return a learner in the state of another one; ValueError if a configuration does not fit."""
     new, state = open_learner(span.config, spec, span.seed), learner.state
-    policy_rng = new.state.policy_rng if span.reseeded else state.policy_rng
+    policy_rng = new.state.policy_rng if "seed" in span.changed else state.policy_rng
     new.restore(LearnerState(state.arrays, state.modules, policy_rng))
     return new
 
 
-def continued(
-    parent: RunHeader, learner: Learner, settings: Sequence[str], seed: int | None
-) -> tuple[ConfigSpan, LearnerState]:
-    """The configuration of a fork, and its learner's state where it begins.
+class Recomputation:
+    """A run's learner at the newest keyframe at or before an iteration, to learn on from there.
 
     Args:
-        parent: the header of the run that it goes on from.
-        learner: that run's, where it goes on.
-        settings: what is set anew, as of --set.
-        seed: of the random choices from there on; None the parent's.
+        run: the run's folder, or its log.
+        iteration: iterations done.
+        source: words that name its source, where the run does not state it, or the open source.
+
+    Attributes:
+        log: the run's log.
+        header: the header of the log.
+        learner: the learner after `learner.iteration` iterations.
+        t: the source's next frame.
 
     Raises:
-        UsageError: a setting cannot change.
+        UsageError: there is no such run, or it was learned with another arithmetic.
+        LogDamagedError: it cannot be read.
     """
-    manifest = parent.manifest
-    before = int(manifest["seed"])
-    config = _config_of_fork(manifest["config"]["learner"], settings)
-    seed = before if seed is None else seed
-    span = ConfigSpan(learner.iteration, config, seed, reseeded=seed != before)
-    try:
-        return span, reconfigured(learner, span, parent.spec).state
-    except (ValueError, UsageError) as error:
-        raise UsageError(
-            f"{' '.join(settings)}: what was learned does not fit it ({error}): fork with keys "
-            "that keep its shape"
-        ) from error
 
-
-def changes(manifest: Mapping[str, Any], span: ConfigSpan) -> dict[str, list[Any]]:
-    """What a fork changes of the configuration of its parent: values before and now, by key."""
-    each = differences(manifest["config"]["learner"], section_table(span.config))
-    changed = {f"learner.{key}": [before, now] for key, before, now in each}
-    if span.reseeded:
-        changed["seed"] = [int(manifest["seed"]), span.seed]
-    return changed
-
-
-def _config_of_fork(before: Mapping[str, Any], settings: Sequence[str]) -> Any:
-    """The configuration of a fork's learner."""
-    words = parse_settings(settings)
-    other = next((section for section in words if section != "learner"), None)
-    if other is not None:
-        raise UsageError(f"{other}.* is the parent's and stays: a fork changes learner.* alone")
-    kind = learner_entry(before["algorithm"]).configuration
-    config = build(kind, "learner", before, words.get("learner", {}))
-    for key, old, new in differences(
-        section_table(build(kind, "learner", before)), section_table(config)
-    ):
-        if key in KEPT:
+    def __init__(
+        self, run: Path, iteration: int, source: Sequence[str] | SeekableSource = ()
+    ) -> None:
+        self.log = run_log(Path(run))
+        self.header: RunHeader = read_header(self.log)
+        self._given = source
+        self._source: SeekableSource | None = None
+        spans = config_history(self.log, self.header.manifest)
+        keyframe = read_keyframe(self.log, iteration)
+        at = keyframe.iteration if keyframe else 0
+        span = [span for span in spans if span.start <= at][-1]
+        self._later = [span for span in spans if span.start > at]
+        self.learner: Learner = open_learner(span.config, self.header.spec, span.seed)
+        then, now = self.header.arithmetic, arithmetic_of(self.learner)
+        if then != now:
             raise UsageError(
-                f"learner.{key} is {old} and stays: what was learned depends on it, so {new} is "
-                "for a run of its own"
+                f"{self.log} was learned with arithmetic {then}, and this cdmisfa computes with "
+                f"{now}: learn it again"
             )
-    return config
+        self.t = 0
+        if keyframe is not None:
+            restore(self.learner, keyframe, self.header.spec)
+            self.t = keyframe.t
+
+    @classmethod
+    def after(cls, run: Path, iterations: int, source: Sequence[str] | SeekableSource = ()) -> Self:
+        """Play a run again up to an iteration; the learner is the same bit for bit.
+
+        The signals that are computed on the way are compared with the log. The caller closes it.
+
+        Args:
+            run: its folder, or its log.
+            iterations: iterations done; 0 is the beginning.
+            source: see the class.
+
+        Raises:
+            UsageError: there is no such run or iteration, or a source is needed and missing.
+            LogDamagedError: the log cannot be read.
+            NotReproducedError: the signals differ from those of the log.
+        """
+        again = cls(Path(run), iterations, source)
+        with contextlib.ExitStack() as failing:
+            failing.enter_context(again)
+            at, difference = again.compare(iterations)
+            if difference is not None:
+                raise NotReproducedError(
+                    f"{again.log}: learned again, {difference}: name its own source with --source"
+                )
+            if at != iterations:
+                raise UsageError(f"{again.log} holds {at} iterations: name one of 0 to {at}")
+            failing.pop_all()
+        return again
+
+    @property
+    def source(self) -> SeekableSource:
+        """What the run learned from, at frame `t`; opened when it is first needed."""
+        if self._source is None:
+            self._source = self._open()
+            self._source.seek(self.t)
+        return self._source
+
+    def _open(self) -> SeekableSource:
+        given = self._given
+        if isinstance(given, SeekableSource):
+            source = given
+        else:
+            try:
+                source = open_source_of(self.log.parent, given)
+            except UsageError as error:
+                raise UsageError(
+                    f"{error} (after {self.learner.iteration} iterations, which the log holds, the "
+                    "source is needed: name it with --source)"
+                ) from error
+        now, then = source.spec, self.header.spec
+        if any(getattr(now, name) != getattr(then, name) for name in SAME):
+            source.close()
+            raise UsageError(
+                f"the source shows other streams than {self.log} was learned from: name its own "
+                "with --source"
+            )
+        held_out = self.header.manifest["source"].get("held_out", 0)
+        if held_out and isinstance(source, StoredSource):
+            source.hold_out(held_out)
+        return source
+
+    def steps(self, count: int) -> Iterator[BlockSignals]:
+        """Learn this many blocks again."""
+        for _ in range(count):
+            block = self.source.take(self.learner.stream, self.learner.tau)
+            signals = self.learner.step(block)
+            turn_to(self.source, block.stream, self.learner.stream)
+            self.t = self.source.t
+            if self._later and self._later[0].start == self.learner.iteration:
+                try:
+                    span = self._later.pop(0)
+                    self.learner = reconfigured(self.learner, span, self.header.spec)
+                except ValueError as error:
+                    raise LogDamagedError(f"{self.log}: its fork cannot be ({error})") from error
+            yield signals
+
+    def compare(
+        self, stop: int | None, keyframes: Iterable[Keyframe] = ()
+    ) -> tuple[int, Difference | None]:
+        """Learn up to an iteration, or to the log's end, and compare with the log.
+
+        Args:
+            stop: the iteration; None for the end of the log.
+            keyframes: keyframes of the log that are compared, too.
+
+        Returns:
+            The iteration that was reached, and the first difference.
+        """
+        left = iter(keyframes)
+        at, keyframe = self.learner.iteration, next(left, None)
+        for logged in self._logged(stop):
+            records: list[BlockSignals] = []
+            other: Difference | None = None
+            with contextlib.suppress(LogExhaustedError):
+                for signals in self.steps(len(logged)):
+                    records.append(signals)
+                    if keyframe is not None and keyframe.iteration == self.learner.iteration:
+                        other = other or self._difference_from(keyframe)
+                        keyframe = next(left, None)
+            found = first_differing(iter([logged]), columns_of_records(records), at)
+            at += len(logged)
+            if both := [difference for difference in (found, other) if difference is not None]:
+                return at, min(both, key=lambda difference: difference.iteration)
+        return at, None
+
+    def _logged(self, stop: int | None) -> Iterator[SignalColumns]:
+        """Yield the records of the log from the learner's iteration on, up to another one."""
+        at = self.learner.iteration
+        if at == stop:
+            return
+        for columns in read_columns(self.log, self.header, start=self.t):
+            count = len(columns) if stop is None else min(len(columns), stop - at)
+            if count <= 0:
+                return
+            if int(columns.iterations[0]) != at:
+                raise LogDamagedError(f"{self.log}: iteration {at} is missing, see cdmisfa verify")
+            yield columns.rows(0, count)
+            at += count
+
+    def _difference_from(self, keyframe: Keyframe) -> Difference | None:
+        """Return where a keyframe differs from the learner after as many iterations."""
+        last, state = keyframe.iteration - 1, self.learner.state
+        stored, computed = arrays_of(keyframe.state), arrays_of(state)
+        if stored.keys() != computed.keys():
+            return Difference(last, "keyframe", (), ", ".join(stored), ", ".join(computed))
+        for name, array in stored.items():
+            if (found := _first_element(array, computed[name])) is not None:
+                return Difference(last, f"keyframe {name}", *found)
+        for name, one, two in (
+            ("t", keyframe.t, self.t),
+            ("policy_rng", dict(keyframe.state.policy_rng), dict(state.policy_rng)),
+        ):
+            if one != two:
+                return Difference(last, f"keyframe {name}", (), repr(one), repr(two))
+        return None
+
+    def other_files(self) -> list[str]:
+        """Return the names of files of the source that changed since the run learned from them.
+
+        None are named of a given source, and of one that was not needed.
+        """
+        if self._source is None or self._given:
+            return []
+        return changed_files(stated_source(self.log), description(self._source, at_once=True))
+
+    def close(self) -> None:
+        """Close the source."""
+        if self._source is not None:
+            self._source.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _first_element(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], str, str] | None:
+    """Return place and values of the first element in which two arrays differ."""
+    if (a.dtype, a.shape) != (b.dtype, b.shape):
+        return (), f"{a.dtype} of shape {a.shape}", f"{b.dtype} of shape {b.shape}"
+    if a.tobytes() == b.tobytes():
+        return None
+    if a.dtype.names:
+        fields = (_first_element(a[name], b[name]) for name in a.dtype.names)
+        return next((found for found in fields if found is not None), None)
+    differ = np.argwhere(differing(a, b))
+    if not len(differ):
+        return None
+    place = tuple(differ[0].tolist())
+    return place, repr(a[place].item()), repr(b[place].item())
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """Result of computing the iterations [start, stop) of a run again.
+
+    `difference` is the first one of the log from the computed signals, `other_files` names files
+    that changed since the run learned from them.
+    """
+
+    start: int
+    stop: int
+    difference: Difference | None
+    other_files: tuple[str, ...] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Whether the signals and the files are the same."""
+        return self.difference is None and not self.other_files
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the result as JSON values."""
+        difference = self.difference
+        return {
+            "from": self.start,
+            "to": self.stop,
+            "identical": difference is None,
+            "first_difference": None if difference is None else difference.as_json(),
+            "other_files": list(self.other_files),
+        }
+
+    def __str__(self) -> str:
+        files = ", ".join(self.other_files)
+        other = f"{files}: no longer what the run learned from" if files else ""
+        if self.difference is None:
+            what = f"iterations {self.start} to {self.stop - 1}"
+            same = f"{what}: learned again, they are identical, bit for bit"
+            return f"{same}; but {other}" if other else same
+        return f"{self.difference} when learned again{other and f': {other}'}"
+
+
+def check_run(
+    run: Path, source: Sequence[str] = (), start: int = 0, stop: int | None = None
+) -> Checked:
+    """Compute the iterations [start, stop) of a run again, and compare signals and keyframes.
+
+    Args:
+        run: its folder, or its log.
+        source: see `Recomputation`.
+        start: learning begins at the newest keyframe at or before this iteration.
+        stop: by default where the log ends.
+
+    Raises:
+        UsageError: there is no such run, source or part.
+        LogDamagedError: the log cannot be read.
+    """
+    with Recomputation(run, start, source) as again:
+        first = again.learner.iteration
+        at, difference = again.compare(stop, read_keyframes(again.log, first))
+        others = tuple(again.other_files())
+    empty = at <= start and bool(at or stop)
+    if difference is None and (empty or at != (stop or at)):
+        raise UsageError(f"{again.log} holds {at} iterations: choose a part FIRST:END of these")
+    return Checked(first, at, difference, others)

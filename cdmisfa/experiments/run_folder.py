@@ -1,50 +1,181 @@
-"""The folder of a run: its log, opened and held, and what is written when it ends."""
+"""The folder of a run: the command that started it, its log, and the files written at its end."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
-from cdmisfa.core.errors import LogWriteError, UsageError
-from cdmisfa.core.learning import ARITHMETIC, Learner, Sink
-from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
+from cdmisfa.core.blocks import FrameSource, SeekableSource
+from cdmisfa.core.config import build
+from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
+from cdmisfa.core.learning import ARITHMETIC
+from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.documents import machine, write_json
-from cdmisfa.experiments.resume import COMMAND, FORK, SET_ASIDE
+from cdmisfa.experiments.sources import open_logs
 from cdmisfa.modules import Module
+from recorder.cameras.words import is_live
+from recorder.config import RecordConfig
 from recorder.images.framing import Recipe
+from recorder.images.options import OF_EVERY_SOURCE, InputOptions
+from recorder.images.options import OPTIONS as INPUTS
 from recorder.log.files import (
+    found_path,
     held,
     logs_in,
     make_folder,
     partial_path,
     refuse_existing,
     refuse_special,
+    relative_path,
 )
+from recorder.world.scenes import SCENES, open_scene
 from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, REPORT_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
+from replay.runs.log import read_header
 from replay.runs.modules import save_modules
 from replay.runs.provenance import final_record
 from replay.runs.writer import RunWriter
 from replay.storage.identity import LoggedSource
 
+COMMAND = "command"
+"""Key of a manifest: the command that started the run, which may differ when it is resumed."""
+
+FORK = "fork"
+"""Key of a manifest: the run and iteration that a fork continues, and its settings before."""
+
+OPENING = ("loop", "salvage", "episodes")
+"""Options of a command that decide how logs are opened."""
+
+OPTIONS = (
+    *("seed", "preset", "settings", "algorithm"),
+    *OPENING,
+    *INPUTS,
+    *("max_iterations", "max_modules"),
+)
+"""Options of a command that are stored with its run."""
+
+SET_ASIDE = "run.before.mcap.partial"
+"""The earlier log of a run that is being resumed, until the new one holds its iterations."""
+
+
+def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
+    """Return the command that starts a run as JSON values, with paths relative to its folder.
+
+    Of the options of the command, those in `OPTIONS` are stored.
+    """
+    stored = {name: options[name] for name in OPTIONS if name in options}
+    if str(stored.get("preset")).endswith(".toml"):
+        stored["preset"] = relative_path(stored["preset"], run)
+    names = [word for word in source if word in SCENES or is_live(word)]
+    words = [word if word in names else relative_path(word, run) for word in source]
+    return {"source": words, **stored}
+
+
+def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return the command that started a run: the words of its source, and its options.
+
+    Raises:
+        UsageError: there is no run, or it does not state its command.
+        LogDamagedError: its log cannot be read.
+    """
+    command = read_header(log_to_resume(run)).manifest.get(COMMAND)
+    if not isinstance(command, Mapping) or not isinstance(command.get("source"), list):
+        raise UsageError(f"{run} does not state what it learned from: name its source")
+    options = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in command.items()
+        if name in OPTIONS
+    }
+    if str(options.get("preset")).endswith(".toml"):
+        options["preset"] = found_path(str(options["preset"]), run)
+    return tuple(found_path(str(word), run) for word in command["source"]), options
+
+
+def command_again(run: Path) -> str:
+    """Return the shell command that starts a run again; "" where the run does not state it."""
+    try:
+        source, options = read_command(run)
+    except CdmisfaError:
+        return ""
+    inputs = {name: options.pop(name) for name in INPUTS if name in options}
+    words = InputOptions(**inputs).words()
+    for name, value in options.items():
+        flag = "--set" if name == "settings" else f"--{name.replace('_', '-')}"
+        if value is True:
+            words.append(flag)
+        elif value and not isinstance(value, bool):
+            for word in value if isinstance(value, tuple) else (value,):
+                words += [flag, str(word)]
+    return shlex.join(["cdmisfa", "learn", *source, *words, "-o", "RUN"])
+
+
+def log_to_resume(run: Path) -> Path:
+    """Return the log of a run, finished or not.
+
+    Raises:
+        UsageError: there is none.
+    """
+    finished = run / RUN_FILE
+    for log in (run / SET_ASIDE, partial_path(finished), finished):
+        if log.is_file():
+            return log
+    raise UsageError(f"{run} holds no {RUN_FILE}: there is no run to resume, start it with --force")
+
+
+def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
+    """Open what a run learned from, as its command states, or what other words name.
+
+    Raises:
+        UsageError: the run does not state its source, or there is no such source.
+    """
+    named, options = tuple[str, ...](), dict[str, Any]()
+    try:
+        named, options = read_command(run)
+    except UsageError:
+        if not words:
+            raise
+    config = read_header(log_to_resume(run)).manifest.get("config", {})
+    first, *_ = words = tuple(words) or named
+    if first in SCENES:
+        scene = config.get("scene", {})
+        if scene.get("kind") != first:
+            raise UsageError(f"{run} did not learn from the scene {first}: name its own source")
+        record = build(RecordConfig, "record", config.get("record", {}))
+        return open_scene(first, build(SCENES[first].config, "scene", scene), record)
+    keys = config.get("input", {})
+    chosen = {name: options[name] for name in INPUTS if name in options}
+    if words != named and not options.get("episodes") and _are_recording(words):
+        chosen, keys = {}, {name: keys[name] for name in OF_EVERY_SOURCE if name in keys}
+    inputs = InputOptions(**chosen).configured(keys)
+    opening: Any = {name: bool(options.get(name)) for name in OPENING}
+    return open_logs(words, inputs=inputs, **opening)
+
+
+def _are_recording(words: Sequence[str]) -> bool:
+    """Return whether words name a recording, whose frames were made when it was recorded."""
+    from replay.corpus.finding import may_be_corpus  # loads pyarrow, which no scene needs
+    from replay.inputs import is_recording
+
+    return not may_be_corpus(words) and is_recording(words)
+
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """What a run came to; `as_json` is the command line's contract.
+    """The result of a run; `as_json` is the command line's contract.
 
     Attributes:
-        run: its folder, if it has one.
-        source: what it learned from, described.
-        modules: what was learned, in order.
-        summary: what else the learner says of itself.
-        held_out: how slow it is on frames that were held out; see `judged`.
-        ended: why, a key of `ENDINGS`.
-        undecided: streams of which the learner had not come to a result when it ended.
+        run: the run's folder, if it has one.
+        source: the description of its source.
+        modules: the learned modules, in order.
+        summary: further results of the learner.
+        held_out: the slowness of the modules on frames that were held out; see `judged`.
+        ended: why the run ended, a key of `ENDINGS`.
+        undecided: streams that were still being learned when the run ended.
     """
 
     run: str | None
@@ -61,7 +192,7 @@ class RunResult:
     undecided: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """The result as `learn --json` prints it."""
+        """Return the result as `learn --json` prints it."""
         return {
             "schema": 1,
             "run": self.run,
@@ -78,16 +209,8 @@ class RunResult:
         }
 
 
-def undecided(learner: Learner, source: FrameSource, summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """The streams that are still being learned, or, where a learner says none, without a module."""
-    if "streams" in summary:
-        return tuple(one["stream"] for one in summary["streams"] if one["state"] == "learning")
-    learned = {module.stream_index for module in learner.modules}
-    return tuple(name for s, name in enumerate(source.spec.streams) if s not in learned)
-
-
 def module_table(module: Module) -> dict[str, Any]:
-    """What a result says about a module, as JSON values."""
+    """Return the facts of a module that results state, as JSON values."""
     return {
         "index": module.index,
         "stream": module.stream,
@@ -100,54 +223,29 @@ def module_table(module: Module) -> dict[str, Any]:
     }
 
 
-def in_words(changed: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Values before and now, by name, in words."""
-    return [f"{name} is {now}, was {before}" for name, (before, now) in changed.items()]
-
-
 def with_recipes(
     modules: Iterable[Module], source: FrameSource, described: Mapping[str, Any]
 ) -> tuple[Module, ...]:
-    """Modules with what becomes of a raw picture of their streams.
+    """Return modules with the recipe by which raw images of their streams become frames.
 
     Args:
-        modules: what was learned.
-        source: from what; of a recording that is what was recorded.
-        described: what it says of itself.
+        modules: the learned modules.
+        source: what they were learned from; of a recording, the recipe is that of its source.
+        described: the description of the source.
     """
     if isinstance(source, RecordedSource):
         described = source.origin()
 
     def recipe(stream: int) -> Recipe:
-        own = Recipe.of(described, source.spec.frame_shape, stream)
-        frames = () if "size" in described else own.size  # else they are the pictures
+        made = Recipe.of(described, source.spec.frame_shape, stream)
+        frames = () if "size" in described else made.size  # else the raw images are frames
         framings = getattr(source, "framings", [None] * len(source.spec.streams))
-        own = replace(own, raw=getattr(framings[stream], "first", frames) or ())
-        own = replace(own, centre=getattr(source, "centre", "run"))
+        made = replace(made, raw=getattr(framings[stream], "first", frames) or ())
+        made = replace(made, centre=getattr(source, "centre", "run"))
         stated = source.pixels(stream) if isinstance(source, LoggedSource) else ""
-        return replace(own, pixels=stated) if stated.startswith("bayer_") else own
+        return replace(made, pixels=stated) if stated.startswith("bayer_") else made
 
     return tuple(replace(module, recipe=recipe(module.stream_index)) for module in modules)
-
-
-class OpenLog(Sink):
-    """A run's log that stays open when learning ends, for what is written after it."""
-
-    def __init__(self, log: RunWriter, learner: Learner) -> None:
-        self._log, self._learner = log, learner
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """See `Sink`."""
-        self._log.block(block, signals, learner)
-
-    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-        """See `Sink`."""
-        self._log.event(t, iteration, text, level)
-
-    def finish(self) -> None:
-        """Write the last weights, and hand over what was written."""
-        self._log.weights(self._learner)
-        self._log.flush()
 
 
 @contextlib.contextmanager
@@ -161,27 +259,28 @@ def opened_log(
     aside: Path | None,
     view: bool,
 ) -> Iterator[RunWriter]:
-    """The log of a run, to be finished inside, while its folder is held.
+    """Open the log of a run, which is to be finished in the context, and lock its folder.
 
-    On failure it is left as a readable prefix; an interrupt then says what is missing.
+    On failure the log is left as a readable prefix; the message of an interrupt then says what is
+    missing.
 
     Args:
-        folder: of the run.
+        folder: the run's folder.
         source: what it learns from.
         manifest: see `RunWriter`.
-        force: replace what is in the folder.
+        force: replace the contents of the folder.
         resumed: whether the run is resumed.
-        aside: its log of before, where it holds anything; set aside under `SET_ASIDE`.
+        aside: its earlier log, where it holds anything, which is moved to `SET_ASIDE`.
         view: whether the run will have a view.
 
     Raises:
-        UsageError: the folder is not empty, in use or of no run.
+        UsageError: the folder is not empty, in use or holds a recording.
         LogWriteError: the log cannot be written.
     """
     if not resumed:
-        goes_on = FORK not in manifest and isinstance(source, SeekableSource)
-        refuse_existing(folder, force=force, goes_on=goes_on)
-        with _telling(folder):
+        resumable = FORK not in manifest and isinstance(source, SeekableSource)
+        refuse_existing(folder, force=force, goes_on=resumable)
+        with _writing(folder):
             make_folder(folder)
     with held(folder):
         finished = folder / RUN_FILE
@@ -189,31 +288,27 @@ def opened_log(
         if others := [path for path in logs_in(folder) if path not in logs]:
             raise UsageError(f"{others[0]} is of no run: choose another folder")
         stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE, REPORT_FILE)]
-        if aside is not None:
-            try:
-                os.replace(aside, logs[0])
-            except OSError as error:
-                raise LogWriteError(f"{aside} cannot be set aside: {error.strerror}") from error
-        elif not resumed:  # the log first: of what is left by a kill nothing then looks like a run
+        if not resumed:  # the logs first, so that a kill leaves nothing that looks like a run
             stale = [*logs, *stale]
-        with _telling(folder):
+        with _writing(folder):
             refuse_special(*stale)
+            if aside is not None:
+                os.replace(aside, logs[0])
             for path in stale:
                 path.unlink(missing_ok=True)
-        force = force or resumed
-        log = RunWriter(finished, source.spec, manifest, force=force)
+        log = RunWriter(finished, source.spec, manifest, force=force or resumed)
         try:
             yield log
         except BaseException as error:
-            left = _left_undone(folder, source, view=view)
+            missing = _missing_part(folder, source, view=view)
             log.abandon()
             if isinstance(error, KeyboardInterrupt):
-                raise KeyboardInterrupt(left) from None
+                raise KeyboardInterrupt(missing) from None
             raise
 
 
-def _left_undone(run: Path, source: FrameSource, *, view: bool) -> str:
-    """What an interrupt leaves of a run, and how to go on."""
+def _missing_part(run: Path, source: FrameSource, *, view: bool) -> str:
+    """Return which part of a run an interrupt left out, and how to make it."""
     from replay.integrity.verify import view_again
 
     if (run / RUN_FILE).is_file():
@@ -230,14 +325,13 @@ def write_results(
     """Write modules and run.json, close the log with its final record, and build the view.
 
     Args:
-        log: of the run, with all its blocks and events.
-        result: what it came to.
+        log: the run's log, with all its blocks and events.
+        result: the run's result.
         manifest: what the log states at its beginning, and `versions`.
         view: whether to build one.
     """
     folder = log.path.parent
     save_modules(folder / MODULES_FILE, result.modules)
-    known = (COMMAND, FORK, ARITHMETIC, "versions")
     document = {
         "schema": 1,
         "signals_schema": SCHEMA_VERSION,
@@ -247,10 +341,12 @@ def write_results(
         "streams": list(result.streams),
         "platform": machine(),
         "result": result.as_json(),
-        **{key: manifest[key] for key in known if key in manifest},
     }
+    for key in (COMMAND, FORK, ARITHMETIC, "versions"):
+        if key in manifest:
+            document[key] = manifest[key]
     write_json(folder / RUN_JSON, document)
-    log.finish(final_record(folder, document, result.signals_sha256, view=view))
+    log.close(final_record(folder, document, result.signals_sha256, view=view))
     if view:
         from replay.view.build import build_view
 
@@ -258,9 +354,8 @@ def write_results(
 
 
 @contextlib.contextmanager
-def _telling(folder: Path) -> Iterator[None]:
+def _writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = error.strerror or error
-        raise UsageError(f"{folder} cannot be a run's folder ({reason}): choose another") from error
+        raise LogWriteError(f"{folder} cannot be written: {error.strerror or error}") from error

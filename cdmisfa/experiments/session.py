@@ -1,4 +1,4 @@
-"""A run: a source, a learner, and the folder that keeps what happened.
+"""A run: a source, a learner, and the folder that stores what happened.
 
 RUN/run.mcap signals, RUN/modules.npz frozen modules, RUN/run.json manifest and result,
 RUN/run.rrd the view. The loop itself is in `loop`, the folder in `run_folder`.
@@ -7,6 +7,8 @@ RUN/run.rrd the view. The loop itself is in `loop`, the folder in `run_folder`.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -16,57 +18,51 @@ from typing import Any, Self
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
-from cdmisfa.core.errors import LogWriteError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.holdout import judged
-from cdmisfa.experiments.loop import INTERRUPTED, BestEffort, Digest, Keyframes, learn_blocks
-from cdmisfa.experiments.recompute import Recomputation, check_run
-from cdmisfa.experiments.resume import (
+from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn_blocks
+from cdmisfa.experiments.resume import Recomputation, fork_span, reconfigured, restore
+from cdmisfa.experiments.run_folder import (
     COMMAND,
     FORK,
     SET_ASIDE,
-    changes,
-    command_of,
-    command_of_fork,
-    continued,
-    header_to_resume,
-    refuse_difference,
-    restore,
-    restore_from,
-)
-from cdmisfa.experiments.run_folder import (
-    OpenLog,
     RunResult,
-    in_words,
+    command_of,
+    log_to_resume,
     opened_log,
-    undecided,
+    read_command,
     with_recipes,
     write_results,
 )
-from recorder.log.files import folder_here
-from replay.runs.folders import run_log
-from replay.runs.provenance import has_whole_hashes, stated_source
+from recorder.log.files import folder_here, partial_path
+from replay.runs.compare import differences
+from replay.runs.folders import RUN_FILE, run_log
+from replay.runs.keyframes import read_keyframe
+from replay.runs.log import RunHeader, read_header
+from replay.runs.provenance import comparable, has_whole_hashes, stated_source
 from replay.runs.writer import RunWriter
 
 Hashing = Callable[[int, int], None]
-"""Told of bytes of the source that were hashed and of how many, while that is waited for."""
+"""Called with the bytes of the source that were hashed and with all, while a run waits for that."""
 
 
-def _not_told(done: int, size: int) -> None:
-    """Tell nobody."""
+def _ignore(done: int, size: int) -> None:
+    """Report nothing."""
 
 
 class Session:
-    """A run that is begun, resumed or forked, and then goes on with `learn`.
+    """A run that is started, resumed or forked; `learn` then learns to its end.
 
     Attributes:
         source: what it learns from; left open.
-        learner: what learns.
-        folder: of the run, or None where nothing is kept.
+        learner: the learner.
+        folder: the run's folder, or None where nothing is stored.
         manifest: what its log states at its beginning.
-        before: the log whose first iterations it keeps: its own of before, or its parent's.
-        keyframe: where in that log it goes on; None at the beginning.
+        before: the log whose first iterations it copies: its own earlier one, or its parent's.
+        keyframe: the state after these iterations; None at the beginning.
+        hashing: see `Hashing`.
     """
 
     def __init__(
@@ -81,21 +77,29 @@ class Session:
         sections: Mapping[str, Any] | None = None,
         command: Mapping[str, Any] | None = None,
         force: bool = False,
-        described: Mapping[str, Any] | None = None,
+        resume: bool = False,
+        hashing: Hashing = _ignore,
     ) -> None:
-        """Prepare to begin a run; nothing is written before `learn`.
+        """Prepare to start or resume a run; nothing is written before `learn`.
 
         Args:
             source: live or recorded.
-            config: of the learner, as its entry says.
-            folder: of the run, or None to keep nothing.
-            seed: of the policy and of the abstractions' first weights.
-            max_iterations: end after so many.
-            max_modules: end after so many modules; by default as the learner says.
+            config: the learner's configuration, of the class that its entry names.
+            folder: the run's folder, or None to store nothing.
+            seed: the seed of the policy and of the abstractions' first weights.
+            max_iterations: end after this many.
+            max_modules: end after this many modules; by default as the learner says.
             sections: further configuration tables (`scene`, `record`) for the manifest.
-            command: how the run is begun, kept with it; see `command_of`.
+            command: how the run is started, stored with it; see `command_of`.
             force: replace an existing run.
-            described: what the source says of itself, where that was asked already.
+            resume: put learner and source to the newest keyframe of the run in the folder; the
+                signals become those of a run that was never stopped.
+            hashing: see `Hashing`.
+
+        Raises:
+            UsageError: to resume: the source cannot go back; there is no run, or one of another
+                configuration or source.
+            LogDamagedError: to resume: the log cannot be read.
         """
         self.source = source
         self.learner: Learner = open_learner(config, source.spec, seed)
@@ -103,65 +107,62 @@ class Session:
         self.before: Path | None = None
         self.keyframe: Keyframe | None = None
         self._limits = {"max_iterations": max_iterations, "max_modules": max_modules}
-        self._force, self._resumed = force, False
-        described = described or description(source, at_once=True)
+        self._force, self._resumed, self.hashing = force, resume, hashing
         self._versions = versions()
         self.manifest: dict[str, Any] = {
             "config": {**(sections or {}), "learner": section_table(config)},
             "seed": seed,
-            "source": described,
+            "source": description(source, at_once=True),
             ARITHMETIC: arithmetic_of(self.learner),
         }
         if command is not None:
             self.manifest[COMMAND] = dict(command)
+        if resume and self.folder is not None:
+            self._resume(self.folder)
 
-    @classmethod
-    def resume(
-        cls,
-        source: FrameSource,
-        config: Any,
-        folder: str | Path | None,
-        *,
-        hashing: Hashing = _not_told,
-        **how: Any,
-    ) -> Self:
-        """Prepare to resume a run where it was stopped, in whatever way.
-
-        Learner and source are put to the newest keyframe of its log. Its signals become those of a
-        run that was never stopped.
-
-        Args:
-            source: what it learned from.
-            config: the learner's.
-            folder: of the run.
-            hashing: see `learn`.
-            how: further arguments, as of a new run.
-
-        Raises:
-            UsageError: the source cannot go back; there is no run, or one of another
-                configuration or source.
-            LogDamagedError: the log cannot be read, or the source shows something else now.
-        """
-        if folder is None:
-            raise UsageError("which run to resume? name its folder")
+    def _resume(self, folder: Path) -> None:
+        source = self.source
         if not isinstance(source, SeekableSource):
             raise UsageError(
-                f"{description(source, at_once=True)['kind']} cannot go back to where the run was "
-                "stopped: resume from its recording, or begin another run"
+                f"{self.manifest['source']['kind']} cannot go back to where the run was stopped: "
+                "resume from its recording, or start another run"
             )
-        log, header = header_to_resume(folder_here(folder))
-        whole = header is not None and has_whole_hashes(stated_source(log))
-        described = description(source, at_once=not whole, told=hashing)
-        session = cls(source, config, folder, described=described, **how)
-        session._resumed = True
-        if header is not None:
-            forked_at = header.forked_at
-            if forked_at is not None:
-                session.manifest[FORK] = header.manifest[FORK]
-            refuse_difference(log, header, source.spec, session.manifest)
-            session.before = log
-            session.keyframe = restore_from(log, session.learner, source, forked_at)
-        return session
+        log = log_to_resume(folder)
+        try:
+            header = read_header(log)
+        except (LogDamagedError, UsageError):
+            if log != partial_path(folder / RUN_FILE):
+                raise
+            return  # killed before the log stated anything: start again
+        if has_whole_hashes(stated_source(log)):
+            self.manifest["source"] = description(source, told=self.hashing)
+        if header.forked_at is not None:
+            self.manifest[FORK] = header.manifest[FORK]
+        self._refuse_difference(log, header)
+        keyframe = read_keyframe(log)
+        if (0 if keyframe is None else keyframe.iteration) < (header.forked_at or 0):
+            raise UsageError(f"{folder} was cut before its fork: fork again with --force")
+        self.before = log
+        if keyframe is not None:
+            restore(self.learner, keyframe, source.spec)
+            source.seek(keyframe.t)
+            self.keyframe = keyframe
+
+    def _refuse_difference(self, log: Path, header: RunHeader) -> None:
+        """Refuse to resume with another configuration, seed or source."""
+        as_json = json.loads(json.dumps(self.manifest))  # lists for tuples, as the log has them
+        source_then, source_now = comparable(stated_source(log), as_json["source"])
+        spec_then, spec_now = map(dataclasses.asdict, (header.spec, self.source.spec))
+        then = {**header.manifest, "source": source_then, "spec": spec_then, COMMAND: None}
+        now = {**as_json, "source": source_now, "spec": spec_now, COMMAND: None}
+        found = {key.removeprefix("config."): values for key, *values in differences(then, now)}
+        if found:
+            # another learner has other keys, so its name explains all of them
+            key = "learner.algorithm" if "learner.algorithm" in found else next(iter(found))
+            raise UsageError(
+                f"{log.parent} was made with {key} = {found[key][0]}, not {found[key][1]}: resume "
+                "with the same settings, or choose another folder"
+            )
 
     @classmethod
     @contextlib.contextmanager
@@ -177,17 +178,17 @@ class Session:
         limits: Mapping[str, int] | None = None,
         force: bool = False,
     ) -> Iterator[Self]:
-        """Prepare to continue a run from some iteration with other settings, in another folder.
+        """Prepare to continue a run from an iteration with other settings, in another folder.
 
         Its log begins with the parent's first iterations as they are.
 
         Args:
             parent: the run, its folder or its log.
-            at: iterations kept of it.
-            folder: of the fork.
-            settings: `learner.key=value` words; keys that what was learned depends on stay.
-            seed: of the random choices from there on; the world stays the parent's.
-            source: words that name its source, where it is not what the run says.
+            at: iterations that are copied of it.
+            folder: the fork's folder.
+            settings: `learner.key=value` words, but for the keys in `resume.FIXED`.
+            seed: the seed of the random choices from there on; the world stays the parent's.
+            source: words that name its source, where the run does not state it.
             limits: `max_iterations` and `max_modules`, by default the parent's.
             force: replace an existing run.
 
@@ -200,12 +201,18 @@ class Session:
         log, folder = run_log(Path(parent)), folder_here(folder)
         if os.path.realpath(log.parent) == os.path.realpath(folder):
             raise UsageError(f"{folder} is the run itself: choose another folder")
-        with cls.at(log, at, source) as stopped:
-            manifest = stopped.header.manifest
-            span, state = continued(stopped.header, stopped.learner, settings, seed)
+        with Recomputation.after(log, at, source) as stopped:
+            manifest, spec = stopped.header.manifest, stopped.source.spec
+            span = fork_span(stopped.learner, manifest, settings, seed)
             sections = {k: part for k, part in manifest["config"].items() if k != "learner"}
-            words, options = command_of_fork(log.parent, source, sections, settings)
-            options |= {"seed": span.seed, **(limits or {})}
+            words, options = tuple(source), dict[str, Any]()
+            with contextlib.suppress(UsageError):  # the run does not state its command
+                named, options = read_command(log.parent)
+                words = words or named
+            world = sections.get("scene", {}).get("seed")
+            kept = () if world is None else (f"scene.seed={world}",)
+            settings = (*options.get("settings", ()), *kept, *settings)
+            options |= {"settings": settings, "seed": span.seed, **(limits or {})}
             session = cls(
                 stopped.source,
                 span.config,
@@ -217,20 +224,23 @@ class Session:
                 command=command_of(words, options, folder) if words else None,
                 force=force,
             )
+            try:
+                session.learner = reconfigured(stopped.learner, span, spec)
+            except ValueError as error:
+                raise UsageError(
+                    f"the settings do not fit what was learned ({error}): fork with keys that "
+                    "keep its shape"
+                ) from error
             session.manifest[FORK] = {
                 "parent": os.path.relpath(log.parent, folder),
                 "at": at,
-                "changed": changes(manifest, span),
+                "changed": span.changed,
                 "before": {k: manifest[k] for k in ("config", "seed", FORK) if k in manifest},
             }
             session.before = log
-            spec = stopped.source.spec
+            state = session.learner.state
             session.keyframe = Keyframe(at, stopped.t, state, session._versions)
-            restore(session.learner, session.keyframe, spec)
             yield session
-
-    at = staticmethod(Recomputation.after)
-    check = staticmethod(check_run)
 
     def learn(
         self,
@@ -240,28 +250,24 @@ class Session:
         keyframes: int | None = None,
         rerun: bool = True,
         live: Callable[[str], AbstractContextManager[None]] | None = None,
-        hashing: Hashing = _not_told,
     ) -> RunResult:
         """Learn until nothing is left to learn, and log every signal.
 
         Args:
-            sinks: told of everything, after the log; one that fails is let go, and a warning and
-                an event say so.
-            stop: asked before every iteration; true ends the run cleanly, without a view, and a
-                long source is known by a sample.
+            sinks: called with everything, after the log; one that raises ends the run.
+            stop: called before every iteration; true ends the run cleanly, without a view, and
+                without reading all of a long source for its hash.
             keyframes: iterations between keyframes, see `Keyframes`.
             rerun: also build the Rerun view.
             live: also serve the run to Rerun's viewers while it learns; called with the address,
                 and entered while the run is served.
-            hashing: told of bytes of the source that were hashed, and of how many, while the run
-                waits for what it states of its source at its end.
 
         Raises:
             UsageError: the folder is not empty and is not to be replaced, or is in use.
-            LogExhaustedError: the source has not enough for a single block.
+            LogExhaustedError: the source has not enough frames for a single block.
         """
         digest, log = Digest(), None
-        told: list[Sink] = [digest]
+        all_sinks: list[Sink] = [digest]
         with contextlib.ExitStack() as opened:
             if self.folder is not None:
                 log = opened.enter_context(
@@ -275,108 +281,98 @@ class Session:
                         view=rerun,
                     )
                 )
-                told.append(OpenLog(log, self.learner))
-                told.append(Keyframes(log, self.source, self.learner, self._versions, keyframes))
+                state = Keyframes(log, self.source, self.learner, self._versions, keyframes)
+                all_sinks += [log, state]
             if live is not None:
                 from replay.view.live import LiveView
 
                 tau, outputs = self.learner.tau, len(self.learner.phi)
                 view = LiveView(self.source.spec, self.manifest, tau, outputs, run=self.folder)
-                told.append(opened.enter_context(view))
+                all_sinks.append(opened.enter_context(view))
                 opened.enter_context(live(view.address))
             if log is not None and self.before is not None:
-                self._copy_log(log, digest)
+                self._copy_log(log, self.before, digest)
                 if live is not None:
                     view.earlier(log.path.parent)
-            told += [BestEffort(sink, told) for sink in sinks]
-            ended = learn_blocks(self.source, self.learner, told, stop=stop, **self._limits)
-            ended, held_out = self._judged(ended, stop)
-            stopped = ended == INTERRUPTED  # then nothing is read that is as long as the log
-            described = description(self.source, at_once=stopped, told=hashing)
-            result = self._result(described, digest.hexdigest(), ended=ended, held_out=held_out)
+            all_sinks += sinks
+            ended = learn_blocks(self.source, self.learner, all_sinks, stop=stop, **self._limits)
+            result = self._result(ended, digest.hexdigest(), stop)
             if log is not None:
-                stated = {**self.manifest, "versions": self._versions}
-                write_results(log, result, stated, view=rerun and not stopped)
+                manifest = {**self.manifest, "versions": self._versions}
+                view_too = rerun and result.ended != INTERRUPTED
+                write_results(log, result, manifest, view=view_too)
         return result
 
-    def _judged(self, ended: str, stop: Callable[[], bool]) -> tuple[str, Mapping[str, Any] | None]:
-        if ended == INTERRUPTED:
-            return ended, None
-        config = self.manifest["config"]["learner"]
-        found = judged(self.source, self.learner.modules, config.get("components", 1), stop)
-        return INTERRUPTED if found is None else ended, found
-
-    def _result(self, described: Mapping[str, Any], sha256: str, **ending: Any) -> RunResult:
-        learner, summary = self.learner, self.learner.summary()
+    def _result(self, ended: str, sha256: str, stop: Callable[[], bool]) -> RunResult:
+        learner, summary, held_out = self.learner, self.learner.summary(), None
+        if ended != INTERRUPTED:
+            components = self.manifest["config"]["learner"].get("components", 1)
+            held_out = judged(self.source, learner.modules, components, stop)
+            ended = INTERRUPTED if held_out is None else ended
+        # After an interrupt nothing is read that is as long as the source.
+        described = description(self.source, at_once=ended == INTERRUPTED, told=self.hashing)
+        streams, undecided = self.source.spec.streams, tuple[str, ...]()
+        if not learner.over:
+            learned = {streams[module.stream_index] for module in learner.modules}
+            undecided = tuple(name for name in streams if name not in learned)
+            if "streams" in summary:
+                states = {one["stream"]: one["state"] for one in summary["streams"]}
+                undecided = tuple(name for name, state in states.items() if state == "learning")
         return RunResult(
             run=str(self.folder) if self.folder is not None else None,
             source=described,
-            streams=self.source.spec.streams,
+            streams=streams,
             seed=self.manifest["seed"],
             iterations=learner.iteration,
             frames=learner.iteration * learner.tau,
             signals_sha256=sha256,
             modules=with_recipes(learner.modules, self.source, described),
             summary=summary,
-            **ending,
-            undecided=() if learner.over else undecided(learner, self.source, summary),
+            held_out=held_out,
+            ended=ended,
+            undecided=undecided,
         )
 
-    def _copy_log(self, log: RunWriter, digest: Digest) -> None:
-        """Write what is kept of the log before, its own or its parent's; hash its signals."""
-        before = log.path.parent / SET_ASIDE if self._resumed else self.before
-        assert before is not None
+    def _copy_log(self, log: RunWriter, before: Path, digest: Digest) -> None:
+        """Copy the iterations up to the keyframe from the earlier log; hash their signals."""
+        if self._resumed:
+            before = log.path.parent / SET_ASIDE
         keyframe, self.keyframe = self.keyframe, None  # as large as the learner's memory
         if keyframe is not None:
-            at, t, fork = keyframe.iteration, keyframe.t, self.manifest.get(FORK, {})
-            for signals in log.copy_log(before, at):
+            for signals in log.copy_log(before, keyframe.iteration):
                 digest.add(signals)
-            if self._resumed:
-                then, now = keyframe.versions, self._versions
-                changed = {k: (then.get(k), v) for k, v in now.items() if then.get(k) != v}
-                log.event(t, max(at - 1, 0), f"resumed at iteration {at}")
-                if changed:
-                    log.event(t, max(at - 1, 0), "; ".join(in_words(changed)), "WARNING")
-            else:
-                text = f"fork of {fork['parent']} after {at} iterations"
-                log.event(t, max(at - 1, 0), "; ".join([text, *in_words(fork["changed"])]))
-                log.keyframe(keyframe, again=True)
+            self._log_start(log, keyframe)
         log.sync()
         if self._resumed:
-            try:
-                before.unlink()
-            except OSError as error:
-                raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
+            before.unlink()
+
+    def _log_start(self, log: RunWriter, keyframe: Keyframe) -> None:
+        """Write into the log where a run is resumed, or where a fork leaves its parent."""
+        at = keyframe.iteration
+        if not self._resumed:
+            fork = self.manifest[FORK]
+            text = [f"fork of {fork['parent']} after {at} iterations", *_changes(fork["changed"])]
+            log.event(keyframe.t, max(at - 1, 0), "; ".join(text))
+            log.keyframe(keyframe, again=True)
+            return
+        log.event(keyframe.t, max(at - 1, 0), f"resumed at iteration {at}")
+        then = keyframe.versions
+        changed = {k: [then.get(k), v] for k, v in self._versions.items() if then.get(k) != v}
+        if changed:
+            log.event(keyframe.t, max(at - 1, 0), "; ".join(_changes(changed)), "WARNING")
+
+
+def _changes(changed: Mapping[str, Sequence[Any]]) -> list[str]:
+    return [f"{name} is {now}, was {before}" for name, (before, now) in changed.items()]
 
 
 def run(
-    source: FrameSource,
-    config: Any,
-    folder: str | Path | None = None,
-    *,
-    seed: int = 0,
-    max_iterations: int | None = None,
-    max_modules: int | None = None,
-    sections: Mapping[str, Any] | None = None,
-    command: Mapping[str, Any] | None = None,
-    force: bool = False,
-    resume: bool = False,
-    **how: Any,
+    source: FrameSource, config: Any, folder: str | Path | None = None, **how: Any
 ) -> RunResult:
-    """Begin a run, or resume the one in `folder`, and learn to its end.
+    """Start a run, or resume the one in `folder`, and learn to its end.
 
-    The arguments are those of `Session`, and as `how` those of `Session.learn`.
+    The arguments are those of `Session` and of `Session.learn`.
     """
-    told: dict[str, Any] = {
-        "seed": seed,
-        "max_iterations": max_iterations,
-        "max_modules": max_modules,
-        "sections": sections,
-        "command": command,
-    }
-    if resume:
-        hashing = how.get("hashing", _not_told)
-        session = Session.resume(source, config, folder, hashing=hashing, **told)
-    else:
-        session = Session(source, config, folder, force=force, **told)
-    return session.learn(**how)
+    names = Session.learn.__kwdefaults__ or {}
+    learning = {name: how.pop(name) for name in names if name in how}
+    return Session(source, config, folder, **how).learn(**learning)

@@ -17,7 +17,7 @@ from cdmisfa.core.blocks import FrameSource, description
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 from cdmisfa.experiments.holdout import hold_out
-from cdmisfa.experiments.resume import command_of
+from cdmisfa.experiments.run_folder import command_of
 from cdmisfa.experiments.session import run as run_to_its_end
 from cdmisfa.experiments.sources import (
     OF_CAMERAS,
@@ -82,7 +82,7 @@ def learn(
         centre: "episode" learns from frames without the mean of their episode.
         force: replace an existing run.
         view: also write the view, run.rrd.
-        sinks: told of every iteration; one that raises is let go with a warning.
+        sinks: called with every iteration; one that raises ends the run.
         stop: asked before every iteration; true ends the run.
         settings: keys of the learner: `tau=20`, `outputs=4`; see docs/reference/configuration.md.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import replay.runs.run
 from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.shown import Shown
 from cdmisfa.core.signals import SIGNALS
-from cdmisfa.experiments.recompute import Run as RecomputedRun
+from cdmisfa.experiments.resume import Recomputation
+from cdmisfa.public.recording import Recording
 from cdmisfa.public.shown import view, watched
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
 from replay.runs.modules import SlowFeatures
@@ -86,7 +89,7 @@ def _refuse_unknown(name: str, known: Collection[str]) -> None:
         raise UnknownSignalError(f"no signal {name!r}: {did_you_mean(str(name), known)}")
 
 
-class Run(Shown, RecomputedRun):
+class Run(Shown, replay.runs.run.Run):
     """A run on disk, of which is read what is asked for.
 
     Args:
@@ -169,14 +172,15 @@ class Run(Shown, RecomputedRun):
                 keyframe every some hundred iterations, needs none.
             NotReproducedError: learning again gives other signals than its log holds.
         """
-        from cdmisfa.public.recording import Recording
-
         source = self._learned_from if isinstance(source, tuple) and not source else source
         words = [source] if isinstance(source, str | Path) else source
-        if isinstance(words, list | tuple) and all(isinstance(w, str | Path) for w in words):
-            return super().at(iterations, tuple(map(str, words)))
-        with Recording.of(source).source() as opened:
-            return super().at(iterations, opened)
+        with contextlib.ExitStack() as opened:
+            if isinstance(words, list | tuple) and all(isinstance(w, str | Path) for w in words):
+                found = tuple(map(str, words))
+            else:
+                found = opened.enter_context(Recording.of(source).source())
+            with Recomputation.after(self.log, iterations, found) as again:
+                return again.learner
 
     def summary(self) -> str:
         """What came of it, in words, as Markdown: what the first page of its view says."""

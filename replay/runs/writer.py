@@ -56,7 +56,7 @@ FLUSH_SECONDS = 1.0
 
 
 class RunWriter(Sink):
-    """Writes run.mcap: to the end with `finish`, or to wherever it was `abandon`ed.
+    """Writes run.mcap: to the end with `close`, or to wherever it was `abandon`ed.
 
     Args:
         path: the file's name once it is finished.
@@ -108,7 +108,7 @@ class RunWriter(Sink):
             },
         )
         self._last_keyframe = -1
-        self._without_weights: tuple[int, int, int] | None = None
+        self._without_weights: tuple[int, int, int, Learner] | None = None
         self._channels: dict[str, int] = {}
         matrix = MATRIX_SCHEMA, MATRIX_DEFINITION
         self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA, SIGNALS_DEFINITION)
@@ -140,7 +140,7 @@ class RunWriter(Sink):
             frames = block.frames.reshape(len(block), -1)
             messages.append((WATCHED_TOPIC, at, encode_matrix(t, frames)))
         leaves = self._by_progress and signals.action == 1
-        self._without_weights = at, k, t
+        self._without_weights = at, k, t, learner
         if k % self._phi_every == 0 or signals.saved or leaves:
             messages.append((PHI_TOPIC, at, encode_matrix(t, weights_after(signals, learner))))
             self._without_weights = None
@@ -148,12 +148,13 @@ class RunWriter(Sink):
         if time.monotonic() >= self._next_flush:
             self.flush()
 
-    def weights(self, learner: Learner) -> None:
-        """Write the weights that the run ended with, where they were not after its last block."""
+    def finish(self) -> None:
+        """Write the last weights; the file stays open for what is written until `close`."""
         if self._without_weights is not None:
-            at, k, t = self._without_weights
+            at, k, t, learner = self._without_weights
             self._write(k, (PHI_TOPIC, at, encode_matrix(t, learner.phi)))
             self._without_weights = None
+        self.flush()
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Write in words what happened at frame t; see `Sink`."""
@@ -214,7 +215,7 @@ class RunWriter(Sink):
         """Let the disk have everything written so far."""
         self._log.sync()
 
-    def finish(self, final: Mapping[str, str] | None = None) -> None:
+    def close(self, final: Mapping[str, str] | None = None) -> None:
         """Write a final record where there is one, and the index; give the file its name."""
         if final is not None:
             self._log.add_metadata(FINAL_METADATA, final)

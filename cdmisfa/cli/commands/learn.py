@@ -109,7 +109,7 @@ def learn_command(
         resume_as_started(ctx, out if resume else None)
         return
     from cdmisfa.experiments.loop import INTERRUPTED
-    from cdmisfa.experiments.resume import command_of
+    from cdmisfa.experiments.run_folder import command_of
     from cdmisfa.experiments.session import run
     from recorder.cameras.words import is_live
 
@@ -246,7 +246,7 @@ def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:
 
 def resume_as_started(ctx: click.Context, run: Path | None) -> None:
     """Resume a run with the source and options it was started with; options given now win."""
-    from cdmisfa.experiments.resume import read_command
+    from cdmisfa.experiments.run_folder import read_command
 
     if run is None:
         source = next(param for param in ctx.command.params if param.name == "source")

@@ -44,10 +44,10 @@ def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: boo
     keyframe no source is needed. --json prints all of its memory.
     """
     from cdmisfa.core.signals import ACTIONS
+    from cdmisfa.experiments.resume import Recomputation
     from cdmisfa.experiments.run_folder import module_table
-    from cdmisfa.experiments.session import Session
 
-    with Session.at(run, iterations, source) as again:
+    with Recomputation.after(run, iterations, source) as again:
         log, learner, t = again.log, again.learner, again.t
     state, streams = learner.state, learner.spec.streams  # type: ignore[attr-defined]
     if as_json:
@@ -110,9 +110,9 @@ def check_command(
     files are no longer those it learned from, and exits with 4 if there are any. A part begins at
     the newest keyframe before it.
     """
-    from cdmisfa.experiments.session import Session
+    from cdmisfa.experiments.resume import check_run
 
-    checked = Session.check(run, source, *iterations)
+    checked = check_run(run, source, *iterations)
     if as_json:
         print_document(run=str(run), **checked.as_json())
     else:
@@ -166,12 +166,8 @@ def fork_command(
         Session.fork(run, folder=out, limits=limits, **told) as session,
         learning(session.source.spec, max_iterations) as (stop, reporter),
     ):
-        result = session.learn(
-            sinks=(reporter,),
-            stop=stop,
-            rerun=not no_rerun,
-            hashing=reporter.hashing,
-        )
+        session.hashing = reporter.hashing
+        result = session.learn(sinks=(reporter,), stop=stop, rerun=not no_rerun)
     print_result(result, as_json=as_json)
     if result.run is not None and result.ended != INTERRUPTED:
         report_beside(result.run, quiet=as_json)
