@@ -113,7 +113,7 @@ class Program(subprocess.Popen[bytes]):
         """
         from rerun.experimental import ViewerClient
 
-        from replay.view.columns import FRAME
+        from replay.view.rows import FRAME
 
         client = self.ask(lambda: ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy"))
         self.ask(lambda: is_painted(client))

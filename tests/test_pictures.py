@@ -14,7 +14,6 @@ from replay.runs.compare import side_by_side
 from replay.runs.run import read_outline
 from replay.view import overlay
 from replay.view.build import recording_layout
-from replay.view.layouts import WorldTab
 from replay.view.panels import run_layout
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
@@ -36,7 +35,6 @@ def drawn(code: dict[str, Any], *sources: str) -> set[str]:
 
 
 def test_every_tab_of_a_run_is_drawn(code: dict[str, Any], tmp_path: Path) -> None:
-    nothing = WorldTab()
     for algorithm, sources in {
         "2.0": ("icub", "seed0", "progress"),
         "progress": ("progress", "cameras", "icub", "seed0"),
@@ -45,16 +43,16 @@ def test_every_tab_of_a_run_is_drawn(code: dict[str, Any], tmp_path: Path) -> No
         folder.mkdir()
         learner = {"algorithm": algorithm, "settled": 0.05, "agreement": 0.25}
         write_run(folder / "run.mcap", IMAGE, 3, learner=learner)
-        shown = run_layout(read_outline(folder), nothing)
+        shown = run_layout(read_outline(folder))
         assert tabs(shown) <= drawn(code, *sources)
 
 
 def test_every_tab_of_a_recording_and_of_a_comparison_is_drawn(
     code: dict[str, Any], three: Any
 ) -> None:
-    assert tabs(recording_layout(VECTOR, 10, scene=True)) == drawn(code, code["SAMPLE"])
+    assert tabs(recording_layout(VECTOR, 10, has_scene=True)) == drawn(code, code["SAMPLE"])
     runs, _ = three
-    layout = overlay._layout(side_by_side(runs), ["a", "b", "c"], None)
+    layout = overlay._layout(side_by_side(runs), ["a"], ["a/learning_error/1_x1"], None)
     assert tabs(layout) == drawn(code, *code["COMPARED"])
 
 

@@ -15,7 +15,6 @@ from cdmisfa.core.errors import UsageError
 from replay.palette import CYCLE, packed
 from replay.runs.run import read_outline
 from replay.view.build import build_view
-from replay.view.layouts import WorldTab
 from replay.view.panels import run_layout
 
 ITERATIONS, TAU = 420, 40
@@ -62,7 +61,7 @@ def test_axes_hold_what_is_drawn_and_leave_room_for_the_legend(built):
             assert time["end"] >= 1.1 * ITERATIONS * TAU, name
         elif time is not None:  # a window of frames up to the cursor, or up to a save
             assert time["end"] - time["start"] < 20 * TAU, name
-        says = any(word in name.lower() for word in ("slowness", "(grey)", "rule", "q of"))
+        says = any(word in name.lower() for word in ("slowness", "(grey", "rule", "q of"))
         assert legend is True or len(entities) == 1 or says, name
     assert held >= 4
     assert sum(time["start"] < 0 < time["end"] for _, _, time, *_ in plots if time) >= 2
@@ -96,7 +95,7 @@ def test_few_modules_have_a_page_each_and_many_stand_on_pages(tmp_path):
         (100, None),
     ):
         outline = dataclasses.replace(read_outline(tmp_path), modules=count)
-        layout = run_layout(outline, WorldTab(), tab="modules")
+        layout = run_layout(outline, tab="modules")
         tabs = layout.root_container.contents
         (modules,) = [tab for tab in tabs if tab.name == "Modules"]
         names = [page.name for page in modules.contents]
@@ -105,8 +104,8 @@ def test_few_modules_have_a_page_each_and_many_stand_on_pages(tmp_path):
         shown = [view.origin for view in views_of(modules) if "weights" in str(view.origin)]
         assert shown == [f"/modules/{i}/weights" for i in range(1, count + 1)]
         assert layout.root_container.active_tab == tabs.index(modules)
-    with pytest.raises(UsageError, match=r"no tab 'nowhere': there are Overview, .*Table"):
-        run_layout(outline, WorldTab(), tab="nowhere")
+    with pytest.raises(UsageError, match=r"no tab 'nowhere': there are Overview, .*Modules"):
+        run_layout(outline, tab="nowhere")
 
 
 def test_the_picture_has_the_name_of_its_stream(built):

@@ -26,7 +26,7 @@ from replay.palette import colour, packed
 from replay.runs.log import read_batches
 from replay.runs.run import read_outline
 from replay.view.build import build_view
-from replay.view.world import places_of
+from replay.view.wall import places_of
 
 CONFIG = section_table(IcubConfig())
 SCENE = SourceSpec(("left", "center", "right"), (12, 32), "uint8", TRUTH, 50.0, IMAGE.start_ns)

@@ -47,10 +47,10 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
 
 
 NAMED = {
-    "2.0": (7, 30, ("R and Q, every 10 iterations", "What was done: the last 50 blocks", "Events")),
+    "2.0": (6, 28, ("Policy in each stream", "What was done: the last 50 blocks", "Events")),
     "progress": (
-        5,
-        23,
+        4,
+        22,
         ("What it mostly attends to", "Output y on new frames, from least to most", "Events"),
     ),
 }

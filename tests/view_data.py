@@ -13,10 +13,6 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
-from replay.runs.run import read_outline
-from replay.view.layouts import WorldTab
-from replay.view.panels import run_layout
-
 
 def scalars(entity: dict[str, list[Any]]) -> NDArray[np.float64]:
     """(n, lines) numbers of an entity's rows."""
@@ -96,6 +92,17 @@ class View:
                 found.append((parts["ViewBlueprint:display_name"], entities, time, values, legend))
         return found
 
+    def contents(self) -> list[tuple[str, list[str]]]:
+        """Name of each view of the layout, and the entities that it asks for."""
+        found = []
+        for path, parts in list(self.layout.items()):
+            if "ViewBlueprint:class_identifier" in parts:
+                origin = parts["ViewBlueprint:space_origin"]
+                wanted = self.layout[f"{path}/ViewContents"]["ViewContents:query"]
+                wanted = [origin] if wanted == ["$origin/**"] else wanted
+                found.append((parts["ViewBlueprint:display_name"], wanted))
+        return found
+
     def numbers(self, entity: str) -> NDArray[np.float64]:
         """All numbers of an entity, without NaN, (n,)."""
         values = np.ravel(scalars(self.rows[entity])) if entity in self.rows else np.empty(0)
@@ -105,13 +112,6 @@ class View:
         """The states of a lane in the order of time, with their frames."""
         rows = self.rows[entity]
         return [(t, s) for t, (s,) in zip(rows["frame"], rows["StateChange:state"], strict=True)]
-
-
-def tabs_of(run: Path) -> dict[str, Any]:
-    """Each tab of a run's layout."""
-    layout = run_layout(read_outline(run), WorldTab())
-    root: Any = layout.root_container
-    return {tab.name: tab for tab in root.contents}
 
 
 def views_of(part: Any) -> list[Any]:

@@ -46,7 +46,6 @@ VIEWS = {
     "gate": ("icub", "Gate"),
     "decisions": ("seed0", "Decision"),
     "modules": ("progress", "Modules"),
-    "table": ("seed0", "Table"),
     "values": ("seed0", "World", "--at", "module 2"),
     "wall": ("cameras", "Overview"),
     "progress": ("progress", "Overview"),

@@ -1,6 +1,6 @@
 """A run in the viewer while it learns.
 
-Signals are kept in memory and handed over in large pieces, so that the learner hardly waits.
+Signals are kept in memory and written in large pieces, so that the learner hardly waits.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -20,30 +19,29 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.learning import Learner, Sink, weights_after
-from cdmisfa.core.signals import NO_STATE, SIGNALS, BlockSignals
+from cdmisfa.core.signals import BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
-from replay.runs.log import Batch, Frames, RunHeader, read_batches
-from replay.runs.run import LINES, Outline
+from replay.runs.log import Batch, RunHeader, read_batches
+from replay.runs.run import Tally
 from replay.view.build import APPLICATION
-from replay.view.columns import MOST_STREAMS, Target
-from replay.view.modules import ModulesView
 from replay.view.panels import MOST_MODULES, run_layout
+from replay.view.rows import MOST_STREAMS, Rows
 from replay.view.run import RunView
-from replay.view.world import WorldView
+from replay.view.scene import SceneView
 
 EVERY_SECONDS = 1.5
 """Time between two pieces."""
 
-SUMMARY = "It is being learned. What came of it stands in the view of the finished run."
+SUMMARY = "The run is still learning. The view of the finished run has its results."
 
 EVERY_FRAMES = 10
-"""Frames between two at which it is said where things are."""
+"""Frames from one pose of the scene to the next, and from one logged image to the next."""
 
 MOST_BLOCKS = 500
 """Most blocks that wait, however quick the learner is."""
 
 PIECE = 10
-"""Blocks of which lanes say what was mostly the case: how many there will be is not known."""
+"""Blocks of which a lane has the state of most: the length of the run is not known."""
 
 
 class LiveView(Sink):
@@ -69,7 +67,9 @@ class LiveView(Sink):
         *,
         run: Path | None = None,
     ) -> None:
-        outline = _nothing_yet(RunHeader(spec, manifest), tau, outputs)
+        header = RunHeader(spec, manifest)
+        modules = min(len(spec.streams), MOST_MODULES)  # as many as there may come
+        begun = replace(Tally(header).outline(), tau=tau, outputs=outputs, modules=modules)
         self._recording = rr.RecordingStream(APPLICATION, recording_id=f"live-{os.getpid()}")
         self._recording.set_log_time_enabled(False)
         with socket.create_server(("127.0.0.1", 0)) as free:
@@ -78,22 +78,17 @@ class LiveView(Sink):
         self._recording.set_sinks(sink)
         self.address = str(sink.uri)
         self._recording.send_recording_name("live")
-        self._recording.log("summary", rr.TextDocument(SUMMARY), static=True)
-        streams = outline.streams(MOST_STREAMS)
-        self._world = WorldView(
-            self._recording, outline.header, run or Path(), streams, EVERY_FRAMES
-        )
-        self._recording.send_blueprint(run_layout(outline, self._world.tab()))
-        # No image is left out here: of each block only the first is taken.
-        self._view = RunView(self._recording, outline.header, streams, every=1, piece=PIECE)
-        self._modules = ModulesView(Target(self._recording, spec))
-        for note in self._world.notes:
-            self._view.event(0, 0, note, "WARN")
+        rows, folder = Rows(self._recording, spec), run or Path()
+        rows.log("summary", rr.TextDocument(SUMMARY))
+        streams = begun.streams(MOST_STREAMS)
+        self._view = RunView(rows, header, streams, folder, every=EVERY_FRAMES, piece=PIECE)
+        has_scene = isinstance(self._view.world, SceneView)
+        self._recording.send_blueprint(run_layout(begun, has_scene=has_scene))
         self._images = spec.images
         self._next = time.monotonic() + EVERY_SECONDS
-        self._forget()
+        self._clear()
 
-    def _forget(self) -> None:
+    def _clear(self) -> None:
         self._records: list[BlockSignals] = []
         self._watched: list[NDArray[Any]] = []
         self._truth: list[NDArray[np.float64]] = []
@@ -117,89 +112,42 @@ class LiveView(Sink):
             UsageError: there is no such run.
             LogDamagedError: its log cannot be read.
         """
-        for batch in read_batches(run):
-            if self._images:
-                batch = replace(batch, watched=_first_of_blocks(batch))
-            self._show(batch)
+        for batch in read_batches(run, every=EVERY_FRAMES):
+            self._view.take(batch)
+            self._view.flush()
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-        """Say in words what happened; see `Sink`."""
+        """Log an event in words; see `Sink`."""
         self._view.event(t, iteration, text, level)
 
     def finish(self) -> None:
-        """Hand over the rest; viewers are served until `close`."""
+        """Write the rest; viewers are served until `__exit__`."""
         self.flush()
 
     def flush(self) -> None:
-        """Hand over everything that waits."""
+        """Write everything that waits."""
         if self._records:
             starts, tau = np.array([s.t for s in self._records]), len(self._records[-1].y)
-            every = (starts[:, None] + np.arange(tau)).reshape(-1)
-            at = starts if self._images else every
+            frames = (starts[:, None] + np.arange(tau)).reshape(-1)
             signals = tuple(columns_of_records(self._records))
-            self._show(
-                Batch(
-                    signals=signals,
-                    blocks=Blocks.concatenated([*map(Blocks.of, signals)]),
-                    watched=((at, np.concatenate(self._watched)),),
-                    truth=((every, np.concatenate(self._truth)),),
-                    phi=tuple(self._phi),
-                    events=(),
-                )
+            batch = Batch(
+                signals=signals,
+                blocks=Blocks.concatenated([*map(Blocks.of, signals)]),
+                watched=((starts if self._images else frames, np.concatenate(self._watched)),),
+                truth=((frames, np.concatenate(self._truth)),),
+                phi=tuple(self._phi),
+                events=(),
             )
-            self._forget()
-        self._next = time.monotonic() + EVERY_SECONDS
-
-    def _show(self, batch: Batch) -> None:
-        self._view.take(batch)
-        self._world.take(batch)
-        for columns in batch.signals:
-            self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
-        self._modules.take(batch)
-        self._modules.flush()
+            self._view.take(batch)
+            self._clear()
         self._view.flush()
-        self._world.flush()
-
-    def close(self) -> None:
-        """Hand over the rest and stop serving; a viewer keeps what it has."""
-        self.flush()
-        self._recording.flush()
-        self._recording.disconnect()
+        self._next = time.monotonic() + EVERY_SECONDS
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-
-def _first_of_blocks(batch: Batch) -> tuple[Frames, ...]:
-    """Of each block's pictures the first one that its log has, wherever the block begins."""
-    pieces = ((np.diff(batch.blocks.places(at), prepend=-1), at, p) for at, p in batch.watched)
-    return tuple((at[begins != 0], pictures[begins != 0]) for begins, at, pictures in pieces)
-
-
-def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:
-    """A run that has not begun: there may come as many modules as there are streams."""
-    streams = len(header.spec.streams)
-    return Outline(
-        header=header,
-        iterations=0,
-        frames=0,
-        blocks=Blocks.concatenated(()),
-        end=0,
-        tau=tau,
-        outputs=outputs,
-        modules=min(streams, MOST_MODULES),
-        visits=np.zeros(streams, dtype=np.int64),
-        saved=(),
-        last=None,
-        lines={name: np.empty(0) for name in LINES},
-        told=frozenset(SIGNALS),
-        states=(NO_STATE,) * streams,
-    )
+    def __exit__(self, *error: object) -> None:
+        """Write the rest and stop serving; a viewer keeps what it has."""
+        self.flush()
+        self._recording.flush()
+        self._recording.disconnect()

@@ -1,14 +1,15 @@
-"""The modules of a run: weights, output on their own streams, and frames of least to most output.
+"""The modules of a run: weights, outputs, and frames of least to greatest output.
 
 `/modules/<number>/output` holds a module's outputs wherever its own stream was watched, before its
-save, too: on the frames that the log has. Of a run without its modules, as one that was broken off
-or is still learning, it holds what the signals tell, from the save on.
+save, too: on the frames that the log has. Where a run's modules are unknown, since it was broken
+off or is still learning, it holds what the signals say, from the save on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import rerun as rr
@@ -16,31 +17,32 @@ import rerun as rr
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.modules import Module
-from replay.outputs import EACH, OwnStream, Sheet
-from replay.palette import (
-    BRICK,
-    DARK,
-    GREY,
-    MIST,
-    Colour,
-    Rgb,
-    colour,
-    faint,
-    packed,
-    packed_all,
-    shade,
-)
+from replay.following import read_outputs
+from replay.outputs import OwnStream, Sheet
+from replay.palette import BRICK, DARK, GREY, MIST, Colour, Rgb, colour, faint, packed, shade
 from replay.runs.columns import SignalColumns
-from replay.runs.log import Batch
+from replay.runs.log import Batch, Frames
 from replay.runs.run import Outline
-from replay.view.columns import Column, Target, tensors
-from replay.view.labels import label
-from replay.view.world import ROOM, places_of
+from replay.view.layouts import Panel
+from replay.view.rows import Rows, label
+from replay.view.wall import BETWEEN, hang, places_of, sheet_size
+
+MOST_BARS = 256
+"""Weights that are no image, and drawn as bars: more are a tensor."""
+
+FOLLOWED = 6
+"""Modules whose output is shown over the quantity that it follows: the first."""
+
+FOLLOWED_FRAMES = 1_000_000
+"""Last frames of a run for which it is shown."""
+
+BROAD, NARROW = 4.0, 1.5
+"""Widths of the line that is followed, and of the output."""
 
 
 @cache
 def saved_mark() -> rr.SeriesPoints:
-    """How the iteration is marked in which a module was saved.
+    """Return how the iteration is marked in which a module was saved.
 
     Made when it is needed: with it pyarrow imports pandas, where that is installed.
     """
@@ -49,70 +51,65 @@ def saved_mark() -> rr.SeriesPoints:
     )
 
 
-MOST_BARS = 256
-"""Weights that are no picture, and drawn as bars: more are a tensor."""
-
-BETWEEN = 4
-"""Pixels between two frames of a row."""
-
-
 def hang_weights(
-    target: Target, path: str, outputs: int, labels: Sequence[str] = (), rgbs: Sequence[Rgb] = ()
+    rows: Rows, path: str, outputs: int, labels: Sequence[str] = (), rgbs: Sequence[Rgb] = ()
 ) -> None:
-    """Say where the weights of several outputs are to hang, each with a frame and words below it.
+    """Write where the weights of several outputs hang, each with a frame and words below it.
 
     Args:
-        target: where they go.
+        rows: of the recording.
         path: the entity of the weights.
         outputs: how many there are.
         labels: of the outputs, by default their numbers.
         rgbs: their colours, by default grey.
     """
-    height, width = target.spec.frame_shape if target.spec.images else (0, 0)
-    for j, (x, y) in enumerate(places_of(outputs, width, height) if width and outputs > 1 else ()):
+    if not rows.spec.images or outputs == 1:
+        return
+    height, width = rows.spec.frame_shape
+    for j, corner in enumerate(places_of(outputs, width, height)):
         words, rgb = labels[j] if labels else str(j + 1), rgbs[j] if rgbs else GREY
-        _hang(target, f"{path}/{j + 1}", (x, y), (width, height), words, rgb)
+        hang(rows, f"{path}/{j + 1}", corner, (width, height), words, rgb)
 
 
-def write_weights(target: Target, path: str, t: int, iteration: int, phi: FloatArray) -> None:
-    """Show (J, I) weights at a frame and iteration: as pictures, bars, or a tensor.
+def write_weights(rows: Rows, path: str, t: int, iteration: int, phi: FloatArray) -> None:
+    """Show (J, I) weights at a frame and iteration: as images, bars, or a tensor.
 
-    Each output's picture, at `path` or of several at `path/<number>`, is in full colour at its own
+    Each output's image, at `path` or of several at `path/<number>`, is in full colour at its own
     largest weight.
     """
-    shape = target.spec.frame_shape
-    if target.spec.images and phi.shape[1] == shape[0] * shape[1]:
-        for j, row in enumerate(phi):
+    shape = rows.spec.frame_shape
+    if rows.spec.images and phi.shape[1] == shape[0] * shape[1]:
+        for j, weights in enumerate(phi):
             place = path if len(phi) == 1 else f"{path}/{j + 1}"
-            target.log_at(place, t, iteration, rr.Image(shade(row.reshape(shape))))
+            rows.log_at(place, t, iteration, rr.Image(shade(weights.reshape(shape))))
     elif phi.size <= MOST_BARS:
-        bars = rr.BarChart(tensors(phi.reshape(1, -1)), color=packed(MIST))
-        target.log_at(path, t, iteration, bars)
+        bars = rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST))
+        rows.log_at(path, t, iteration, bars)
     else:
-        target.log_at(path, t, iteration, rr.Tensor(phi.copy(), dim_names=("output", "input")))
+        rows.log_at(path, t, iteration, rr.Tensor(phi.copy(), dim_names=("output", "input")))
 
 
 class ModulesView:
     """Writes the modules of a run.
 
     Args:
-        target: where they go.
+        rows: of the recording.
         modules: of the run, where they are known.
 
     Attributes:
-        notes: which modules say nothing of the run's frames, and why.
+        notes: which modules have no output on the run's frames, and why.
+        sheets: modules with images of least to greatest output.
     """
 
-    def __init__(self, target: Target, modules: Sequence[Module] = ()) -> None:
-        self._target, spec, self.notes = target, target.spec, list[str]()
-        known = [m for m in modules if m.stream_index < len(spec.streams)]
-        self._own = {module.index: OwnStream(module, spec) for module in known}
+    def __init__(self, rows: Rows, modules: Sequence[Module] = ()) -> None:
+        self._rows, self.notes, self.sheets = rows, list[str](), set[int]()
+        known = [m for m in modules if m.stream_index < len(rows.spec.streams)]
+        self._own = {module.index: OwnStream(module, rows.spec) for module in known}
         self._stream_of: dict[int, int] = {}
-        self._columns: dict[int, Column] = {}
         self._tau = 0
 
-    def take(self, batch: Batch) -> None:
-        """Take what a log holds of some iterations."""
+    def take_batch(self, batch: Batch) -> None:
+        """Write what a log holds of some iterations."""
         weights = dict(batch.phi)
         for columns in batch.signals:
             self._tau = columns.tau
@@ -120,46 +117,34 @@ class ModulesView:
             for number, stream in self._stream_of.items():
                 own = columns["stream"] == stream
                 if number not in self._own and number <= columns["y_frozen"].shape[1] and own.any():
-                    frames, iterations = (
-                        times[np.repeat(own, columns.tau)]
-                        for times in columns.times(per_frame=True)
-                    )
+                    frames, iterations = columns.times(per_frame=True)
+                    of = np.repeat(own, columns.tau)
                     y = columns["y_frozen"][own, number - 1]
-                    self._draw(number, frames, iterations, y.reshape(len(frames), -1))
+                    self._output(number, frames[of], iterations[of], y.reshape(of.sum(), -1))
         for number, module in list(self._own.items()):
             try:
                 for t, _, y in module.take(batch):
-                    self._draw(number, t, batch.blocks.iteration(t), y)
+                    self._output(number, t, batch.blocks.iteration(t), y)
             except UsageError as error:
                 del self._own[number]
                 self.notes.append(f"module {number} says nothing of these frames: {error}")
 
     def finish(self, outline: Outline) -> None:
-        """Write what is known at the end, and hand over what waits."""
+        """Write weights and frames of the modules that are known."""
         saved = {save.module: save.t for save in outline.saved}
         for number, own in self._own.items():
-            module, at = own.module, saved.get(number, outline.end)
+            module, place = own.module, f"modules/{number}"
             slow = module.slow.astype(bool).tolist()
             labels = [
-                f"{j + 1} {'slow' if is_slow else 'not slow'}" for j, is_slow in enumerate(slow)
+                f"{j} {'slow' if is_slow else 'not slow'}" for j, is_slow in enumerate(slow, 1)
             ]
             rgbs = [colour(module.stream_index) if is_slow else GREY for is_slow in slow]
-            place = f"modules/{number}"
-            hang_weights(self._target, f"{place}/weights", len(module.phi), labels, rgbs)
-            write_weights(self._target, f"{place}/weights", at, module.iteration, module.phi)
-            if self._target.spec.images and own.count:
+            hang_weights(self._rows, f"{place}/weights", len(module.phi), labels, rgbs)
+            at = saved.get(number, outline.end), module.iteration
+            write_weights(self._rows, f"{place}/weights", *at, module.phi)
+            if self._rows.spec.images and own.count:
+                self.sheets.add(number)
                 self._sheet(place, own.sheet())
-        self.flush()
-
-    def sheets(self) -> int:
-        """How many modules have pictures of least to greatest output."""
-        pictures = self._target.spec.images
-        return sum(own.count > 0 for own in self._own.values()) if pictures else 0
-
-    def flush(self) -> None:
-        """Hand over everything that waits."""
-        for column in self._columns.values():
-            column.flush()
 
     def _saved(self, columns: SignalColumns, weights: dict[int, FloatArray]) -> None:
         """Mark where modules were saved; show weights of those that are not known otherwise."""
@@ -167,61 +152,71 @@ class ModulesView:
             number, stream = int(columns["module"][i]), int(columns["stream"][i])
             t, iteration = int(columns.frames[i]), int(columns.iterations[i])
             self._stream_of[number], place = stream, f"modules/{number}"
-            self._target.log(f"{place}/saved", saved_mark())
-            self._target.log_at(f"{place}/saved", t + columns.tau, iteration, rr.Scalars([0.0]))
+            self._rows.log(f"{place}/saved", saved_mark())
+            self._rows.log_at(f"{place}/saved", t + columns.tau, iteration, rr.Scalars([0.0]))
             if number not in self._own and t in weights:
-                hang_weights(self._target, f"{place}/weights", len(weights[t]))
-                write_weights(self._target, f"{place}/weights", t, iteration, weights[t])
+                hang_weights(self._rows, f"{place}/weights", len(weights[t]))
+                write_weights(self._rows, f"{place}/weights", t, iteration, weights[t])
 
-    def _draw(self, number: int, t: IntArray, iterations: IntArray, y: FloatArray) -> None:
-        """Draw the (n, J) outputs of a module at n frames; of those it marks, the slow ones."""
+    def _output(self, number: int, t: IntArray, iterations: IntArray, y: FloatArray) -> None:
+        """Draw the (n, J) outputs of a module at n frames; only slow ones where any is slow."""
         module = self._own[number].module if number in self._own else None
         stream = self._stream_of[number] if module is None else module.stream_index
         slow = np.zeros(0) if module is None else module.slow
         shown = np.flatnonzero(slow) if slow.any() else np.arange(y.shape[1])
-        if number not in self._columns:
-            names = [f"output {j + 1}" for j in shown.tolist()]
-            rgbs: list[Colour] = [colour(stream), *(faint(colour(stream)) for _ in shown[1:])]
-            place = f"modules/{number}/output"
-            self._columns[number] = self._target.lines(place, names, rgbs, within=self._tau)
-        self._columns[number].add(t, iterations, y[:, shown])
+        names = [f"output {j + 1}" for j in shown.tolist()]
+        rgbs: list[Colour] = [colour(stream), *(faint(colour(stream)) for _ in shown[1:])]
+        path = f"modules/{number}/output"
+        self._rows.lines(path, names, (t, iterations), y[:, shown], rgbs, gap=self._tau)
 
     def _sheet(self, place: str, sheet: Sheet) -> None:
         """Hang frames of least, middle and greatest output below one another."""
-        height, width = self._target.spec.frame_shape
+        height, width = self._rows.spec.frame_shape
         gap = np.full((height, BETWEEN), DARK[0], dtype=np.uint8)
-        rows = ("least", sheet.least), ("middle", sheet.middle), ("greatest", sheet.greatest)
-        size = sheet_size(height, width)
-        corners = places_of(len(rows), *size, columns=1)
-        for number, ((name, picks), corner) in enumerate(zip(rows, corners, strict=True), 1):
+        strips = ("least", sheet.least), ("middle", sheet.middle), ("greatest", sheet.greatest)
+        corners = places_of(len(strips), *sheet_size(height, width), columns=1)
+        for number, ((name, picks), corner) in enumerate(zip(strips, corners, strict=True), 1):
             if not picks:
                 continue
             path = f"{place}/sheet/{number}_{name}"
-            row = np.hstack([part for pick in picks for part in (pick.frame, gap)])[:, :-BETWEEN]
+            strip = np.hstack([part for pick in picks for part in (pick.frame, gap)])[:, :-BETWEEN]
             words = f"{name}: {picks[0].y:.2f} to {picks[-1].y:.2f}"
-            _hang(self._target, path, corner, row.shape[::-1], words, GREY)
-            self._target.log(path, rr.Image(row))
+            hang(self._rows, path, corner, strip.shape[::-1], words, GREY)
+            self._rows.log(path, rr.Image(strip))
 
 
-def sheet_size(height: int, width: int) -> tuple[int, int]:
-    """Width and height of a row of a contact sheet of frames of a size."""
-    return EACH * (width + BETWEEN) - BETWEEN, height
+def write_followed(rows: Rows, log: Path, outline: Outline, truth: Sequence[Frames]) -> list[Panel]:
+    """Write each module's output where its stream was watched, and what it follows at all frames.
 
+    Args:
+        rows: of the recording.
+        log: of the run.
+        outline: the run in short.
+        truth: ground truth of each frame, piece after piece.
 
-def _hang(
-    target: Target,
-    path: str,
-    corner: tuple[float, float],
-    size: Sequence[int],
-    words: str,
-    rgb: Rgb,
-) -> None:
-    """Say where a picture of a size (width, height) hangs, with a frame, and words below it."""
-    width, height = size
-    target.log(path, rr.Transform3D(translation=[*corner, 0.0]))
-    rgbs = packed_all([rgb])
-    frame = rr.Boxes2D(mins=[[0, 0]], sizes=[size], colors=rgbs, show_labels=False)
-    target.log(f"{path}/frame", frame)
-    place = [[width / 2, (1 + ROOM / 8) * height]]
-    said = rr.Points2D(place, labels=[label(words)], colors=rgbs, radii=[0.0], show_labels=True)
-    target.log(f"{path}/words", said)
+    Returns:
+        A panel for each module that follows anything.
+    """
+    names, spec, panels = outline.header.spec.streams, rows.spec, list[Panel]()
+    if not truth or not outline.saved:
+        return panels
+    frames, values = (np.concatenate(p)[-FOLLOWED_FRAMES:] for p in zip(*truth, strict=True))
+    at = frames, outline.blocks.iteration(frames)
+    for output in read_outputs(log, outline, (frames, values), FOLLOWED, FOLLOWED_FRAMES):
+        fit = output.best_fit(spec.truth)
+        if fit is None:
+            continue
+        y = np.full(len(frames), np.nan)
+        y[np.isin(frames, output.t)] = output.y[np.isin(output.t, frames)]
+        stream, root = names[output.stream], f"learned/{output.module}"
+        for path, name, line, rgb, width in (
+            ("followed", f"{fit.function}, fitted to it", fit(values[:, fit.column]), GREY, BROAD),
+            ("output", f"module {output.module} on {stream}", y, colour(output.stream), NARROW),
+        ):
+            rows.lines(f"{root}/{path}", [name], at, line[:, None], [rgb], width=width, gap=1)
+        followed = f"{label(fit.function)} (grey, |r| = {fit.r:.2f})"
+        title = f"Module {output.module} on {label(stream)} has learned {followed}"
+        entities = f"/{root}/followed", f"/{root}/output"
+        panels.append(Panel(title, entities, "near", fit=True, legend=False))
+    rows.flush()
+    return panels

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from cdmisfa.core.arrays import FloatArray, IntArray
 from replay.palette import colour
 from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Row
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
-from replay.view.columns import ITERATION, MOST_STREAMS, Column, Target, power_of_ten
-from replay.view.labels import label, part, text_table
-from replay.view.layouts import blueprint, lines, time_axis
+from replay.view.layouts import blueprint, lines
+from replay.view.rows import ITERATION, MOST_STREAMS, Rows, label, part, power_of_ten
+from replay.view.summary import text_table
 
 CURVES = {
     "eta_dot": "Change of slowness η̇, as powers of ten: a module is saved when it is below δ",
@@ -35,7 +34,7 @@ ERROR = "learning_error"
 
 def build_overlay(
     runs: Sequence[Path],
-    rows: Sequence[Row],
+    compared: Sequence[Row],
     out: Path,
     *,
     force: bool = False,
@@ -47,7 +46,7 @@ def build_overlay(
 
     Args:
         runs: the runs.
-        rows: their rows by `side_by_side`.
+        compared: their rows by `side_by_side`.
         out: the file.
         force: replace an existing file.
         tab: name of the tab that is open; by default the first.
@@ -57,56 +56,61 @@ def build_overlay(
         LogDamagedError: a run cannot be read.
         CdmisfaError: the file cannot be written.
     """
-    roots = [f"compare/{part([row.name for row in rows], i)}" for i in range(len(rows))]
+    names, written = [row.name for row in compared], set[str]()
+    roots = [f"compare/{part(names, i)}" for i in range(len(names))]
     with recording_to(out, out.stem, out, force=force) as recording:
-        text = label("\n".join(text_table(HEAD, (row.cells() for row in rows))))
+        text = label("\n".join(text_table(HEAD, (row.cells() for row in compared))))
         table = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         recording.log("summary", table, static=True)
-        for number, (run, row, root) in enumerate(zip(runs, rows, roots, strict=True)):
-            header, columns = row.outline.header, dict[str, Column]()
-            target, shown = Target(recording, header.spec), row.outline.streams(MOST_STREAMS)
+        for number, (run, row, root) in enumerate(zip(runs, compared, roots, strict=True)):
+            header, shown = row.outline.header, row.outline.streams(MOST_STREAMS)
+            rows = Rows(recording, header.spec)
             for signals in read_columns(run, header):
-                for entity, kept, values in _curves(signals, header.spec.streams, shown):
-                    path, within = f"{root}/{entity}", signals.tau if ERROR in entity else 0
-                    if path not in columns:
-                        names = [row.name] * values.shape[1]
-                        rgbs = [colour(number)] * len(names)
-                        columns[path] = target.lines(path, names, rgbs, within=within)
-                    columns[path].add(signals.frames[kept], signals.iterations[kept], values)
-            for column in columns.values():
-                column.flush()
-        recording.send_blueprint(_layout(rows, roots, tab))
+                _write_curves(rows, root, signals, shown, number, row.name)
+            rows.flush()
+            written |= rows.spans.keys()
+        recording.send_blueprint(_layout(compared, roots, written, tab))
 
 
-def _curves(
-    signals: SignalColumns, names: Sequence[str], shown: Sequence[int]
-) -> Iterator[tuple[str, IntArray, FloatArray]]:
-    """Entity of each curve, the records in which it has values, and these."""
-    for name in CURVES:
-        values = signals[name].astype(np.float64).reshape(len(signals), -1)
-        yield name, np.arange(len(signals)), power_of_ten(values) if name == "eta_dot" else values
+def _write_curves(
+    rows: Rows, root: str, signals: SignalColumns, shown: Sequence[int], number: int, name: str
+) -> None:
+    """Write the curves of a run, and its learning error in the blocks of each stream."""
+    for signal in CURVES:
+        values = signals[signal].astype(np.float64).reshape(len(signals), -1)
+        values = power_of_ten(values) if signal == "eta_dot" else values
+        count = values.shape[1]
+        rows.lines(
+            f"{root}/{signal}", [name] * count, signals.times(), values, [colour(number)] * count
+        )
     for s in shown:
         own = np.flatnonzero(signals["stream"] == s)
         if len(own):
             untested = np.isnan(signals["tested"][own])
-            errors = np.where(untested, np.nan, signals[ERROR][own])
-            yield f"{ERROR}/{part(names, s)}", own, errors.reshape(len(own), -1)
+            errors = np.where(untested, np.nan, signals[ERROR][own])[:, None]
+            at = signals.frames[own], signals.iterations[own]
+            path = f"{root}/{ERROR}/{part(rows.spec.streams, s)}"
+            rows.lines(path, [name], at, errors, [colour(number)], gap=signals.tau)
 
 
-def _layout(rows: Sequence[Row], roots: Sequence[str], tab: str | None) -> rrb.Blueprint:
-    length, outline = max(row.outline.iterations for row in rows), rows[0].outline
-    told = frozenset[str]().union(*(row.outline.told for row in rows))
+def _layout(
+    compared: Sequence[Row], roots: Sequence[str], written: Collection[str], tab: str | None
+) -> rrb.Blueprint:
+    """Return a panel for each curve and each stream's error that a run has."""
+    outline, length = compared[0].outline, max(row.outline.iterations for row in compared)
 
-    def panel(title: str, entity: str) -> rrb.View:
-        return lines(title, [f"/{root}/{entity}" for root in roots], time_axis(length))
+    def panels(titles: dict[str, str]) -> list[rrb.View]:
+        return [
+            lines(title, [f"/{root}/{entity}" for root in roots], length)
+            for entity, title in titles.items()
+            if any(f"{root}/{entity}" in written for root in roots)
+        ]
 
-    curves = [panel(title, name) for name, title in CURVES.items() if name in told]
-    first = rrb.TextDocumentView(origin="/summary", name="Runs"), rrb.Grid(*curves, grid_columns=2)
-    tabs = [rrb.Vertical(*first, row_shares=[1, 3], name="Overview")]
-    if ERROR in told:
-        names, shown = outline.names(), outline.streams(MOST_STREAMS)
-        titles = [f"Learning error of {label(names[s])}" for s in shown]
-        places = [f"{ERROR}/{part(names, s)}" for s in shown]
-        errors = map(panel, titles, places)
-        tabs.append(rrb.Vertical(*errors, name="Streams"))
+    table = rrb.TextDocumentView(origin="/summary", name="Runs")
+    grid = rrb.Grid(*panels(CURVES), grid_columns=2)
+    tabs = [rrb.Vertical(table, grid, row_shares=[1, 3], name="Overview")]
+    names, shown = outline.names(), outline.streams(MOST_STREAMS)
+    errors = {f"{ERROR}/{part(names, s)}": f"Learning error of {label(names[s])}" for s in shown}
+    if views := panels(errors):
+        tabs.append(rrb.Vertical(*views, name="Streams"))
     return blueprint(*tabs, name="Comparison", timeline=ITERATION, length=length, tab=tab)

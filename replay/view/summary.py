@@ -3,118 +3,104 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Iterable, Sequence
 
 from cdmisfa.core.names import counted
 from cdmisfa.core.signals import ACTIONS, STATES
 from replay.runs.run import Outline
-from replay.view.columns import MOST_STREAMS
-from replay.view.labels import text_table
+from replay.view.rows import MOST_STREAMS
 
 ENDED = "ended:"
 """Start of the event that says why a run ended."""
 
-TOLD = ("nu", "tau", "sigma", "delta")
-"""Settings of CD-MISFA that are told."""
-
-TOLD_OF_PROGRESS = ("tau", "components", "window", "attention")
-"""Settings of the progress learner that are told."""
+SETTINGS = {
+    "paper": ("nu", "tau", "sigma", "delta"),
+    "progress": ("tau", "components", "window", "attention"),
+}
+"""Settings that the summary names, by learner."""
 
 NAMED = 4
 """Most streams whose names are given together."""
 
 
 def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str:
-    """Summary of a run as Markdown: modules or streams learned, why it ended, settings.
+    """Return the summary of a run as Markdown: what it learned, why it ended, settings.
 
     Args:
         outline: the run in short.
         name: of the run.
         events: what happened in it, in words.
     """
-    header = outline.header
-    lines = [f"## {name}", _opening(outline), ""]
-    lines += _of_streams(outline, events) if header.by_progress else _of_modules(outline)
+    header, names, by_progress = outline.header, outline.names(), outline.header.by_progress
+    lines = [
+        f"## {name}",
+        f"**{counted(len(outline.saved), 'module')} learned** in "
+        f"{counted(outline.iterations, 'iteration', ',')} "
+        f"({counted(outline.frames, 'frame', ',')} of {counted(len(names), 'stream')}).",
+        "",
+    ]
+    lines += _of_streams(outline, events) if by_progress else _of_modules(outline)
     reasons = [text.removeprefix(ENDED).strip() for text in events if text.startswith(ENDED)]
     lines += [f"It ended: {reason}.\n" for reason in reasons[-1:] if reason]
-    if not header.by_progress:
-        names, visits, frames = outline.names(), outline.visits, max(outline.frames, 1)
-        watched = [
+    if not by_progress:
+        visits, frames = outline.visits, max(outline.frames, 1)
+        shares = (
             (names[s], f"{visits[s]} frames, {visits[s] / frames:.0%}")
             for s in outline.streams(MOST_STREAMS)
-        ]
-        lines += text_table(("stream", "watched"), watched)
+        )
+        lines += text_table(("stream", "watched"), shares)
     settings = [("seed", header.manifest.get("seed"))]
-    keys = TOLD_OF_PROGRESS if header.by_progress else TOLD
+    keys = SETTINGS["progress" if by_progress else "paper"]
     settings += [(key, header.setting("learner", key)) for key in keys]
-    said = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
-    lines += [said, ""]
+    lines += [", ".join(f"{key} {value}" for key, value in settings if value is not None), ""]
     return "\n".join(lines)
 
 
 def _of_modules(outline: Outline) -> list[str]:
-    """The modules of a run of CD-MISFA, and the one that was not saved."""
-    streams, rows = outline.names(), []
+    """Return the modules of a run of CD-MISFA, and the one that was not saved."""
+    streams, last, rows = outline.names(), outline.last, []
     for save in outline.saved:
         eta = ", ".join(f"{value:.4f}" for value in save.eta)
         policy = policy_text(save.policy, streams)
         rows.append((save.module, streams[save.stream], save.iteration, eta, policy))
     head = "module", "stream", "iteration", "η [1/frame]", "policy"
     lines = text_table(head, rows) if rows else []
-    unfinished = _unfinished(outline)
-    return [*lines, unfinished, ""] if unfinished else lines
+    if last is None or any(save.module == last.module for save in outline.saved):
+        return lines
+    most = int(last.novel_of.argmax())
+    share = last.novel_of[most] / max(last.novel, 1)
+    of_most = f", and {share:.0%} of these were of {streams[most]}" if last.novel else ""
+    unsaved = (
+        f"Module {last.module} was not saved: {last.novel / last.blocks:.0%} of its "
+        f"{last.blocks:,} blocks were novel{of_most}."
+    )
+    return [*lines, unsaved, ""]
 
 
 def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
-    """State of each stream of a run of the progress learner, in the words of the run's events."""
+    """Return the state of each stream of the progress learner, in the words of the events."""
     names = outline.names()
-    said: dict[str, str] = {}
+    outcomes: dict[str, str] = {}
     for text in events:
-        about = [name for name in names if text.startswith(f"stream {name} ")]
-        if about:
+        if about := [name for name in names if text.startswith(f"stream {name} ")]:
             name = max(about, key=len)
-            said[name] = text.removeprefix(f"stream {name} ")
+            outcomes[name] = text.removeprefix(f"stream {name} ").removeprefix("is ")
     counts = Counter(outline.states)
-    found = [(counts[code], state.replace("_", " ")) for code, state in enumerate(STATES)]
-    lines = [", ".join(f"{count} {state}" for count, state in found if count), ""]
+    states = [(counts[code], state.replace("_", " ")) for code, state in enumerate(STATES)]
+    lines = [", ".join(f"{count} {state}" for count, state in states if count), ""]
     for s in outline.streams(MOST_STREAMS):
         learning = outline.states[s] == STATES.index("learning")
-        became = "being learned" if learning else said.get(names[s], "").removeprefix("is ")
-        lines.append(f"- **{names[s]}**: {became}")
+        outcome = "being learned" if learning else outcomes.get(names[s], "")
+        lines.append(f"- **{names[s]}**: {outcome}")
     more = len(names) - MOST_STREAMS
     return [*lines, "", *([f"And {more} streams that were watched less.", ""] if more > 0 else [])]
 
 
-def decision_text(
-    names: Sequence[str], reward: NDArray[np.float64], value: NDArray[np.float64]
-) -> str:
-    """R and Q as Markdown tables, in thousandths.
-
-    Args:
-        names: of the streams.
-        reward: (S, A, S) R from a stream, by an action, to a stream.
-        value: (S, A) Q.
-    """
-    tables = [
-        (f"R to {name}", ("from, to", *names), reward[:, action])
-        for action, name in enumerate(ACTIONS)
+def policy_text(policy: Sequence[int], streams: Sequence[str]) -> str:
+    """Return a policy in words, as "stay on x1" or "stay on 40 of 78 streams"."""
+    stays = [
+        s for s, action in zip(streams, policy, strict=True) if action == ACTIONS.index("stay")
     ]
-    lines: list[str] = []
-    for title, head, values in (*tables, ("Q", ("in", *ACTIONS), value)):
-        rows = [
-            (name, *(f"{1000 * v:.3f}" for v in row))
-            for name, row in zip(names, values.tolist(), strict=True)
-        ]
-        lines += [f"**{title}** [1/1000]", "", *text_table(head, rows)]
-    return "\n".join(lines)
-
-
-def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:
-    """A policy in words, as "stay on left"."""
-    stays = [streams[s] for s, action in enumerate(policy) if action == 0]
     if len(stays) == len(streams):
         return "stay everywhere"
     if len(stays) > NAMED:
@@ -122,23 +108,7 @@ def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:
     return f"stay on {', '.join(stays)}" if stays else "switch everywhere"
 
 
-def _unfinished(outline: Outline) -> str:
-    """A sentence about the abstraction that was not saved."""
-    last = outline.last
-    if last is None or any(save.module == last.module for save in outline.saved):
-        return ""
-    most = int(last.novel_of.argmax())
-    share = last.novel_of[most] / max(last.novel, 1)
-    of_most = f", and {share:.0%} of these were of {outline.names()[most]}" if last.novel else ""
-    return (
-        f"Module {last.module} was not saved: {last.novel / last.blocks:.0%} of its "
-        f"{last.blocks:,} blocks were novel{of_most}."
-    )
-
-
-def _opening(outline: Outline) -> str:
-    learned = f"{counted(len(outline.saved), 'module')} learned"
-    return (
-        f"**{learned}** in {counted(outline.iterations, 'iteration', ',')} "
-        f"({counted(outline.frames, 'frame', ',')} of {counted(len(outline.names()), 'stream')})."
-    )
+def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """Return the lines of a Markdown table, and an empty one behind it."""
+    lines = [head, ["---"] * len(head), *rows]
+    return [*(f"| {' | '.join(map(str, line))} |" for line in lines), ""]

@@ -1,0 +1,152 @@
+"""Images on a wall, with frames and words: the streams of a run that is in no known world."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from cdmisfa.core.signals import STATES
+from replay.outputs import EACH
+from replay.palette import Rgb, colour, packed_all
+from replay.runs.columns import SignalColumns
+from replay.runs.log import Batch
+from replay.view.rows import Rows, Span, changes, label, part
+
+WALL = "wall"
+
+SHAPE = 1.7
+"""Width of the wall over its height, as near as whole images allow."""
+
+ROOM, SPACE = 0.5, 0.06
+"""Room below an image for its words, and between two, in heights of an image."""
+
+BETWEEN = 4
+"""Pixels between two frames of a strip of frames."""
+
+
+def places_of(
+    count: int, width: int, height: int, columns: int | None = None
+) -> list[tuple[float, float]]:
+    """Return corners (x, y) of images of a size on a wall, in rows of so many, or as fit."""
+    across, down = width + SPACE * height, (1 + ROOM) * height
+
+    def badness(columns: int) -> float:
+        return abs(math.log(columns * across / (math.ceil(count / columns) * down) / SHAPE))
+
+    columns = columns or min(range(1, count + 1), key=badness)
+    return [(i % columns * across, i // columns * down) for i in range(count)]
+
+
+def bounds(count: int, height: int, width: int, columns: int | None = None) -> tuple[Span, Span]:
+    """Return ranges of x and y that hold a wall of images of a size; see `places_of`."""
+    x, y = map(max, zip(*places_of(count, width, height, columns), strict=True))
+    margin = SPACE * height
+    return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
+
+
+def sheet_size(height: int, width: int) -> tuple[int, int]:
+    """Return width and height of a strip of frames of a size."""
+    return EACH * (width + BETWEEN) - BETWEEN, height
+
+
+def hang(
+    rows: Rows, path: str, corner: Sequence[float], size: Sequence[int], words: str, rgb: Rgb
+) -> None:
+    """Write where an image of a size (width, height) hangs, with a frame, and words below it."""
+    width, height = size
+    rows.log(path, rr.Transform3D(translation=[*corner, 0.0]))
+    rgbs = packed_all([rgb])
+    frame = rr.Boxes2D(mins=[[0, 0]], sizes=[size], colors=rgbs, show_labels=False)
+    rows.log(f"{path}/frame", frame)
+    place, texts = [[width / 2, (1 + ROOM / 8) * height]], [label(words)]
+    text = rr.Points2D(place, labels=texts, colors=rgbs, radii=[0.0], show_labels=True)
+    rows.log(f"{path}/words", text)
+
+
+class WallView:
+    """Writes the streams of a run as images on a wall.
+
+    Each shows the last image of the last block in which its stream was watched. The stream that
+    is watched is framed.
+
+    Args:
+        rows: of the recording.
+        streams: those that are shown.
+        by_progress: the run is one of the progress learner.
+    """
+
+    def __init__(self, rows: Rows, streams: Sequence[int], *, by_progress: bool) -> None:
+        self._rows, self._by_progress = rows, by_progress
+        height, width = rows.spec.frame_shape
+        self._size = width, height
+        self._corners = dict(zip(streams, places_of(len(streams), width, height), strict=True))
+        self._paths = {s: f"{WALL}/{part(rows.spec.streams, s)}" for s in streams}
+        self._framed, self._words = -1, dict.fromkeys(streams, "")
+        for s, corner in self._corners.items():
+            rows.log(self._paths[s], rr.Transform3D(translation=[*corner, 0.0]))
+
+    def show_batch(self, batch: Batch) -> None:
+        """Write what a log holds of some iterations."""
+        for columns in batch.signals:
+            self._frame(columns)
+            for s in self._paths:
+                self._write_words(columns, s)
+        blocks = batch.blocks
+        for frames, images in batch.watched if len(blocks.starts) else ():
+            places = blocks.places(frames)
+            last = np.flatnonzero(np.diff(places, append=len(blocks.starts)))
+            streams = blocks.streams[places[last]]
+            for s in self._paths.keys() & set(streams.tolist()):
+                shown = last[streams == s]
+                at = frames[shown], blocks.iterations[places[shown]]
+                self._rows.frames(self._paths[s], at, images[shown])
+
+    def _frame(self, columns: SignalColumns) -> None:
+        """Put the frame around the watched stream; around one that is not shown it has no size."""
+        turns = changes(columns["stream"], self._framed)
+        if not len(turns):
+            return
+        watched = columns["stream"][turns].tolist()
+        self._framed = watched[-1]
+        half = np.array(self._size) / 2
+        boxes = rr.Boxes2D.columns(
+            half_sizes=[half if s in self._corners else (0.0, 0.0) for s in watched],
+            centers=[half + self._corners.get(s, (0.0, 0.0)) for s in watched],
+            colors=packed_all([colour(s) for s in watched]),
+            radii=[self._size[1] / 80] * len(watched),
+        )
+        at = columns.frames[turns], columns.iterations[turns]
+        self._rows.send(f"{WALL}/frame", at, boxes)
+
+    def _write_words(self, columns: SignalColumns, s: int) -> None:
+        """Write below an image its stream's name, and state or module, where they change."""
+        name, words = label(self._rows.spec.streams[s]), self._words[s]
+        texts: list[tuple[int, str]] = []
+        if self._by_progress:
+            codes = columns["state"][:, s]
+            for i in changes(codes, codes[0] - 1).tolist():
+                state = STATES[codes[i]].replace("_", " ") if codes[i] >= 0 else ""
+                texts.append((i, f"{name}: {state}" if state else name))
+        else:
+            saves = np.flatnonzero(columns["saved"] & (columns["stream"] == s)).tolist()
+            texts = [] if words else [(0, name)]
+            texts += [(i, f"{name}: module {columns['module'][i]}") for i in saves]
+        if texts and texts[0][1] == words:
+            texts = texts[1:]
+        if not texts:
+            return
+        turns, labels = zip(*texts, strict=True)
+        self._words[s], count = labels[-1], len(texts)
+        width, height = self._size
+        points = rr.Points2D.columns(
+            positions=[(width / 2, (1 + ROOM / 2) * height)] * count,
+            labels=labels,
+            colors=packed_all([colour(s)] * count),
+            radii=[0.0] * count,
+            show_labels=[True] * count,
+        )
+        at = columns.frames[[*turns]], columns.iterations[[*turns]]
+        self._rows.send(f"{self._paths[s]}/state", at, points)
