@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.learners import learner_entry, open_learner
+from cdmisfa.agents.learners import learner_class, open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, turn_to
 from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import LogExhaustedError, UsageError
@@ -90,8 +90,9 @@ class WatchEnv(Env):
             raise UsageError(
                 f"max_iterations={max_iterations!r} given: it is a number from 1, or None"
             )
-        entry = learner_entry(algorithm)
-        base = load_preset(entry.preset)["learner"] if entry.preset else {}
+        entry = learner_class(algorithm)
+        preset = getattr(entry, "preset", None)
+        base = load_preset(preset)["learner"] if preset else {}
         told = ({"algorithm": algorithm}, settings)
         self._config = build(entry.configuration, "learner", base, *told)
         self._source, self._start, self._observe = source, source.t, observe

@@ -340,7 +340,7 @@ REFUSED = {
     f"learn {TEST} --resume -o run": "learn from a recording of them",
     f"record {TEST} -o x --resume": "leave out --resume",
     f"convert {TEST} -o x": "is a live stream: cdmisfa record",
-    "record icub --size 32x24 -o x": "icub is a scene: --size is for cameras",
+    "record icub --size 32x24 -o x": "icub is a scene: --size is for logs and cameras",
 }
 
 

@@ -10,7 +10,7 @@ import pytest
 from conftest import Cdmisfa
 from contracts.learners import LearnerContract
 
-from cdmisfa.agents.learners import learner_entry
+from cdmisfa.agents.learners import learner_class
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Learner
@@ -29,8 +29,8 @@ def _found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 class TestWatcher(LearnerContract):
     def open(self, spec: SourceSpec, seed: int) -> Learner:
-        entry = learner_entry(OWN)
-        return entry.open(entry.configuration(), spec, seed)
+        watcher = learner_class(OWN)
+        return watcher(watcher.configuration(), spec, seed)
 
 
 def test_it_learns_is_checked_and_resumed(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -203,8 +203,7 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
         ("attention=progres", "learner.attention is 'progres': it must be one of novel, progress"),
         ("outputs=17", r"learner.outputs is 17: it must be in \[1, 16\]"),
         ("tau=2", r"learner.tau is 2: it must be in \[3, 100000\]"),
-        ("nu=.1", "learner.nu is of the learner 2.0, and this is progress: leave it out"),
-        ("nuu=.1", "unknown key learner.nuu"),
+        ("nu=.1", "unknown key learner.nu: there are algorithm, tau"),
     ],
 )
 def test_wrong_settings_are_named(setting: str, message: str) -> None:

@@ -71,6 +71,8 @@ class CuriousLearner:
         (100, 1)
     """
 
+    configuration = LearnerConfig
+
     def __init__(
         self,
         config: LearnerConfig,

@@ -25,7 +25,7 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, unbroken
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.processes import thread_count
-from cdmisfa.experiments.sources import configure, is_scene, of_scene, open_logs
+from cdmisfa.experiments.sources import configure, is_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.words import is_live, open_live, refuse_stored
 from recorder.images.framing import Recipe
@@ -118,8 +118,8 @@ class Application:
         if any(map(is_live, words)):
             refuse_stored(words, inputs)
             source = open_live(words, self._with_recipe(inputs), say=say)
-        elif is_scene(words, inputs):
-            source = configure(words[0], settings=of_scene((), inputs)).open_scene()
+        elif is_scene(words):
+            source = configure(words[0], inputs=inputs).open_scene()
         else:
             source = self._open_log(words, inputs, loop=loop, salvage=salvage)
         if source.spec.frame_shape != self.recipe.shape:

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.learners import learner_entry, open_learner
+from cdmisfa.agents.learners import learner_class, open_learner
 from cdmisfa.core.blocks import SeekableSource, SourceSpec, description, turn_to
 from cdmisfa.core.config import build, parse_settings, section_table
 from cdmisfa.core.errors import (
@@ -60,7 +60,7 @@ def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, 
     """Return the configurations of a run, in order."""
     try:
         table, seed, fork = manifest["config"]["learner"], manifest["seed"], manifest.get(FORK)
-        config = build(learner_entry(table["algorithm"]).configuration, "learner", table)
+        config = build(learner_class(table["algorithm"]).configuration, "learner", table)
         if fork is None:
             return (ConfigSpan(0, config, seed, {}),)
         span = ConfigSpan(int(fork["at"]), config, seed, dict(fork["changed"]))
@@ -84,7 +84,7 @@ def fork_span(
         UsageError: a setting cannot change.
     """
     table, words = manifest["config"]["learner"], parse_settings(settings)
-    kind = learner_entry(table["algorithm"]).configuration
+    kind = learner_class(table["algorithm"]).configuration
     config = build(kind, "learner", table, words.get("learner", {}))
     before = section_table(build(kind, "learner", table))
     found = differences(before, section_table(config))

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from cdmisfa.agents.learners import LEARNERS, learner_entry
-from cdmisfa.core.config import parse_settings, section_table
+from cdmisfa.agents.learners import LEARNERS, learner_class
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import MAX_LIST
 from cdmisfa.experiments.documents import as_text, write_json
@@ -28,8 +28,6 @@ from cdmisfa.experiments.sources import (
     configure,
     configure_for,
     is_scene,
-    log_settings,
-    of_scene,
     open_logs,
     read_inputs,
 )
@@ -154,8 +152,8 @@ def plan(
     if keys := [key for key in grid if key.startswith("input.")]:
         raise UsageError(f"grid: {keys[0]} is the same for all trials: give it with --set")
     words = (source,) if isinstance(source, str | Path) else tuple(source)
-    if not is_scene(words, inputs):
-        inputs = read_inputs(inputs, preset, parse_settings(settings))
+    if not is_scene(words):
+        inputs = read_inputs(inputs, preset, settings)
     inputs = inputs or InputOptions()
     configured, recorded = _configured(words, preset, loop, inputs)
     # Workers may have another working directory.
@@ -196,7 +194,7 @@ def _own_code(algorithm: str) -> str:
     """Return a hash of the module of a user's learner, as `code` is of ours; "" for ours."""
     if algorithm in LEARNERS:
         return ""
-    module = inspect.getfile(learner_entry(algorithm).open)
+    module = inspect.getfile(learner_class(algorithm))
     return hashlib.sha256(Path(module).read_bytes()).hexdigest()
 
 
@@ -204,17 +202,12 @@ def _configured(
     words: tuple[str | Path, ...], preset: str | None, loop: bool, inputs: InputOptions
 ) -> tuple[Callable[[Sequence[str]], Configuration], dict[str, Any] | None]:
     """The configuration for settings, and what a source says of itself; None of a live scene."""
-    if is_scene(words, inputs):
-        return lambda told: configure(str(words[0]), preset, of_scene(told, inputs), None), None
+    if is_scene(words):
+        return lambda told: configure(str(words[0]), preset, told, None, inputs), None
     source = open_logs(words, loop=loop, inputs=inputs, goal=("sweep", "SWEEP"))
     with contextlib.closing(source):
         recorded, spec = dict(source.describe()), source.spec
-
-    def configured(settings: Sequence[str]) -> Configuration:
-        told = log_settings(settings, words[0])
-        return configure_for(spec, recorded, preset, told, None, inputs)
-
-    return configured, recorded
+    return lambda told: configure_for(spec, recorded, preset, told, None, inputs), recorded
 
 
 def compute(trial: SweepTrial) -> Mapping[str, Any]:

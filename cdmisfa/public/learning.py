@@ -24,8 +24,6 @@ from cdmisfa.experiments.sources import (
     Configuration,
     configure_for,
     is_scene,
-    log_settings,
-    open_cameras_now,
     open_source,
     read_inputs,
 )
@@ -166,7 +164,7 @@ def _opened(
             raise UsageError("episodes is of a recording: learn(Recording(source, episodes=True))")
         raise UsageError("episodes is for logs: record or write what is shown first")
     if words:
-        streams, configuration = open_cameras_now(words, **how)
+        streams, configuration = open_source(words, **how)
         with contextlib.closing(streams):
             yield streams, configuration, (words, {})
         return
@@ -196,11 +194,10 @@ def _configured(
     source: FrameSource, how: dict[str, Any], inputs: InputOptions | None = None
 ) -> Configuration:
     """The configuration of an open source, which shows its frames as keys `input.*` say."""
-    told = log_settings(how["settings"], None)
-    inputs = read_inputs(inputs, how["preset"], told)
+    inputs = read_inputs(inputs, how["preset"], how["settings"])
     if inputs.centre != "run":
         if not isinstance(source, StoredSource):
             raise UsageError("centre is for logs: record or write what is shown first")
         source.centre_by(inputs.centre)
     described = description(source, at_once=True)
-    return configure_for(source.spec, described, how["preset"], told, how["seed"], inputs)
+    return configure_for(source.spec, described, **how, inputs=inputs)

@@ -74,6 +74,9 @@ class ProgressLearner:
         rule: chooses the next stream; that of the configuration unless another is assigned.
     """
 
+    configuration = ProgressConfig
+    preset = "cameras"
+
     def __init__(self, config: ProgressConfig, spec: SourceSpec, seed: int) -> None:
         self.config, self.spec = config, spec
         self.modules: list[Module] = []

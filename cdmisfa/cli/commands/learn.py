@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.report import report_beside
 from cdmisfa.cli.printing import (
@@ -45,7 +44,7 @@ KEPT = ("seed", "max_iterations", "max_modules")
 @click.option(
     "--algorithm",
     metavar="NAME",
-    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a "
+    help="The learner, short for --set learner.algorithm=: 2.0, 1.0, progress, or a "
     "class of your own, package.module:Class. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
 )
@@ -198,7 +197,7 @@ def opened_live(
     told: Mapping[str, Any], source: tuple[str, ...], inputs: InputOptions
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """Live streams, recorded meanwhile where that is asked for; see `opened_logs`."""
-    from cdmisfa.experiments.sources import open_cameras_now
+    from cdmisfa.experiments.sources import open_source
     from recorder.live import RecordedWhileWatched
     from recorder.log.files import refuse_existing
 
@@ -212,9 +211,9 @@ def opened_live(
     for folder in (out, record_to):
         if folder is not None:
             refuse_existing(folder, force=force, goes_on=False)
-    frames, configuration = open_cameras_now(
+    frames, configuration = open_source(
         source,
-        inputs,
+        inputs=inputs,
         preset=told["preset"],
         settings=settings_of(told),
         seed=told["seed"],

@@ -82,7 +82,7 @@ def record_command(
     Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
     av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. Logs of others are written by cdmisfa convert.
     """
-    from cdmisfa.experiments.sources import configure, is_scene, of_scene
+    from cdmisfa.experiments.sources import configure
     from recorder.cameras.words import is_live
     from recorder.log.manifest import RecordingStart
     from recorder.recording import recorded
@@ -102,7 +102,6 @@ def record_command(
     resumed = out if writing["resume"] else None
     start = RecordingStart() if resumed is None else _start(resumed)
     named = "".join(source) or start.scene
-    is_scene([named], inputs)  # which refuses options of cameras
     given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
     asked = named or given_seed or writing["frames"] or writing["split"]
     if resumed is not None and not asked and (files := recorded(resumed)):
@@ -113,7 +112,7 @@ def record_command(
         where = "" if resumed is None else f"{resumed} does not say of what it is: "
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
     seed = seed if given_seed or start.seed is None else start.seed
-    configuration = configure(named, preset, of_scene(settings, inputs), seed)
+    configuration = configure(named, preset, settings, seed, inputs)
     files = _record_scene(ctx, configuration, out, **writing)
     _print_recording(out, files, as_json=as_json)
 
@@ -131,14 +130,14 @@ def _record_streams(
     **how: Any,
 ) -> None:
     """Record live streams until there are so many frames, they end, or Ctrl-C."""
-    from cdmisfa.experiments.sources import open_cameras_now
+    from cdmisfa.experiments.sources import open_source
     from recorder.config import Split
     from recorder.live import RecordedWhileWatched, record_watched
     from recorder.log.files import refuse_existing
     from recorder.recording import DEFAULT_FRAMES
 
     refuse_existing(out, force=force, goes_on=False)
-    source, configuration = open_cameras_now(words, inputs, say=tell, **how)
+    source, configuration = open_source(words, inputs=inputs, say=tell, **how)
     notice = "finishing the recording; again to stop at once\n"
     with contextlib.closing(source), stoppable(notice=notice) as stop:
         frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)
