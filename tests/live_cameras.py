@@ -14,7 +14,7 @@ import foxglove
 import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
-from recorder.cameras.readers import Picture, Readers
+from recorder.cameras.readers import CameraState, Readers, Stamped
 
 SHAPE = (12, 16)
 BEGIN = 10**18
@@ -38,15 +38,13 @@ class ScriptedReaders(Readers):
 
     def __init__(self, script: Sequence[Arrival], streams: int, rate: float | None = 30.0) -> None:
         self._script = deque(sorted(script, key=lambda arrival: arrival.comes))
-        self._waiting: list[deque[Picture]] = [deque() for _ in range(streams)]
-        self._now, self._rate = BEGIN, rate
+        self.states = [CameraState(n, Hand(f"camera {n}", rate), BEGIN) for n in range(streams)]
+        self._now = BEGIN
         self.closed = 0
+        self._look_ahead()
 
     def now(self) -> int:
         return self._now
-
-    def take(self, stream: int) -> Picture | None:
-        return self._waiting[stream].popleft() if self._waiting[stream] else None
 
     def wait(self, until: int) -> None:
         comes = self._script[0].comes if self._script else np.inf
@@ -56,21 +54,20 @@ class ScriptedReaders(Readers):
         arrival = self._script.popleft()
         self._now = BEGIN + round(arrival.comes * NANOSECONDS)
         taken = arrival.comes if arrival.taken is None else arrival.taken
-        picture = Picture(BEGIN + round(taken * NANOSECONDS), arrival.image)
-        self._waiting[arrival.stream].append(picture)
+        stamped = Stamped(BEGIN + round(taken * NANOSECONDS), arrival.image)
+        self.states[arrival.stream].queue.append(stamped)
+        self._look_ahead()
 
-    def over(self, stream: int) -> str:
-        left = any(arrival.stream == stream for arrival in self._script)
-        return "" if left else f"camera {stream} ended"
-
-    def lost(self, stream: int) -> int:
-        return 0
-
-    def rate(self, stream: int) -> float | None:
-        return self._rate
+    def take(self, state: CameraState) -> Stamped | None:
+        return state.queue.popleft() if state.queue else None
 
     def close(self) -> None:
         self.closed += 1
+
+    def _look_ahead(self) -> None:
+        for number, state in enumerate(self.states):
+            left = any(arrival.stream == number for arrival in self._script)
+            state.over = "" if left else f"camera {number} ended"
 
 
 def bar(seed: int, k: int) -> np.ndarray[Any, Any]:
@@ -84,10 +81,9 @@ class Hand:
     """A camera that shows what it is handed: images, an error to raise, or None to end."""
 
     finite = False
-    rate: float | None = 50.0
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, rate: float | None = 50.0) -> None:
+        self.name, self.rate = name, rate
         self.opened = 0
         self._given: deque[Any] = deque()
         self._there = threading.Condition()
@@ -97,7 +93,7 @@ class Hand:
             self._given.extend(things)
             self._there.notify_all()
 
-    def pictures(self) -> Iterator[tuple[int, Any]]:
+    def images(self) -> Iterator[tuple[int, Any]]:
         self.opened += 1
         number = self.opened
         while True:

@@ -25,6 +25,7 @@ from cdmisfa.features.incsfa import Feature, IncrementalFeature
 from cdmisfa.features.recursive import RecursiveFeature
 from recorder.cameras.readers import Camera
 from recorder.cameras.words import CAMERAS
+from recorder.images.options import InputOptions
 from recorder.images.pixels import Shown
 from recorder.world.oscillatory import OscillatorySource
 
@@ -60,12 +61,14 @@ class TestVideo(CameraContract):
         pytest.importorskip("av")
 
     def open(self) -> Camera:
-        return CAMERAS["av"].open("av:lavfi:testsrc=rate=100:size=64x48", "bars")
+        return CAMERAS["av"]("av:lavfi:testsrc=rate=100:size=64x48", "bars", InputOptions())
 
 
 class TestColours(TestVideo):
     def open(self) -> Camera:
-        return CAMERAS["av"].open("av:lavfi:testsrc=rate=100:size=64x48", "bars", color=True)
+        return CAMERAS["av"](
+            "av:lavfi:testsrc=rate=100:size=64x48", "bars", InputOptions(color=True)
+        )
 
 
 class Readings:
@@ -76,7 +79,7 @@ class Readings:
     def __init__(self, *shown: Shown) -> None:
         self._shown = shown
 
-    def pictures(self) -> Iterator[tuple[int, Shown]]:
+    def images(self) -> Iterator[tuple[int, Shown]]:
         return ((0, shown) for shown in self._shown)
 
     def describe(self) -> Mapping[str, Any]:
@@ -106,7 +109,7 @@ def test_a_camera_that_shows_something_else_breaks_its_contract(shown: list[Show
             return Readings(*shown)
 
     with pytest.raises(AssertionError):
-        Wrong().test_its_pictures_are_of_one_kind_and_no_older_than_now()
+        Wrong().test_its_images_are_of_one_kind_and_no_older_than_now()
 
 
 def test_signals_that_are_not_said_do_not_exist() -> None:

@@ -22,9 +22,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
-from recorder.cameras.live import LiveSource
+from recorder.cameras.live import LiveSource, Steady
 from recorder.cameras.readers import CameraFrames, Readers
-from recorder.cameras.video import Steady
 from recorder.config import Split
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
 from replay.integrity.info import describe
@@ -134,15 +133,13 @@ def test_the_clock_has_the_rate_that_is_stated_measured_or_asked_for() -> None:
     assert (two.spec.start_ns, two.spec.fps) == (BEGIN + 10**7 + round(1e9 / 60), FPS)
     assert opened(steady(0, 0, 30, 12.5), states=None).spec.fps == 12.5
     assert opened(steady(0, 0, 30), rate=7.5).spec.fps == 7.5
-    with pytest.raises(UsageError, match="tells no rate: set one with --rate"):
+    with pytest.raises(UsageError, match="states no rate: set one with --rate"):
         opened(steady(0, 0, 1), states=None)
-    with pytest.raises(UsageError, match="--rate is 1e-05"):
-        opened(steady(0, 0, 30), rate=1e-5)
 
 
 def test_a_camera_that_shows_nothing_is_named() -> None:
     readers = ScriptedReaders([*steady(0, 0, 3000), Arrival(99, 1, flat(0))], 2)
-    with pytest.raises(UsageError, match="right shows no picture"):
+    with pytest.raises(UsageError, match="right shows no image"):
         LiveSource(readers, ("left", "right"), {})
     assert readers.closed
 
@@ -261,15 +258,15 @@ class Cameras:
         return thread.join
 
 
-GONE, HANGS = "right is gone: unplugged", "right: no picture for 0.3 s"
+GONE, HANGS = "right is gone: unplugged", "right: no image for 0.3 s"
 
 
 @pytest.mark.parametrize(
     ("on_loss", "why", "then"),
     [
-        ("reconnect", GONE, ": connecting to it anew"),
-        ("reconnect", HANGS, ": connecting to it anew"),
-        ("wait", GONE, ": the others go on without it"),
+        ("reconnect", GONE, ": reconnecting"),
+        ("reconnect", HANGS, ": reconnecting"),
+        ("wait", GONE, ": the other cameras continue without it"),
         ("wait", HANGS, ": waiting"),
         ("end", GONE, ""),
         ("end", HANGS, ""),
@@ -291,7 +288,7 @@ def test_a_camera_that_is_lost_is_a_gap_or_the_end(on_loss: Any, why: str, then:
         if (on_loss, why) != ("wait", GONE):
             right.give(*[flat(7)] * 3)
         if why == HANGS:
-            wait_for(lambda: "right shows pictures again" in cameras.said, seconds=20)
+            wait_for(lambda: "right shows images again" in cameras.said, seconds=20)
         assert cameras.said[0] == why + then
         assert (right.opened > 1) is (on_loss == "reconnect")
         assert source.alignment["right"]["missing"] > 0
@@ -332,9 +329,7 @@ def test_a_full_queue_is_emptied_and_says_so() -> None:
     source = cameras.source()
     cameras.hands[0].give(*[flat(k) for k in range(25)])
     wait_for(lambda: source.alignment["left"]["lost"] == 20, seconds=20)
-    assert cameras.said == 2 * [
-        "left: 10 pictures thrown away: they came faster than they were taken"
-    ]
+    assert cameras.said == 2 * ["left: discarded 10 images: they came faster than they were used"]
     cameras.close(source)
 
 

@@ -1,8 +1,8 @@
-"""Live streams on one clock: which picture each shows at each tick, or that it has none.
+"""Live streams on one clock: when images were taken, and which image a stream shows at each tick.
 
-At a tick a stream shows its last picture at or before it, as `--align time` does for logs. One
-that is older than `hold` is shown no more: the stream has a gap there. A picture keeps its time:
-one that comes when the ticks at and after its time are decided is late, and changes none of them.
+At a tick a stream shows its last image at or before it, as `--align time` does for logs. After
+`hold` seconds an image is no longer shown: the stream has a gap. An image keeps its time: if it
+comes when the ticks at and after its time are decided, it is late, and changes none of them.
 """
 
 from __future__ import annotations
@@ -21,55 +21,95 @@ from cdmisfa.core.blocks import (
     freeze,
     take_unbroken,
 )
-from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS, time_of
+from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from recorder.cameras.readers import Picture, Readers
+from recorder.cameras.readers import CameraState, Readers, Stamped
 from recorder.images.pixels import Shown
 
 PATIENCE: Final = 0.2
-"""Seconds for which a tick waits for a picture that is on its way."""
+"""Seconds for which a tick waits for an image that is on its way."""
 
 START: Final = 30.0
-"""Seconds in which every camera must show its first picture."""
+"""Seconds in which every camera must show its first image."""
 
 COUNTED: Final = ("messages", "repeated", "dropped", "late", "disordered", "missing")
-"""What is counted of each stream: pictures that came; ticks that show the picture of the tick
-before; pictures that no tick shows, for a newer one had come; pictures that came after a tick was
-decided which should have shown them; pictures no newer than one before them, which are not shown;
-ticks without a picture."""
+"""Counts of each stream: images that came; ticks that show the image of the tick before; images
+that no tick shows, as a newer one had come; images that came after a tick was decided which should
+have shown them; images no newer than one before them, which are not shown; ticks without an image.
+"""
+
+DRIFT: Final = 1e-3
+"""Seconds a second by which a camera's clock may be slow."""
+
+JUMP: Final = 1.0
+"""Seconds by which presentation times differ from those due if they start again."""
+
+LATE: Final = 60
+"""Images in a row that are later than `JUMP` before presentation times count as started again."""
 
 _POLL: Final = NANOSECONDS // 10
 _MEASURED: Final = 12
-"""Pictures by which a camera's rate is measured that does not state it."""
+"""Images by which a camera's rate is measured if the camera does not state it."""
 
 
-class _Stream:
-    """The pictures of one stream, and which of them are shown.
+class Steady:
+    """Estimates when images were taken by their presentation times, which have no network jitter.
 
-    Attributes:
-        counts: see `COUNTED`.
-        newest: time of the newest picture, -1 before the first.
+    The image with the least delay so far sets the offset between the two clocks. The least delay
+    is forgotten slowly, as clocks drift.
     """
 
     def __init__(self) -> None:
+        self._offset = 0.0
+        self._last = 0.0
+        self._late = 0
+
+    def age(self, now: float, presented: float | None) -> int:
+        """Return how many nanoseconds ago an image that comes now was taken.
+
+        Args:
+            now: seconds of a monotonic clock.
+            presented: the image's own time in seconds; None if it has none.
+        """
+        if presented is None:
+            return 0
+        delay = now - presented
+        drifted = self._offset + DRIFT * (now - self._last)
+        self._late = self._late + 1 if delay > self._offset + JUMP else 0
+        restarted = self._last == 0.0 or delay < self._offset - JUMP or self._late > LATE
+        self._offset = delay if restarted else min(delay, drifted)
+        self._last = now
+        return round((delay - self._offset) * NANOSECONDS)
+
+
+class _Stream:
+    """The images of one stream, and the last one shown.
+
+    Attributes:
+        counts: see `COUNTED`.
+        newest: time of the newest image, -1 before the first.
+    """
+
+    def __init__(self, state: CameraState) -> None:
+        self.state = state
         self.counts = dict.fromkeys(COUNTED, 0)
         self.newest = -1
-        self._coming: deque[Picture] = deque()
-        self._last: Picture | None = None
+        self._coming: deque[Stamped] = deque()
+        self._last: Stamped | None = None
         self._shown = True
 
-    def put(self, picture: Picture, decided: int) -> None:
-        """Add a picture; ticks up to `decided` (ns) do not change any more."""
+    def put(self, stamped: Stamped, decided: int) -> None:
+        """Add an image; ticks up to `decided` (ns) do not change any more."""
         self.counts["messages"] += 1
-        if picture.time_ns <= self.newest:
+        if stamped.time_ns <= self.newest:
             self.counts["disordered"] += 1
             return
-        self.counts["late"] += picture.time_ns <= decided
-        self.newest = picture.time_ns
-        self._coming.append(picture)
+        self.counts["late"] += stamped.time_ns <= decided
+        self.newest = stamped.time_ns
+        self._coming.append(stamped)
 
     def show(self, tick: int, hold: int) -> Shown | None:
-        """The image at a tick, None for a gap; both in nanoseconds."""
+        """Return the image at a tick, None for a gap; both in nanoseconds."""
         while self._coming and self._coming[0].time_ns <= tick:
             self.counts["dropped"] += not self._shown
             self._last, self._shown = self._coming.popleft(), False
@@ -82,24 +122,24 @@ class _Stream:
 
 
 class LiveSource(ForwardSource):
-    """Cameras as a source of frames, with gaps where a stream has no picture.
+    """Cameras as a source of frames, with gaps if a stream has no image.
 
-    It cannot go back: record what it shows to have it again. `take_all` gives a block for each
-    unbroken stretch of a stream, and none for one that shows nothing. The source ends with the
-    first stream that does.
+    The source cannot go back: record its frames to have them again. `take_all` returns a block for
+    each unbroken stretch of a stream, and none for a stream without images. The source ends with
+    the first stream that ends.
 
     Args:
-        readers: of the cameras, whose images are of one size; closed with the source.
+        readers: of the cameras, whose images have one size; closed with the source.
         names: of the streams.
         about: what identifies the cameras.
         rate: ticks a second; by default the first camera's rate, stated or measured.
-        hold: seconds for which a picture stands for those that are missing.
+        hold: seconds for which an image replaces missing ones.
 
     Attributes:
-        stop: asked while waiting; true ends the wait as if the cameras had ended.
+        stop: called while waiting; true ends the wait as if the cameras had ended.
 
     Raises:
-        UsageError: a camera shows nothing, or tells no rate.
+        UsageError: a camera shows nothing, or states no rate.
     """
 
     gaps = True
@@ -116,42 +156,35 @@ class LiveSource(ForwardSource):
         self.stop: Callable[[], bool] = lambda: False
         self._readers = readers
         self._hold = round(hold * NANOSECONDS)
-        self._streams = [_Stream() for _ in names]
+        self._streams = [_Stream(state) for state in readers.states]
         self._tick, self._decided = 0, -1
         self._ahead: deque[list[Shown | None]] = deque()
         self._ends: int | None = None
         self._why = ""
         try:
-            firsts = self._first_pictures(names, measure=rate is None)
-            fps = rate or self._rate(firsts[0])
-            slowest, fastest = RECORDED_FPS
-            if not slowest <= fps <= fastest:
-                raise UsageError(f"--rate is {fps:g}: it must be in [{slowest:g}, {fastest:g}]")
+            firsts = self._first_images(names, measure=rate is None)
+            fps = rate or readers.states[0].camera.rate or _measured_rate(firsts[0])
         except BaseException:
             readers.close()
             raise
         # Half a tick later, so that a camera at the rate of the clock may jitter by as much.
-        start = max(pictures[0].time_ns for pictures in firsts) + round(NANOSECONDS / fps / 2)
+        start = max(images[0].time_ns for images in firsts) + round(NANOSECONDS / fps / 2)
         image = firsts[0][0].image
         self._spec = SourceSpec(tuple(names), image.shape, str(image.dtype), (), fps, start)
         self._about = {**about, "size": list(image.shape), "rate": fps, "hold": hold}
-        for stream, pictures in zip(self._streams, firsts, strict=True):
-            before = sum(picture.time_ns <= start for picture in pictures)
-            for picture in pictures[max(before - 1, 0) :]:
-                stream.put(picture, self._decided)
+        for stream, images in zip(self._streams, firsts, strict=True):
+            before = sum(stamped.time_ns <= start for stamped in images)
+            for stamped in images[max(before - 1, 0) :]:
+                stream.put(stamped, self._decided)
 
     @property
     def alignment(self) -> dict[str, dict[str, int]]:
-        """What became of each stream's pictures so far: `COUNTED`, and what the queue lost."""
-        return {
-            name: {**stream.counts, "lost": self._readers.lost(number)}
-            for number, (name, stream) in enumerate(
-                zip(self._spec.streams, self._streams, strict=True)
-            )
-        }
+        """The counts of each stream so far: `COUNTED`, and the images that its queue lost."""
+        streams = zip(self._spec.streams, self._streams, strict=True)
+        return {name: {**stream.counts, "lost": stream.state.lost} for name, stream in streams}
 
     def take(self, stream: int, n: int) -> Block:
-        """The next n frames of a stream that follow one another without a gap.
+        """Return the next n frames of a stream that follow one another without a gap.
 
         Raises:
             LogExhaustedError: a camera ended before.
@@ -160,7 +193,7 @@ class LiveSource(ForwardSource):
         return take_unbroken(self, stream, n)
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """What every stream shows in the next n ticks, a block for each unbroken stretch.
+        """Return the frames of all streams at the next n ticks, a block for each stretch.
 
         Raises:
             LogExhaustedError: a camera ended before; t stays.
@@ -179,20 +212,20 @@ class LiveSource(ForwardSource):
         return tuple(blocks)
 
     def describe(self) -> Mapping[str, Any]:
-        """The cameras, and how their pictures became frames."""
+        """Return what identifies the cameras, and how their images became frames."""
         return {"kind": "cameras", **self._about}
 
     def close(self) -> None:
-        """Let go of the cameras."""
+        """Close the cameras."""
         self._readers.close()
 
     def _next_tick(self) -> list[Shown | None]:
-        """What every stream shows at the next tick, waited for."""
+        """Wait for the next tick and return the image of every stream."""
         tick = time_of(self._tick, self._spec.fps, self._spec.start_ns)
         deadline = tick + round(PATIENCE * NANOSECONDS)
         while True:
-            now = self._readers.now()  # before looking, so that all that came until then is seen
-            waiting = [self._take_in(number, tick) for number in range(len(self._streams))]
+            now = self._readers.now()  # before the queues, so that all images until then are seen
+            waiting = [self._take_images(stream, tick) for stream in self._streams]
             if self._ends is not None and tick > self._ends:
                 raise LogExhaustedError(self._why)
             if not any(waiting) or now >= deadline:
@@ -202,56 +235,52 @@ class LiveSource(ForwardSource):
                 raise LogExhaustedError(f"stopped while waiting for frame {self._tick}")
             self._readers.wait(min(deadline, now + _POLL))
 
-    def _take_in(self, number: int, tick: int) -> bool:
-        """Take in what came of a stream; whether a picture for the tick may still come."""
-        stream = self._streams[number]
+    def _take_images(self, stream: _Stream, tick: int) -> bool:
+        """Take a stream's images from its queue; return whether one for the tick may still come."""
         while stream.newest <= tick:
-            why = self._readers.over(number)  # before looking, as above
-            picture = self._readers.take(number)
-            if picture is None:
+            why = stream.state.over  # before the queue, as above
+            stamped = self._readers.take(stream.state)
+            if stamped is None:
                 if why and self._ends is None:
                     step = round(NANOSECONDS / self._spec.fps)
                     self._ends, self._why = stream.newest + step, why
                 return not why
-            stream.put(picture, self._decided)
+            stream.put(stamped, self._decided)
         return False
 
-    def _first_pictures(self, names: Sequence[str], *, measure: bool) -> list[list[Picture]]:
-        """The first picture of each stream, and more of the first where its rate is measured."""
+    def _first_images(self, names: Sequence[str], *, measure: bool) -> list[list[Stamped]]:
+        """Wait for the first image of each stream, and for those that measure the first's rate."""
         readers = self._readers
-        found: list[list[Picture]] = [[] for _ in names]
+        images: list[list[Stamped]] = [[] for _ in names]
         deadline = readers.now() + round(START * NANOSECONDS)
         while True:
             now = readers.now()
             missing = []
-            for number, pictures in enumerate(found):
-                why = readers.over(number)
-                measured = measure and not number and not readers.rate(number)
+            for name, state, own in zip(names, readers.states, images, strict=True):
+                why = state.over
+                measured = measure and own is images[0] and not state.camera.rate
                 wanted = _MEASURED if measured else 1
-                while len(pictures) < wanted and (picture := readers.take(number)):
-                    pictures.append(picture)
-                if why and not pictures:
-                    raise UsageError(why)
-                if not why and len(pictures) < wanted:
-                    missing.append(names[number])
-            if not missing:
-                return found
-            if now >= deadline:
-                raise UsageError(f"{missing[0]} shows no picture: look at the camera and its name")
+                while len(own) < wanted and (stamped := readers.take(state)):
+                    own.append(stamped)
+                if not own and (why or now >= deadline):
+                    raise UsageError(why or f"{name} shows no image: check the camera and its name")
+                if not why and len(own) < wanted:
+                    missing.append(name)
+            if not missing or now >= deadline:
+                return images
             readers.wait(min(deadline, now + _POLL))
 
-    def _rate(self, pictures: Sequence[Picture]) -> float:
-        """Pictures a second of the first camera, stated or measured."""
-        if stated := self._readers.rate(0):
-            return stated
-        steps = np.diff([picture.time_ns for picture in pictures])
-        if not len(steps) or np.median(steps) <= 0:
-            raise UsageError("the first camera tells no rate: set one with --rate")
-        return float(f"{NANOSECONDS / float(np.median(steps)):.3g}")
+
+def _measured_rate(images: Sequence[Stamped]) -> float:
+    """Return images a second, by the median of the steps between them, with three digits."""
+    steps = np.diff([stamped.time_ns for stamped in images])
+    if not len(steps) or np.median(steps) <= 0:
+        raise UsageError("the first camera states no rate: set one with --rate")
+    return float(f"{NANOSECONDS / float(np.median(steps)):.3g}")
 
 
 def _stretches(stream: int, t: int, column: Sequence[Shown | None]) -> list[Block]:
-    """The unbroken stretches of what a stream shows from tick t on."""
+    """Return the unbroken stretches of a stream from tick t on."""
     blocks: list[Block] = []
     run: list[Shown] = []
     for at, image in enumerate([*column, None]):

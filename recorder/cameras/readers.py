@@ -1,4 +1,4 @@
-"""Cameras, each read in a thread of its own, and what is done about one that is lost."""
+"""Read cameras, each in a thread of its own, and recover those that are lost."""
 
 from __future__ import annotations
 
@@ -17,23 +17,17 @@ from recorder.images.options import Fit, OnLoss, Size
 from recorder.images.pixels import Shown
 
 QUEUE_BYTES: Final = 64 * 1024 * 1024
-"""Most bytes of pictures that wait of one camera."""
+"""Most bytes of images in the queue of one camera."""
 
 _DELAYS: Final = (0.5, 30.0)
-"""Seconds from a loss to the first try to reconnect, and most that there are between two."""
+"""Seconds from a loss to the first try to reconnect, and the longest time between two tries."""
 
 _LEAVE: Final = 0.5
 """Seconds for which closing waits for the threads; they are daemons, and end with the process."""
 
 
-class Picture(NamedTuple):
-    """One image of a camera.
-
-    Attributes:
-        time_ns: when it was taken or came, by the clock that all cameras share.
-        image: gray, (height, width) uint8, or in colours, (height, width, 3); or numbers, (I,)
-            float64.
-    """
+class Stamped(NamedTuple):
+    """An image of a camera, and the time when it was taken or came, by the clock of all cameras."""
 
     time_ns: int
     image: Shown
@@ -45,7 +39,7 @@ class Camera(Protocol):
     Attributes:
         name: of its stream.
         finite: whether its end is an end, and not a loss to recover from.
-        rate: images a second that it states; None where it states none, or is not open yet.
+        rate: images a second that it states; None if it states none, or is not open yet.
     """
 
     name: str
@@ -55,34 +49,34 @@ class Camera(Protocol):
     def rate(self) -> float | None:
         """See above."""
 
-    def pictures(self) -> Iterator[tuple[int, Shown]]:
-        """Open it and give its images as they come, until it ends.
+    def images(self) -> Iterator[tuple[int, Shown]]:
+        """Open the camera and yield its images as they come, until it ends.
 
         Yields:
-            How many nanoseconds ago the image was taken, 0 where only its coming is known; and
-            the image at its own size, gray, (height, width) uint8, or in colours, (height, width,
-            3) uint8; or numbers, (I,) float64, finite and as many each time.
+            How many nanoseconds ago the image was taken, 0 if only its coming is known; and the
+            image at its own size, gray, (height, width) uint8, or in colours, (height, width, 3)
+            uint8; or numbers, (I,) float64, finite and as many each time.
 
         Raises:
-            Exception: it cannot be opened, or is gone.
+            Exception: the camera cannot be opened, or is gone.
         """
 
     def describe(self) -> Mapping[str, Any]:
-        """What identifies it, as JSON values, without secrets."""
+        """Return what identifies the camera, as JSON values, without secrets."""
 
 
 class CameraFrames:
-    """Makes the images of several cameras frames, all of one size.
+    """Turns the images of several cameras into frames, all of one size.
 
-    Without a size it is the `default_size` of the first camera's first image; images of others
-    that come before are passed over.
+    The default size is the `default_size` of the first camera's first image; earlier images of
+    other cameras are skipped.
 
     Args:
         names: of the cameras.
         size: (height, width) of a frame, or None.
         fit: see `fitted`.
         color: show red, green and blue beside one another.
-        say: told in a line what is cut or added, and when a camera's images change their size.
+        say: receives a line about what is cut or added, and about images that change their size.
     """
 
     def __init__(
@@ -96,22 +90,29 @@ class CameraFrames:
     ) -> None:
         self._names, self._say = names, say
         self._size, self._fit, self._color = size, fit, color
-        self._numbers: Vector | None = None
+        self._first: Shown | None = None
         self._framings: dict[int, Framing | Vector] = {}
         self._changed: set[int] = set()
 
     def frame(self, camera: int, image: Shown) -> Shown | None:
-        """An image as a frame; None as long as the size of frames is not known.
+        """Turn an image into a frame; return None while the size of frames is unknown.
 
         Raises:
             UsageError: the image is smaller than a frame, or has other numbers than the first.
         """
         name = self._names[camera]
-        framing = self._framings.get(camera)
-        if framing is None:
+        if camera not in self._framings:
             if image.ndim > 1 and self._size is None and camera:
                 return None
-            framing = self._framings[camera] = self._begin(name, image)
+            self._first = image if self._first is None else self._first
+            both = [self._first, image]
+            framing = framings(both, self._size, self._fit, color=self._color)[1]
+            self._framings[camera] = framing
+            if isinstance(framing, Framing):
+                self._size = framing.size
+                if size_of(image) != framing.size:
+                    self._say(f"{name}: {framing}")
+        framing = self._framings[camera]
         if camera not in self._changed:
             change = rounded((), image) if image.ndim == 1 else framing.change(image.shape)
             if change:
@@ -122,33 +123,22 @@ class CameraFrames:
         except UsageError as error:
             raise type(error)(f"{name}: {error}") from None
 
-    def _begin(self, name: str, first: Shown) -> Framing | Vector:
-        """How a camera's images become frames, by the first of them."""
-        framing = framings([first], self._size, self._fit, color=self._color)[0]
-        if isinstance(framing, Framing):
-            self._size = framing.size
-            if size_of(first) != framing.size:
-                self._say(f"{name}: {framing}")
-        else:
-            self._numbers = self._numbers or framing
-            self._numbers.frame(first)
-        return framing
-
 
 @dataclass(eq=False)
-class _Reading:
-    """A camera being read.
+class CameraState:
+    """What is known of a camera while it is read.
 
     Attributes:
-        connection: number of the thread that reads it: one that hangs is given up, and may still
-            come back.
-        waiting: pictures that nobody took yet.
-        bytes: of these.
-        lost: pictures that were thrown away because the queue was full.
-        over: why nothing more comes; "" while it may.
-        heard: when its last picture came, or its reading began.
-        silent: whether it has been said that nothing comes.
-        came: whether any picture ever came.
+        number: of the camera.
+        heard: when its last image came, or its reading began.
+        connection: number of the thread that reads the camera: a thread that hangs is abandoned,
+            and may still return.
+        queue: images that nobody took yet.
+        bytes: of the queue.
+        lost: number of images that were discarded because the queue was full.
+        over: why no more images come; "" while they may.
+        silent: whether its silence has been reported.
+        came: whether any image ever came.
         away: whether it is not being read: it is gone, or its next connection is not due yet.
     """
 
@@ -156,7 +146,7 @@ class _Reading:
     camera: Camera
     heard: int
     connection: int = 0
-    waiting: deque[Picture] = field(default_factory=deque)
+    queue: deque[Stamped] = field(default_factory=deque)
     bytes: int = 0
     lost: int = 0
     over: str = ""
@@ -166,19 +156,22 @@ class _Reading:
 
 
 class Readers:
-    """Reads cameras, each in a thread, and keeps their pictures until they are taken.
+    """Reads cameras, each in a thread, and queues their images until they are taken.
 
-    A queue that is full is emptied, so that what follows is one hole and not every other picture.
-    A camera that never showed anything ends with what is wrong; one that did and stalls or goes
-    away is waited for, connected to anew with growing delays, or at its end, as `on_loss` says.
+    A full queue is emptied, so that the loss is one gap and not every other image. A camera that
+    never showed an image ends with its error. One that stalls or goes away later is waited for,
+    reconnected with growing delays, or ended, as `on_loss` says.
 
     Args:
         cameras: opened in their threads.
-        frame: makes an image of the camera with this number a frame; None passes it over.
+        frame: turns an image of the camera with this number into a frame; None skips the image.
         on_loss: see above.
-        stall: seconds without a picture after which a camera has stalled.
-        queue_bytes: most bytes that wait of one camera.
-        say: told in a line of every change of a camera's state.
+        stall: seconds without an image after which a camera has stalled.
+        queue_bytes: most bytes in the queue of one camera.
+        say: receives a line for every change of a camera's state.
+
+    Attributes:
+        states: of the cameras, in their order.
     """
 
     def __init__(
@@ -193,141 +186,122 @@ class Readers:
     ) -> None:
         self._frame, self._on_loss, self._say = frame, on_loss, say
         self._stall, self._limit = round(stall * NANOSECONDS), queue_bytes
-        # Time never goes back while cameras are read, whatever is done to the wall clock.
+        # Time never goes back while cameras are read, even if somebody sets the wall clock.
         self._offset = time.time_ns() - time.monotonic_ns()
         self._lock = threading.Lock()
         self._news, self._closed = threading.Event(), threading.Event()
-        self._readings = [_Reading(n, camera, self.now()) for n, camera in enumerate(cameras)]
-        self._threads = [self._connect(reading) for reading in self._readings]
+        self.states = [CameraState(n, camera, self.now()) for n, camera in enumerate(cameras)]
+        self._threads = [self._connect(state) for state in self.states]
 
     def now(self) -> int:
-        """The time since 1970 in nanoseconds."""
+        """Return the time since 1970 in nanoseconds."""
         return time.monotonic_ns() + self._offset
 
-    def take(self, camera: int) -> Picture | None:
-        """Remove and return the oldest queued picture of a camera; None if there is none."""
-        reading = self._readings[camera]
+    def take(self, state: CameraState) -> Stamped | None:
+        """Remove and return the oldest image in the queue of a camera; None if it is empty."""
         with self._lock:
-            if not reading.waiting:
+            if not state.queue:
                 return None
-            picture = reading.waiting.popleft()
-            reading.bytes -= picture.image.nbytes
-            return picture
+            stamped = state.queue.popleft()
+            state.bytes -= stamped.image.nbytes
+            return stamped
 
     def wait(self, until: int) -> None:
-        """Return when something came in since the last wait, or at a time."""
-        self._look_for_stalls()
+        """Return when an image came in since the last wait, or at a time."""
+        for state in self.states:
+            read = state.came and not state.away and not state.over
+            if read and self.now() - state.heard > self._stall:
+                self._handle_stall(state)
         self._news.wait(max((until - self.now()) / NANOSECONDS, 0))
         self._news.clear()
 
-    def over(self, camera: int) -> str:
-        """Why a camera has ended; "" while it has not."""
-        return self._readings[camera].over
-
-    def lost(self, camera: int) -> int:
-        """Pictures of a camera that were thrown away because the queue was full."""
-        return self._readings[camera].lost
-
-    def rate(self, camera: int) -> float | None:
-        """Pictures a second that a camera states."""
-        return self._readings[camera].camera.rate
-
     def close(self) -> None:
-        """Let go of the cameras; one that hangs is left to itself."""
+        """Stop reading; a camera that hangs is abandoned."""
         self._closed.set()
         end = time.monotonic() + _LEAVE
         for thread in self._threads:
             thread.join(max(end - time.monotonic(), 0))
 
-    def _connect(self, reading: _Reading) -> threading.Thread:
-        args = (reading, reading.connection)
+    def _connect(self, state: CameraState) -> threading.Thread:
+        args = (state, state.connection)
         thread = threading.Thread(target=self._read, args=args, daemon=True)
         thread.start()
         return thread
 
-    def _read(self, reading: _Reading, connection: int) -> None:
-        """Read a camera until it is over, again and again where that is asked for."""
+    def _read(self, state: CameraState, connection: int) -> None:
+        """Read a camera until it is over; reconnect to it if that is asked for."""
         shortest, longest = _DELAYS
-        delay, name = shortest, reading.camera.name
-        while self._is_on(reading, connection):
+        delay, name = shortest, state.camera.name
+        while self._is_current(state, connection):
             came = False
             try:
-                for age, image in reading.camera.pictures():
+                for age, image in state.camera.images():
                     taken = self.now() - age
-                    frame = self._frame(reading.number, image)
+                    frame = self._frame(state.number, image)
                     if frame is None:
                         continue
-                    if not self._put(reading, connection, Picture(taken, frame)):
+                    if not self._put(state, connection, Stamped(taken, frame)):
                         return
                     came, delay = True, shortest
-                why = f"{name} ended{'' if reading.came else ' before a picture of it came'}"
+                why = f"{name} ended{'' if state.came else ' before an image of it came'}"
             except CdmisfaError as error:
                 why = str(error)
-            except Exception as error:
+            except Exception as error:  # whatever the library of the camera raises
                 why = f"{name} is gone: {one_line(error)}"
-            if not self._is_on(reading, connection):
+            if not self._is_current(state, connection):
                 return
-            if not reading.came or reading.camera.finite or self._on_loss == "end":
-                self._end(reading, why)
+            state.away = True
+            waits = self._on_loss == "wait"
+            alone = all(other.away or other.over for other in self.states)
+            if not state.came or state.camera.finite or self._on_loss == "end" or (waits and alone):
+                self._end(state, why)
                 return
-            reading.away = True
-            if self._on_loss == "wait":
-                if all(other.away or other.over for other in self._readings):
-                    self._end(reading, why)
-                else:
-                    self._say(f"{why}: the others go on without it")
+            if waits:
+                self._say(f"{why}: the other cameras continue without it")
                 return
             if came or delay == shortest:
-                self._say(f"{why}: connecting to it anew")
+                self._say(f"{why}: reconnecting")
             self._closed.wait(delay)
-            reading.away, reading.heard = False, self.now()
+            state.away, state.heard = False, self.now()
             delay = min(2 * delay, longest)
 
-    def _is_on(self, reading: _Reading, connection: int) -> bool:
-        return reading.connection == connection and not self._closed.is_set()
+    def _is_current(self, state: CameraState, connection: int) -> bool:
+        return state.connection == connection and not self._closed.is_set()
 
-    def _put(self, reading: _Reading, connection: int, picture: Picture) -> bool:
-        """Queue a picture; false if its thread was abandoned."""
-        name = reading.camera.name
+    def _put(self, state: CameraState, connection: int, stamped: Stamped) -> bool:
+        """Queue an image; return False if its thread was abandoned."""
+        name, size = state.camera.name, stamped.image.nbytes
         with self._lock:
-            if not self._is_on(reading, connection):
+            if not self._is_current(state, connection):
                 return False
-            full = len(reading.waiting)
-            if full and reading.bytes + picture.image.nbytes > self._limit:
-                reading.lost += full
-                reading.waiting.clear()
-                reading.bytes = 0
-                said = "pictures thrown away: they came faster than they were taken"
-                self._say(f"{name}: {full} {said}")
-            reading.waiting.append(picture)
-            reading.bytes += picture.image.nbytes
-            back = reading.silent
-            reading.heard, reading.silent, reading.came = self.now(), False, True
+            count = len(state.queue)
+            if count and state.bytes + size > self._limit:
+                state.lost += count
+                state.queue.clear()
+                state.bytes = 0
+                self._say(f"{name}: discarded {count} images: they came faster than they were used")
+            state.queue.append(stamped)
+            state.bytes += size
+            back = state.silent
+            state.heard, state.silent, state.came = self.now(), False, True
         self._news.set()
         if back:
-            self._say(f"{name} shows pictures again")
+            self._say(f"{name} shows images again")
         return True
 
-    def _end(self, reading: _Reading, why: str) -> None:
-        reading.over = why
+    def _end(self, state: CameraState, why: str) -> None:
+        state.over = why
         self._news.set()
 
-    def _look_for_stalls(self) -> None:
-        """Handle cameras that showed nothing for too long."""
-        now = self.now()
-        for number, reading in enumerate(self._readings):
-            read = reading.came and not reading.away and not reading.over
-            if not read or now - reading.heard <= self._stall:
-                continue
-            said, reading.silent = reading.silent, True
-            why = f"{reading.camera.name}: no picture for {self._stall / NANOSECONDS:g} s"
-            if self._on_loss == "end":
-                self._end(reading, why)
-            elif not said:
-                what = "waiting" if self._on_loss == "wait" else "connecting to it anew"
-                self._say(f"{why}: {what}")
-            if self._on_loss == "reconnect":
-                with self._lock:
-                    reading.connection += 1  # the thread that hangs is for the connection before
-                    reading.heard = now
-                self._threads[number] = self._connect(reading)
+    def _handle_stall(self, state: CameraState) -> None:
+        reported, state.silent = state.silent, True
+        why = f"{state.camera.name}: no image for {self._stall / NANOSECONDS:g} s"
+        if self._on_loss == "end":
+            self._end(state, why)
+        elif not reported:
+            self._say(f"{why}: {'waiting' if self._on_loss == 'wait' else 'reconnecting'}")
+        if self._on_loss == "reconnect":
+            with self._lock:
+                state.connection += 1  # abandons the thread that hangs
+                state.heard = self.now()
+            self._threads[state.number] = self._connect(state)

@@ -1,6 +1,6 @@
-"""Streams that wait for their reader: arrays of the caller's, and Gymnasium's environments.
+"""Streams that wait for their reader: arrays of the caller, and environments of Gymnasium.
 
-They are iterators of frames, one step at a time together.
+They are iterators of frames, which take a step together.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ FPS: Final = 30.0
 """Frames a second of an environment that states no rate."""
 
 Step = tuple[Sequence[Any], FloatArray]
-"""The frame of each stream, and what the world knows at it, (D,) float64."""
+"""The frame of each stream, and the ground truth at it, (D,) float64."""
 
 Policy = Callable[[Any], Any]
-"""Gives the action for an observation."""
+"""Chooses the action for an observation."""
 
 
 class SteppedSource(ForwardSource):
-    """Streams that are iterators, on one clock; it ends with the first of them.
+    """A source of streams that are iterators, on one clock; it ends with the first of them.
 
-    It cannot go back. A class that derives from it adds `describe`.
+    The source cannot go back. Derived classes add `describe`.
 
     Args:
-        spec: what the source delivers.
-        steps: what is shown, frame by frame.
+        spec: of the source.
+        steps: the frames, step by step.
     """
 
     def __init__(self, spec: SourceSpec, steps: Iterator[Step]) -> None:
@@ -74,23 +74,17 @@ class SteppedSource(ForwardSource):
         return tuple(blocks)
 
     def _picture(self) -> NDArray[np.uint8] | None:
-        """The next image of each stream, which is not gone then."""
+        """Return the next image of each stream, without taking it."""
         self._ahead += islice(self._steps, 0 if self._ahead else 1)
         if not (self._ahead and self._spec.images):
             return None
         return beside(list(self._ahead[0][0][:MOST_STREAMS]))
 
 
-_ARRAYS = (
-    'name each, as {"left": frames}, with an array (n, height, width) of uint8 or (n, I) of '
-    "float64, or an iterable of such frames"
-)
-
-
 class ArraySource(SteppedSource):
     """Frames that the caller makes, one after the other, as streams.
 
-    Of arrays that are all there `cdmisfa.Recording` gives a source that can go back, too.
+    For arrays that exist as a whole, `cdmisfa.Recording` has a source that can go back, too.
 
     Args:
         streams: for each stream, by its name, an array (n, height, width) of uint8 or (n, I) of
@@ -99,8 +93,8 @@ class ArraySource(SteppedSource):
         start_ns: log time of frame 0, in nanoseconds.
 
     Raises:
-        UsageError: a stream is empty, or frames are of other sizes or types than pixels or values,
-            or hold what is no finite number; as soon as such a one comes.
+        UsageError: there is no stream, or a frame has another shape or type than the first, or
+            holds NaN or infinity; as soon as such a frame comes.
     """
 
     def __init__(
@@ -110,64 +104,58 @@ class ArraySource(SteppedSource):
         fps: float = 50.0,
         start_ns: int = START_NS,
     ) -> None:
-        if not isinstance(streams, Mapping):
-            raise UsageError(f"streams of {type(streams).__name__} given: {_ARRAYS}")
-        if not streams:
-            raise UsageError("no stream given: name one at least")
-        for name, frames in streams.items():
-            if not isinstance(name, str) or not isinstance(frames, Iterable):
-                raise UsageError(f"{type(frames).__name__} given as stream {name!r}: {_ARRAYS}")
-        shown = {name: iter(frames) for name, frames in streams.items()}
-        firsts = {name: as_array(next(frames, ())) for name, frames in shown.items()}
-        for name, first in firsts.items():
-            if (str(first.dtype), first.ndim) not in (("uint8", 2), ("float64", 1)):
-                raise UsageError(
-                    f"{name} shows {first.dtype} of shape {first.shape}: give frames (height, "
-                    "width) of uint8 or (I,) of float64"
-                )
-        first = next(iter(firsts.values()))
+        if not isinstance(streams, Mapping) or not streams:
+            raise UsageError(
+                f"streams of {type(streams).__name__} given, or none: name each, as "
+                '{"left": frames}, with an array (n, height, width) of uint8 or (n, I) of float64, '
+                "or an iterable of such frames"
+            )
+        rows = zip(*(map(as_array, frames) for frames in streams.values()), strict=False)
+        first = next(rows, (np.empty(()),))
         known = [len(frames) for frames in streams.values() if isinstance(frames, Sized)]
         length = min(known) if len(known) == len(streams) else None
-        dtype = str(first.dtype)
-        spec = SourceSpec(tuple(streams), first.shape, dtype, (), fps, start_ns, length)
-        alike = [_checked(n, chain([firsts[n]], frames), spec) for n, frames in shown.items()]
-        super().__init__(spec, ((frames, np.empty(0)) for frames in zip(*alike, strict=False)))
+        shape, dtype = first[0].shape, str(first[0].dtype)
+        spec = SourceSpec(tuple(streams), shape, dtype, (), fps, start_ns, length)
+        steps = _checked(spec, chain([first], rows))
+        super().__init__(spec, chain([next(steps)], steps))  # rejects the first frames at once
 
     def describe(self) -> Mapping[str, Any]:
-        """The kind of source, and its streams."""
+        """Return the kind of source, and its streams."""
         return {"kind": "arrays", "streams": list(self._spec.streams)}
 
 
-def _checked(name: str, frames: Iterable[Any], spec: SourceSpec) -> Iterator[Any]:
-    """The frames of a stream, all of one size and type, and of finite numbers."""
-    for t, frame in enumerate(map(as_array, frames)):
-        if frame.shape != spec.frame_shape or frame.dtype != spec.dtype:
-            raise UsageError(
-                f"{name} shows {frame.dtype} of shape {frame.shape}, not {spec.dtype} of "
-                f"{spec.frame_shape} as the first stream does: give frames of one size and type"
-            )
-        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-            raise UsageError(
-                f"{name}: frame {t}, counted from 0, holds what is no finite number (NaN or "
-                "infinity): leave it out or fill it in"
-            )
-        yield frame
+def _checked(spec: SourceSpec, rows: Iterable[Sequence[NDArray[Any]]]) -> Iterator[Step]:
+    """Yield the frames of all streams, of one size and type, and of finite numbers."""
+    for t, row in enumerate(rows):
+        for name, frame in zip(spec.streams, row, strict=True):
+            alike = frame.shape == spec.frame_shape and str(frame.dtype) == spec.dtype
+            if not alike or (spec.dtype, frame.ndim) not in (("uint8", 2), ("float64", 1)):
+                raise UsageError(
+                    f"{name} shows {frame.dtype} of shape {frame.shape}: give frames (height, "
+                    "width) of uint8 or (I,) of float64, of one size and type for all streams"
+                )
+            if frame.ndim == 1 and not np.isfinite(frame).all():
+                raise UsageError(
+                    f"{name}: frame {t}, counted from 0, holds what is no finite number (NaN or "
+                    "infinity): leave it out or fill it in"
+                )
+        yield row, np.empty(0)
 
 
 class GymSource(SteppedSource):
-    """Environments that render, one a stream, stepped together; the same seed shows the same.
+    """Environments that render, one a stream, stepped together; a seed repeats all frames.
 
-    An episode that ends is followed by another. Their truth is the numbers of each one's
-    observation, of the action that it is followed by, and whether an episode begins with it.
+    An episode that ends is followed by another. The ground truth is the numbers of each
+    observation, of the action that follows it, and whether an episode begins with it.
 
     Args:
         tasks: the environments' ids, or environments made with `render_mode="rgb_array"`.
         names: of the streams; by default the ids.
-        size: (height, width) of a frame; by default `default_size` of the first's pictures.
-        fit: how pictures of another aspect ratio become frames: see `fitted`.
+        size: (height, width) of a frame; by default `default_size` of the first's images.
+        fit: how images of another aspect ratio become frames: see `fitted`.
         fps: frames a second; by default as the first environment states.
         seed: of the environments and of random actions.
-        policy: gives the action for an observation; by default actions are random.
+        policy: chooses the action for an observation; by default actions are random.
         hold: frames for which an action is kept.
         color: show red, green and blue beside one another.
 
@@ -195,40 +183,15 @@ class GymSource(SteppedSource):
         ]
         tasks = [str(getattr(e.spec, "id", e)) for e in environments]
         names = tuple(names or tasks)
-        plain = [re.sub(r"[^0-9A-Za-z]", "_", name) for name in names]
-        observed = [_numbers(e.observation_space) for e in environments]
-        acted = [_numbers(e.action_space) for e in environments]
-        truth = (
-            *(f"{name}_{i}" for name, n in zip(plain, observed, strict=True) for i in range(n)),
-            *(
-                f"{ACTION}{name}_{i}"
-                for name, n in zip(plain, acted, strict=True)
-                for i in range(n)
-            ),
-            *(f"{BEGINS}{name}" for name in plain),
-        )
         fps = float(fps or environments[0].metadata.get("render_fps") or FPS)
-        shown = np.asarray if color else gray_picture
-        generators = [np.random.default_rng([seed, i]) for i in range(len(environments))]
-        played = [
-            play(e, rng, hold, policy) for e, rng in zip(environments, generators, strict=True)
-        ]
-
-        def step(played: Sequence[tuple[Any, Any, bool]]) -> Step:
-            seen, actions, begins = zip(*played, strict=True)
-            known = [np.ravel(o) for o, n in zip(seen, observed, strict=True) if n]
-            known += [np.ravel(a) for a, n in zip(actions, acted, strict=True) if n]
-            pictures = [shown(e.render()) for e in environments]
-            return pictures, np.concatenate([*known, begins]).astype(np.float64)
-
-        steps = map(step, zip(*played, strict=True))
+        steps = self._played(seed, hold, policy, color=color)
         first = next(steps)
         made = framings(first[0], size, fit, color=color)
         frames = (
-            ([f.frame(picture) for f, picture in zip(made, pictures, strict=True)], values)
-            for pictures, values in chain([first], steps)
+            ([f.frame(image) for f, image in zip(made, images, strict=True)], values)
+            for images, values in chain([first], steps)
         )
-        spec = SourceSpec(names, made[0].shape, "uint8", truth, fps, START_NS)
+        spec = SourceSpec(names, made[0].shape, "uint8", self._truth(names), fps, START_NS)
         super().__init__(spec, frames)
         self._about = {
             "kind": "gym",
@@ -242,8 +205,34 @@ class GymSource(SteppedSource):
             "recipe": COLOR_RECIPE if color else RECIPE,
         }
 
+    def _truth(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Name the columns of truth: all observations, then all actions, then all beginnings."""
+        plain = [re.sub(r"[^0-9A-Za-z]", "_", name) for name in names]
+        named = list(zip(plain, self._environments, strict=True))
+        observed = [f"{n}_{i}" for n, e in named for i in range(_count(e.observation_space))]
+        acted = [f"{ACTION}{n}_{i}" for n, e in named for i in range(_count(e.action_space))]
+        return (*observed, *acted, *(f"{BEGINS}{name}" for name in plain))
+
+    def _played(
+        self, seed: int, hold: int, policy: Policy | None, *, color: bool
+    ) -> Iterator[Step]:
+        """Step all environments together, and render each."""
+        environments = self._environments
+        generators = [np.random.default_rng([seed, i]) for i in range(len(environments))]
+        played = [
+            play(e, rng, hold, policy) for e, rng in zip(environments, generators, strict=True)
+        ]
+        for step in zip(*played, strict=True):
+            seen, actions, begins = zip(*step, strict=True)
+            spaces = [(e.observation_space, o) for e, o in zip(environments, seen, strict=True)]
+            spaces += [(e.action_space, a) for e, a in zip(environments, actions, strict=True)]
+            numbers = [np.ravel(values) for space, values in spaces if _count(space)]
+            images = [np.asarray(e.render()) for e in environments]
+            shown = images if color else [gray_picture(image) for image in images]
+            yield shown, np.concatenate([*numbers, begins]).astype(np.float64)
+
     def describe(self) -> Mapping[str, Any]:
-        """The environments, their seed, and how they were played."""
+        """Return the environments, their seed, and how they were played."""
         return self._about
 
     def close(self) -> None:
@@ -255,13 +244,13 @@ class GymSource(SteppedSource):
 def play(
     environment: Any, rng: np.random.Generator, hold: int, policy: Policy | None = None
 ) -> Iterator[tuple[Any, Any, bool]]:
-    """An environment's observations, step by step, for ever.
+    """Yield the observations of an environment, step by step, for ever.
 
     Args:
         environment: reset here.
-        rng: gives its seed, and that of random actions.
+        rng: generates its seed, and that of random actions.
         hold: steps for which an action is kept.
-        policy: gives the action for an observation; by default actions are random.
+        policy: chooses the action for an observation; by default actions are random.
 
     Yields:
         An observation, the action for it, and whether an episode begins with it.
@@ -282,7 +271,7 @@ def play(
 
 
 def make_environment(task: str, **options: Any) -> Any:
-    """Make an environment that renders, of Gymnasium's own or of Atari's.
+    """Make an environment of Gymnasium or Atari that renders.
 
     Args:
         task: its id.
@@ -304,7 +293,7 @@ def make_environment(task: str, **options: Any) -> Any:
 
 
 def gray_picture(seen: Any) -> ByteArray:
-    """A colour picture, (height, width, 3), in gray, (height, width) uint8."""
+    """Convert a colour image, (height, width, 3), to gray, (height, width) uint8."""
     return np.asarray(Image.fromarray(seen).convert("L"))
 
 
@@ -316,7 +305,7 @@ def _package(name: str, extra: str) -> Any:
         raise UsageError(missing) from error
 
 
-def _numbers(space: Any) -> int:
-    """How many numbers an observation is; 0 where it is a picture, or no array."""
+def _count(space: Any) -> int:
+    """Return how many numbers a value of a space has; 0 for an image, and for no array."""
     shape = getattr(space, "shape", None)
     return int(np.prod(shape)) if shape is not None and len(shape) < 2 else 0

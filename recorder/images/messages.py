@@ -181,13 +181,13 @@ def _ffmpeg_packet(data: Data) -> Packet:
     return Packet(bytes(fields.data()), codec)
 
 
-_FOXGLOVE: Final[Mapping[str, tuple[Any, Callable[[Any], Any]]]] = {
+_FOXGLOVE: Final[Mapping[str, tuple[Any, Callable[[Any, bytes], Any]]]] = {
     "foxglove.RawImage": (
         RawImage,
-        lambda m: Pixels(m.data, m.height, m.width, m.encoding, m.step),
+        lambda m, data: Pixels(data, m.height, m.width, m.encoding, m.step),
     ),
-    "foxglove.CompressedImage": (CompressedImage, lambda m: Compressed(m.data)),
-    "foxglove.CompressedVideo": (CompressedVideo, lambda m: Packet(m.data, m.format)),
+    "foxglove.CompressedImage": (CompressedImage, lambda m, data: Compressed(data)),
+    "foxglove.CompressedVideo": (CompressedVideo, lambda m, data: Packet(data, m.format)),
 }
 """Foxglove's messages with images: their class, and their content."""
 
@@ -197,11 +197,13 @@ def _foxglove(schema: str, encoding: str, data: Data) -> Any:
     message_class, content = _FOXGLOVE[schema]
     try:
         if encoding == "protobuf":
-            return content(message_class.FromString(data))
+            message = message_class.FromString(data)
+            return content(message, message.data)
         stated = parse_json(bytes(data), len(data))
-        stated["data"] = base64.b64decode(stated["data"], validate=True)
+        packed = base64.b64decode(stated.pop("data"), validate=True)
         names = set(message_class.DESCRIPTOR.fields_by_name) - {"timestamp"}
-        return content(message_class(**{name: stated[name] for name in names & stated.keys()}))
+        message = message_class(**{name: stated[name] for name in names & stated.keys()})
+        return content(message, packed)
     except Exception as error:  # protobuf raises anything on broken messages
         raise MalformedImage(f"a message is no {schema} ({one_line(error)})") from None
 

@@ -186,7 +186,7 @@ class CameraContract:
     """The tests; a subclass gives a camera that is not opened yet in `open`.
 
     Attributes:
-        count: pictures that are waited for.
+        count: images that are waited for.
     """
 
     count = 3
@@ -195,8 +195,8 @@ class CameraContract:
         """Make a camera of the kind under test."""
         raise NotImplementedError
 
-    def test_its_pictures_are_of_one_kind_and_no_older_than_now(self) -> None:
-        taken = list(itertools.islice(self.open().pictures(), self.count))
+    def test_its_images_are_of_one_kind_and_no_older_than_now(self) -> None:
+        taken = list(itertools.islice(self.open().images(), self.count))
         assert len(taken) == self.count
         for age, image in taken:
             assert age >= 0
@@ -213,10 +213,10 @@ class CameraContract:
     def test_it_can_be_opened_again(self) -> None:
         camera = self.open()
         for _ in range(2):  # as after a loss
-            pictures = camera.pictures()
-            assert next(iter(pictures))[1].size
-            if hasattr(pictures, "close"):
-                pictures.close()
+            images = camera.images()
+            assert next(iter(images))[1].size
+            if hasattr(images, "close"):
+                images.close()
 
     def test_its_description_is_json(self) -> None:
         camera = self.open()
