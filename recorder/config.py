@@ -1,32 +1,29 @@
-"""What every scene and every recording can be told (keys `scene.*` and `record.*`), and --split.
+"""Configuration of every scene and every recording (keys `scene.*` and `record.*`), and --split.
 
-Imported by `world` and `log`. What only one scene has stands with that scene.
+`world` and `log` import it. Keys of one scene alone are in the module of that scene.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal
+from typing import ClassVar, Literal
 
 from cdmisfa.core.clock import RECORDED_FPS, START_NS
 from cdmisfa.core.config import Section, key
 from cdmisfa.core.errors import UsageError
 
 Compression = Literal["zstd", "lz4", "none"]
-"""What the chunks of a log can be compressed with."""
-
-_BYTES: Final = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
-_SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
+"""Compression of the chunks of a log."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneConfig(Section):
-    """What every scene can be told; each adds its own keys.
+    """Keys of every scene; each adds its own.
 
     Attributes:
-        kind: name of the scene; each gives its own.
-        seed: of what moves in it; None is "as the run's seed".
+        kind: name of the scene.
+        seed: of its motions; None is "as the run's seed".
     """
 
     prefix: ClassVar[str] = "scene"
@@ -36,7 +33,7 @@ class SceneConfig(Section):
 
 @dataclass(frozen=True, slots=True)
 class RecordConfig(Section):
-    """How frames become a log (keys `record.*`).
+    """Settings of a recording (keys `record.*`).
 
     Attributes:
         fps: frames per second of the common clock.
@@ -53,53 +50,20 @@ class RecordConfig(Section):
     chunk_size: int = key(1024 * 1024, 1024, 2**27)
 
 
-@dataclass(frozen=True, slots=True)
-class Split:
-    """Where a new part begins; one of the two is set.
+def parse_split(text: str) -> float:
+    """Return the seconds of a part of a recording, from a duration as "10min".
 
-    Attributes:
-        size: bytes of a part, exceeded by a chunk and the index at most.
-        seconds: of log time in a part.
+    Raises:
+        UsageError: it is no duration.
     """
-
-    size: int | None = None
-    seconds: float | None = None
-
-    @classmethod
-    def parse(cls, text: str) -> Split:
-        """Read "512MB" or "10min".
-
-        Raises:
-            UsageError: it is neither.
-        """
-        found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?) ?([A-Za-z]+)", text.strip())
-        number, unit = (float(found[1]), found[2]) if found else (0.0, "")
-        if number > 0 and unit in _BYTES:
-            return cls(size=max(round(number * _BYTES[unit]), 1))
-        if number > 0 and unit in _SECONDS:
-            return cls(seconds=number * _SECONDS[unit])
-        raise UsageError(
-            f"--split is {text!r}: give a size ({', '.join(_BYTES)}) or a duration "
-            f"({', '.join(_SECONDS)}), as 512MB or 10min"
-        )
-
-    def __str__(self) -> str:
-        """The limit as `parse` reads it, in the largest unit that it is a multiple of."""
-        units: dict[str, Any] = _SECONDS if self.size is None else _BYTES
-        limit = (self.seconds or 0.0) if self.size is None else self.size
-        least = next(iter(units))
-        unit = max(
-            (u for u in units if limit % units[u] == 0), key=units.__getitem__, default=least
-        )
-        return f"{limit / units[unit]:.6f}".rstrip("0").rstrip(".") + unit
-
-    def frames(self, fps: float) -> int | None:
-        """Frames of a part, where a duration is given."""
-        return None if self.seconds is None else max(round(self.seconds * fps), 1)
+    duration = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?) ?(s|min|h)", text.strip())
+    if duration is None or not float(duration[1]):
+        raise UsageError(f"--split is {text!r}: give a duration as 90s, 10min or 1h")
+    return float(duration[1]) * {"s": 1, "min": 60, "h": 3600}[duration[2]]
 
 
 def check_view_names(names: tuple[str, ...], key: str) -> None:
-    """Refuse names of views that could not be told apart, or not be names of files.
+    """Refuse names of views that are equal, or cannot be names of files.
 
     Raises:
         UsageError: at the first such name.

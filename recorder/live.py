@@ -10,28 +10,28 @@ from typing import Any, Final, Self
 
 from cdmisfa.core.blocks import Block, ForwardSource, FrameSource, check_request, take_unbroken
 from cdmisfa.core.errors import LogExhaustedError
-from recorder.config import RecordConfig, Split
+from recorder.config import RecordConfig
 from recorder.log.files import folder_here, prepared_folder, refuse_existing
 from recorder.log.resume import begin_view, other_recordings
 from recorder.recording import ViewLogs, ViewRecording, recording_spec
 from recorder.world.scenes import BLOCK
 
 COUNTS: Final = "cdmisfa.live"
-"""Name of the metadata record that says what became of a live stream's pictures."""
+"""Name of the metadata record that counts used and dropped images of a live stream."""
 
 
 class RecordedWhileWatched(ForwardSource):
-    """A source whose every stream is recorded, whichever is watched.
+    """Record every stream of a source, whichever is watched.
 
-    What `take` gives can be taken again from the recording, to the bit: `learn` from both gives
-    the same signals. Used as a context: leaving it finishes the files, also when the source has
-    ended or learning was stopped; an error leaves readable `.partial` files.
+    The recording gives the blocks of `take` again, to the bit: `learn` from both gives the same
+    signals. Used as a context: leaving it finishes the files, also when the source has ended or
+    learning was stopped; an error leaves readable `.partial` files.
 
     Args:
         source: at its first frame, such as cameras that cannot go back; closed with this.
         folder: of the recording; made if it does not exist.
         settings: how the files are written; the clock is the source's.
-        split: write every view as parts of limited size or duration.
+        split: seconds of the parts that every view is written as.
         force: overwrite an earlier recording in the folder.
 
     Attributes:
@@ -49,7 +49,7 @@ class RecordedWhileWatched(ForwardSource):
         folder: str | Path,
         *,
         settings: RecordConfig | None = None,
-        split: Split | None = None,
+        split: float | None = None,
         force: bool = False,
     ) -> None:
         self.files: list[ViewRecording] = []
@@ -59,7 +59,7 @@ class RecordedWhileWatched(ForwardSource):
         self.gaps = bool(getattr(source, "gaps", False))
         refuse_existing(self.folder, force=force, goes_on=False)
         settings = settings or RecordConfig()
-        recording = recording_spec(source, None, settings, None)
+        recording = recording_spec(source, settings, None)
         views = recording.spec.streams
         places = {view: begin_view(self.folder, view, split, source.t) for view in views}
         with ExitStack() as stack:
@@ -76,7 +76,7 @@ class RecordedWhileWatched(ForwardSource):
 
     @property
     def stop(self) -> Callable[[], bool]:
-        """Asked while the source waits; true ends the wait."""
+        """Function that the source calls while it waits; true ends the wait."""
         return getattr(self._source, "stop", lambda: False)
 
     @stop.setter
@@ -102,7 +102,7 @@ class RecordedWhileWatched(ForwardSource):
         return blocks
 
     def describe(self) -> Mapping[str, Any]:
-        """What identifies the source."""
+        """Return the identity of the source."""
         return self._source.describe()
 
     def finish(self) -> None:
@@ -114,7 +114,7 @@ class RecordedWhileWatched(ForwardSource):
         self.files = self._logs.finish()
 
     def close(self) -> None:
-        """Let go of the source, and of the files as they are."""
+        """Close the source, and leave the files as they are."""
         self._source.close()
         self._open.close()
 
@@ -140,9 +140,9 @@ def record_watched(
 
     Args:
         recorded: entered, and finished, here.
-        frames: how many; by default all that the source shows.
-        stop: asked often; true ends the recording.
-        progress: told how many frames there are.
+        frames: number of frames; by default all that the source shows.
+        stop: called often; true ends the recording.
+        progress: called with the number of frames.
 
     Raises:
         LogWriteError: the disk does not take it.

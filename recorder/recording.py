@@ -1,4 +1,4 @@
-"""Recording a source: every view at every frame, one MCAP file for each view."""
+"""Record a source: every view at every frame, one MCAP file for each view."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from cdmisfa.core.blocks import Block, FrameSource, HeadPose, description
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.config import RecordConfig, SceneConfig, Split
+from recorder.config import RecordConfig, SceneConfig
 from recorder.log.files import (
     folder_here,
     holds_recording,
@@ -42,15 +42,10 @@ from recorder.world.scenes import (
     take_here,
 )
 
-MAX_JOBS = 1024
-
 _FILE_NAME = re.compile(r"[\w-][\w.-]*")
 
-DEFAULT_FRAMES = 1000
-"""Frames of each view where the source does not end and nothing else is wanted."""
-
-Progress = Callable[[float], None]
-"""Told, after every block, how many frames have been written of every view."""
+DEFAULT_FRAMES: Final = 1000
+"""Frames of each view if the source does not end and no number is given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +67,7 @@ class ViewRecording:
     sha256: str
 
     def as_json(self) -> dict[str, Any]:
-        """The file as plain JSON values."""
+        """Return the file as plain JSON values."""
         return {**dataclasses.asdict(self), "file": str(self.file)}
 
 
@@ -88,14 +83,13 @@ def record(
     *,
     frames: int | None = None,
     views: Sequence[str] | None = None,
-    names: Sequence[str] | None = None,
     settings: RecordConfig | None = None,
-    split: Split | None = None,
+    split: float | None = None,
     jobs: int = 1,
     force: bool = False,
     resume: bool = False,
     stop: Callable[[], bool] = lambda: False,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> list[ViewRecording]:
     """Record the first frames of a source into a folder.
 
@@ -109,15 +103,14 @@ def record(
         frames: how many, of each view; by default all of the source, or `DEFAULT_FRAMES` where it
             does not end, and where a recording is resumed as many as it was begun with.
         views: which views; by default all.
-        names: of the views, and so of their files; by default those of the streams.
         settings: how the files are written; the clock is the source's.
-        split: write every view as parts of limited size or duration; where a recording is
-            resumed by default as it was begun.
+        split: seconds of the parts that every view is written as; by default one file, or where
+            a recording is resumed as it was started.
         jobs: processes that render; only a scene can be opened in more than one.
         force: overwrite an earlier recording in the folder.
         resume: continue where an earlier attempt with the same arguments ended.
         stop: asked after every block; true ends the recording with an error.
-        progress: called after every block; never where there was nothing left to record.
+        progress: called after every block with the number of frames written of every view.
 
     Raises:
         UsageError: the folder exists, or an argument is wrong.
@@ -130,13 +123,22 @@ def record(
     settings = settings or (RecordConfig() if scene is None else scene.record)
     folder = folder_here(folder)
     length = source.spec.length
-    _refuse_arguments(length, scene, frames, jobs, force=force, resume=resume)
+    if frames is not None and not 1 <= frames <= (length or frames):
+        most = "" if length is None else f", and no more than the {length} that there are"
+        raise UsageError(f"--frames is {frames}: record at least one{most}")
+    if jobs > 1 and scene is None:
+        raise UsageError(f"--jobs is {jobs}: only a scene can be opened by several processes")
+    if force and resume:
+        raise UsageError("--force starts anew and --resume goes on: use one of them")
     if not resume:
         refuse_existing(folder, force=force)
     elif not holds_recording(folder):
         raise UsageError(f"{folder} holds no recording to go on with: choose another folder")
-    recording = recording_spec(source, names, settings, scene)
-    chosen = _chosen(recording, views, "source" if scene is None else "scene")
+    recording = recording_spec(source, settings, scene)
+    for view in views or ():
+        if view not in recording.spec.streams:
+            raise UsageError(f"no view {view!r}: name one of {', '.join(recording.spec.streams)}")
+    chosen = [name for name in recording.spec.streams if not views or name in views]
     default = length or DEFAULT_FRAMES
     with ExitStack() as open_logs:
         stale = other_recordings(folder, recording) if force else []
@@ -159,8 +161,7 @@ def record(
             for block in blocks:
                 logs.write(block)
                 done = min(logs.starts().values())
-                if progress is not None:
-                    progress(done)
+                progress(done)
                 if stop() and done < frames:
                     raise RecordingStoppedError(f"{folder} is not finished: go on with --resume")
         if starts:
@@ -169,15 +170,15 @@ def record(
 
 
 class ViewLogs:
-    """The logs of a recording, while they are written.
+    """Write the logs of a recording.
 
     Args:
         folder: of the recording, made and held.
         recording: what is recorded.
         settings: how the files are written.
         places: where each view is begun or resumed.
-        frames: how many each view shall have.
-        split: where parts end.
+        frames: number of frames that each view shall have.
+        split: seconds of a part.
         poses: of the head in each of the recording's views, where there is a head.
     """
 
@@ -188,7 +189,7 @@ class ViewLogs:
         settings: RecordConfig,
         places: Mapping[str, ViewResume],
         frames: int,
-        split: Split | None,
+        split: float | None,
         poses: Sequence[HeadPose] = (),
     ) -> None:
         self._folder, self._recording = folder, recording
@@ -197,7 +198,7 @@ class ViewLogs:
         streams = recording.spec.streams
         pose_of = dict(zip(streams, poses, strict=False))
         if unfinished := [view for view, place in places.items() if not place.complete]:
-            limits = {} if split is None else dict.fromkeys(unfinished, str(split))
+            limits = {} if split is None else dict.fromkeys(unfinished, split)
             lengths = dict.fromkeys(unfinished, frames)
             start = RecordingStart(recording.kind, recording.seed, lengths, limits)
             store_start(folder, unfinished, start)
@@ -223,11 +224,11 @@ class ViewLogs:
             raise
 
     def starts(self) -> dict[int, int]:
-        """The next frame of each stream that is written."""
+        """Return the next frame of each stream that is written."""
         return {stream: log.t for stream, log in self._logs.items()}
 
     def write(self, block: Block) -> None:
-        """Write a block, unless it is not what the source says, which would spoil the file."""
+        """Write a block; one that contradicts its source would spoil the file and is refused."""
         shape, dtype, spec = block.frames.shape[1:], block.frames.dtype, self._recording.spec
         if shape != spec.frame_shape or dtype != spec.dtype:
             raise CdmisfaError(
@@ -241,7 +242,7 @@ class ViewLogs:
         self._logs[stream].add_metadata(name, values)
 
     def finish(self) -> list[ViewRecording]:
-        """Finish the files; all of the views that there are."""
+        """Finish the files, and return those of all views."""
         for log in self._logs.values():
             log.finish()
         store_start(self._folder, list(self._parts))
@@ -253,36 +254,6 @@ class ViewLogs:
         """Leave the files as they are, readable; nothing where they are finished."""
         for log in self._logs.values():
             log.abandon()
-
-
-def _chosen(recording: RecordingSpec, views: Sequence[str] | None, what: str) -> list[str]:
-    """The views that are recorded, in the order of their streams."""
-    streams = recording.spec.streams
-    for view in views or ():
-        if view not in streams:
-            raise UsageError(f"no view {view!r}: the {what} has {', '.join(streams)}")
-    return [name for name in streams if not views or name in views]
-
-
-def _refuse_arguments(
-    length: int | None,
-    scene: OpenScene | None,
-    frames: int | None,
-    jobs: int,
-    *,
-    force: bool,
-    resume: bool,
-) -> None:
-    """Refuse what `record` cannot do with a source of a length, or without a scene."""
-    if frames is not None and not 1 <= frames <= (length or frames):
-        most = "" if length is None else f", and no more than the {length} that there are"
-        raise UsageError(f"--frames is {frames}: record at least one{most}")
-    if not 1 <= jobs <= MAX_JOBS:
-        raise UsageError(f"--jobs is {jobs}: use 1 to {MAX_JOBS}")
-    if jobs > 1 and scene is None:
-        raise UsageError(f"--jobs is {jobs}: only a scene can be opened by several processes")
-    if force and resume:
-        raise UsageError("--force starts anew and --resume goes on: use one of them")
 
 
 def record_scene(
@@ -309,7 +280,7 @@ def record_scene(
 
 
 def recorded(folder: Path) -> list[ViewRecording]:
-    """The files of a recording that is complete, with all of its views; none of another.
+    """Return the files of a complete recording; nothing for an incomplete one.
 
     Raises:
         LogDamagedError: the disk does not give a file.
@@ -318,28 +289,21 @@ def recorded(folder: Path) -> list[ViewRecording]:
 
 
 def view_recording(view: str, path: Path, frames: int) -> ViewRecording:
-    """A finished file of a view, with its size and checksum, for which all of it is read."""
+    """Return a finished file of a view with its size and checksum, which reads all of it."""
     with path.open("rb") as file:
         checksum = hashlib.file_digest(file, "sha256").hexdigest()
     return ViewRecording(view, path, frames, path.stat().st_size, checksum)
 
 
 def recording_spec(
-    source: FrameSource,
-    names: Sequence[str] | None,
-    settings: RecordConfig,
-    scene: OpenScene | None,
+    source: FrameSource, settings: RecordConfig, scene: OpenScene | None
 ) -> RecordingSpec:
-    """What is recorded of a source.
+    """Return what is recorded of a source.
 
     Raises:
         UsageError: no recording can hold it.
     """
-    if names and len(names) != len(source.spec.streams):
-        raise UsageError(
-            f"{len(names)} names given for {len(source.spec.streams)} views: name each, or none"
-        )
-    spec = replace(source.spec, streams=tuple(names or source.spec.streams))
+    spec = source.spec
     for name in spec.streams:
         if not _FILE_NAME.fullmatch(name) or spec.streams.count(name) > 1:
             raise UsageError(f"a view cannot be called {name!r}: give different names of files")

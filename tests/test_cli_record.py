@@ -16,7 +16,6 @@ from conftest import Cdmisfa
 from folders import contents
 from waiting import started, wait_for
 
-from recorder.config import Split
 from recorder.recording import RecordingStoppedError, record, record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.camera_logs.source import ForeignSource
@@ -76,7 +75,7 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
             folder,
             OscillatoryConfig(seed=7),
             frames=400,
-            split=Split(seconds=5),
+            split=5.0,
             progress=stop,
         )
     again = ("record", "--resume", "-o", folder)

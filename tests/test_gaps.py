@@ -18,7 +18,6 @@ from folders import contents, coverage
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError
-from recorder.config import Split
 from recorder.images.framing import FRAME_PIXELS, default_size, fitted
 from recorder.images.options import Align, Fit
 from recorder.recording import RecordingStoppedError, record, recorded
@@ -181,8 +180,8 @@ def test_a_conversion_keeps_its_clock_and_has_the_gaps_of_its_logs(
         assert runs[0].json["signals_sha256"] == runs[1].json["signals_sha256"]
 
 
-@pytest.mark.parametrize("split", [None, Split.parse("2s")], ids=["one", "parts"])
-def test_a_conversion_with_gaps_is_resumed(tmp_path: Path, split: Split | None) -> None:
+@pytest.mark.parametrize("split", [None, 2.0], ids=["one", "parts"])
+def test_a_conversion_with_gaps_is_resumed(tmp_path: Path, split: float | None) -> None:
     left = write_log(tmp_path / "left.mcap", PAUSED)
     # its first image comes before the other's, its next long after, and it ends before the other
     right = write_log(tmp_path / "right.mcap", [400, *range(3000, 8000, STEP_MS), 12000])

@@ -24,7 +24,6 @@ from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from recorder.cameras.live import LiveSource, Steady
 from recorder.cameras.readers import CameraFrames, Readers
-from recorder.config import Split
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
 from replay.integrity.info import describe
 from replay.integrity.verify import check_log
@@ -183,11 +182,11 @@ def learned(source: FrameSource, config: Any) -> RunResult:
 
 @pytest.mark.parametrize(
     ("config", "split"),
-    [(CONFIGS[0], None), (CONFIGS[1], Split.parse("9s"))],
+    [(CONFIGS[0], None), (CONFIGS[1], 9.0)],
     ids=["curious", "progress in parts"],
 )
 def test_what_is_learned_live_is_learned_again_from_the_recording(
-    tmp_path: Path, config: Any, split: Split | None
+    tmp_path: Path, config: Any, split: float | None
 ) -> None:
     with RecordedWhileWatched(opened(rough(), 3), tmp_path / "rec", split=split) as live:
         first = learned(live, config)

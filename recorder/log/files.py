@@ -1,8 +1,8 @@
-"""Files that are there in whole or not at all, and a recording's folder with its files.
+"""Write files that exist as a whole or not at all, and find the files of a recording.
 
-What is being written has a name of its own until it is complete, so a NAME is always whole. A log
+A file that is being written has another name until it is complete, so a NAME is always whole. A log
 is called NAME.partial, for it is readable; anything else NAME.<process>.partial, so that two
-processes never write one file. A folder is held by one process at a time.
+processes never write one file. One process at a time holds a folder.
 """
 
 from __future__ import annotations
@@ -14,77 +14,36 @@ import itertools
 import os
 import re
 import shutil
-import stat
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 
-PARTIAL = ".partial"
-"""Ending of what is being written, or whose writing was cut short."""
-
-RECORDING = "recording.json"
+RECORDING: Final = "recording.json"
 """File that says how a recording was started; gone when every view is finished.
 
-Beside the logs, because these hold the same bytes whatever length was wanted first.
+It is beside the logs, because these hold the same bytes whatever length was wanted first.
 """
 
-OF_FILES: Final = frozenset({".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"})
-"""Endings of what is a file wherever it is written."""
-
-_HELD: Final[set[tuple[int, int]]] = set()
-"""Folders that this process holds."""
-
+# Endings of names that are always taken for files, never for folders.
+_OF_FILES = frozenset({".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"})
 _LOG = re.compile(r"(?P<name>.+)\.mcap(\.partial(\.kept)?)?")
 _PART = re.compile(r"-\d{3,}$")
 
 
-def partial_path(path: Path) -> Path:
-    """Where a log is written until it is complete."""
-    return path.with_name(path.name + PARTIAL)
+# Checks of the name of an output; each raises a UsageError
 
 
-def aside_path(path: Path) -> Path:
-    """Where a partial log is kept while its frames are copied into a new one."""
-    return path.with_name(path.name + ".partial.kept")
-
-
-def to_disk(path: Path) -> None:
-    """Sync a file, or the names in a folder, before anything else is done."""
-    try:
-        handle = os.open(path, os.O_RDONLY)
-    except PermissionError:
-        return  # a folder that may be written, but not read
-    try:
-        os.fsync(handle)
-    except OSError as error:
-        if error.errno != errno.EINVAL:  # of a file system that cannot, as for folders of some
-            raise
-    finally:
-        os.close(handle)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder, with those above it, that a power cut cannot take away again.
-
-    Raises:
-        UsageError: something stands there that is no folder.
-    """
-    above = (folder, *folder.parents)
-    for path in above:
-        refuse_file(path)
-    missing = [path for path in above if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    for made in reversed(missing):
-        to_disk(made.parent)
-
-
-# What is refused, with a UsageError
+def refuse_special(*paths: Path) -> None:
+    """Refuse to replace a device, a pipe, a socket, or a link to one."""
+    for path in paths:
+        if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
+            raise UsageError(f"{path} is no file but a device, pipe or socket: choose another name")
 
 
 def refuse_file(folder: Path) -> None:
-    """Refuse to make a folder where a file stands, or a device or a pipe."""
+    """Refuse to make a folder where a file, a device or a pipe is."""
     refuse_special(folder)
     if folder.is_file():
         raise UsageError(f"{folder} is a file: name a folder, which is made if it is not there")
@@ -103,9 +62,9 @@ def refuse_unless(path: Path, what: str, *endings: str) -> None:
     """Refuse to write a file under the name of another kind.
 
     Args:
-        path: of the file.
-        what: it is, as "the picture is a PNG".
-        endings: that it may have, the first is its own.
+        path: the file.
+        what: a clause about the file, as "the image is a PNG".
+        endings: allowed endings; the first is recommended.
     """
     if path.suffix.lower() not in endings:
         raise UsageError(f"{path}: {what}, name it {path.stem}{endings[0]}")
@@ -113,19 +72,8 @@ def refuse_unless(path: Path, what: str, *endings: str) -> None:
 
 def refuse_named_as_file(folder: Path) -> None:
     """Refuse to make a folder under the name of a file."""
-    if (ending := folder.suffix.lower()) in OF_FILES:
+    if (ending := folder.suffix.lower()) in _OF_FILES:
         raise UsageError(f"{folder}: a folder is written, name it without {ending}")
-
-
-def refuse_special(*paths: Path) -> None:
-    """Refuse to replace what is no file or folder, as a device, a pipe or a link to one."""
-    for path in paths:
-        try:
-            mode = os.stat(path).st_mode
-        except OSError:
-            continue
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise UsageError(f"{path} is no file but a device, pipe or socket: choose another name")
 
 
 def refuse_existing(folder: Path, *, force: bool, goes_on: bool = True) -> None:
@@ -133,8 +81,8 @@ def refuse_existing(folder: Path, *, force: bool, goes_on: bool = True) -> None:
 
     Args:
         folder: of the recording or the run.
-        force: what is there is overwritten.
-        goes_on: whether what is there could be resumed instead, by --resume.
+        force: overwrite its content.
+        goes_on: whether --resume could continue its content.
     """
     refuse_file(folder)
     refuse_named_as_file(folder)
@@ -144,51 +92,49 @@ def refuse_existing(folder: Path, *, force: bool, goes_on: bool = True) -> None:
 
 
 def folder_here(place: str | Path) -> Path:
-    """A folder of this machine, by its path; a URL, which would become a folder, is refused."""
+    """Return a folder of this machine by its path; refuse a URL, which would become a folder."""
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(place)):
         raise UsageError(f"{place} is a URL: name a path on this machine")
     return Path(place)
 
 
+# Paths within a document
+
+
 def relative_path(word: str, folder: Path) -> str:
-    """A path relative to the folder that keeps it, so that both can move; a URL as it is."""
+    """Return a path relative to a folder, so that both can move; a URL as it is."""
     return word if "://" in word else os.path.join(os.curdir, os.path.relpath(word, folder))
 
 
 def found_path(word: str, folder: Path) -> str:
-    """A path of `relative_path` where it lies now; another word as it is."""
+    """Resolve a path of `relative_path`; return another word as it is."""
     return os.path.normpath(folder / word) if word.startswith(os.curdir) else word
 
 
-# Files that replace what was there
+# Files that replace others as a whole
 
 
 @contextlib.contextmanager
 def atomic_write(path: Path, *, sync: bool = True) -> Iterator[Path]:
-    """A path to write a file or a folder at, which takes its own name once it is complete.
+    """Yield a path to write a file or a folder at, which takes its own name once it is complete.
 
-    Its folder is made; what was there under that name is replaced. On an error what was written
-    is removed.
+    Its folder is made; a file or folder of that name is replaced. After an error nothing is left.
 
     Args:
         path: the name.
         sync: let the disk have all of a file before it takes its name, and then the name, so that
             a power cut leaves this file or the one before.
 
-    Yields:
-        A path that does not exist.
-
     Raises:
-        UsageError: that name is a device's, or that of something else that is no file, or a file
-            stands where its folder would be.
+        UsageError: a device or a pipe has that name, or a file that of its folder.
         LogWriteError: it cannot be written.
     """
     refuse_special(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         make_folder(partial.parent)
-        for left in (*_left_behind(path), partial):
-            _remove(left)
+        _remove_leftovers(path)
+        _remove(partial)
         yield partial
         if sync and partial.is_file():
             to_disk(partial)
@@ -198,31 +144,23 @@ def atomic_write(path: Path, *, sync: bool = True) -> Iterator[Path]:
         if sync:
             to_disk(path.parent)
     except OSError as error:
-        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-            raise LogWriteError(
-                f"{path} was written by another process meanwhile: choose another name"
-            ) from error
         raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
         with contextlib.suppress(OSError):
             _remove(partial)
 
 
-def _left_behind(path: Path) -> list[Path]:
-    """What processes left of a name that are not there any more."""
-    name = re.compile(rf"{re.escape(path.name)}\.(\d+){re.escape(PARTIAL)}")
-    found = ((other, name.fullmatch(other.name)) for other in path.parent.iterdir())
-    return [other for other, match in found if match and not _lives(int(match[1]))]
-
-
-def _lives(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    return True
+def _remove_leftovers(path: Path) -> None:
+    """Remove what processes that were killed have left of a file."""
+    name = re.compile(rf"{re.escape(path.name)}\.(\d+)\.partial")
+    for other in path.parent.iterdir():
+        if match := name.fullmatch(other.name):
+            try:
+                os.kill(int(match[1]), 0)  # signal 0 only asks whether the process lives
+            except (ProcessLookupError, OverflowError):
+                _remove(other)
+            except PermissionError:
+                pass  # it lives, and is another user's
 
 
 def _remove(path: Path) -> None:
@@ -233,12 +171,39 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-# A folder that one process holds
+def to_disk(path: Path) -> None:
+    """Sync a file, or the names in a folder, before anything else is done."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        return  # a folder that may be written, but not read
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # some file systems cannot sync folders
+            raise
+    finally:
+        os.close(handle)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, with its parents, that a power cut cannot take away again.
+
+    Raises:
+        UsageError: there is a file of that name.
+    """
+    paths = (folder, *folder.parents)
+    for path in paths:
+        refuse_file(path)
+    missing = [path for path in paths if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for made in reversed(missing):
+        to_disk(made.parent)
 
 
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Keep every other process that holds folders out of this one; a kill lets go of it, too.
+    """Keep every other process that holds folders out of this one; a kill releases it, too.
 
     Raises:
         UsageError: another process holds it, or there is no such folder.
@@ -248,80 +213,70 @@ def held(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"{folder} is no folder that can be opened: {error.strerror}") from error
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(
-                f"{folder} is in use by another process: wait for it, or choose another folder"
-            ) from error
-        except OSError:
-            pass  # A file system without locks: nothing can be held there.
-        _HELD.add(_inode(handle))
-        try:
-            yield
-        finally:
-            _HELD.discard(_inode(handle))
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise UsageError(
+            f"{folder} is in use by another process: wait for it, or choose another folder"
+        ) from error
+    except OSError:
+        pass  # a file system without locks: nothing can be held there
+    try:
+        yield
     finally:
         os.close(handle)
-
-
-def refuse_held(folder: Path) -> None:
-    """Refuse to replace what is being written where another process holds the folder.
-
-    It writes many files, and has not all of them open.
-
-    Raises:
-        UsageError: so it is.
-    """
-    if _inode(folder) not in _HELD:
-        with held(folder):
-            pass
-
-
-def _inode(folder: Path | int) -> tuple[int, int]:
-    found = os.stat(folder)
-    return found.st_dev, found.st_ino
 
 
 # The files of a recording
 
 
+def partial_path(path: Path) -> Path:
+    """Return the name of a log until it is complete."""
+    return path.with_name(path.name + ".partial")
+
+
+def aside_path(path: Path) -> Path:
+    """Return the name of a partial log while its frames are copied into a new one."""
+    return path.with_name(path.name + ".partial.kept")
+
+
 def part_name(view: str, number: int | None) -> str:
-    """Name of a view's file, or of one of its parts."""
+    """Return the name of a view's file, or of one of its parts."""
     return f"{view}.mcap" if number is None else f"{view}-{number:03d}.mcap"
 
 
 def part_number(path: Path, view: str) -> int | None:
-    """Number of a view's part by its file's name; None for the file of one that is not split."""
+    """Return the number of a view's part by its file's name; None if the view is not split."""
     number = path.name.removeprefix(view).partition(".")[0]
     return int(number[1:]) if number else None
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """The logs in a folder, finished or not."""
+    """List the logs in a folder, finished or not."""
     return sorted(p for p in folder.glob("*.mcap*") if _LOG.fullmatch(p.name) and p.is_file())
 
 
 def view_logs(folder: Path, views: Collection[str]) -> dict[str, list[Path]]:
-    """Files of some views in a folder, finished or not; a name may be of a part of another view.
+    """List the files of some views in a folder, finished or not.
 
     Raises:
         UsageError: one is no file but a device or a pipe.
     """
-    found: dict[str, list[Path]] = {view: [] for view in views}
+    logs: dict[str, list[Path]] = {view: [] for view in views}
     for path in sorted(folder.iterdir()):
         if log := _LOG.fullmatch(path.name):
-            for view in {log["name"], _PART.sub("", log["name"])} & found.keys():
+            # "left-001.mcap" is a part of "left", or the file of a view "left-001".
+            for view in {log["name"], _PART.sub("", log["name"])} & logs.keys():
                 refuse_special(path)
-                found[view].append(path)
-    return found
+                logs[view].append(path)
+    return logs
 
 
 def holds_recording(folder: Path) -> bool:
-    """Whether a folder holds what may be of a recording, or nothing yet."""
-    there = list(folder.iterdir()) if folder.is_dir() else []
-    return not there or any(
-        _LOG.fullmatch(path.name) or path.name.startswith(RECORDING) for path in there
+    """Return whether a folder may hold a recording, or holds nothing yet."""
+    paths = list(folder.iterdir()) if folder.is_dir() else []
+    return not paths or any(
+        _LOG.fullmatch(path.name) or path.name.startswith(RECORDING) for path in paths
     )
 
 
@@ -329,7 +284,7 @@ def holds_recording(folder: Path) -> bool:
 def prepared_folder(
     folder: Path, views: Sequence[str], stale: Sequence[Path] = ()
 ) -> Iterator[None]:
-    """Make and hold a recording's folder, and remove what it has of some views.
+    """Make and hold a recording's folder, and remove its files of some views.
 
     Args:
         folder: of the recording.

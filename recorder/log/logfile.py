@@ -1,4 +1,4 @@
-"""Writing an MCAP file that survives what happens to it.
+"""Write an MCAP file that survives what happens to it.
 
 A `LogFile` is `NAME.partial` until it is finished, so a file called NAME is always
 whole. What was written is readable up to the last flush after any end: an error, a
@@ -17,27 +17,24 @@ from weakref import WeakSet
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import Compression
-from recorder.log.files import partial_path, refuse_held, refuse_special, refuse_taken, to_disk
+from recorder.log.files import partial_path, refuse_special, refuse_taken, to_disk
+from recorder.mcap.store import OPEN_FILES
 from recorder.mcap.writer import McapWriter
 
-FLUSH_NS = 1_000_000_000
+FLUSH_NS: Final = 1_000_000_000
 """Log time after which the chunk in progress is handed to the operating system, by default.
 
 A run's log flushes by wall time (`replay/runs/writer.py`).
 """
 
-OPEN_FILES = 24
-"""Files that stay open while they are written; a recording has a file for each of its views."""
-
 
 class AppendOnlyFile:
     """A binary file that is only appended to and, once a write failed, refuses every later one.
 
-    The MCAP writer would go on after a failed write, and the log would have a hole in it.
+    The MCAP writer would continue after a failed write, and the log would have a hole in it.
 
-    The first `OPEN_FILES` that are written at the same time stay open, which keeps them from other
-    processes; further ones are opened for each write. What became of these meanwhile is noticed,
-    and who writes many holds their folder, see `held`.
+    The first `OPEN_FILES` that are written at the same time stay open, which locks them for other
+    processes; further ones are opened for each write. A recorder of many files holds their folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,18 +44,17 @@ class AppendOnlyFile:
             UsageError: another process writes it.
             LogWriteError: it cannot be opened.
         """
-        self._path = path
+        self._path, self._size = path, 0
         self._error: LogWriteError | None = None
         self._file: BinaryIO | None = None
         self.closed = False
-        try:
+        with self._errors():
             file: BinaryIO = open(path, "ab")  # noqa: SIM115 - open until `close`
             try:
-                self._hold(file)
+                self._lock(file)
                 file.seek(0)
-                if os.fstat(file.fileno()).st_size:
+                if os.fstat(file.fileno()).st_size:  # a device, as /dev/full, cannot be truncated
                     file.truncate()
-                self._seen = os.fstat(file.fileno())
             except BaseException:
                 file.close()
                 raise
@@ -67,11 +63,9 @@ class AppendOnlyFile:
                 _STAY_OPEN.add(self)
             else:
                 file.close()
-        except OSError as error:
-            raise write_error(path, error) from error
 
     def check(self) -> None:
-        """Refuse to go on where something was not written, or nothing more is to be."""
+        """Raise a LogWriteError if a write has failed, or the file is closed."""
         if self._error is not None:
             raise LogWriteError(str(self._error)) from self._error
         if self.closed:
@@ -80,11 +74,12 @@ class AppendOnlyFile:
     def write(self, data: bytes | memoryview) -> int:
         """Append all of the bytes."""
         with self._opened() as file:
-            return file.write(data)
+            self._size += file.write(data)
+        return len(data)
 
     def tell(self) -> int:
-        """Bytes that were appended."""
-        return self._seen.st_size if self._file is None else self._file.tell()
+        """Return the number of bytes that were appended."""
+        return self._size
 
     def flush(self) -> None:
         """Hand everything to the operating system."""
@@ -98,64 +93,58 @@ class AppendOnlyFile:
             os.fsync(file.fileno())
 
     def close(self) -> None:
-        """Write nothing more."""
+        """Close the file; the error of an earlier write is kept, as closing repeats that write."""
         self.closed = True
         _STAY_OPEN.discard(self)
         file, self._file = self._file, None
-        if file is None:
-            return
-        try:
-            with contextlib.closing(file):
+        if file is not None:
+            with contextlib.suppress(LogWriteError), self._errors(), file:
                 file.flush()
-                self._seen = os.fstat(file.fileno())
-        except OSError as error:  # the first one counts: closing tries again what failed
-            self._error = self._error or write_error(self._path, error)
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[BinaryIO]:
-        """The file, open; after an error nothing more is written."""
+        """Yield the file, open; after an error nothing more is written."""
         self.check()
-        try:
+        with self._errors():
             if self._file is not None:
                 yield self._file
-                return
-            with open(os.open(self._path, os.O_WRONLY | os.O_APPEND), "ab") as file:
-                self._hold(file)
-                now = os.fstat(file.fileno())
-                if not os.path.samestat(now, self._seen) or now.st_size != self._seen.st_size:
-                    raise self._in_use()
-                yield file
-                file.flush()
-                self._seen = os.fstat(file.fileno())
-        except (OSError, UsageError) as error:
-            known = write_error(self._path, error) if isinstance(error, OSError) else error
-            self._error = LogWriteError(str(known))
-            self.close()
+            else:
+                with open(os.open(self._path, os.O_WRONLY | os.O_APPEND), "ab") as file:
+                    yield file
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Turn an error of the disk into one of the log, keep the first, and close the file."""
+        try:
+            yield
+        except OSError as error:
+            self._error = self._error or write_error(self._path, error)
+            if not self.closed:
+                self.close()
             raise self._error from error
 
-    def _hold(self, file: BinaryIO) -> None:
+    def _lock(self, file: BinaryIO) -> None:
         """Keep other processes from writing the file while it is open."""
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if not isinstance(error, BlockingIOError):
-                return  # a file system without locks: nothing can be held there
-            raise self._in_use() from error
-        there = os.fstat(file.fileno())
-        if not (self._path.exists() and os.path.samestat(os.stat(self._path), there)):
-            raise self._in_use()
-
-    def _in_use(self) -> UsageError:
-        return UsageError(
-            f"{self._path} is being written by another process: wait for it, or choose another name"
-        )
+        except BlockingIOError as error:
+            raise UsageError(
+                f"{self._path} is being written by another process: wait for it, or choose another "
+                "name"
+            ) from error
+        except OSError:
+            return  # a file system without locks: nothing can be held there
+        # The other process may have given it its final name since it was opened here.
+        opened = os.fstat(file.fileno())
+        if not (self._path.exists() and os.path.samestat(os.stat(self._path), opened)):
+            raise UsageError(f"{self._path} was just finished by another process")
 
 
 _STAY_OPEN: Final[WeakSet[AppendOnlyFile]] = WeakSet()
 
 
 def write_error(path: Path, error: OSError) -> LogWriteError:
-    """The error for a disk that does not take a file."""
+    """Return the error for a disk that does not take a file."""
     return LogWriteError(
         f"{path} cannot be written: {error.strerror or error}; "
         "check the free space and rights there, what was flushed is readable"
@@ -166,8 +155,8 @@ class LogFile:
     """One MCAP file: chunked, indexed, with CRCs and repeated schemas and channels.
 
     As a context manager it finishes the file on success and leaves the flushed
-    `.partial` on an exception. The same calls give the same bytes. What writes raises a
-    `LogWriteError` where the disk does not take it, or did not take something before.
+    `.partial` on an exception. The same calls give the same bytes. Every method that writes raises
+    a `LogWriteError` if the disk does not take it, or did not take something before.
 
     Attributes:
         path: the file's name once it is finished.
@@ -190,8 +179,8 @@ class LogFile:
 
         Args:
             path: the file's name once it is finished.
-            force: overwrite what is there.
-            library: what wrote it, as the header states.
+            force: overwrite an earlier file.
+            library: writer of the file, as the header states.
             profile: of the messages, as the header states.
             compression: of the chunks.
             chunk_size: bytes of messages at which a chunk is closed.
@@ -212,13 +201,11 @@ class LogFile:
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         refuse_taken(self.path, force=force)
         refuse_special(self.partial)
-        if self.partial.exists():
-            if not force:
-                raise UsageError(
-                    f"{self.partial} is left from a writing that was cut short: "
-                    "recover or remove it, or overwrite with --force"
-                )
-            refuse_held(self.partial.parent)
+        if self.partial.exists() and not force:
+            raise UsageError(
+                f"{self.partial} is left from a writing that was cut short: "
+                "recover or remove it, or overwrite with --force"
+            )
         self._stream = AppendOnlyFile(self.partial)
         try:
             self._writer = McapWriter(
@@ -240,7 +227,7 @@ class LogFile:
 
     @property
     def size(self) -> int:
-        """Bytes written so far; the chunk in progress is not among them."""
+        """Bytes written so far, without the chunk in progress."""
         self._writer.settle()
         return self._stream.tell()
 
@@ -293,7 +280,7 @@ class LogFile:
             log_time: nanoseconds.
             data: the encoded message.
             sequence: the publisher's counter.
-            publish_time: nanoseconds; the log time where none is given.
+            publish_time: nanoseconds; by default the log time.
         """
         published = log_time if publish_time is None else publish_time
         self.write_all(((channel, log_time, data, published, sequence),))
@@ -326,8 +313,7 @@ class LogFile:
         self.flush()
         self._stream.sync()
         if not self._named_on_disk:
-            with self._telling():
-                to_disk(self.partial.parent)
+            self._rename(self.partial)  # to the same name, which only syncs it
             self._named_on_disk = True
 
     def finish(self) -> None:
@@ -347,22 +333,20 @@ class LogFile:
                 f"{self.path} appeared while it was being written: "
                 f"the new log is whole in {self.partial.name}, rename it"
             )
-        with self._telling():
-            os.replace(self.partial, self.path)
-            to_disk(self.path.parent)
+        self._rename(self.path)
 
     def abandon(self) -> None:
         """Flush what can be flushed and close, leaving a readable `.partial`."""
-        if self.closed:
-            return
-        with contextlib.suppress(LogWriteError):
-            self.sync()
-        self._stream.close()
+        if not self.closed:
+            with contextlib.suppress(LogWriteError):
+                self.sync()
+            self._stream.close()
 
-    @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _rename(self, name: Path) -> None:
+        """Give the file a name, also on the disk."""
         try:
-            yield
+            os.replace(self.partial, name)
+            to_disk(name.parent)
         except OSError as error:
             raise write_error(self.path, error) from error
 

@@ -1,4 +1,4 @@
-"""The manifest of a recording: the metadata of each view's file, and RECORDING.
+"""Store the manifest of a recording: the metadata of each view's file, and RECORDING.
 
 RECORDING holds the command that started a recording, stored for --resume.
 """
@@ -26,11 +26,12 @@ from cdmisfa.core.untrusted import MAX_JSON, parse_json, read_regular
 from recorder.log.files import RECORDING, atomic_write, to_disk
 from recorder.log.messages import SCHEMA_VERSION
 
+# Limits of what a file may state, far above any recording: a broken file must not take all memory.
 MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
 MAX_FRAMES: Final = 2**33
 
-MOST_NAMED = 100
+MOST_NAMED: Final = 100
 """Streams that every file of a recording names; of more each names its own, so that all together
 do not grow with their square."""
 
@@ -40,31 +41,31 @@ PACKAGES: Final = ("cdmisfa", "numpy", "zstandard")
 _VERSION = "version_"
 
 _AT_NEED = ("gaps", "stream_count")
-"""Keys that stand in a file only where they say something."""
+"""Keys that a file has only if they are not their default, which most recordings have."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingStart:
-    """How a recording was started, as far as it says so.
+    """How a recording was started.
 
     Attributes:
-        scene: name of what is recorded; "" where that is not known.
+        scene: name of what is recorded; "" if it is not known.
         seed: of the scene's motions.
-        frames: how many each unfinished view shall have.
-        split: where the parts of each unfinished view end, as `Split.parse` reads it.
+        frames: number of frames that each unfinished view shall have.
+        split: seconds of a part of each unfinished view that is split.
     """
 
     scene: str = ""
     seed: int | None = None
     frames: Mapping[str, int] = field(default_factory=dict)
-    split: Mapping[str, str] = field(default_factory=dict)
+    split: Mapping[str, float] = field(default_factory=dict)
 
 
 def read_start(folder: Path) -> RecordingStart:
-    """How an unfinished recording was started, as far as its folder readably says so.
+    """Read how an unfinished recording was started; a broken RECORDING says nothing.
 
     Raises:
-        UsageError: its file is larger than any that says so.
+        UsageError: the file is too large.
         LogDamagedError: the disk does not give it.
     """
     path = folder / RECORDING
@@ -72,25 +73,26 @@ def read_start(folder: Path) -> RecordingStart:
     try:
         values = parse_json(data)
         frames = {str(v): n for v, n in values["frames"].items() if type(n) is int and n > 0}
-        split = {v: limit for v, limit in values.get("split", {}).items() if isinstance(limit, str)}
-        scene, seed = values.get("scene"), values.get("seed")
+        split = {str(v): float(limit) for v, limit in values["split"].items()}
+        scene, seed = str(values["scene"]), values["seed"]
     except (ValueError, KeyError, TypeError, AttributeError):
         return RecordingStart()
+    if not frames:
+        return RecordingStart()
     known = type(seed) is int and 0 <= seed < 2**63
-    scene = scene if isinstance(scene, str) else ""
     return RecordingStart(scene, seed if known else None, frames, split)
 
 
 def store_start(folder: Path, views: Sequence[str], start: RecordingStart | None = None) -> None:
-    """Store how some views are started, or that they are finished, beside what the others are.
+    """Store how some views are started, or that they are finished, beside the others.
 
     Raises:
         LogWriteError: the disk does not take it.
     """
-    known = read_start(folder)
-    start = start or dataclasses.replace(known, frames={}, split={})
-    frames = {v: n for v, n in known.frames.items() if v not in views} | dict(start.frames)
-    split = {v: limit for v, limit in known.split.items() if v not in views} | dict(start.split)
+    before = read_start(folder)
+    start = start or dataclasses.replace(before, frames={}, split={})
+    frames = {v: n for v, n in before.frames.items() if v not in views} | dict(start.frames)
+    split = {v: limit for v, limit in before.split.items() if v not in views} | dict(start.split)
     path = folder / RECORDING
     if not frames:
         path.unlink(missing_ok=True)
@@ -103,13 +105,13 @@ def store_start(folder: Path, views: Sequence[str], start: RecordingStart | None
 
 @dataclass(frozen=True, slots=True)
 class ViewMetadata:
-    """What a view's file states about itself; each is a key of its metadata record.
+    """Metadata record of a view's file; each attribute is a key.
 
     Attributes:
         scene: name of what was recorded.
         view: name of the stream.
         stream_index: its place among the streams of the recording, from 0.
-        streams: all of them; none where they are more than `MOST_NAMED`.
+        streams: all of them; none if they are more than `MOST_NAMED`.
         frame_shape: (height, width) or (I,).
         dtype: "uint8" or "float64".
         truth: a name for each column of ground truth.
@@ -118,11 +120,10 @@ class ViewMetadata:
         first_frame: number of the file's first frame.
         seed: of the scene's motions.
         config_sha256: checksum of the configuration that is attached.
-        gaps: whether frames may be missing, of live streams that had none to show; a key only
-            where they may.
-        stream_count: how many streams there are where they are not named; a key only there.
+        gaps: whether frames may be missing, because live streams had none to show.
+        stream_count: number of streams if they are not named, else 0.
         versions: of packages that the bytes may depend on, each a key, too.
-        values: the record as it stands in the file, where it was read from one.
+        values: the record as it is in the file that it was read from.
     """
 
     scene: str
@@ -144,21 +145,21 @@ class ViewMetadata:
 
     @property
     def spec(self) -> SourceSpec:
-        """What the file's view delivers, without a length."""
+        """Specification of the file's view as a source, without a length."""
         return SourceSpec(
             (self.view,), self.frame_shape, self.dtype, self.truth, self.fps, self.start_ns
         )
 
     def times(self, frames: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """Log times of frames, (n,) nanoseconds, as `SourceSpec.time_ns` gives them."""
+        """Return the log times of frames, (n,) nanoseconds, as `SourceSpec.time_ns` gives them."""
         return times_of(frames, self.fps, self.start_ns).astype(np.uint64)
 
     def frames_at(self, times: NDArray[np.uint64]) -> NDArray[np.int64]:
-        """Frames at log times, (n,) nanoseconds, or near those that are not exactly a frame's."""
+        """Return the frames nearest to log times, (n,) nanoseconds."""
         return np.clip(nearest_frames(times, self.fps, self.start_ns), -1, MAX_FRAMES)
 
     def record(self) -> dict[str, str]:
-        """The file's metadata record."""
+        """Return the file's metadata record."""
         others = ["versions", "values", *(n for n in _AT_NEED if not getattr(self, n))]
         names = [f.name for f in dataclasses.fields(self) if f.name not in others]
         stated = {name: _text(getattr(self, name)) for name in names}
@@ -171,60 +172,61 @@ class ViewMetadata:
         Raises:
             LogDamagedError: a key that reading depends on is missing or makes no sense.
         """
-
-        def demand(right: bool, key: str, remedy: str) -> None:
-            if not right:
-                value = values.get(key)
-                said = "misses" if value is None else f"says {value[:60]!r} for"
-                raise LogDamagedError(f"{path}: its recording metadata {said} {key}: {remedy}")
-
-        def number(key: str, low: int, high: int, default: str = "") -> int:
-            text = values.get(key, default)
-            demand(_is_number(text, 19), key, "record it again")
-            demand(low <= int(text) <= high, key, f"it must be in [{low}, {high}]")
-            return int(text)
-
-        version = f"this version reads schema {SCHEMA_VERSION}"
-        demand(values.get("schema") == str(SCHEMA_VERSION), "schema", version)
-        view = values.get("view", "")
-        demand(view != "", "view", "record it again")
-        sides = values.get("frame_shape", "").split("x")
-        whole = len(sides) <= 2 and all(_is_number(side, 9) for side in sides)
-        demand(whole, "frame_shape", "it must be as 48x128 or 2")
-        shape, dtype = tuple(map(int, sides)), values.get("dtype", "")
-        kinds = (("uint8", 2), ("float64", 1))
-        remedy = "it must be uint8 for images, float64 for vectors"
-        demand((dtype, len(shape)) in kinds, "dtype", remedy)
-        most = MAX_FRAME_VALUES
-        demand(0 < math.prod(shape) <= most, "frame_shape", "no frame has that size")
         try:
-            fps = float(values.get("fps", ""))
-        except ValueError:
-            fps = math.nan
-        slowest, fastest = RECORDED_FPS
-        remedy = f"it must be in [{slowest:g}, {fastest:.0f}]"
-        demand(slowest <= fps <= fastest, "fps", remedy)
-        truth = _names(values.get("truth", ""))
-        different = len(set(truth)) == len(truth) and all(n.isidentifier() for n in truth)
-        demand(different, "truth", "they must be different names")
-        return cls(
-            scene=values.get("scene", ""),
-            view=view,
-            stream_index=number("stream_index", 0, MAX_STREAMS),
-            streams=_names(values.get("streams", "")),
-            frame_shape=shape,
-            dtype=dtype,
-            truth=truth,
-            fps=fps,
-            start_ns=number("start_ns", 0, 2**62),
-            first_frame=number("first_frame", 0, MAX_FRAMES, "0"),
-            seed=values.get("seed", ""),
-            config_sha256=values.get("config_sha256", ""),
-            gaps=values.get("gaps") == str(True),
-            stream_count=number("stream_count", 0, MAX_STREAMS, "0"),
-            versions={key: v for key, v in values.items() if key.startswith(_VERSION)},
-            values=dict(values),
-        )
+            shape = tuple(map(int, values["frame_shape"].split("x")))
+            stated = cls(
+                scene=values.get("scene", ""),
+                view=values["view"],
+                stream_index=int(values["stream_index"]),
+                streams=_names(values.get("streams", "")),
+                frame_shape=shape,
+                dtype=values["dtype"],
+                truth=_names(values.get("truth", "")),
+                fps=float(values["fps"]),
+                start_ns=int(values["start_ns"]),
+                first_frame=int(values.get("first_frame", "0")),
+                seed=values.get("seed", ""),
+                config_sha256=values.get("config_sha256", ""),
+                gaps=values.get("gaps") == str(True),
+                stream_count=int(values.get("stream_count", "0")),
+                versions={key: v for key, v in values.items() if key.startswith(_VERSION)},
+                values=dict(values),
+            )
+        except (KeyError, ValueError) as error:
+            raise LogDamagedError(
+                f"{path}: its recording metadata is broken ({error}): record it again"
+            ) from None
+        possible = {
+            "schema": values.get("schema") == str(SCHEMA_VERSION),
+            "view": stated.view != "",
+            "stream_index": 0 <= stated.stream_index <= MAX_STREAMS,
+            "frame_shape": min(shape) > 0 and math.prod(shape) <= MAX_FRAME_VALUES,
+            "dtype": (stated.dtype, len(shape)) in (("uint8", 2), ("float64", 1)),
+            "truth": len(set(stated.truth)) == len(stated.truth)
+            and all(name.isidentifier() for name in stated.truth),
+            "fps": RECORDED_FPS[0] <= stated.fps <= RECORDED_FPS[1],
+            "start_ns": 0 <= stated.start_ns <= 2**62,
+            "first_frame": 0 <= stated.first_frame <= MAX_FRAMES,
+            "stream_count": 0 <= stated.stream_count <= MAX_STREAMS,
+        }
+        if wrong := [key for key, right in possible.items() if not right]:
+            raise LogDamagedError(
+                f"{path}: its recording metadata says {values.get(wrong[0], '')[:60]!r} for "
+                f"{wrong[0]}, which this version does not read: record it again"
+            )
+        return stated
+
+
+def _text(value: Any) -> str:
+    """Return a value as a metadata record has it."""
+    if isinstance(value, tuple):
+        between = "," if not value or isinstance(value[0], str) else "x"
+        return between.join(map(str, value))
+    return str(value)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split(",")) if text else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,8 +236,8 @@ class RecordingSpec:
     Attributes:
         kind: name of what is recorded: a scene's, or the kind of a source.
         seed: of the scene's motions.
-        spec: what its source delivers, with the names of the views as its streams.
-        config: what it was told, as JSON values.
+        spec: of its source, with the names of the views as its streams.
+        config: its configuration, as JSON values.
         packages: whose versions the frames depend on, beside `PACKAGES`.
         gaps: whether streams may lack frames.
     """
@@ -248,11 +250,11 @@ class RecordingSpec:
     gaps: bool = False
 
     def config_json(self) -> bytes:
-        """The configuration as the attachment holds it."""
+        """Return the configuration as the attachment holds it."""
         return (json.dumps(self.config, indent=2, sort_keys=True) + "\n").encode()
 
     def metadata(self, view: str, first_frame: int = 0) -> ViewMetadata:
-        """What the file of a view that begins with a frame states."""
+        """Return the metadata of the file of a view that begins with a frame."""
         spec, named = self.spec, len(self.spec.streams) <= MOST_NAMED
         return ViewMetadata(
             scene=self.kind,
@@ -275,25 +277,8 @@ class RecordingSpec:
 
 @cache
 def version(package: str) -> str:
-    """Version of an installed package."""
+    """Return the version of an installed package."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "unknown"
-
-
-def _text(value: Any) -> str:
-    """A value as a metadata record has it."""
-    if isinstance(value, tuple):
-        between = "," if not value or isinstance(value[0], str) else "x"
-        return between.join(map(str, value))
-    return str(value)
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(text.split(",")) if text else ()
-
-
-def _is_number(text: str, most: int) -> bool:
-    """Whether a text is a whole number of at most so many digits."""
-    return text.isascii() and text.isdigit() and len(text) <= most

@@ -1,8 +1,9 @@
-"""The messages of a recording, as protobuf: encoders, schemas and their byte layout.
+"""Encode the messages of a recording as protobuf: encoders, schemas and their byte layout.
 
 Images are `foxglove.RawImage`, and a scene's cameras, frames and objects Foxglove's messages, too,
-so that Foxglove and Rerun show them without us. What a vectorised reader takes out of a message
-stands at a fixed distance from its end, because only the timestamp in front of it varies in length.
+so that Foxglove and Rerun show them without us. The values that a vectorised reader takes out of a
+message are at a fixed distance from its end, because only the timestamp before them varies in
+length.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from foxglove_schemas_protobuf import (
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
+from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import UsageError
 from recorder.log.scenery import (
     Eye,
@@ -68,18 +70,18 @@ _FIELD = descriptor_pb2.FieldDescriptorProto
 
 
 def view_topic(view: str) -> str:
-    """Topic of a view's frames."""
+    """Return the topic of a view's frames."""
     return f"/view/{view}"
 
 
 def calibration_topic(view: str, side: str) -> str:
-    """Topic of the calibration of an eye of a view."""
+    """Return the topic of the calibration of an eye of a view."""
     return f"/calibration/{view}/{side}"
 
 
 @dataclass(frozen=True, slots=True)
 class Payload:
-    """Where a message holds its values, counted from its end.
+    """Place of a message's values, counted from its end.
 
     Attributes:
         tail: bytes between the values' end and the message's end.
@@ -93,7 +95,7 @@ class Payload:
 
 
 def image_payload(height: int, width: int, frame_id: str) -> Payload:
-    """Where a `foxglove.RawImage` of grey pixels holds them."""
+    """Return the place of the pixels of a grey `foxglove.RawImage`."""
     name = frame_id.encode()
     size = height * width
     tail = 1 + len(varint(len(name))) + len(name) if name else 0
@@ -101,36 +103,42 @@ def image_payload(height: int, width: int, frame_id: str) -> Payload:
 
 
 def vector_payload(length: int) -> Payload:
-    """Where a `cdmisfa.Vector` holds its little-endian float64 values."""
+    """Return the place of the little-endian float64 values of a `cdmisfa.Vector`."""
     size = 8 * length
     return Payload(0, size, b"\x12" + varint(size) if size else b"")
 
 
 def truth_tags(names: Sequence[str]) -> list[bytes]:
-    """What stands before each of the float64 that end a `cdmisfa.GroundTruth`: its tag."""
+    """Return the tags before each of the float64 values that end a `cdmisfa.GroundTruth`."""
     return [varint((_FIRST_TRUTH_FIELD + i) << 3 | 1) for i in range(len(names))]
 
 
-class _Encoder:
-    """Encodes one kind of message, all of which have a timestamp; `schema` is its name."""
+class Encoder:
+    """Encode messages of one kind, which have a timestamp; `schema` is its name.
 
-    def __init__(self, message: Any) -> None:
+    Args:
+        message: filled in, but for its time.
+        stamped: its parts that have the timestamp, if it has none itself.
+    """
+
+    def __init__(self, message: Any, stamped: Sequence[Any] = ()) -> None:
         self._message = message
+        self._stamped = stamped or (message,)
         self.schema: str = message.DESCRIPTOR.full_name
 
     def schema_data(self) -> bytes:
-        """The FileDescriptorSet that describes the message."""
+        """Return the FileDescriptorSet that describes the message."""
         return descriptor_set(self._message.DESCRIPTOR)
 
-    def _encoded(self, time_ns: int, *stamped: Any) -> bytes:
-        """The message at a time, which it holds itself or in its parts."""
-        for part in stamped or (self._message,):
+    def __call__(self, time_ns: int, values: Any) -> bytes:
+        """Encode the message at a time; subclasses fill in the values of this time."""
+        for part in self._stamped:
             part.timestamp.FromNanoseconds(time_ns)
         return bytes(self._message.SerializeToString())
 
 
-class ImageEncoder(_Encoder):
-    """Frames of a view as `foxglove.RawImage`, mono8.
+class ImageEncoder(Encoder):
+    """Encode frames of a view as `foxglove.RawImage`, mono8.
 
     Args:
         height: rows of pixels.
@@ -139,48 +147,53 @@ class ImageEncoder(_Encoder):
     """
 
     def __init__(self, height: int, width: int, frame_id: str) -> None:
-        super().__init__(
-            RawImage_pb2.RawImage(
-                width=width, height=height, step=width, encoding=IMAGE_ENCODING, frame_id=frame_id
-            )
-        )
         payload = image_payload(height, width, frame_id)
         self._size = payload.size
-        self._message.data = bytes(payload.size)
+        super().__init__(
+            RawImage_pb2.RawImage(
+                width=width,
+                height=height,
+                step=width,
+                encoding=IMAGE_ENCODING,
+                frame_id=frame_id,
+                data=bytes(payload.size),
+            )
+        )
         blank = self._message.SerializeToString()
         end = len(blank) - payload.tail
-        # All but its time and its pixels is the same in every message of the view.
+        # All but its time and its pixels is the same in every message of the view, and protobuf
+        # would copy the pixels twice.
         self._around = blank[: end - payload.size], blank[end:]
 
-    def __call__(self, time_ns: int, frame: ByteArray) -> bytes:
+    def __call__(self, time_ns: int, values: ByteArray) -> bytes:
         """Encode one frame, (height, width) uint8.
 
         Raises:
             ValueError: it is of another size.
         """
         before, after = self._around
-        if frame.nbytes != self._size:
-            raise ValueError(f"a frame of {frame.nbytes} bytes given, not of {self._size}")
-        pixels: Any = np.ascontiguousarray(frame)
+        if values.nbytes != self._size:
+            raise ValueError(f"a frame of {values.nbytes} bytes given, not of {self._size}")
+        pixels: Any = np.ascontiguousarray(values)
         return b"".join((_timestamp(time_ns), before, pixels, after))
 
 
-class VectorEncoder(_Encoder):
-    """Values of a stream as `cdmisfa.Vector`, exact to the bit."""
+class VectorEncoder(Encoder):
+    """Encode values of a stream as `cdmisfa.Vector`, exact to the bit."""
 
     def __init__(self) -> None:
         repeated = _FIELD.LABEL_REPEATED
         values = _FIELD(name="values", number=2, type=_FIELD.TYPE_DOUBLE, label=repeated)
         super().__init__(_message("Vector", [values]))
 
-    def __call__(self, time_ns: int, frame: FloatArray) -> bytes:
+    def __call__(self, time_ns: int, values: FloatArray) -> bytes:
         """Encode one frame, (I,) float64."""
-        self._message.values[:] = frame.tolist()
-        return self._encoded(time_ns)
+        self._message.values[:] = values.tolist()
+        return super().__call__(time_ns, values)
 
 
-class TruthEncoder(_Encoder):
-    """What the world knows, as `cdmisfa.GroundTruth`: one double a name.
+class TruthEncoder(Encoder):
+    """Encode ground truth as `cdmisfa.GroundTruth`: one double a name.
 
     Args:
         names: the columns of `Block.truth`.
@@ -191,13 +204,12 @@ class TruthEncoder(_Encoder):
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
-        if len(names) > MAX_TRUTH or len(set(names)) != len(names):
-            raise UsageError(f"ground truth needs at most {MAX_TRUTH} different names")
-        for name in names:
-            if not _NAME.fullmatch(name) or name == "timestamp":
-                raise UsageError(
-                    f"ground truth cannot be called {name!r}: use letters, digits and _"
-                )
+        allowed = all(_NAME.fullmatch(name) and name != "timestamp" for name in names)
+        if not allowed or len(names) > MAX_TRUTH or len(set(names)) != len(names):
+            raise UsageError(
+                f"ground truth needs at most {MAX_TRUTH} different names of letters, digits and _, "
+                f"not {', '.join(map(repr, names))[:200]}"
+            )
         # Explicit presence: a zero is written too, so that every message has the same layout.
         fields = [
             _FIELD(
@@ -216,111 +228,90 @@ class TruthEncoder(_Encoder):
         """Encode one row of ground truth, (D,) float64."""
         for name, value in zip(self._names, values.tolist(), strict=True):
             setattr(self._message, name, value)
-        return self._encoded(time_ns)
+        return super().__call__(time_ns, values)
 
 
-class PoseEncoder(_Encoder):
-    """A pose in a frame as `foxglove.PoseInFrame`."""
-
-    def __init__(self, frame_id: str) -> None:
-        super().__init__(PoseInFrame_pb2.PoseInFrame(frame_id=frame_id))
-
-    def __call__(
-        self, time_ns: int, position: Sequence[float], quaternion: Sequence[float]
-    ) -> bytes:
-        """Encode a position (x, y, z) in metres and an orientation (x, y, z, w)."""
-        _set(self._message.pose.position, position)
-        _set(self._message.pose.orientation, quaternion)
-        return self._encoded(time_ns)
-
-
-class CalibrationEncoder(_Encoder):
-    """How an eye, with its coordinate frame, maps what it sees, as `foxglove.CameraCalibration`."""
-
-    def __init__(self, eye: Eye, frame_id: str) -> None:
-        f, x, y = eye.focal, eye.width / 2, eye.height / 2
-        super().__init__(
-            CameraCalibration_pb2.CameraCalibration(
-                frame_id=frame_id,
-                width=eye.width,
-                height=eye.height,
-                K=[f, 0, x, 0, f, y, 0, 0, 1],
-                R=[1, 0, 0, 0, 1, 0, 0, 0, 1],
-                P=[f, 0, x, 0, 0, f, y, 0, 0, 0, 1, 0],
-            )
-        )
-
-    def __call__(self, time_ns: int) -> bytes:
-        """Encode it at a time."""
-        return self._encoded(time_ns)
-
-
-class TransformsEncoder(_Encoder):
-    """Where a view's head and eyes are, as `foxglove.FrameTransforms`.
-
-    From the root's frame to `VIEW/head`, turned by the yaw; from there to VIEW, between the eyes,
-    tilted, along whose z they look; and from there to each eye.
+class ObjectsEncoder(Encoder):
+    """Encode where the objects and the table are, as `foxglove.SceneUpdate`.
 
     Args:
-        gaze: of the view.
-        root: name of the root's frame.
-    """
-
-    def __init__(self, gaze: Gaze, root: str) -> None:
-        super().__init__(FrameTransforms_pb2.FrameTransforms())
-        view, head, middle = gaze.name, f"{gaze.name}/head", gaze.middle
-        neck, turn = gaze.head.position, gaze.head.quaternion
-        self._add(root, head, neck, turn)
-        self._add(head, view, *_seen_from(neck, turn, middle))
-        for side, eye in zip(SIDES, gaze.eyes, strict=True):
-            self._add(view, f"{view}/{side}", *_seen_from(middle.place, middle.turn, eye))
-
-    def __call__(self, time_ns: int) -> bytes:
-        """Encode them at a time."""
-        return self._encoded(time_ns, *self._message.transforms)
-
-    def _add(self, parent: str, child: str, place: Place, turn: Quaternion) -> None:
-        added = self._message.transforms.add(parent_frame_id=parent, child_frame_id=child)
-        _set(added.translation, place)
-        _set(added.rotation, turn)
-
-
-class ObjectsEncoder(_Encoder):
-    """Where the objects are, and the table, as `foxglove.SceneUpdate`.
-
-    Args:
-        scenery: what they look like.
+        scenery: the objects.
         names: of the columns of truth.
         root: name of the root's frame.
     """
 
     def __init__(self, scenery: Scenery, names: Sequence[str], root: str) -> None:
-        super().__init__(SceneUpdate_pb2.SceneUpdate())
+        update = SceneUpdate_pb2.SceneUpdate()
+        _add_thing(update, scenery.table, root)
         self._moved = []
-        self._add(scenery.table, root)
         for thing in scenery.objects:
             column, row = (list(names).index(name) for name in thing.truth)
-            self._moved.append((self._add(thing, root), column, row))
+            self._moved.append((_add_thing(update, thing, root), column, row))
+        super().__init__(update, update.entities)
 
-    def __call__(self, time_ns: int, truth: FloatArray) -> bytes:
+    def __call__(self, time_ns: int, values: FloatArray) -> bytes:
         """Encode where everything is at a time with this (D,) truth."""
-        values = truth.tolist()
+        truth = values.tolist()
         for place, x, y in self._moved:
-            place.x, place.y = values[x], -values[y]
-        return self._encoded(time_ns, *self._message.entities)
+            place.x, place.y = truth[x], -truth[y]
+        return super().__call__(time_ns, values)
 
-    def _add(self, thing: Thing, root: str) -> Any:
-        entity = self._message.entities.add(id=thing.name, frame_id=root)
-        shapes = {"box": entity.cubes, "cylinder": entity.cylinders, "sphere": entity.spheres}
-        shape = shapes[thing.shape].add()
-        if thing.shape == "cylinder":
-            shape.bottom_scale = shape.top_scale = 1.0
-        _set(shape.size, thing.size)
-        shape.color.r, shape.color.g, shape.color.b = thing.colour
-        shape.color.a = 1.0
-        _set(shape.pose.position, thing.place)
-        _set(shape.pose.orientation, (0.0, 0.0, 0.0, 1.0))
-        return shape.pose.position
+
+def _add_thing(update: Any, thing: Thing, root: str) -> Any:
+    """Add a thing to a `foxglove.SceneUpdate`, and return its place there."""
+    entity = update.entities.add(id=thing.name, frame_id=root)
+    shapes = {"box": entity.cubes, "cylinder": entity.cylinders, "sphere": entity.spheres}
+    shape = shapes[thing.shape].add()
+    if thing.shape == "cylinder":
+        shape.bottom_scale = shape.top_scale = 1.0
+    _set(shape.size, thing.size)
+    shape.color.r, shape.color.g, shape.color.b = thing.colour
+    shape.color.a = 1.0
+    _set(shape.pose.position, thing.place)
+    _set(shape.pose.orientation, (0.0, 0.0, 0.0, 1.0))
+    return shape.pose.position
+
+
+def pose_encoder(frame_id: str, pose: HeadPose) -> Encoder:
+    """Return the encoder of a pose in a frame, as `foxglove.PoseInFrame`."""
+    message = PoseInFrame_pb2.PoseInFrame(frame_id=frame_id)
+    _set(message.pose.position, pose.position)
+    _set(message.pose.orientation, pose.quaternion)
+    return Encoder(message)
+
+
+def calibration_encoder(eye: Eye, frame_id: str) -> Encoder:
+    """Return the encoder of how an eye maps the world, as `foxglove.CameraCalibration`."""
+    f, x, y = eye.focal, eye.width / 2, eye.height / 2
+    return Encoder(
+        CameraCalibration_pb2.CameraCalibration(
+            frame_id=frame_id,
+            width=eye.width,
+            height=eye.height,
+            K=[f, 0, x, 0, f, y, 0, 0, 1],
+            R=[1, 0, 0, 0, 1, 0, 0, 0, 1],
+            P=[f, 0, x, 0, 0, f, y, 0, 0, 0, 1, 0],
+        )
+    )
+
+
+def transforms_encoder(gaze: Gaze, root: str) -> Encoder:
+    """Return the encoder of where a view's head and eyes are, as `foxglove.FrameTransforms`.
+
+    From the root's frame to `VIEW/head`, turned by the yaw; from there to VIEW, between the eyes,
+    tilted, along whose z they look; and from there to each eye.
+    """
+    message = FrameTransforms_pb2.FrameTransforms()
+    view, head, middle = gaze.name, f"{gaze.name}/head", gaze.middle
+    neck, turn = gaze.head.position, gaze.head.quaternion
+    transforms = [(root, head, (neck, turn)), (head, view, _seen_from(neck, turn, middle))]
+    for side, eye in zip(SIDES, gaze.eyes, strict=True):
+        transforms.append((view, f"{view}/{side}", _seen_from(middle.place, middle.turn, eye)))
+    for parent, child, (place, turn) in transforms:
+        added = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+        _set(added.translation, place)
+        _set(added.rotation, turn)
+    return Encoder(message, message.transforms)
 
 
 def _set(message: Any, values: Sequence[float]) -> None:
@@ -330,14 +321,14 @@ def _set(message: Any, values: Sequence[float]) -> None:
 
 
 def _seen_from(place: Place, turn: Quaternion, eye: Eye) -> tuple[Place, Quaternion]:
-    """Where an eye is, seen from a frame."""
+    """Return the place and the turn of an eye, seen from a frame."""
     back = inverse(turn)
     x, y, z = turned(back, np.subtract(eye.place, place).tolist()).tolist()
     return (x, y, z), times(back, eye.turn)
 
 
 def descriptor_set(descriptor: Any) -> bytes:
-    """A message's file and every file it imports, imports first, as MCAP wants it."""
+    """Return a message's file and every file it imports, imports first, as MCAP wants it."""
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
     def collect(file: Any) -> None:
@@ -353,7 +344,7 @@ def descriptor_set(descriptor: Any) -> bytes:
 
 
 def _message(name: str, fields: Sequence[Any]) -> Any:
-    """An empty message of package cdmisfa: a timestamp as field 1, then the fields."""
+    """Make an empty message of package cdmisfa: a timestamp as field 1, then the fields."""
     file = descriptor_pb2.FileDescriptorProto(
         name=f"cdmisfa/{name}.proto",
         package="cdmisfa",
@@ -379,7 +370,7 @@ def _message(name: str, fields: Sequence[Any]) -> Any:
 
 
 def _timestamp(time_ns: int) -> bytes:
-    """A time as field 1 of a message, a `google.protobuf.Timestamp`."""
+    """Encode a time as field 1 of a message, a `google.protobuf.Timestamp`."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)
     since = b"\x08" + varint(seconds) if seconds else b""
     rest = b"\x10" + varint(nanos) if nanos else b""
@@ -388,7 +379,7 @@ def _timestamp(time_ns: int) -> bytes:
 
 @lru_cache(1024)
 def varint(number: int) -> bytes:
-    """A whole number as protobuf's variable-length integer."""
+    """Encode a whole number as protobuf's variable-length integer."""
     out = bytearray()
     while number > 127:
         out.append(number & 127 | 128)

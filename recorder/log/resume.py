@@ -1,4 +1,4 @@
-"""Resume a recording: what an earlier attempt left of each view, and where to continue.
+"""Resume a recording: find what an earlier attempt left of each view, and where to continue.
 
 The logs of an attempt are read in the order of the file, up to where they are damaged or torn. A
 log that is resumed is kept aside while its frames are copied into a new one, which so has the
@@ -14,11 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.records import Metadata
-
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.core.untrusted import opened_regular
-from recorder.config import Split
 from recorder.log.files import (
     RECORDING,
     aside_path,
@@ -28,13 +25,10 @@ from recorder.log.files import (
     partial_path,
     view_logs,
 )
-from recorder.log.manifest import RecordingSpec, RecordingStart, ViewMetadata, read_start
+from recorder.log.manifest import RecordingSpec, ViewMetadata, read_start
 from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MAGIC
-
-_LEAST = 64
-"""Bytes that no log has less of once its header and metadata are written."""
 
 
 class FramesHeld(NamedTuple):
@@ -45,7 +39,7 @@ class FramesHeld(NamedTuple):
         stop: its frames [first, stop) are all there, except those of gaps.
         end: one more than its last frame; 0 without any.
         gaps: whether the source may lack frames, the first of a log, too.
-        frames: how many of [first, stop) are there.
+        frames: number of frames in [first, stop).
     """
 
     first: int
@@ -55,7 +49,7 @@ class FramesHeld(NamedTuple):
     frames: int = 0
 
     def stop_from(self, first: int) -> int:
-        """The stop of the frames [first, stop) that are all there."""
+        """Return the stop of the frames [first, stop) that are all there."""
         follows = self.first == first or (self.gaps and self.first > first)
         return self.stop if self.end and follows else first
 
@@ -76,7 +70,7 @@ def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
 
 
 def messages(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
-    """Messages in the order of the file, up to where it is damaged or torn.
+    """Yield messages in the order of the file, up to where it is damaged or torn.
 
     Yields:
         The topic of each, its sequence number, log time in nanoseconds, and data.
@@ -89,6 +83,7 @@ def messages(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
         return
     with log:
         for segment in log.segments:
+            # A gap in the frames would shift all that follow: nothing behind damage is taken.
             damage = log.first_damage
             unproven = segment.cut or (damage is not None and segment.offset >= damage)
             table = None if unproven else log.table(segment)
@@ -107,9 +102,9 @@ class ViewResume:
         path: file of the part to write.
         parts: file and number of frames of each part that is finished.
         first: first frame of the part to write.
-        log: the earlier log that holds the most frames of that part, where one does.
+        log: the earlier log that holds the most frames of that part, if any does.
         stop: it holds [first, stop).
-        stale: logs of which nothing is needed.
+        stale: logs that are not needed.
         complete: whether the parts are the whole view, and nothing is to be written.
     """
 
@@ -122,8 +117,8 @@ class ViewResume:
     complete: bool = False
 
 
-def begin_view(folder: Path, view: str, split: Split | None, first: int = 0) -> ViewResume:
-    """Where a view begins of which nothing is there yet."""
+def begin_view(folder: Path, view: str, split: float | None, first: int = 0) -> ViewResume:
+    """Return where a view without files begins."""
     return ViewResume(folder / part_name(view, None if split is None else 0), first=first)
 
 
@@ -131,29 +126,40 @@ def resume_views(
     folder: Path,
     recording: RecordingSpec,
     views: Sequence[str],
-    split: Split | None,
+    split: float | None,
     frames: int | None,
     default: int,
-) -> tuple[dict[str, ViewResume], Split | None, int]:
+) -> tuple[dict[str, ViewResume], float | None, int]:
     """Find where each view of a recording is resumed. Changes nothing.
 
     Args:
         folder: of the recording.
         recording: what is recorded.
         views: names of the views.
-        split: where parts end; None for where they did.
-        frames: how many each view shall have; None for as many as it was started with.
-        default: as many, where the recording does not say how it was started.
+        split: seconds of a part; None for those of the start.
+        frames: frames of each view; None for those of the start.
+        default: frames of each view if the recording does not say how it was started.
 
     Returns:
-        The place of each view, where parts end, and the frames of each view.
+        The place of each view, the seconds of a part, and the frames of each view.
 
     Raises:
         UsageError: it was started with another source, seed or split, has more frames, or there
             are files of another recording.
     """
     start = read_start(folder)
-    split = _split_as_started(folder, start, recording, views, split)
+    limit = min((start.split[view] for view in views if view in start.split), default=None)
+    split = limit if split is None else split
+    for option, before, now in (
+        ("", start.scene or None, recording.kind),
+        ("--seed ", start.seed, recording.seed),
+        ("--split ", limit and f"{limit:g}s", split and f"{split:g}s"),
+    ):
+        if before not in (None, now):
+            raise UsageError(
+                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
+                "same, or overwrite with --force"
+            )
     earlier = {
         view: {path: frames_held(path, view, gaps=recording.gaps) for path in logs}
         for view, logs in view_logs(folder, views).items()
@@ -164,13 +170,13 @@ def resume_views(
     )
     if not finished and not lengths:
         lengths = [default]
-    for path, there in itertools.chain(*(files.items() for files in earlier.values())):
-        if frames is not None and there.end > frames:
+    for path, held in itertools.chain(*(files.items() for files in earlier.values())):
+        if frames is not None and held.end > frames:
             raise UsageError(
-                f"{path} holds {there.end} frames, more than --frames {frames}: --resume shortens "
-                f"nothing, give --frames {there.end} or more, or overwrite with --force"
+                f"{path} holds {held.end} frames, more than --frames {frames}: --resume shortens "
+                f"nothing, give --frames {held.end} or more, or overwrite with --force"
             )
-        lengths.append(there.end)
+        lengths.append(held.end)
     frames = frames or max(lengths)
     places = {}
     for view, files in earlier.items():
@@ -181,165 +187,129 @@ def resume_views(
     return places, split, frames
 
 
-def _split_as_started(
-    folder: Path,
-    start: RecordingStart,
-    recording: RecordingSpec,
-    views: Sequence[str],
-    split: Split | None,
-) -> Split | None:
-    """Refuse to resume with another scene, seed or split; where the parts end."""
-    limit = min((start.split[view] for view in views if view in start.split), default=None)
-    for option, before, now in (
-        ("", start.scene or None, recording.kind),
-        ("--seed ", start.seed, recording.seed),
-        ("--split ", limit, limit if split is None else str(split)),
-    ):
-        if before not in (None, now):
-            raise UsageError(
-                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
-                "same, or overwrite with --force"
-            )
-    return Split.parse(limit) if split is None and limit is not None else split
-
-
 def _resume_view(
     folder: Path,
     view: str,
     recording: RecordingSpec,
-    split: Split | None,
-    there: Mapping[Path, FramesHeld],
+    split: float | None,
+    files: Mapping[Path, FramesHeld],
     frames: int,
     *,
     ended: bool,
 ) -> ViewResume:
-    """Pass over the parts of a view that are finished, and find where to resume.
+    """Skip the parts of a view that are finished, and find where to resume.
 
     Args:
         folder: of the recording.
         view: name of the view.
         recording: what is recorded.
-        split: where parts end.
-        there: all of the view's files, and what they hold.
-        frames: how many the view shall have; no file has more.
-        ended: whether its recording has ended, so that what its files lack is a gap.
+        split: seconds of a part.
+        files: all of the view's files, and the frames in each.
+        frames: of the view; no file has more.
+        ended: whether its recording has ended, so that frames missing in its files are a gap.
 
     Raises:
-        UsageError: what is there is something else, or split in another way.
+        UsageError: the files are of something else, or split in another way.
     """
-    numbers = {path: part_number(path, view) for path in there}
-    other = next((p for p, number in numbers.items() if (number is None) != (split is None)), None)
-    if other is not None:
-        raise UsageError(
-            f"{other} was recorded {'with' if split is None else 'without'} --split: "
-            "use the same, or overwrite with --force"
-        )
+    numbers = {path: part_number(path, view) for path in files}
+    for path, number in numbers.items():
+        if (number is None) != (split is None):
+            how = "with" if split is None else "without"
+            raise UsageError(
+                f"{path} was recorded {how} --split: use the same, or overwrite with --force"
+            )
     parts: list[tuple[Path, int]] = []
     stale: list[Path] = []
     first = 0
     while True:
         path = folder / part_name(view, None if split is None else len(parts))
         kept = aside_path(path)
-        attempts = [p for p in (path, partial_path(path), kept) if p in there]
+        attempts = [p for p in (path, partial_path(path), kept) if p in files]
         later = [p for p, number in numbers.items() if number is not None and number > len(parts)]
-        log = max(attempts, key=lambda p: there[p].stop_from(first), default=path)
-        stop = there[log].stop_from(first) if attempts else first
+        log = max(attempts, key=lambda p: files[p].stop_from(first), default=path)
+        stop = files[log].stop_from(first) if attempts else first
         if stop > first:
             _refuse_other(log, recording.metadata(view, first))
         elif path in attempts:
             raise UsageError(
                 f"{path} holds no frames of {view} from {first} on: overwrite with --force"
             )
-        follows = any(there[p].end or p.suffix == ".mcap" for p in later)
+        follows = any(files[p].end or p.suffix == ".mcap" for p in later)
         if stop > first and log == path and (follows or stop == frames or ended):
-            parts.append((path, there[path].frames))
+            parts.append((path, files[path].frames))
             stale += [kept] if kept in attempts else []
             first = stop
             if follows:
                 continue
             return ViewResume(path, tuple(parts), first, stale=(*stale, *later), complete=True)
-        _refuse_finished(path, later)
+        if whole := next((p for p in later if p.suffix == ".mcap"), None):
+            raise UsageError(
+                f"{whole} is there, {path.name} before it is not whole: recover that "
+                "part first, or overwrite with --force"
+            )
         if stop > first:
             return ViewResume(path, tuple(parts), first, log, stop, (*stale, *later))
         return ViewResume(path, tuple(parts), first, stale=(*stale, *attempts, *later))
 
 
-def _refuse_finished(path: Path, later: Sequence[Path]) -> None:
-    """Refuse to write a part where later ones are finished."""
-    if finished := next((p for p in later if p.suffix == ".mcap"), None):
-        raise UsageError(
-            f"{finished} is there, {path.name} before it is not whole: recover that "
-            "part first, or overwrite with --force"
-        )
-
-
 def _refuse_other(path: Path, stated: ViewMetadata) -> None:
     """Refuse to resume a log that states something else."""
-    record = _metadata(path)
-    if record is None or record.name != RECORDING_METADATA:
-        raise UsageError(f"{path} does not say what it is a recording of: overwrite with --force")
+    found = _recording_metadata(path) or {}
     for key, value in stated.record().items():
-        if record.metadata.get(key) != value:
+        if found.get(key) != value:
             raise UsageError(
-                f"{path} cannot be continued: its {key} is {record.metadata.get(key)!r}, now it is "
+                f"{path} cannot be continued: its {key} is {found.get(key)!r}, now it is "
                 f"{value!r}; use the same command and versions, or overwrite with --force"
             )
 
 
 def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
-    """View, file and frames of each log of a recording that is complete; none of another.
+    """List view, file and frames of each log of a complete recording; nothing of another.
 
     Raises:
         LogDamagedError: the disk does not give a log.
     """
     if not folder.is_dir() or (folder / RECORDING).exists():
         return []
-    found: list[tuple[str, Path, int]] = []
+    logs: list[tuple[str, Path, int]] = []
     stops: dict[str, int] = {}
     stated: ViewMetadata | None = None
     for path in sorted(logs_in(folder), key=lambda path: (len(path.name), path.name)):
-        record = _metadata(path)
-        if path.suffix != ".mcap" or record is None or record.name != RECORDING_METADATA:
+        record = _recording_metadata(path)
+        if path.suffix != ".mcap" or record is None:
             return []
-        stated = ViewMetadata.parse(path, record.metadata)
-        there = frames_held(path, stated.view, gaps=stated.gaps)
-        if there.stop_from(stops.get(stated.view, 0)) != there.end or not there.end:
+        stated = ViewMetadata.parse(path, record)
+        held = frames_held(path, stated.view, gaps=stated.gaps)
+        if held.stop_from(stops.get(stated.view, 0)) != held.end or not held.end:
             return []
-        stops[stated.view] = there.stop
-        found.append((stated.view, path, there.frames))
+        stops[stated.view] = held.stop
+        logs.append((stated.view, path, held.frames))
     if stated is None or len(stops) != (len(stated.streams) or stated.stream_count):
         return []
-    return found if stated.gaps or len(set(stops.values())) == 1 else []
+    return logs if stated.gaps or len(set(stops.values())) == 1 else []
 
 
 def other_recordings(folder: Path, recording: RecordingSpec) -> list[Path]:
-    """Logs in a folder that are of another recording.
+    """List the logs in a folder that are of another recording.
 
     Raises:
         UsageError: one is readably of something else.
     """
-    if not folder.is_dir():
-        return []
     others = []
-    own = set(itertools.chain(*view_logs(folder, recording.spec.streams).values()))
     for path in logs_in(folder):
-        record = _metadata(path)
+        record = _recording_metadata(path)
         if record is None:
-            if path not in own and path.stat().st_size < _LEAST:
-                others.append(path)  # begun, and killed before it said of what it is
             continue
-        if record.name != RECORDING_METADATA:
-            raise UsageError(f"{path} is of no recording: choose another folder")
-        view = record.metadata.get("view", "")
+        view = record.get("view", "")
         stated = recording.metadata(view).record() if view in recording.spec.streams else {}
         mine = {k: v for k, v in stated.items() if k != "first_frame" and "version_" not in k}
-        if not mine or any(record.metadata.get(key) != value for key, value in mine.items()):
+        if not mine or any(record.get(key) != value for key, value in mine.items()):
             others.append(path)
     return others
 
 
 def set_log_aside(place: ViewResume) -> Path | None:
-    """Remove what is stale, and move the log to be resumed aside.
+    """Remove stale logs, and move the log to be resumed aside.
 
     Returns:
         Where that log is now, if there is one.
@@ -363,7 +333,7 @@ def set_log_aside(place: ViewResume) -> Path | None:
 
 
 def _opened(path: Path) -> LogReader | None:
-    """A log, damaged or not; None of a file that does not begin as one.
+    """Open a log, damaged or not; return None for a file that does not begin as one.
 
     Raises:
         LogDamagedError: the disk does not give it.
@@ -373,10 +343,18 @@ def _opened(path: Path) -> LogReader | None:
     return LogReader(path, salvage=True, check="chunks") if start == MAGIC else None
 
 
-def _metadata(path: Path) -> Metadata | None:
-    """The first metadata record of a log, or None."""
+def _recording_metadata(path: Path) -> Mapping[str, str] | None:
+    """Return the metadata of a recording's log; None if the log ends before it.
+
+    Raises:
+        UsageError: it is a log of something else.
+    """
     log = _opened(path)
     if log is None:
         return None
     with log:
-        return log.metadata[0] if log.metadata else None
+        if not log.metadata:
+            return None
+        if log.metadata[0].name != RECORDING_METADATA:
+            raise UsageError(f"{path} is of no recording: choose another folder")
+        return log.metadata[0].metadata

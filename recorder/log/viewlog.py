@@ -1,14 +1,14 @@
-"""The log of one view: its channels and metadata, as one file or as parts of limited size."""
+"""Write the log of one view: its channels and metadata, as one file or as parts of a duration."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from cdmisfa.core.blocks import Block, HeadPose
 from cdmisfa.core.errors import LogDamagedError
-from recorder.config import RecordConfig, Split
+from recorder.config import RecordConfig
 from recorder.log.files import aside_path, part_name
 from recorder.log.logfile import LogFile
 from recorder.log.manifest import RecordingSpec, version
@@ -20,21 +20,24 @@ from recorder.log.messages import (
     SIDES,
     TRANSFORMS_TOPIC,
     TRUTH_TOPIC,
-    CalibrationEncoder,
+    Encoder,
     ImageEncoder,
     ObjectsEncoder,
-    PoseEncoder,
-    TransformsEncoder,
     TruthEncoder,
     VectorEncoder,
+    calibration_encoder,
     calibration_topic,
+    pose_encoder,
+    transforms_encoder,
     view_topic,
 )
 from recorder.log.resume import messages
 from recorder.log.scenery import scenery_of
 
-CONFIG_NAME = "config.json"
-ROOT_FRAME = "root"
+CONFIG_NAME: Final = "config.json"
+"""Name of the attachment with the configuration of what was recorded."""
+ROOT_FRAME: Final = "root"
+"""Name of the coordinate frame of the robot's root."""
 
 
 class ViewLog:
@@ -52,7 +55,7 @@ class ViewLog:
         recording: what is recorded.
         settings: how it is written.
         pose: of the head in this view, where there is a head; written once a second.
-        split: where parts end; None for a single file.
+        split: seconds of a part; None for a single file.
         parts: file and number of frames of each part that is finished.
         first: first frame of the part that is next.
 
@@ -69,7 +72,7 @@ class ViewLog:
         settings: RecordConfig,
         *,
         pose: HeadPose | None = None,
-        split: Split | None = None,
+        split: float | None = None,
         parts: list[tuple[Path, int]] | None = None,
         first: int = 0,
     ) -> None:
@@ -77,17 +80,13 @@ class ViewLog:
         self.t = first
         self._folder, self._view, self._recording = folder, view, recording
         self._settings = settings
-        self._split = split
         self._spec = spec = recording.spec
-        self._length = split.frames(spec.fps) if split else None
+        self._length = None if split is None else max(round(split * spec.fps), 1)
         self._stream = spec.streams.index(view)
         self._topic = view_topic(view)
         self._encoders = _encoders(view, recording, pose)
-        self._moving = [t for t in (OBJECTS_TOPIC, TRUTH_TOPIC) if t in self._encoders]
-        still = [t for t in self._encoders if t not in (self._topic, *self._moving)]
-        self._still: dict[str, tuple[Any, ...]] = dict.fromkeys(still, ())
-        if pose is not None:
-            self._still[POSE_TOPIC] = pose.position, pose.quaternion
+        self._moving = [t for t in (OBJECTS_TOPIC, TRUTH_TOPIC, self._topic) if t in self._encoders]
+        self._still = [t for t in self._encoders if t not in self._moving]
         self._second = max(round(spec.fps), 1)
         self._channels: dict[str, int] = {}
         self._first, self._frames = first, 0
@@ -103,16 +102,16 @@ class ViewLog:
         follows = block.t >= self.t if self._recording.gaps else block.t == self.t
         if block.stream != self._stream or not follows:
             raise ValueError(f"{self._file.path}: frame {self.t} is next, not {block.t}")
-        for t, (frame, values) in enumerate(zip(block.frames, block.truth, strict=True), block.t):
-            if self._is_full():
+        for t, (frame, truth) in enumerate(zip(block.frames, block.truth, strict=True), block.t):
+            if self._length is not None and self.t - self._first >= self._length:
                 self._begin_next_part()
             self.t = t
-            self._write_frame(frame, values)
+            self._write_frame(frame, truth)
             self.t += 1
             self._frames += 1
 
     def copy(self, path: Path, stop: int) -> None:
-        """Take over the frames before `stop` that an earlier log has of the part to be written.
+        """Copy the frames before `stop` that an earlier log has of the part to be written.
 
         Raises:
             LogDamagedError: they are not there any more.
@@ -134,48 +133,35 @@ class ViewLog:
         self._file.add_metadata(name, values)
 
     def finish(self) -> None:
-        """Give the last part its index and its name, and forget what it was copied from."""
+        """Give the last part its index and its name, and remove the log it was copied from."""
         self._file.finish()
         aside_path(self._file.path).unlink(missing_ok=True)
         self.parts.append((self._file.path, self._frames))
-
-    def flush(self) -> None:
-        """Hand what was written to the operating system."""
-        self._file.flush()
 
     def abandon(self) -> None:
         """Leave a readable partial."""
         self._file.abandon()
 
     def _begin_part(self) -> LogFile:
-        """Begin the part that comes after those that are done, with the next frame."""
+        """Begin the part that follows the finished ones, with the next frame."""
         self._first, self._frames = self.t, 0
-        spec, settings = self._spec, self._settings
-        number = None if self._split is None else len(self.parts)
+        number = None if self._length is None else len(self.parts)
         log = LogFile(
             self._folder / part_name(self._view, number),
             library=f"cdmisfa {version('cdmisfa')}",
-            compression=settings.compression,
-            chunk_size=settings.chunk_size,
+            compression=self._settings.compression,
+            chunk_size=self._settings.chunk_size,
         )
         stated = self._recording.metadata(self._view, self.t)
         log.add_metadata(RECORDING_METADATA, stated.record())
         if not stated.stream_count or stated.stream_index == 0:  # it may name all of many views
-            config = self._recording.config_json()
-            log.add_attachment(CONFIG_NAME, "application/json", config, log_time=spec.start_ns)
+            config, start = self._recording.config_json(), self._spec.start_ns
+            log.add_attachment(CONFIG_NAME, "application/json", config, log_time=start)
         self._channels = {
             topic: log.add_channel(topic, log.add_schema(e.schema, ENCODING, e.schema_data()))
             for topic, e in self._encoders.items()
         }
         return log
-
-    def _is_full(self) -> bool:
-        """Whether a new part must be begun before the next frame."""
-        if self._split is None or self.t == self._first:
-            return False
-        if self._length is not None:
-            return self.t - self._first >= self._length
-        return self._file.size >= (self._split.size or 0)
 
     def _begin_next_part(self) -> None:
         """Begin a part before the one before is finished.
@@ -192,38 +178,33 @@ class ViewLog:
         aside_path(full.path).unlink(missing_ok=True)
 
     def _write_frame(self, frame: Any, truth: Any) -> None:
-        if self.t % self._second == 0 or self.t == self._first:
-            for topic, values in self._still.items():
-                self._write(topic, *values)
-        for topic in self._moving:
-            self._write(topic, truth)
-        self._write(self._topic, frame)
-
-    def _write(self, topic: str, *values: Any) -> None:
         time = self._spec.time_ns(self.t)
-        self._file.write(self._channels[topic], time, self._encoders[topic](time, *values), self.t)
+        begins = self.t % self._second == 0 or self.t == self._first
+        for topic in (*self._still, *self._moving) if begins else self._moving:
+            data = self._encoders[topic](time, frame if topic == self._topic else truth)
+            self._file.write(self._channels[topic], time, data, self.t)
 
 
-def _encoders(view: str, recording: RecordingSpec, pose: HeadPose | None) -> dict[str, Any]:
-    """Encoders by topic of a view's frames and truth, and of its scene's world where it has one."""
+def _encoders(view: str, recording: RecordingSpec, pose: HeadPose | None) -> dict[str, Encoder]:
+    """Return encoders by topic: of a view's frames and truth, and of its scene's world if any."""
     spec = recording.spec
-    found: dict[str, Any] = {view_topic(view): VectorEncoder()}
+    encoders: dict[str, Encoder] = {view_topic(view): VectorEncoder()}
     if spec.images:
         height, width = spec.frame_shape
-        found[view_topic(view)] = ImageEncoder(height, width, frame_id=view)
+        encoders[view_topic(view)] = ImageEncoder(height, width, frame_id=view)
     if spec.truth:
-        found[TRUTH_TOPIC] = TruthEncoder(spec.truth)
+        encoders[TRUTH_TOPIC] = TruthEncoder(spec.truth)
     if pose is None:
-        return found
-    found[POSE_TOPIC] = PoseEncoder(ROOT_FRAME)
+        return encoders
+    encoders[POSE_TOPIC] = pose_encoder(ROOT_FRAME, pose)
     config = recording.config.get("scene")
     scenery = scenery_of(config, pose.position) if isinstance(config, Mapping) else None
     gaze = None if scenery is None else scenery.gaze(view)
     if scenery is None or gaze is None:
-        return found
+        return encoders
     for side, eye in zip(SIDES, gaze.eyes, strict=True):
-        found[calibration_topic(view, side)] = CalibrationEncoder(eye, f"{view}/{side}")
-    found[TRANSFORMS_TOPIC] = TransformsEncoder(gaze, ROOT_FRAME)
+        encoders[calibration_topic(view, side)] = calibration_encoder(eye, f"{view}/{side}")
+    encoders[TRANSFORMS_TOPIC] = transforms_encoder(gaze, ROOT_FRAME)
     if all(set(thing.truth) <= set(spec.truth) for thing in scenery.objects):
-        found[OBJECTS_TOPIC] = ObjectsEncoder(scenery, spec.truth, ROOT_FRAME)
-    return found
+        encoders[OBJECTS_TOPIC] = ObjectsEncoder(scenery, spec.truth, ROOT_FRAME)
+    return encoders

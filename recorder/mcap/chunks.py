@@ -35,7 +35,7 @@ from recorder.mcap.records import (
     Segment,
     crc32,
 )
-from recorder.mcap.store import FileStore, Store
+from recorder.mcap.store import Store
 
 Pairs = list[tuple[int, NDArray[np.uint64]]]
 """The message indexes of a chunk: channel, and (n, 2) log time and place of each message."""
@@ -289,7 +289,7 @@ class Chunks:
         in_order = self._following.get(self._last) is segment
         self._last = segment.offset
         following = self._following.get(segment.offset)
-        if following is None or not in_order or not isinstance(self._file, FileStore):
+        if following is None or not in_order or type(self._file) is not Store:
             return
         slow = following.compression and _LONG <= following.stored < _PACKED * following.size
         if slow and following.size <= _LARGE and not following.cut:
@@ -302,8 +302,7 @@ class Chunks:
         compression, size, begin = segment.compression, segment.size, segment.offset
         check_size(compression, 0 if segment.cut else size)
         held = min(segment.data_end, self._file.size) - begin
-        raw = np.empty(held, np.uint8)
-        self._file.read_into(begin, raw.data)
+        raw = np.frombuffer(self._file.read(begin, held), np.uint8)
         if segment.stated:
             confirm(segment, raw.data)
         stored = raw[segment.data_offset - begin :]

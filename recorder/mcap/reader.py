@@ -27,7 +27,7 @@ from recorder.mcap.records import (
     Segment,
     crc32,
 )
-from recorder.mcap.store import FileStore, OnePass, Store
+from recorder.mcap.store import OnePass, Store
 from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]
@@ -85,9 +85,9 @@ class LogReader:
         self.problems: list[Problem] = []
         self._failed: set[int] = set()
         self._defined = self._searched = self._checked = False
-        self.file = log if isinstance(log, Store) else FileStore(Path(log))
-        if check == "pass":
-            self.file = OnePass(self.file)
+        if not isinstance(log, Store):
+            log = OnePass(Path(log)) if check == "pass" else Store(Path(log))
+        self.file = log
         self.path = self.file.path
         try:
             check = check or ("data" if salvage else "chunks")

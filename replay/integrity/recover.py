@@ -22,7 +22,7 @@ from recorder.log.logfile import LogFile
 from recorder.mcap.chunks import UNUSED, MessageTable, check_size, decompressed, walked_table
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segment, crc32
-from recorder.mcap.store import PARTIAL, FileStore, Store
+from recorder.mcap.store import PARTIAL, Store
 from recorder.mcap.walk import LogStructure
 from replay.camera_logs.opening import only_foreign
 from replay.integrity.info import ChannelCount, problems_of
@@ -122,7 +122,7 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
         reader = stack.enter_context(LogReader(src, salvage=True))
         repaired: list[Problem] = []
         if reader.problems:
-            store = repair(FileStore(src))
+            store = repair(src)
             repaired = [Problem(f"{src}: {p.where}", p.what) for p in store.repaired]
             reader = stack.enter_context(LogReader(store, salvage=True))
         content = reader.channels or reader.metadata or reader.attachments
@@ -241,16 +241,15 @@ def _lost_messages(reader: LogReader, kept: dict[int, ChannelCount]) -> dict[int
 class RepairedStore(Store):
     """A log with some bytes replaced; `repaired` lists what was wrong."""
 
-    def __init__(self, store: Store) -> None:
-        super().__init__(store.path, store.size)
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
         self.repaired: list[Problem] = []
-        self._store = store
         self._places: list[int] = []
         self._parts: list[bytes] = []
 
     def put(self, at: int, right: bytes, where: str, what: str) -> None:
         """Replace the bytes at a place, behind those of the last call, where they differ."""
-        present = self._store.read(at, len(right))
+        present = self.read(at, len(right))
         if self._places and at < self._places[-1] + len(self._parts[-1]):
             return
         if present == right or len(present) < len(right):
@@ -263,7 +262,7 @@ class RepairedStore(Store):
         self._window = b""  # it may hold the bytes before the repair
 
     def read_at(self, offset: int, count: int) -> bytes:
-        data = bytearray(self._store.read_at(offset, count))
+        data = bytearray(super().read_at(offset, count))
         stop = offset + len(data)
         first = max(bisect_right(self._places, offset) - 1, 0)
         last = bisect_right(self._places, stop)
@@ -273,17 +272,14 @@ class RepairedStore(Store):
                 data[low - offset : high - offset] = part[low - place : high - place]
         return bytes(data)
 
-    def close(self) -> None:
-        self._store.close()
 
-
-def repair(file: Store) -> RepairedStore:
+def repair(path: Path) -> RepairedStore:
     """Return a damaged log with the heads and message indexes of its chunks repaired."""
-    store = RepairedStore(file)
-    structure = LogStructure(file, lambda *_: None, resync=True)
+    store = RepairedStore(path)
+    structure = LogStructure(store, lambda *_: None, resync=True)
     stated = structure.summary.sound_chunks() if structure.summary else []
     chunks = stated or [segment for segment in structure.segments if segment.chunked]
-    ends = [chunk.offset for chunk in chunks[1:]] + [structure.data_end or file.size]
+    ends = [chunk.offset for chunk in chunks[1:]] + [structure.data_end or store.size]
     for chunk, end in zip(chunks, ends, strict=False):
         try:
             if chunk.stated:  # the summary says everything of a chunk's head but its CRC

@@ -53,9 +53,9 @@ LIVE = ("cameras", "gym")
 @click.option("--resume", is_flag=True, help="Resume an interrupted recording.")
 @click.option(
     "--split",
-    metavar="LIMIT",
-    help="Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
-    "--resume as first asked for.",
+    metavar="TIME",
+    help="Begin a new file of each view after this time: 90s, 10min; by default, with --resume as "
+    "first asked for.",
 )
 @options.input_options("fields", "size", "rate", "color")
 @options.force
@@ -131,7 +131,7 @@ def _record_streams(
 ) -> None:
     """Record live streams until there are so many frames, they end, or Ctrl-C."""
     from cdmisfa.experiments.sources import open_source
-    from recorder.config import Split
+    from recorder.config import parse_split
     from recorder.live import RecordedWhileWatched, record_watched
     from recorder.log.files import refuse_existing
     from recorder.recording import DEFAULT_FRAMES
@@ -145,7 +145,7 @@ def _record_streams(
             source,
             out,
             settings=configuration.record,
-            split=None if split is None else Split.parse(split),
+            split=parse_split(split) if split else None,
             force=force,
         )
         with bar("recording", "frames") as shown:
@@ -216,7 +216,7 @@ def _record_scene(
     **how: Any,
 ) -> list[ViewRecording]:
     """Record a scene, or the rest of it."""
-    from recorder.config import Split
+    from recorder.config import parse_split
     from recorder.recording import DEFAULT_FRAMES, record_scene
 
     with recording(ctx, out, resume=resume, notice="") as (report, stop):
@@ -227,7 +227,7 @@ def _record_scene(
             configuration.record,
             frames=frames,
             views=views or None,
-            split=None if split is None else Split.parse(split),
+            split=parse_split(split) if split else None,
             resume=resume,
             stop=stop,
             progress=lambda done: report(done, max(done, frames or DEFAULT_FRAMES)),
