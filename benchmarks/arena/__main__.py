@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -93,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
         for done in pool.map(run_trials, *zip(*tasks, strict=True)):
             rows += done
             document = {"schema": 2, "rows": rows, "versions": versions()}
-            write_json(given.out / "results.json", json.dumps(plain(document)))
+            write_json(given.out / "results.json", plain(document))
             print(done[0]["set"], "seed", done[0]["seed"], file=sys.stderr)
     rows.sort(key=lambda row: (list(SETS).index(row["set"]), learners.index(row["learner"])))
     print(table(rows))

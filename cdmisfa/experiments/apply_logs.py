@@ -7,18 +7,18 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import stream_name
 from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.apply import Application, Totals, follow
-from cdmisfa.experiments.documents import plain, write_json
+from cdmisfa.experiments.documents import plain, write_json, writing
 from cdmisfa.experiments.store import (
     FAILED,
     ROWS,
@@ -150,7 +150,7 @@ def apply_to_logs(
     if not folder.exists():
         refuse_existing(out, force=force, goes_on=False)
     with contextlib.ExitStack() as stack:
-        with _writing(out):
+        with writing(out):
             make_folder(folder)
         stack.enter_context(held(out))
         stack.callback(shutil.rmtree, parts, ignore_errors=True)
@@ -207,7 +207,7 @@ def _compute(trial: ApplyTrial) -> dict[str, Any]:
         warnings = [*getattr(source, "warnings", ()), *getattr(source, "changes", {}).values()]
         warnings += getattr(source, "salvaged", list)()
     assert trial.log is not None
-    with _writing(trial.log):
+    with writing(trial.log):
         os.replace(trial.part, trial.log)
         to_disk(trial.log.parent)
     damaged = None if totals.damaged is None else str(totals.damaged)
@@ -228,14 +228,6 @@ def written_to(
 
         return written_view(place, spec, modules, force=force)
     return written(place, spec, modules, force=force, log=log)
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise LogWriteError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def _earlier_root(folder: Path, request: Mapping[str, Any], *, force: bool) -> str:

@@ -1,4 +1,4 @@
-"""How results are written down: JSON values and files, Markdown tables, what they depend on."""
+"""How results are written: JSON values and files, Markdown tables, versions and machine."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ import functools
 import json
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from cdmisfa.core.errors import LogWriteError
 from recorder.log.files import atomic_write
 
 PACKAGES = ("cdmisfa", "numpy", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON has it: paths as texts, arrays as lists, None where it has no number."""
+    """Return a value as JSON has it: paths as texts, arrays as lists, None for NaN."""
     match value:
         case Mapping():
             return {str(k): plain(v) for k, v in value.items()}
@@ -35,7 +36,7 @@ def plain(value: Any) -> Any:
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Rows of cells as a table of Markdown; its last line has no end."""
+    """Return rows of cells as a Markdown table, without a line end after the last line."""
     lines = (head, ["---"] * len(head), *rows)
     cells = ([str(cell).replace("|", r"\|") for cell in line] for line in lines)
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
@@ -43,7 +44,7 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 @functools.cache
 def versions() -> Mapping[str, str]:
-    """Versions of Python and of the packages every result may depend on."""
+    """Return the versions of Python and of the packages that any result may depend on."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -53,7 +54,7 @@ def versions() -> Mapping[str, str]:
 
 @functools.cache
 def machine() -> dict[str, str]:
-    """The system and the processor.
+    """Return the system, the processor and the C library.
 
     No signal depends on them; renderings of the simulator, batch SFA and times may.
     """
@@ -64,17 +65,20 @@ def machine() -> dict[str, str]:
     }
 
 
-def as_text(document: Mapping[str, Any]) -> str:
-    """A JSON document as its file has it."""
-    return json.dumps(document, indent=2) + "\n"
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Raise what the operating system refuses in the context as a LogWriteError of a path."""
+    try:
+        yield
+    except OSError as error:
+        raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-def write_json(path: Path, document: Mapping[str, Any] | str) -> None:
-    """Write a JSON document, or its text, whole or not at all.
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document, whole or not at all.
 
     Raises:
         LogWriteError: the file cannot be written.
     """
-    text = document if isinstance(document, str) else as_text(document)
     with atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")

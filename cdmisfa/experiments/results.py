@@ -1,4 +1,4 @@
-"""What a sweep found: mean and standard deviation over seeds at each point of its grid."""
+"""Results of a sweep: mean and standard deviation over seeds at each point of its grid."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class MeanSd:
 
 
 def summary(values: ArrayLike) -> MeanSd:
-    """Mean and standard deviation of the values that are numbers.
+    """Return mean and standard deviation of the values that are numbers.
 
     Example:
         >>> summary([1.0, 3.0, float("nan")])
@@ -64,7 +64,7 @@ def summary(values: ArrayLike) -> MeanSd:
 
 
 def wilson(successes: int, n: int) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson 1927), within [0, 1].
+    """Return the 95 % interval of a proportion (Wilson 1927), within [0, 1].
 
     Example:
         >>> [round(bound, 3) for bound in wilson(20, 20)]
@@ -79,7 +79,7 @@ def wilson(successes: int, n: int) -> tuple[float, float]:
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float]:
-    """95 % interval of the mean of the values that are numbers (Student); infinite for one.
+    """Return the 95 % interval of the mean of the values (Student); infinite for one value.
 
     Example:
         >>> [round(bound, 2) for bound in mean_interval([1.0, 2.0, 3.0])]
@@ -134,7 +134,7 @@ def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> float:
 def _log_likelihood(
     x: FloatArray, hits: FloatArray, total: FloatArray, m: FloatArray, k: FloatArray
 ) -> FloatArray:
-    """Log likelihood plus half the log determinant of the information, (M, K).
+    """Return the log likelihood plus half the log determinant of the information, (M, K).
 
     Of M midpoints and K slopes, for answers at L levels of x, `total` at each and `hits` of them
     yes.
@@ -149,18 +149,10 @@ def _log_likelihood(
 
 
 def correlation(a: FloatArray, b: FloatArray) -> float:
-    """Absolute Pearson correlation of two (n,) series; 0 where one does not vary."""
+    """Return the absolute Pearson correlation of two (n,) series; 0 where one does not vary."""
     if a.max() == a.min() or b.max() == b.min():
         return 0.0
-    a, b = a - a.mean(), b - b.mean()
-    lengths = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return abs(float(a @ b)) / lengths if lengths > 0 else 0.0
-
-
-SCHEMA = 1
-
-NOTHING = summary([])
-"""A measure that a point does not have."""
+    return abs(float(np.corrcoef(a, b)[0, 1]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,12 +161,12 @@ class PointResult:
 
     Attributes:
         point: the grid's keys and this point's values, as they were given.
-        trials: how many were asked for.
-        done: how many of them the measures are about.
-        failed: how many of them failed.
-        missing: how many were not computed yet.
-        measures: mean and SD over those that are done, by name.
-        orders: how often which streams were learned in which order, the most frequent first.
+        trials: the number of trials that were asked for.
+        done: the number of trials that the measures are about.
+        failed: the number that failed.
+        missing: the number that were not computed yet.
+        measures: mean and SD over the finished trials, by name.
+        orders: how often streams were learned in this order, the most frequent first.
     """
 
     point: Mapping[str, Any]
@@ -187,18 +179,14 @@ class PointResult:
 
 
 def results(folder: str | Path) -> list[PointResult]:
-    """The points of a sweep as it was requested last, in the grid's order.
-
-    Args:
-        folder: of the sweep.
+    """Return the points of a sweep as it was requested last, in the grid's order.
 
     Raises:
         UsageError: the folder holds no sweep.
         LogDamagedError: its files are damaged.
     """
     folder = Path(folder)
-    path = folder / REQUEST
-    if not path.is_file():
+    if not (folder / REQUEST).is_file():
         raise UsageError(f"{folder} holds no {REQUEST}: name the folder of a sweep")
     trials = read_request(folder)
     rows = {row["id"]: row for row in read_rows(folder)}
@@ -237,58 +225,49 @@ def _point(point: Mapping[str, Any], rows: Sequence[Mapping[str, Any] | None]) -
 
 
 def varied(points: Sequence[PointResult]) -> dict[str, list[Any]]:
-    """The settings that differ between points, and their values in order, each once."""
-    found: dict[str, list[Any]] = {}
-    for point in points:
-        for key, value in point.point.items():
-            values = found.setdefault(key, [])
-            if value not in values:
-                values.append(value)
-    return {key: values for key, values in found.items() if len(values) > 1}
+    """Return the settings that differ between points, and their values in order."""
+    keys = points[0].point if points else ()
+    values = {key: list(dict.fromkeys(point.point[key] for point in points)) for key in keys}
+    return {key: found for key, found in values.items() if len(found) > 1}
 
 
 def as_json(points: Sequence[PointResult]) -> dict[str, Any]:
-    """The results as one JSON document."""
-    found = [asdict(point) for point in points]
-    return {"schema": SCHEMA, "differ": varied(points), "points": found}
+    """Return the results as one JSON document."""
+    return {"schema": 1, "differ": varied(points), "points": [asdict(point) for point in points]}
 
 
-def measure_names(points: Sequence[PointResult]) -> list[str]:
-    """Every measure that some point has, in order."""
-    return list(dict.fromkeys(name for p in points for name in p.measures))
+def _measures(points: Sequence[PointResult]) -> dict[str, list[MeanSd]]:
+    """Return each measure of any point, by name, with its values at all points."""
+    names = dict.fromkeys(name for point in points for name in point.measures)
+    return {name: [p.measures.get(name, summary([])) for p in points] for name in names}
 
 
 def as_csv(points: Sequence[PointResult]) -> str:
-    """A line a point; two columns a measure, empty where there is no number."""
-    names = measure_names(points)
-    keys = list(points[0].point) if points else []
-    text = io.StringIO()
+    """Return a line a point; two columns a measure, empty where there is no number."""
+    measures, text = _measures(points), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    columns = [f"{name}_{part}" for name in names for part in ("mean", "sd")]
+    columns = [f"{name}_{part}" for name in measures for part in ("mean", "sd")]
+    keys = list(points[0].point) if points else []
     writer.writerow([*keys, "trials", "done", "failed", *columns, "order", "order_count"])
-    for p in points:
-        cells: list[Any] = [*p.point.values(), p.trials, p.done, p.failed]
-        for name in names:
-            found = p.measures.get(name, NOTHING)
-            cells += ["" if math.isnan(v) else repr(v) for v in (found.mean, found.sd)]
-        order, count = next(iter(p.orders.items()), ("", 0))
-        writer.writerow([*cells, order, count])
+    for p, *found in zip(points, *measures.values(), strict=True):
+        numbers = [value for measure in found for value in (measure.mean, measure.sd)]
+        cells = ["" if math.isnan(value) else repr(value) for value in numbers]
+        order = next(iter(p.orders.items()), ("", 0))
+        writer.writerow([*p.point.values(), p.trials, p.done, p.failed, *cells, *order])
     return text.getvalue()
 
 
 def as_table(points: Sequence[PointResult]) -> tuple[list[str], list[list[str]]]:
-    """Head and rows for a person: mean ± SD, and the most frequent order with its share."""
-    names = measure_names(points)
-    keys = list(points[0].point) if points else []
-    head = [*keys, "done", "failed", *names, "order"]
+    """Return head and rows for a person: mean ± SD, and the most frequent order with its share."""
+    measures = _measures(points)
+    head = [*(points[0].point if points else ()), "done", "failed", *measures, "order"]
     rows = []
-    for p in points:
+    for p, *found in zip(points, *measures.values(), strict=True):
         order, count = next(iter(p.orders.items()), ("", 0))
-        shown = f"{order} ({count}/{p.done})" if order else ""
-        cells = [_cell(p.measures.get(name, NOTHING)) for name in names]
-        rows.append(
-            [*map(str, p.point.values()), f"{p.done}/{p.trials}", str(p.failed), *cells, shown]
-        )
+        share = f"{order} ({count}/{p.done})" if order else ""
+        cells = [_cell(measure) for measure in found]
+        done = f"{p.done}/{p.trials}"
+        rows.append([*map(str, p.point.values()), done, str(p.failed), *cells, share])
     return head, rows
 
 

@@ -12,10 +12,10 @@ from typing import Any
 
 from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import build
-from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.experiments.documents import machine, write_json
+from cdmisfa.experiments.documents import machine, write_json, writing
 from cdmisfa.experiments.sources import open_logs
 from cdmisfa.modules import Module
 from recorder.cameras.words import is_live
@@ -280,7 +280,7 @@ def opened_log(
     if not resumed:
         resumable = FORK not in manifest and isinstance(source, SeekableSource)
         refuse_existing(folder, force=force, goes_on=resumable)
-        with _writing(folder):
+        with writing(folder):
             make_folder(folder)
     with held(folder):
         finished = folder / RUN_FILE
@@ -290,7 +290,7 @@ def opened_log(
         stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE, REPORT_FILE)]
         if not resumed:  # the logs first, so that a kill leaves nothing that looks like a run
             stale = [*logs, *stale]
-        with _writing(folder):
+        with writing(folder):
             refuse_special(*stale)
             if aside is not None:
                 os.replace(aside, logs[0])
@@ -351,11 +351,3 @@ def write_results(
         from replay.view.build import build_view
 
         build_view(folder, folder / VIEW_FILE)
-
-
-@contextlib.contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise LogWriteError(f"{folder} cannot be written: {error.strerror or error}") from error
