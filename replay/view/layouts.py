@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -29,6 +29,8 @@ ROOM = 0.14
 MARGIN = 0.018
 """Part of a time axis that the numbers of a plot take; lanes have none, and begin as much later."""
 
+CURSOR = rr.TimeRangeBoundary.cursor_relative
+
 PLAY_SECONDS = 60
 """Time in which a run is played."""
 
@@ -38,11 +40,12 @@ class Panel:
     """A view in a column of views.
 
     Attributes:
-        title: with the number of the module as {i}, and thresholds of CD-MISFA by their keys.
+        title: with the number of the module as {i}, and facts of the run, see `RunLayout`.
         entities: what it shows; curves that the run does not have are left out, and the panel
             where the first of them is.
-        kind: curves, or lanes; of all of the run, or of the last frames or blocks.
-        height: of curves, beside other panels; lanes have what they need.
+        kind: curves, or lanes; of all of the run, or of the last frames or blocks; or of the time
+            cursor the last frame of each stream, the input, the weights, or the summary.
+        height: of all but lanes, which have what they need.
         beside: it stands on the right of the one before.
         lanes: how many there are; `per_stream` besides one for each stream.
         low: least value of the axis.
@@ -54,8 +57,10 @@ class Panel:
     """
 
     title: str
-    entities: tuple[str, ...]
-    kind: Literal["lines", "near", "lanes", "near lanes"] = "lines"
+    entities: tuple[str, ...] = ()
+    kind: Literal[
+        "lines", "near", "lanes", "near lanes", "streams", "input", "weights", "summary"
+    ] = "lines"
     height: float = 130
     beside: bool = False
     lanes: int = 0
@@ -70,11 +75,11 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Tab:
-    """Panels below one another; on the left input and summary, or input, output and weights."""
+    """Panels below one another, with others on their left."""
 
     name: str
     panels: tuple[Panel, ...]
-    left: Literal["", "sees", "now"] = ""
+    left: tuple[Panel, ...] = ()
 
 
 @cache
@@ -82,7 +87,11 @@ def tabs_of(learner: Literal["paper", "progress"]) -> tuple[Tab, ...]:
     """Return the tabs of a learner's runs."""
     tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
     return tuple(
-        Tab(**tab | {"panels": tuple(Panel(**panel) for panel in tab["panels"])})
+        Tab(
+            tab["name"],
+            tuple(Panel(**panel) for panel in tab["panels"]),
+            tuple(Panel(**panel) for panel in tab.get("left", ())),
+        )
         for tab in tables[learner]
     )
 
@@ -112,14 +121,10 @@ def blueprint(
     if tab is not None and tab.lower() not in map(str.lower, names):
         raise UsageError(f"there is no tab {tab!r}: there are {', '.join(names)}")
     opened = 0 if tab is None else [part.lower() for part in names].index(tab.lower())
+    speed = max(round(length / PLAY_SECONDS), 1) if length else None
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=opened, name=name),
-        rrb.TimePanel(
-            timeline=timeline,
-            state="collapsed",
-            play_state="following",
-            fps=max(round(length / PLAY_SECONDS), 1) if length else None,
-        ),
+        rrb.TimePanel(timeline=timeline, state="collapsed", play_state="following", fps=speed),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
@@ -149,48 +154,40 @@ def lines(
         legend: whether there is one.
     """
     corner = rrb.Corner2D.RightTop if end or near else rrb.Corner2D.LeftTop
-    first = rr.TimeRangeBoundary.cursor_relative(seq=-near)
-    recent = rr.VisibleTimeRange(FRAME, start=first, end=rr.TimeRangeBoundary.cursor_relative())
+    axis, recent = None, None
+    if near:
+        axis = _axis(-near, round(ROOM * near), CURSOR)
+        recent = [rr.VisibleTimeRange(FRAME, start=CURSOR(seq=-near), end=CURSOR(seq=0))]
+    elif end:
+        axis = _axis(start, end + round(ROOM * max(end - start, 1)))
     return rrb.TimeSeriesView(
         origin="/",
         contents=[*entities],
         name=f"{name}: the last {near} frames" if near else name,
-        axis_x=near_axis(near, room=True) if near else time_axis(start, end) if end else None,
+        axis_x=axis,
         axis_y=None if span is None else rrb.ScalarAxis(range=span),
         plot_legend=rrb.PlotLegend(corner, visible=legend),
-        time_ranges=[recent] if near else None,
+        time_ranges=recent,
     )
 
 
 def lanes(
-    name: str, entities: Sequence[str], end: int = 0, *, near: int = 0, room: bool = False
+    name: str, entities: Sequence[str], end: int = 0, *, near: int = 0, room: bool = True
 ) -> rrb.View:
     """Return states over time, in line with plots of the same time; see `lines`."""
-    axis = near_axis(near, room=room) if near else None
-    if end and not near:
-        axis = time_axis(-round(MARGIN * (1 + ROOM) * end), end)
+    axis = None
+    if near:
+        axis = _axis(-near, round(ROOM * near) if room else 0, CURSOR)
+    elif end:
+        axis = _axis(-round(MARGIN * (1 + ROOM) * end), end + round(ROOM * end))
     return rrb.StateTimelineView(origin="/", contents=[*entities], name=name, time_view=axis)
 
 
-def time_axis(start: int, end: int) -> rrb.archetypes.TimeAxis:
-    """Return a time axis that shows [start, end], and has room for a legend beyond."""
-    room = round(ROOM * max(end - max(start, 0), 1))
-    return rrb.archetypes.TimeAxis(
-        view_range=rr.TimeRange(
-            start=rr.TimeRangeBoundary.absolute(seq=start),
-            end=rr.TimeRangeBoundary.absolute(seq=end + room),
-        )
-    )
-
-
-def near_axis(frames: int, *, room: bool) -> rrb.archetypes.TimeAxis:
-    """Return a time axis that shows so many frames up to the cursor."""
-    return rrb.archetypes.TimeAxis(
-        view_range=rr.TimeRange(
-            start=rr.TimeRangeBoundary.cursor_relative(seq=-frames),
-            end=rr.TimeRangeBoundary.cursor_relative(seq=round(ROOM * frames) if room else 0),
-        )
-    )
+def _axis(
+    start: int, end: int, boundary: Callable[..., Any] = rr.TimeRangeBoundary.absolute
+) -> rrb.archetypes.TimeAxis:
+    shown = rr.TimeRange(start=boundary(seq=start), end=boundary(seq=end))
+    return rrb.archetypes.TimeAxis(view_range=shown)
 
 
 def images(origin: str, name: str, bounds: tuple[Span, Span] | None = None) -> rrb.View:
@@ -200,16 +197,13 @@ def images(origin: str, name: str, bounds: tuple[Span, Span] | None = None) -> r
     return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=shown)
 
 
-def scene(name: str = "The world, and where it looks") -> rrb.View:
+def scene() -> rrb.View:
     """Return the world in 3D, seen from in front of the robot."""
-    return rrb.Spatial3DView(
-        origin="/scene",
-        name=name,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(
-            position=(-1.5, -0.85, 0.72), look_target=(-0.38, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
-        ),
+    name, hidden = "The world, and where it looks", rrb.LineGrid3D(visible=False)
+    eye = rrb.EyeControls3D(
+        position=(-1.5, -0.85, 0.72), look_target=(-0.38, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
     )
+    return rrb.Spatial3DView(origin="/scene", name=name, line_grid=hidden, eye_controls=eye)
 
 
 def beside(views: Views) -> rrb.View | rrb.Container:

@@ -89,25 +89,27 @@ class RunLayout:
         self._rows, self._spec, self._has_scene = rows, outline.header.spec, has_scene
         keys = ("roc_error", "delta", "novel_share", "min_variance")
         self._facts = {key: f"{self._header.number(key) or 0.0:g}" for key in keys}
+        self._facts["colours"] = " (blue below 0, orange above)" if self._spec.images else ""
+        self._facts["kept"] = f", every {PHI_EVERY} blocks" if outline.iterations else ""
 
     def tab(self, tab: Tab) -> rrb.Container:
         """Return a tab of a table."""
+        columns = [self._column(panels, tab.name) for panels in (tab.left, tab.panels) if panels]
+        if len(columns) == 1:
+            return columns[0]
+        return rrb.Horizontal(*columns, column_shares=[2, 5], name=tab.name)
+
+    def _column(self, panels: Sequence[Panel], name: str) -> rrb.Container:
+        """Return panels below one another, and those of modules beside one another."""
         found: list[tuple[Panel, Views]] = []
-        for panel in tab.panels:
+        for panel in panels:
             if views := self._views(panel):
                 if panel.beside and found:
                     found[-1][1].extend(views)
                 else:
                     found += [(panel, views[i : i + ACROSS]) for i in range(0, len(views), ACROSS)]
-        column = rrb.Vertical(
-            *(beside(views) for _, views in found),
-            row_shares=self._heights([panel for panel, _ in found]),
-            name=tab.name,
-        )
-        if not tab.left:
-            return column
-        left = self._sees() if tab.left == "sees" else self._now()
-        return rrb.Horizontal(left, column, column_shares=[2, 5], name=tab.name)
+        heights = self._heights([panel for panel, _ in found])
+        return rrb.Vertical(*(beside(views) for _, views in found), row_shares=heights, name=name)
 
     def _heights(self, panels: Sequence[Panel]) -> list[float]:
         """Return the heights of rows, so that a small screen shows each lane."""
@@ -120,23 +122,35 @@ class RunLayout:
 
     def _views(self, panel: Panel) -> Views:
         """Return the views of a panel: none, one, or one for each module."""
-        is_so = {"bands": not self._header.clusters, "clusters": self._header.clusters}
-        is_so["outputs"] = self._outline.outputs > 1
-        if not is_so.get(panel.when, True):
+        when = {
+            "bands": not self._header.clusters,
+            "clusters": self._header.clusters,
+            "outputs": self._outline.outputs > 1,
+        }
+        if not when.get(panel.when, True):
             return []
+        title = panel.title.format(i="{i}", **self._facts)
         if panel.kind == "lanes":
-            return [lanes(panel.title, panel.entities, self._end)]
+            return [lanes(title, panel.entities, self._end)]
         if panel.kind == "near lanes":
-            title = f"{panel.title}: the last {NEAR_BLOCKS} blocks"
+            title = f"{title}: the last {NEAR_BLOCKS} blocks"
             blocks = NEAR_BLOCKS * max(self._outline.tau, 1)
-            return [lanes(title, panel.entities, near=blocks)]
+            return [lanes(title, panel.entities, near=blocks, room=False)]
+        if panel.kind == "summary":
+            return [rrb.TextDocumentView(origin="/summary", name=title)]
+        if panel.kind == "streams":
+            return [self._streams(title)]
+        if panel.kind == "input":
+            return [self._input(title)]
+        if panel.kind == "weights":
+            return [self._weights(panel.entities[0], title)]
         count = min(self._outline.modules, MOST_MODULES) if panel.each_module else 1
         views: Views = []
         for i in range(1, count + 1):
             entities = [entity.format(i=i) for entity in panel.entities]
             written = [e for e in entities if self._rows is None or self._rows.matching(e)]
             if entities[0] in written:
-                views.append(self._plot(panel, panel.title.format(i=i, **self._facts), written))
+                views.append(self._plot(panel, title.format(i=i), written))
         return views
 
     def _plot(self, panel: Panel, title: str, entities: Sequence[str]) -> rrb.View:
@@ -169,10 +183,10 @@ class RunLayout:
         summary = rrb.TextDocumentView(origin="/summary", name="What came of it")
         words = rrb.Tabs(summary, events("What happened when"))
         if self._has_scene:
-            right = rrb.Vertical(self._watched("What it sees now"), words, row_shares=[2, 4])
+            right = rrb.Vertical(self._input("What it sees now"), words, row_shares=[2, 4])
             above = rrb.Horizontal(scene(), right, column_shares=[5, 3])
         else:
-            above = rrb.Horizontal(self._streams(), words, column_shares=[5, 3])
+            above = rrb.Horizontal(self._streams("What it sees"), words, column_shares=[5, 3])
         plots: Views = [self._plot(panel, panel.title, panel.entities) for panel in followed]
         below = [beside(plots[i : i + 2]) for i in range(0, len(plots), 2)]
         return rrb.Vertical(above, *below, row_shares=[5, *(2 for _ in below)], name="World")
@@ -188,7 +202,7 @@ class RunLayout:
         for start in range(1, count + 1, MOST_MODULES if count > PAGES else 1):
             page = range(start, min(start + MOST_MODULES, count + 1))
             if count > PAGES:
-                pairs = (rrb.Horizontal(self._weights_of(i), self._output(i)) for i in page)
+                pairs = (rrb.Horizontal(*self._module_views(i)) for i in page)
                 pages.append(rrb.Vertical(*pairs, name=f"{page[0]} to {page[-1]}"))
             else:
                 pages.append(self._module(start, has_sheet=start in sheets))
@@ -196,7 +210,8 @@ class RunLayout:
 
     def _module(self, i: int, *, has_sheet: bool) -> rrb.Container:
         """Return a module's page: weights, frames, and its output, also around its save."""
-        left, output, name = Views([self._weights_of(i)]), Views([self._output(i)]), f"Module {i}"
+        left, output = ([view] for view in self._module_views(i))
+        name = f"Module {i}"
         if has_sheet:
             title = "Frames of least, middle and greatest output 1, and its values"
             width, height = sheet_size(*self._spec.frame_shape)
@@ -205,61 +220,43 @@ class RunLayout:
             name += f": {label(self._spec.streams[save.stream])}"
             blocks, saved = self._outline.blocks, save.t + self._outline.tau
             later = blocks.starts[(blocks.streams == save.stream) & (blocks.starts >= saved)]
-            windows: Views = [self._output(i, "until it was saved", saved)]
+            ends = {"until it was saved": saved}
             if len(later):
-                end = int(later[-1]) + self._outline.tau
-                windows.append(self._output(i, "of its stream", end))
+                ends["of its stream"] = int(later[-1]) + self._outline.tau
+            entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
+            windows: Views = [
+                lines(f"The last {NEAR} frames {words}", entities, end, start=end - NEAR)
+                for words, end in ends.items()
+            ]
             output.append(beside(windows))
         columns = (rrb.Vertical(*views) for views in (left, output))
         return rrb.Horizontal(*columns, column_shares=[3, 4], name=name)
 
-    def _weights_of(self, i: int) -> rrb.View:
-        colours = " (blue below 0, orange above), each by its largest" if self._spec.images else ""
-        return self._weights(f"/modules/{i}/weights", f"Weights of module {i}{colours}")
+    def _module_views(self, i: int) -> Views:
+        """Return a module's weights, and its output wherever its own stream was watched."""
+        colours = f"{self._facts['colours']}, each by its largest" if self._spec.images else ""
+        output = f"Output of module {i} wherever its own stream was watched"
+        return [
+            self._weights(f"/modules/{i}/weights", f"Weights of module {i}{colours}"),
+            lines(output, [f"/modules/{i}/output", f"/modules/{i}/saved"], self._end),
+        ]
 
-    def _output(self, i: int, until: str = "", end: int = 0) -> rrb.View:
-        """Return a module's output on its own stream, or on the frames before an end."""
-        entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
-        if end:
-            return lines(f"The last {NEAR} frames {until}", entities, end, start=end - NEAR)
-        title = f"Output of module {i} wherever its own stream was watched"
-        return lines(title, entities, self._end)
-
-    def _streams(self) -> rrb.View | rrb.Container:
+    def _streams(self, title: str) -> rrb.View | rrb.Container:
         """Return what each stream showed last; of a scene or of numbers what is watched now."""
         if self._has_scene or not self._spec.images:
-            return self._watched("What it sees")
+            return self._input(title)
         count = min(len(self._spec.streams), MOST_STREAMS)
-        return images(
-            f"/{WALL}", "What each stream showed last", bounds(count, *self._spec.frame_shape)
-        )
+        shown = bounds(count, *self._spec.frame_shape)
+        return images(f"/{WALL}", "What each stream showed last", shown)
 
-    def _sees(self) -> rrb.Container:
-        """Return input, summary, and weights; of many candidates they are apart."""
-        views: Views = [self._streams(), rrb.TextDocumentView(origin="/summary", name="Summary")]
-        if not self._header.by_progress:
-            colours = " (blue below 0, orange above)" if self._spec.images else ""
-            views.append(self._weights("/abstraction/phi", f"Weights φ{colours}"))
-        return rrb.Vertical(*views, row_shares=[3, 4, 2][: len(views)])
-
-    def _now(self) -> rrb.Container:
-        """Return input, output and weights at the time cursor."""
-        output = self._views(Panel("Output y", ("/signals/y",), "near"))
-        kept = f", every {PHI_EVERY} blocks" if self._outline.iterations else ""
-        colours = " (blue < 0 < red)" if self._spec.images else ""
-        whose = " of this stream" if self._header.by_progress else ""
-        weights = self._weights("/abstraction/phi", f"Weights φ{whose}{kept}{colours}")
-        shares = [3, 2, 3] if output else [3, 3]
-        return rrb.Vertical(self._watched("Input x"), *output, weights, row_shares=shares)
-
-    def _watched(self, name: str) -> rrb.View | rrb.Container:
+    def _input(self, name: str) -> rrb.View | rrb.Container:
         """Return the learner's input: an image with the name of its stream, or the last values."""
         if self._spec.images:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
         values = lines(name, ["/world/watched"], near=NEAR)
-        whose = lanes("Of which stream", ["/attends"], near=NEAR, room=True)
+        whose = lanes("Of which stream", ["/attends"], near=NEAR)
         return rrb.Vertical(values, whose, row_shares=[3, 2])
 
     def _weights(self, path: str, name: str) -> rrb.View:
