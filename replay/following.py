@@ -22,17 +22,17 @@ from replay.runs.log import (
 from replay.runs.modules import load_modules
 from replay.runs.run import Outline
 
+# Last frames of each module's output that are fitted.
 KEPT = 20_000
-"""Last frames of each module's output that are fitted."""
 
+# By how much a function must be followed better than a simpler one.
 BETTER = 0.03
-"""By how much a function must be followed better than a simpler one."""
 
+# Sines of an angle that are tried.
 FREQUENCIES = 12
-"""Sines of an angle that are tried."""
 
+# Blocks before the save whose output is shown with that of the frozen module later.
 LAST_BLOCKS = 40
-"""Blocks before the save whose output is shown with that of the frozen module later."""
 
 
 @dataclass(frozen=True, slots=True)

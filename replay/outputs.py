@@ -19,11 +19,11 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.modules import CHUNK, Module
 from replay.runs.log import Batch
 
+# Frames of a contact sheet with the least output, and of those with the greatest.
 EACH = 5
-"""Frames of a contact sheet with the least output, and of those with the greatest."""
 
+# Frames from which those of middle output are picked.
 KEPT = 64
-"""Frames from which those of middle output are picked."""
 
 
 class Thinned:

@@ -25,8 +25,8 @@ VERMILLION: Rgb = (213, 94, 0)
 PURPLE: Rgb = (204, 121, 167)
 GREY: Rgb = (136, 136, 136)
 
+# Colours of streams, and of what belongs to one.
 CYCLE: tuple[Rgb, ...] = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
-"""Colours of streams, and of what belongs to one."""
 
 SAND: Rgb = (190, 180, 130)
 MIST: Rgb = (165, 180, 195)
@@ -42,17 +42,15 @@ CLAY: Rgb = (195, 140, 130)
 BRICK: Rgb = (190, 95, 90)
 BROWN: Rgb = (140, 115, 95)
 
+# Colours of what became of a stream: learning, learned, known, given up; none is a stream's.
 STATES: tuple[Rgb, ...] = (SAND, PLUM, MIST, DARK)
-"""Colours of what became of a stream: learning, learned, known, given up; none is a stream's."""
 
+# Colours of lines that belong to no stream: a full colour is a stream's, and its module's. They are
+# seen on black, and on the white on which browsers show the viewer.
 PALE: tuple[Rgb, ...] = (STEEL, KHAKI, PLUM, MOSS, CLAY, BROWN)
-"""Colours of lines that belong to no stream: a full colour is a stream's, and its module's.
 
-They are seen on black, and on the white on which browsers show the viewer.
-"""
-
+# Shades between white and a full colour: as many as eight bits can tell apart.
 STEPS = 255
-"""Shades between white and a full colour: as many as eight bits can tell apart."""
 
 
 def colour(index: int) -> Rgb:

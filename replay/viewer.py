@@ -27,17 +27,17 @@ from replay.runs.log import EVENT_TOPIC, read_batches, read_columns
 
 HOST = "127.0.0.1"
 
+# Size of a screenshot, in points.
 WINDOW = "1600x1000"
-"""Size of a screenshot, in points."""
 
+# Seconds after which the viewer's notices are gone from a screenshot.
 SETTLE = 6.0
-"""Seconds after which the viewer's notices are gone from a screenshot."""
 
+# Longest wait for an answer of the viewer, which is slow without a graphics card.
 SECONDS = 120.0
-"""Longest wait for an answer of the viewer, which is slow without a graphics card."""
 
+# Installs a Vulkan driver that needs no graphics card.
 INSTALL = "apt-get install mesa-vulkan-drivers libvulkan1"
-"""Installs a Vulkan driver that needs no graphics card."""
 
 ITERATION = re.compile(r"iteration\s*(\d+)", re.IGNORECASE)
 

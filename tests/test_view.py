@@ -107,7 +107,7 @@ def test_lanes_say_what_was_the_case(shown):
 
 def test_eyes_get_threshold_band_weights_and_events(shown):
     spec, records, rows, view = shown
-    assert set(np.ravel(scalars(rows["/abstraction/delta"]))) == {np.log10(DELTA)}
+    assert set(np.ravel(scalars(rows["/thresholds/eta_dot"]))) == {np.log10(DELTA)}
     band = scalars(rows["/gate/band/1"])
     np.testing.assert_allclose(band, np.tile([0.008, 0.012], (len(band), 1)))
     assert rows["/abstraction/phi"]["iteration"] == [0, 10, 20]

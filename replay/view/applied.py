@@ -20,8 +20,8 @@ from replay.view.rows import MOST_STREAMS, Rows, label, part
 if TYPE_CHECKING:
     from replay.export.applied import Applied
 
+# Frames from one image that is shown to the next; values are all shown.
 EVERY = 10
-"""Frames from one image that is shown to the next; values are all shown."""
 
 
 class ViewSink:

@@ -35,13 +35,13 @@ from replay.view.run import RunView
 from replay.view.scene import SceneView, scenery_of_recording
 from replay.view.summary import summary_text
 
+# Rerun's application id: the viewer remembers one layout for it.
 APPLICATION = "cdmisfa"
-"""Rerun's application id: the viewer remembers one layout for it."""
 
 FLUSH_SECONDS = 60.0
 
+# Frames of a recording that are read at once.
 BLOCK = 500
-"""Frames of a recording that are read at once."""
 
 
 def build_view(

@@ -21,22 +21,20 @@ from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.view.rows import Rows, label, part
 
+# Gives the code of each block's state, (n,).
 Codes = Callable[[SignalColumns], IntArray]
-"""Gives the code of each block's state, (n,)."""
 
-Names = Callable[[int], tuple[str, Rgb]]
-"""Gives the name and the colour of the state that a code stands for."""
+# Gives the name and the colour of the state that a code stands for.
+States = Callable[[int], tuple[str, Rgb]]
 
+# Pieces of a run, in each of which a lane of most blocks has one state.
 PIECES = 80
-"""Pieces of a run, in each of which a lane of most blocks has one state."""
 
+# Share of the blocks of a piece that is most of them.
 MOST_OF = 2 / 3
-"""Share of the blocks of a piece that is most of them."""
 
-STAY, SWITCH = ACTIONS
-
-_NOVEL = -1
-_MIXED = -2
+# Codes of blocks most of which have no state in common, and of novel ones.
+_MIXED, _NOVEL = -2, -1
 _KNOWN = STATES.index("known")
 
 
@@ -54,40 +52,33 @@ class Lanes:
     def __init__(
         self, rows: Rows, shown: Sequence[int], *, by_progress: bool, piece: int | None = None
     ) -> None:
-        streams = rows.spec.streams
-        names, count = list(map(label, streams)), len(streams)
+        streams, count = rows.spec.streams, len(rows.spec.streams)
+        names, (stay, switch) = [label(name) for name in streams], ACTIONS
         self._known_by = np.zeros(count, dtype=np.int64)
-
-        def attended(stream: int) -> tuple[str, Rgb]:
-            return names[stream], colour(stream)
-
-        def done(code: int) -> tuple[str, Rgb]:
-            if code >= count:
-                return SWITCH, palette.GREY
-            return f"{STAY} on {names[code]}", colour(code)
-
-        # Path, codes, names, and what a mixture of states is called in the lane of most blocks.
-        table: list[tuple[str, Codes, Names, str]] = [
-            ("attends", lambda c: c["stream"], attended, "switches")
-        ]
-        if not by_progress:
-            table += [
-                ("learns", lambda c: c["module"], _learned, ""),
-                ("novelty", _verdicts, _verdict, "both"),
-                ("does", lambda c: c["stream"] + count * c["action"], done, ""),
-                ("explores", lambda c: c["explored"], _explored, ""),
-            ]
-        for s in shown:
-            place = part(streams, s)
-            if by_progress:
-                table.append((f"state/{place}", partial(self._states, s), _state, ""))
-            else:
-                table.append((f"policy/{place}", partial(_policy, s), partial(_planned, s), ""))
         self._lanes: list[tuple[Codes, Lane]] = []
-        for path, codes, named, mixed in table:
-            self._lanes.append((codes, Lane(rows, path, named)))
+
+        def lane(path: str, codes: Codes, states: States, mixed: str = "") -> None:
+            self._lanes.append((codes, Lane(rows, path, states)))
             if mixed:
-                self._lanes.append((codes, Lane(rows, f"mostly/{path}", named, piece, mixed)))
+                self._lanes.append((codes, Lane(rows, f"mostly/{path}", states, piece, mixed)))
+
+        attended = {s: (name, colour(s)) for s, name in enumerate(names)}
+        lane("attends", lambda c: c["stream"], attended.__getitem__, "switches")
+        if by_progress:
+            for s in shown:
+                lane(f"state/{part(streams, s)}", partial(self._states, s), _state)
+            return
+        done = {s: (f"{stay} on {name}", colour(s)) for s, name in enumerate(names)}
+        done |= {count + s: (switch, palette.GREY) for s in range(count)}
+        explored = {0: ("greedy", palette.MOSS), 1: ("explored", palette.ROSE)}
+        lane("learns", lambda c: c["module"], _learned)
+        lane("novelty", _verdicts, _verdict, "both")
+        lane("does", lambda c: c["stream"] + count * c["action"], done.__getitem__)
+        lane("explores", lambda c: c["explored"], explored.__getitem__)
+        for s in shown:
+            planned = {0: (stay, colour(s)), 1: (switch, palette.GREY)}
+            codes = partial(lambda s, c: c["policy"][:, s], s)
+            lane(f"policy/{part(streams, s)}", codes, planned.__getitem__)
 
     def add_blocks(self, columns: SignalColumns) -> None:
         """Take the states of consecutive iterations."""
@@ -122,22 +113,21 @@ class Lane:
     Args:
         rows: of the recording.
         path: the entity.
-        names: the states of the codes.
+        states: of the codes.
         piece: blocks that have one state, that of most of them; see `Lanes`.
         mixed: name of the state of blocks most of which have none.
     """
 
     def __init__(
-        self, rows: Rows, path: str, names: Names, piece: int | None = 1, mixed: str = ""
+        self, rows: Rows, path: str, states: States, piece: int | None = 1, mixed: str = ""
     ) -> None:
-        self._rows, self._path, self._names = rows, path, names
+        self._rows, self._path, self._states = rows, path, states
         self._piece, self._mixed, self._tau = piece, mixed, 0
         self._blocks: list[tuple[IntArray, IntArray, IntArray]] = []
         self._state: str | None = None
         self._stop: int | None = None
         self._changes: list[tuple[int, int, str]] = []
         self._colours: dict[str, Rgb] = {}
-        self._declared = 0
 
     def add_codes(self, frames: IntArray, iterations: IntArray, codes: IntArray, tau: int) -> None:
         """Take the codes of consecutive blocks of `tau` frames."""
@@ -177,7 +167,7 @@ class Lane:
         gaps, self._stop = frames != stops[:-1], int(stops[-1])
         for i in np.flatnonzero(gaps | (np.diff(codes, prepend=codes[0] + 1) != 0)).tolist():
             code = int(codes[i])
-            state, rgb = (self._mixed, palette.GREY) if code == _MIXED else self._names(code)
+            state, rgb = (self._mixed, palette.GREY) if code == _MIXED else self._states(code)
             self._colours.setdefault(state, rgb)
             if gaps[i]:
                 self._changes.append((int(stops[i]), int(iterations[i]), ""))
@@ -186,14 +176,12 @@ class Lane:
                 self._changes.append((int(frames[i]), int(iterations[i]), state))
 
     def send_changes(self) -> None:
-        """Send what waits, and declare the states where there are new ones."""
+        """Declare the states, and send the changes that wait."""
         if not self._changes:
             return
-        if self._declared < len(self._colours):
-            self._declared = len(self._colours)
-            known, rgbs = list(self._colours), packed_all(list(self._colours.values()))
-            config = rr.StateConfiguration(values=known, labels=known, colors=rgbs)
-            self._rows.log(self._path, config)
+        known, rgbs = list(self._colours), packed_all(list(self._colours.values()))
+        config = rr.StateConfiguration(values=known, labels=known, colors=rgbs)
+        self._rows.log(self._path, config)
         frames, iterations, states = zip(*self._changes, strict=True)
         at = np.array(frames), np.array(iterations)
         self._rows.send(self._path, at, rr.StateChange.columns(state=states))
@@ -212,18 +200,6 @@ def _verdict(code: int) -> tuple[str, Rgb]:
     if code == _NOVEL:
         return "novel", palette.LILAC
     return (f"known by {code}", palette.MIST) if code else ("constant", palette.BROWN)
-
-
-def _explored(explored: int) -> tuple[str, Rgb]:
-    return ("explored", palette.ROSE) if explored else ("greedy", palette.MOSS)
-
-
-def _policy(s: int, columns: SignalColumns) -> IntArray:
-    return columns["policy"][:, s]
-
-
-def _planned(stream: int, action: int) -> tuple[str, Rgb]:
-    return (SWITCH, palette.GREY) if action else (STAY, colour(stream))
 
 
 def _state(code: int) -> tuple[str, Rgb]:

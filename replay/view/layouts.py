@@ -17,22 +17,22 @@ from replay.view.rows import FRAME, ITERATION, Span
 
 Views = list[rrb.View | rrb.Container]
 
+# Frames of a window in which the inside of a block can be seen, up to the time cursor.
 NEAR = 300
-"""Frames of a window in which the inside of a block can be seen, up to the time cursor."""
 
+# Blocks of the windows of lanes.
 NEAR_BLOCKS = 50
-"""Blocks of the windows of lanes."""
 
+# Part of a time axis, beyond its end, that is left to the legend, which so covers no data.
 ROOM = 0.14
-"""Part of a time axis, beyond its end, that is left to the legend, which so covers no data."""
 
+# Part of a time axis that the numbers of a plot take; lanes have none, and begin as much later.
 MARGIN = 0.018
-"""Part of a time axis that the numbers of a plot take; lanes have none, and begin as much later."""
 
 CURSOR = rr.TimeRangeBoundary.cursor_relative
 
+# Time in which a run is played.
 PLAY_SECONDS = 60
-"""Time in which a run is played."""
 
 
 @dataclass(frozen=True, slots=True)

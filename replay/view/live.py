@@ -29,19 +29,19 @@ from replay.view.rows import MOST_STREAMS, Rows
 from replay.view.run import RunView
 from replay.view.scene import SceneView
 
+# Time between two pieces.
 EVERY_SECONDS = 1.5
-"""Time between two pieces."""
 
 SUMMARY = "The run is still learning. The view of the finished run has its results."
 
+# Frames from one pose of the scene to the next, and from one logged image to the next.
 EVERY_FRAMES = 10
-"""Frames from one pose of the scene to the next, and from one logged image to the next."""
 
+# Most blocks that wait, however quick the learner is.
 MOST_BLOCKS = 500
-"""Most blocks that wait, however quick the learner is."""
 
+# Blocks of which a lane has the state of most: the length of the run is not known.
 PIECE = 10
-"""Blocks of which a lane has the state of most: the length of the run is not known."""
 
 
 class LiveView(Sink):

@@ -27,17 +27,17 @@ from replay.view.layouts import Panel
 from replay.view.rows import Rows, label
 from replay.view.wall import BETWEEN, hang, places_of, sheet_size
 
+# Weights that are no image, and drawn as bars: more are a tensor.
 MOST_BARS = 256
-"""Weights that are no image, and drawn as bars: more are a tensor."""
 
+# Modules whose output is shown over the quantity that it follows: the first.
 FOLLOWED = 6
-"""Modules whose output is shown over the quantity that it follows: the first."""
 
+# Last frames of a run for which it is shown.
 FOLLOWED_FRAMES = 1_000_000
-"""Last frames of a run for which it is shown."""
 
+# Widths of the line that is followed, and of the output.
 BROAD, NARROW = 4.0, 1.5
-"""Widths of the line that is followed, and of the output."""
 
 
 @cache

@@ -18,6 +18,7 @@ from replay.view.layouts import blueprint, lines
 from replay.view.rows import ITERATION, MOST_STREAMS, Rows, label, part, power_of_ten
 from replay.view.summary import text_table
 
+# Signals that are overlaid where a run has them, with the titles of their panels.
 CURVES = {
     "eta_dot": "Change of slowness η̇, as powers of ten: a module is saved when it is below δ",
     "epsilon": "Exploration ε",
@@ -26,10 +27,9 @@ CURVES = {
     "share": "Share of novel blocks",
     "tested": "Slowness on new frames, of the stream that is watched [1/frame]",
 }
-"""Signals that are overlaid where a run has them, with the titles of their panels."""
 
+# The signal that is overlaid stream by stream.
 ERROR = "learning_error"
-"""The signal that is overlaid stream by stream."""
 
 
 def build_overlay(

@@ -26,23 +26,23 @@ from replay.view.layouts import (
 from replay.view.rows import MOST_STREAMS, Rows, Span, label
 from replay.view.wall import WALL, bounds, sheet_size
 
+# Modules that have a page each; of more, those that stand on one page.
 PAGES, MOST_MODULES = 12, 6
-"""Modules that have a page each; of more, those that stand on one page."""
 
+# Modules that stand beside one another in the gate.
 ACROSS = 3
-"""Modules that stand beside one another in the gate."""
 
+# Height of a panel of lanes without them, and of each, in points.
 ROW, LANE = 55, 40
-"""Height of a panel of lanes without them, and of each, in points."""
 
+# Lanes that get their full height; more are scrolled.
 MOST_LANES = 9
-"""Lanes that get their full height; more are scrolled."""
 
+# Height of a tab on a screen of 1280 x 720, in points, and least one of a row of plots.
 HEIGHT, LEAST = 624, 60
-"""Height of a tab on a screen of 1280 x 720, in points, and least one of a row of plots."""
 
+# Share of an axis that is added on either side of the values that it must hold.
 MARGIN = 0.05
-"""Share of an axis that is added on either side of the values that it must hold."""
 
 
 def run_layout(

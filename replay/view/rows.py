@@ -24,44 +24,41 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import times_of
 from replay.palette import Colour, packed_all, pale
 
+# Timeline of the global frame counter t.
 FRAME = "frame"
-"""Timeline of the global frame counter t."""
 
+# Timeline of the learner's iterations.
 ITERATION = "iteration"
-"""Timeline of the learner's iterations."""
 
+# Timeline of the log time: the name Rerun's own MCAP loader gives it.
 LOG_TIME = "message_log_time"
-"""Timeline of the log time: the name Rerun's own MCAP loader gives it."""
 
+# Streams with lines and lanes of their own: the most watched ones.
 MOST_STREAMS = 16
-"""Streams with lines and lanes of their own: the most watched ones."""
 
+# Lines with more values than the screen has columns are drawn from the least to the most. Their
+# mean, the viewer's default, may be a value that never occurred.
 AGGREGATION = rr.components.AggregationPolicy.MinMax
-"""Lines with more values than the screen has columns are drawn from the least to the most.
 
-Their mean, the viewer's default, may be a value that never occurred.
-"""
-
+# Rows of an entity that are sent at once.
 MAX_ROWS = 16_000
-"""Rows of an entity that are sent at once."""
 
+# Bytes of an entity's rows that are sent at once. With 12 MB of images at once Rerun's threads take
+# twice as long, with 0.5 MB our own loop does.
 MAX_BYTES = 4 * 1024 * 1024
-"""Bytes of an entity's rows that are sent at once.
 
-With 12 MB of images at once Rerun's threads take twice as long, with 0.5 MB our own loop does.
-"""
-
+# Width of lines, in points.
 WIDTH = 1.5
-"""Width of lines, in points."""
 
+# Least and greatest value.
 Span = tuple[float, float]
-"""Least and greatest value."""
 
+# Frames of n rows, and their iterations where the source has any, (n,) each.
 At = tuple[IntArray, IntArray | None]
-"""Frames of n rows, and their iterations where the source has any, (n,) each."""
 
 Encode = Callable[[NDArray[Any]], Any]
 
+# Letters in the viewer's font: at any other the viewer panics and ends.
 _DRAWN = (
     (0x20, 0x7E),  # ASCII
     (0xA1, 0x17F),  # Latin
@@ -70,7 +67,6 @@ _DRAWN = (
     (0x384, 0x3CE),  # Greek
     (0x400, 0x45F),  # Cyrillic
 )
-"""Letters in the viewer's font: at any other the viewer panics and ends."""
 
 
 @lru_cache(maxsize=4096)

@@ -27,34 +27,26 @@ from replay.view.modules import ModulesView, hang_weights, saved_mark, write_wei
 from replay.view.rows import WIDTH, Rows, changes, label, part, power_of_ten
 from replay.view.scene import world_of_run
 
+# Signals that are the timelines.
 TIMELINES = ("iteration", "t", "log_time")
-"""Signals that are the timelines."""
 
+# Number of the first colour of signals that are drawn beside another one.
 BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2, "roc_error": 1}
-"""Number of the first colour of signals that are drawn beside another one."""
 
-POWERS = {"eta_dot": "abstraction/log_eta_dot", "xi": "abstraction/log_xi"}
-"""Entities of signals drawn as powers of ten: they fall through several."""
+# Signals drawn as powers of ten, too: they fall through several.
+POWERS = ("eta_dot", "xi")
 
+# Signals of the watched stream: each has its line, of powers of ten, through its own blocks.
 OF_STREAM = ("learning_error", "tested", "fitted", "change")
-"""Signals of the watched stream: each has its line, of powers of ten, through its own blocks."""
 
+# Signals whose name is their symbol, spelled out.
 SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi", "xi_dot")
-"""Signals whose name is their symbol, spelled out."""
 
-THRESHOLDS = {
-    "eta_dot": "abstraction/delta",
-    "roc_error": "gate/clustering",
-    "share": "gate/novel_share",
-    "variance": "abstraction/min_variance",
-}
-"""Entity of the threshold of each signal that a rule to save a module names."""
-
+# Interest from which on a stream promises most because it was hardly watched: it has no line.
 HARDLY_WATCHED = 1000.0
-"""Interest from which on a stream promises most because it was hardly watched: it has no line."""
 
+# Blocks over which the share of each stream is taken.
 RECENT = 50
-"""Blocks over which the share of each stream is taken."""
 
 PHI = "abstraction/phi"
 WATCHED_NAME = "world/watched/name"
@@ -196,10 +188,10 @@ class RunView:
     def _learning(self, columns: SignalColumns) -> None:
         """Draw what must fall or rise until a module is saved, and mark where one was."""
         outputs = columns["y"].shape[2]
-        for name, path in POWERS.items():
+        for name in POWERS:
             values = power_of_ten(columns[name].astype(np.float64).reshape(len(columns), -1))
             names = line_names(SIGNALS[name], 0, outputs)[: values.shape[1]]
-            self._line(columns, path, names, values)
+            self._line(columns, f"abstraction/log_{name}", names, values)
         for i, rule in enumerate(self._rules):
             values = power_of_ten(rule.met(columns))
             self._line(columns, f"rules/{rule.signal}", [rule.ratio], values, [pale(i)])
@@ -320,12 +312,12 @@ def thresholds_of(header: RunHeader) -> Iterator[tuple[str, str, float]]:
     """Yield entity, label and value of each line that is crossed where something is learned."""
     if header.by_progress and header.settled is not None:
         change, error = header.settled
-        yield "streams/settled", "settled below", math.log10(change)
-        yield "streams/threshold", "learned below", math.log10(error)
+        yield "thresholds/change", "settled below", math.log10(change)
+        yield "thresholds/learning_error", "learned below", math.log10(error)
     rules = rules_of(header)
     for rule in rules:
         value = math.log10(rule.threshold) if rule.signal == "eta_dot" else rule.threshold
         name = "δ" if rule.signal == "eta_dot" else f"{rule.threshold:g}"
-        yield THRESHOLDS[rule.signal], f"{name}: saved {rule.side}", value
+        yield f"thresholds/{rule.signal}", f"{name}: saved {rule.side}", value
     if rules:
         yield "rules/met", "saved above", 0.0

@@ -34,31 +34,31 @@ from replay.storage.opening import log_files
 from replay.view.rows import Rows, changes, label, part
 from replay.view.wall import WallView
 
+# The entity whose frame is the robot's root frame.
 SCENE = "scene"
-"""The entity whose frame is the robot's root frame."""
 
 WATCHING = f"{SCENE}/watching"
 
+# Length of a view's pyramid, metres.
 REACH = 0.6
-"""Length of a view's pyramid, metres."""
 
+# Radii of the edges of a view's pyramid, and of that of the watched one.
 THIN, THICK = 0.0015, 0.005
-"""Radii of the edges of a view's pyramid, and of that of the watched one."""
 
+# Edges of a pyramid: four along its sides, one around its end.
 EDGES = 5
-"""Edges of a pyramid: four along its sides, one around its end."""
 
+# Added to the greys of objects: the viewer's background is as dark as they are.
 LIGHT = 0.25
-"""Added to the greys of objects: the viewer's background is as dark as they are."""
 
+# The joints that turn the head to the left, and bend it upwards.
 NECK, NECK_PITCH = "neck_yaw", "neck_pitch"
-"""The joints that turn the head to the left, and bend it upwards."""
 
+# The entity of the robot's links, in that of the scene.
 BODY = "body"
-"""The entity of the robot's links, in that of the scene."""
 
+# Prefix of the meshes' names in the models.
 PACKAGE = "package://iCub/"
-"""Prefix of the meshes' names in the models."""
 
 PRESET = (
     "the recording that it learned from is not where it was: the table, the eyes and the sizes of "
@@ -170,8 +170,10 @@ class SceneView:
                 self._write_pyramid(s, gaze)
         try:
             self._joints = write_body(rows.recording, scenery.robot)
-        except CdmisfaError as error:
-            self.notes.append(str(error))
+        except ImportError:
+            self.notes = ["the robot's body is not shown: `pip install icub-models` for it"]
+        except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:
+            self.notes = [f"the robot's body is not shown: {error}"]
 
     def show_batch(self, batch: Batch) -> None:
         """Write what a log holds of some iterations."""
@@ -290,36 +292,30 @@ def write_body(recording: rr.RecordingStream, robot: str) -> UrdfTree:
         robot: its name in icub-models.
 
     Raises:
-        CdmisfaError: the package or the model is not there, or it cannot be read.
+        ImportError: the package icub-models is not installed.
+        OSError, RuntimeError, ValueError, ElementTree.ParseError: it has no such robot, or the
+            model cannot be read.
     """
-    try:
-        import icub_models
-    except ImportError as error:
-        raise CdmisfaError(
-            "the robot's body is not shown: `pip install icub-models` for it"
-        ) from error
+    import icub_models
+
     if robot not in icub_models.get_robot_names():
-        raise CdmisfaError(f"the robot's body is not shown: icub-models has no {robot[:60]!r}")
+        raise ValueError(f"icub-models has no {robot[:60]!r}")
     model = Path(icub_models.get_model_file(robot))
     share = next(folder for folder in model.parents if (folder / "robots").is_dir())
+    shown: Any = ElementTree.parse(model)
+    shown.getroot().set("name", BODY)
+    for link in shown.iter("link"):
+        for collision in link.findall("collision"):
+            link.remove(collision)
+    for mesh in shown.iter("mesh"):
+        mesh.set("filename", mesh.get("filename", "").replace(PACKAGE, f"{share}/"))
     with tempfile.TemporaryDirectory(prefix="cdmisfa-robot-") as folder:
-        try:
-            shown: Any = ElementTree.parse(model)
-            shown.getroot().set("name", BODY)
-            for link in shown.iter("link"):
-                for collision in link.findall("collision"):
-                    link.remove(collision)
-            for mesh in shown.iter("mesh"):
-                mesh.set("filename", mesh.get("filename", "").replace(PACKAGE, f"{share}/"))
-            shown.write(Path(folder) / model.name)
-            tree = UrdfTree.from_file_path(
-                Path(folder) / model.name,
-                entity_path_prefix=SCENE,
-                static_transform_entity_path=f"{SCENE}/joints",
-            )
-            tree.log_urdf_to_recording(recording)
-        except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:
-            raise CdmisfaError(f"{model} cannot be shown: {error}") from error
+        file, joints = Path(folder) / model.name, f"{SCENE}/joints"
+        shown.write(file)
+        tree = UrdfTree.from_file_path(
+            file, entity_path_prefix=SCENE, static_transform_entity_path=joints
+        )
+        tree.log_urdf_to_recording(recording)
     stands = rr.Transform3D(parent_frame=f"tf#/{SCENE}", child_frame=tree.root_link().name)
     recording.log(f"{SCENE}/stands", stands, static=True)
     return tree

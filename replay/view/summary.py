@@ -10,17 +10,17 @@ from cdmisfa.core.signals import ACTIONS, STATES
 from replay.runs.run import Outline
 from replay.view.rows import MOST_STREAMS
 
+# Start of the event that says why a run ended.
 ENDED = "ended:"
-"""Start of the event that says why a run ended."""
 
+# Settings that the summary names, by learner.
 SETTINGS = {
     "paper": ("nu", "tau", "sigma", "delta"),
     "progress": ("tau", "components", "window", "attention"),
 }
-"""Settings that the summary names, by learner."""
 
+# Most streams whose names are given together.
 NAMED = 4
-"""Most streams whose names are given together."""
 
 
 def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str:

@@ -17,14 +17,14 @@ from replay.view.rows import Rows, Span, changes, label, part
 
 WALL = "wall"
 
+# Width of the wall over its height, as near as whole images allow.
 SHAPE = 1.7
-"""Width of the wall over its height, as near as whole images allow."""
 
+# Room below an image for its words, and between two, in heights of an image.
 ROOM, SPACE = 0.5, 0.06
-"""Room below an image for its words, and between two, in heights of an image."""
 
+# Pixels between two frames of a strip of frames.
 BETWEEN = 4
-"""Pixels between two frames of a strip of frames."""
 
 
 def places_of(
