@@ -1,14 +1,15 @@
-"""The kernels: what is computed in C, ahead of time, behind one boundary.
+"""The kernels: C, compiled ahead of time, behind one boundary.
 
-Every function checks the type, shape and order of what it is given and hands pointers on; C trusts
-them. The same arguments give the same bits with every compiler and on every x86-64 and 64-bit Arm
-processor: see `lanes.h`. What each computes is said where it is used, and in the C file.
+Every function checks the type, shape and order of its arrays and passes pointers on; C trusts them.
+The same arguments give the same bits with every compiler and on every x86-64 and 64-bit Arm
+processor: see `lanes.h`. The C files say how each result is computed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -30,68 +31,58 @@ except ImportError as error:
 FLOAT64, INT64 = np.dtype(np.float64), np.dtype(np.int64)
 _POINTERS = {FLOAT64: "double[]", INT64: "int64_t[]", UINT8: "uint8_t[]"}
 
+# Version of the order in which the kernels compute, to be raised with every change of their bits:
+# runs of another version are neither continued nor checked.
 ARITHMETIC = 3
-"""Version of the order in which the kernels compute, to be raised with every change of their bits.
 
-Runs of another version are neither continued nor checked.
-"""
-
-
-def _chosen() -> Any:
-    """The module for the instruction set of this processor; the bits are the same."""
-    if _plain.lib.has_wide_lanes():
-        import cdmisfa.kernels._wide as _wide
-
-        return _wide
-    return _plain
-
-
-_module = _chosen()
+# The same bits come from both modules; the second is for processors with AVX2 and FMA.
+WIDE: bool = bool(_plain.lib.has_wide_lanes())
+_module: Any = import_module("cdmisfa.kernels._wide") if WIDE else _plain
 lib: Any = _module.lib
 ffi: Any = _module.ffi
 _buffer = ffi.from_buffer
 
-WIDE: bool = _module is not _plain
-"""Whether the kernels for AVX2 and FMA run here."""
+
+def expect(name: str, given: object, wanted: object) -> None:
+    """Refuse an argument that C could not use.
+
+    Raises:
+        UsageError: what is given is not what C needs.
+    """
+    if given != wanted:
+        raise UsageError(f"{name} given as {given}: give {wanted}")
 
 
 def pointer(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] = FLOAT64) -> Any:
-    """Where an array lies, for C to read and write; it keeps the array alive.
+    """Return the address of an array for C to read and write; it keeps the array alive.
 
     Raises:
-        UsageError: it is of another type or shape, or does not lie in C order, or is read-only.
+        UsageError: it is of another type or shape, does not lie in C order, or is read-only.
     """
-    if type(array) is not np.ndarray or array.dtype != dtype or array.shape != shape:
-        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array)
-        raise UsageError(f"{name} is {found}: give an array of {dtype} {shape}")
-    flags = array.flags
-    if not (flags.c_contiguous and flags.aligned and flags.writeable):
-        raise UsageError(f"{name} does not lie in C order, aligned and writable: give a copy")
+    given: object = type(array)
+    if given is np.ndarray:
+        given = str(array.dtype), array.shape, "C" if array.flags.carray else "other order"
+    expect(name, given, (str(dtype), shape, "C"))
     return _buffer(_POINTERS[dtype], array, True)
 
 
-def records(kind: str, array: NDArray[np.void]) -> Any:
-    """Where an array of records lies, which are those of C by that name; it keeps it alive."""
-    return _buffer(f"{kind}[]", array, True)
-
-
 def readable(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] = FLOAT64) -> Any:
-    """Where the numbers of an array lie, or a copy of them in C order, for C to read.
+    """Return the address of an array, or of a copy in C order, for C to read.
 
     Raises:
-        UsageError: it is of another shape, or holds no numbers.
+        UsageError: it is of another shape.
     """
-    if type(array) is not np.ndarray or array.dtype != dtype:
-        try:
-            array = np.asarray(array, dtype=dtype)
-        except (TypeError, ValueError) as error:
-            raise UsageError(f"{name} holds no numbers: give an array of {shape}") from error
-    if array.shape != shape:
-        raise UsageError(f"{name} has the shape {array.shape}: give an array of {shape}")
-    flags = array.flags
-    if not (flags.c_contiguous and flags.aligned):
-        array = array.copy(order="C")
+    if type(array) is not np.ndarray or array.dtype != dtype or not array.flags.c_contiguous:
+        array = np.array(array, dtype, order="C")
+    if not array.flags.aligned:
+        array = array.copy()
+    expect(name, array.shape, shape)
     return _buffer(_POINTERS[dtype], array)
+
+
+def records(kind: str, array: NDArray[np.void]) -> Any:
+    """Return the address of an array of records, which C has by that name."""
+    return _buffer(f"{kind}[]", array, True)
 
 
 class Struct:
@@ -252,47 +243,47 @@ def iterate(
     t: int,
     uniforms: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """One iteration of a curious agent whose abstraction is `feature`; see `CuriousLearner.step`.
+    """Compute one iteration of a curious agent with an abstraction; see `CuriousLearner.step`.
 
     Args:
-        agent: changed in place, as is what it writes its outcome to.
+        agent: changed in place, as is the outcome that it points to.
         frozen: the frozen modules.
         feature: learns from the block where it is novel.
-        shown: the block as it came.
+        shown: the block.
         x: the same, expanded.
-        t: frame at which it begins.
+        t: its first frame.
         uniforms: (3,) draws from [0, 1): whether to explore, which action, which stream.
 
     Returns:
         Outputs (n, J), NaN where the block is not novel; those of the frozen modules (M, n, J),
         their slowness (M, J) and clustering error (M,).
     """
-    n, J = _block(agent, frozen, shown, x)
-    _fits(feature, agent, x)
-    y, told = np.empty((n, J)), _told(agent, frozen)
-    into = [_buffer("double[]", array) for array in (y, *told)]
-    draws = readable("uniforms", uniforms, (3,))
+    _expect_block(agent, frozen, shown, x)
+    _expect_feature(agent, feature, x)
+    y = np.empty((agent.pointer.tau, agent.pointer.outputs))
+    results = (y, *_frozen_results(agent, frozen))
     code = lib.iterate(
-        agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer, t, draws, *into
+        *(agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer),
+        *(t, readable("uniforms", uniforms, (3,)), *(_buffer("double[]", r) for r in results)),
     )
     check(code, "the learner")
-    return y, *told
+    return results
 
 
 def recognise(
     agent: Struct, frozen: Struct, shown: Struct, x: Struct
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The first part of `iterate`: the agent's outcome says what knows the block."""
-    _block(agent, frozen, shown, x)
-    told = _told(agent, frozen)
-    into = [_buffer("double[]", array) for array in told]
+    """Compute the first part of `iterate`: the agent's outcome says what knows the block."""
+    _expect_block(agent, frozen, shown, x)
+    results = _frozen_results(agent, frozen)
+    into = (_buffer("double[]", array) for array in results)
     code = lib.recognise(agent.pointer, frozen.pointer, shown.pointer, x.pointer, *into)
     check(code, "the learner")
-    return told
+    return results
 
 
 def think(agent: Struct, xi: Any, y: FloatArray, t: int, uniforms: FloatArray) -> None:
-    """The last part of it, after `recognise` and an update whose weight changes were xi (n,)."""
+    """Compute the last part, after `recognise` and an update with weight changes xi (n,)."""
     n, J = agent.pointer.tau, agent.pointer.outputs
     arrays = readable("xi", xi, (n,)), readable("y", y, (n, J))
     code = lib.think(agent.pointer, *arrays, t, readable("uniforms", uniforms, (3,)))
@@ -311,10 +302,10 @@ def iterations(
 ) -> int:
     """Iterate on streams that repeat until something is to be done; see `CuriousLearner.repeat`."""
     n, rows, streams = len(uniforms), shown.pointer.n, agent.pointer.streams
-    if x.pointer.n != rows or rows % streams or rows <= streams * agent.pointer.tau:
-        raise UsageError(f"{rows} frames shown and {x.pointer.n} expanded: give as many a stream")
-    _fits(feature, agent, x)
-    _fits(frozen, None, x)
+    enough = rows > streams * agent.pointer.tau
+    expect("frames", (x.pointer.n, rows % streams, enough), (rows, 0, True))
+    _expect_feature(agent, feature, x)
+    expect("frozen modules", frozen.pointer.inputs, x.pointer.size)
     draws, curves = readable("uniforms", uniforms, (n, 3)), kept.pointer if kept else ffi.NULL
     done: int = lib.iterations(
         *(agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer),
@@ -325,28 +316,24 @@ def iterations(
 
 
 def action_values(agent: Struct) -> FloatArray:
-    """Values of both actions in every stream under the agent's policy, (S, 2)."""
+    """Return the values of both actions in every stream under the agent's policy, (S, 2)."""
     Q = np.empty((agent.pointer.streams, 2))
     lib.action_values(agent.pointer, _buffer("double[]", Q))
     return Q
 
 
-def _block(agent: Struct, frozen: Struct, shown: Struct, x: Struct) -> tuple[int, int]:
-    n = agent.pointer.tau
-    if not n == shown.pointer.n == x.pointer.n:
-        raise UsageError(f"{x.pointer.n} frames after expansion of {shown.pointer.n}: give {n}")
-    _fits(frozen, None, x)
-    return n, agent.pointer.outputs
+def _expect_block(agent: Struct, frozen: Struct, shown: Struct, x: Struct) -> None:
+    tau = agent.pointer.tau
+    expect("frames", (shown.pointer.n, x.pointer.n), (tau, tau))
+    expect("frozen modules", frozen.pointer.inputs, x.pointer.size)
 
 
-def _fits(weights: Struct, agent: Struct | None, x: Struct) -> None:
-    if weights.pointer.inputs != x.pointer.size:
-        raise UsageError(f"frames of {x.pointer.size} values for {weights.pointer.inputs} inputs")
-    if agent is not None and weights.pointer.outputs != agent.pointer.outputs:
-        raise UsageError(f"{weights.pointer.outputs} outputs for {agent.pointer.outputs}")
+def _expect_feature(agent: Struct, feature: Struct, x: Struct) -> None:
+    sizes = feature.pointer.inputs, feature.pointer.outputs
+    expect("the abstraction", sizes, (x.pointer.size, agent.pointer.outputs))
 
 
-def _told(agent: Struct, frozen: Struct) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _frozen_results(agent: Struct, frozen: Struct) -> tuple[FloatArray, FloatArray, FloatArray]:
     M, n, J = frozen.pointer.modules, agent.pointer.tau, agent.pointer.outputs
     return np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
 

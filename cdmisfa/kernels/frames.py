@@ -11,13 +11,9 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import ByteArray, IntArray
 from cdmisfa.core.blocks import UINT8
 from cdmisfa.core.errors import UsageError
-from cdmisfa.kernels import INT64, Struct, pointer, readable
+from cdmisfa.kernels import INT64, Struct, pointer, readable, records
 
-
-def _buffer(kind: str, data: Any) -> Any:
-    return kernels.ffi.from_buffer(kind, data)
-
-
+# A message of a chunk: times in nanoseconds, and the place of its payload.
 MESSAGE = np.dtype(
     {
         "names": ["log_time", "publish_time", "at", "size", "sequence", "channel", "unused"],
@@ -25,10 +21,8 @@ MESSAGE = np.dtype(
     },
     align=True,
 )
-"""A message of a chunk: times in nanoseconds, and where its payload stands."""
-
+# Most messages of a chunk, and most other records, that are read.
 MOST_RECORDS = 1 << 20
-"""Most messages of a chunk, and most other records, that are looked at."""
 
 
 def walk_records(data: ByteArray) -> tuple[NDArray[np.void], IntArray, int, tuple[int, int]]:
@@ -45,13 +39,13 @@ def walk_records(data: ByteArray) -> tuple[NDArray[np.void], IntArray, int, tupl
     Raises:
         UsageError: there are more than `MOST_RECORDS` of a kind.
     """
-    found, records, null = kernels.ffi.new("walked *"), _buffer("uint8_t[]", data), kernels.ffi.NULL
-    kernels.lib.walk_records(records, len(data), null, null, found)
+    found, chunk = kernels.ffi.new("walked *"), kernels.ffi.from_buffer("uint8_t[]", data)
+    kernels.lib.walk_records(chunk, len(data), kernels.ffi.NULL, kernels.ffi.NULL, found)
     if max(found.messages, found.others) > MOST_RECORDS:
         raise UsageError(f"it holds more than {MOST_RECORDS} messages, the limit of a chunk")
     messages, spans = np.empty(found.messages, MESSAGE), np.empty((found.others, 2), np.int64)
-    rows = kernels.records("message", messages), _buffer("int64_t[]", spans)
-    kernels.lib.walk_records(records, len(data), *rows, found)
+    rows = records("message", messages), kernels.ffi.from_buffer("int64_t[]", spans)
+    kernels.lib.walk_records(chunk, len(data), *rows, found)
     return messages, spans, found.end, (found.earliest, found.latest)
 
 
@@ -67,9 +61,9 @@ def layout(least: int, places: Any, marks: Any, distances: Any, width: int) -> S
     """
     m, r = len(marks), len(distances)
     arrays = {
-        "distances": readable("distances", np.array(distances, np.int64), (r,), INT64),
-        "places": readable("places", np.array(places, np.int64), (m,), INT64),
-        "bytes": readable("marks", np.array(marks, np.uint8), (m,), UINT8),
+        "distances": readable("distances", distances, (r,), INT64),
+        "places": readable("places", places, (m,), INT64),
+        "bytes": readable("marks", marks, (m,), UINT8),
     }
     numbers = {"least": least, "values": r, "width": width, "marks": m}
     return Struct("layout", numbers, arrays)
@@ -100,6 +94,7 @@ def gather(
     held, (start, stop) = laid_out.pointer, rows
     shape = stop - start, held.values * held.width
     into = kernels.ffi.NULL if out is None else pointer("out", out, shape, UINT8)
-    chunk = _buffer("uint8_t[]", data), len(data), _buffer("message[]", messages), len(messages)
-    found = int(kernels.lib.gather(*chunk, channel, start, stop, held, into))
+    chunk = kernels.ffi.from_buffer("uint8_t[]", data), len(data)
+    wanted = kernels.ffi.from_buffer("message[]", messages), len(messages)
+    found = int(kernels.lib.gather(*chunk, *wanted, channel, start, stop, held, into))
     return None if found < 0 else found
