@@ -12,8 +12,8 @@ from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig
 from recorder.world.icub.config import EyesConfig, IcubConfig, SphereConfig
-from recorder.world.icub.matrices import eye_matrix, grey, perspective
-from recorder.world.icub.world import Motions
+from recorder.world.icub.eyes import eye_matrix, grey, perspective
+from recorder.world.icub.motions import Motions
 from recorder.world.scenes import SCENES, open_scene
 
 pytest.importorskip("pybullet")
@@ -127,10 +127,10 @@ def test_a_scene_of_another_size(seen):
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
-        ({"robot": "iCubNowhere"}, r"scene\.robot is iCubNowhere: icub-models has .*V2_5"),
-        ({"robot": "left_hand_mk3"}, r"left_hand_mk3 has no neck"),
+        ({"robot": "iCubNowhere"}, r"scene\.robot is iCubNowhere, .* icub-models has .*V2_5"),
+        ({"robot": "left_hand_mk3"}, r"left_hand_mk3, which cannot be built"),
         ({"eyes": {"yaw": [80, 0, -45]}}, r"scene\.eyes\.yaw has 80.*-50 to 50"),
-        ({"eyes": {"views": ["../a", "b", "c"]}}, r"scene\.eyes\.views has '\.\./a'"),
+        ({"eyes": {"views": ["../a", "b", "c"]}}, r"scene\.eyes\.views is '\.\./a'"),
         ({"eyes.titl": 3}, r"scene\.eyes\.titl: did you mean scene\.eyes\.tilt"),
     ],
 )

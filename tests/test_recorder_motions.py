@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cdmisfa.core.errors import UsageError
 from recorder.world.icub.config import BoxConfig, IcubConfig, SphereConfig
-from recorder.world.icub.world import CHUNK, Motions, reflect
+from recorder.world.icub.motions import CHUNK, Motions, reflect
 
 SCENE = IcubConfig()
 WHOLE = Motions(SCENE, 3).positions(0, 2 * CHUNK + 100)
@@ -73,5 +73,5 @@ def test_a_walk_turns_round_at_its_limits():
 
 
 def test_limits_the_wrong_way_round_are_named():
-    with pytest.raises(UsageError, match=r"scene\.object3\.y.*lower limit first"):
+    with pytest.raises(UsageError, match=r"scene\.object3\.y.*the smaller first"):
         SphereConfig(y=(0.2, 0.1))

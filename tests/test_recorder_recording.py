@@ -309,7 +309,7 @@ def test_a_killed_rendering_process_ends_the_recording_with_one_line(recorder, t
     _, complaint = process.communicate(timeout=10)
     assert process.returncode == 1
     (line,) = complaint.strip().splitlines()
-    assert line.startswith("cdmisfa: a rendering process ended: go on with --resume")
+    assert line.startswith("cdmisfa: a rendering process ended: continue with --resume")
     assert not any(alive(pid) for pid in workers)
     for view in STREAMS:
         assert whole_frames(tmp_path / "a" / f"{view}.mcap.partial", view) > 0
@@ -360,11 +360,6 @@ def test_a_source_that_was_opened_by_name_is_recorded_as_by_name(name: str, tmp_
     with open_scene(name, config, clock) as source:
         record(source, tmp_path / "source", frames=20)
     assert contents(tmp_path / "name") == contents(tmp_path / "source")
-
-
-def test_a_scene_takes_its_own_configuration(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="oscillatory takes OscillatoryConfig, not IcubConfig"):
-        record_scene("oscillatory", tmp_path / "rec", IcubConfig())
 
 
 def test_a_recording_stores_what_its_unfinished_views_shall_be(tmp_path: Path) -> None:

@@ -45,8 +45,6 @@ def test_turns_cost_what_lies_between_two_views_and_most_with_one_that_roams():
     for broken in (1e-320, "x", float("nan"), float("inf"), -1.0):
         assert not np.any(turns_of({**stated, "transit": broken}, [0, 1]))
     assert turn_frames(1e300, 1.0) == 360
-    with pytest.raises(UsageError, match=r"scene\.transit is 0\.01"):
-        IcubConfig(transit=0.01)
 
 
 def test_a_roaming_head_dwells_on_views_and_turns_between_them_the_same_at_every_cut():
@@ -156,5 +154,5 @@ def test_a_roaming_view_shows_what_the_others_do_while_it_dwells_there():
         assert there.any()
         np.testing.assert_array_equal(block.frames[there], roam.frames[there])
     assert ((yaw > -30) & (yaw < 30)).any()
-    with pytest.raises(UsageError, match="rename it"):
+    with pytest.raises(UsageError, match="name each view once"):
         dataclasses.replace(roaming, eyes=EyesConfig(views=("roam",), yaw=(0.0,)))

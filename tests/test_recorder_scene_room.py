@@ -15,14 +15,13 @@ from cdmisfa.experiments.sources import configure
 from recorder.config import RecordConfig
 from recorder.world.icub.config import EyesConfig, IcubConfig
 from recorder.world.icub.lens import SAMPLES, Lens, light
-from recorder.world.icub.meshes import ball_mesh, box_mesh, can_mesh
+from recorder.world.icub.room import ball_mesh, box_mesh, can_mesh
 from recorder.world.icub.textures import SIDE, TEXTURES, texture
 
 pytest.importorskip("pybullet")
 
-from recorder.world.icub.physics import PhysicalMotions
+from recorder.world.icub.motions import Motions, PhysicalMotions
 from recorder.world.icub.source import HEIGHTS, TRUTH, IcubSource
-from recorder.world.icub.world import Motions
 
 REAL = build(IcubConfig, "scene", load_preset("icub-real")["scene"], {"seed": 1})
 SMALL = IcubConfig(

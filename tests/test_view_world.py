@@ -18,8 +18,8 @@ from cdmisfa.core.signals import STATES
 from recorder.log.scenery import scenery_of, turned
 from recorder.mcap.reader import LogReader
 from recorder.world.icub.config import IcubConfig
+from recorder.world.icub.eyes import eye_matrix
 from recorder.world.icub.head import NECK
-from recorder.world.icub.matrices import eye_matrix
 from recorder.world.icub.source import TRUTH
 from replay.following import OutputHistory, read_outputs
 from replay.palette import colour, packed

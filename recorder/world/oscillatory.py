@@ -20,7 +20,7 @@ PERIOD = 500
 
 
 def x1(theta: FloatArray) -> FloatArray:
-    """Stream 1, (n, 2), at phases theta, (n,); its slow feature has frequency 4/500.
+    """Return stream 1, (n, 2), at phases theta, (n,); its slow feature has frequency 4/500.
 
     Equation: 7
     """
@@ -29,7 +29,7 @@ def x1(theta: FloatArray) -> FloatArray:
 
 
 def x2(theta: FloatArray) -> FloatArray:
-    """Stream 2, (n, 2), at phases theta, (n,); its slow feature has frequency 3/500.
+    """Return stream 2, (n, 2), at phases theta, (n,); its slow feature has frequency 3/500.
 
     Equation: 8
     """
@@ -38,7 +38,7 @@ def x2(theta: FloatArray) -> FloatArray:
 
 
 def x3(theta: FloatArray) -> FloatArray:
-    """Stream 3, (n, 2), at phases theta, (n,); its slow feature has frequency 2/500.
+    """Return stream 3, (n, 2), at phases theta, (n,); its slow feature has frequency 2/500.
 
     Equation: 9
     """
@@ -47,7 +47,7 @@ def x3(theta: FloatArray) -> FloatArray:
 
 
 def zero(theta: FloatArray) -> FloatArray:
-    """The stream that shows nothing, (n, 2), of the non-stationary environment."""
+    """Return the zero stream, (n, 2), of the non-stationary environment."""
     return np.zeros((len(theta), 2))
 
 
@@ -60,7 +60,7 @@ STREAMS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def one_period(name: str) -> FloatArray:
-    """All PERIOD frames of a stream, (500, 2).
+    """Return all PERIOD frames of a stream, (500, 2).
 
     Taking frames from this table makes a block's bits independent of how it is cut.
 
@@ -99,7 +99,7 @@ class OscillatorySource(ClockedSource):
         length: frames after which the streams end; by default they do not.
 
     Raises:
-        UsageError: no streams, or one that does not exist.
+        UsageError: a stream does not exist.
 
     Example:
         >>> source = OscillatorySource()
@@ -115,19 +115,17 @@ class OscillatorySource(ClockedSource):
         start_ns: int = START_NS,
         length: int | None = None,
     ) -> None:
-        if not streams:
-            raise UsageError("a source has at least one stream: name some of " + ", ".join(STREAMS))
         self._shown = list(streams)
         self._tables = [one_period(name) for name in streams]
         self._spec = SourceSpec(tuple(streams), (2,), "float64", ("theta",), fps, start_ns, length)
 
     def replace(self, stream: int, name: str) -> None:
-        """From the next block on, show another signal on a stream (the abrupt swap)."""
+        """Show another signal on a stream, from the next block on (the abrupt swap)."""
         self._tables[stream] = one_period(name)
         self._shown[stream] = name
 
     def take(self, stream: int, n: int) -> Block:
-        """The next n frames of a stream; see `FrameSource.take`."""
+        """Return the next n frames of a stream; see `FrameSource.take`."""
         check_request(self._spec, stream, n)
         length = self._spec.length
         if length is not None and self._t + n > length:
@@ -141,5 +139,5 @@ class OscillatorySource(ClockedSource):
         return block
 
     def describe(self) -> Mapping[str, Any]:
-        """The streams shown now."""
+        """Return the streams shown now."""
         return {"kind": "oscillatory", "streams": list(self._shown)}

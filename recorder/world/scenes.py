@@ -1,8 +1,7 @@
-"""The scenes, opened by name, and the blocks that they show, in order of time."""
+"""Open scenes by name, and render the blocks of their frames in order of time."""
 
 from __future__ import annotations
 
-import contextlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, MutableMapping
 from dataclasses import dataclass, replace
@@ -23,9 +22,9 @@ if TYPE_CHECKING:
 
 
 Opener = Callable[[Any, RecordConfig], SeekableSource]
-"""Makes a scene's source from its configuration and the clock of the frames.
+"""Opens a scene's source by its configuration and the clock of the frames.
 
-Only a function that can be imported can also open it in other processes.
+Worker processes import the function: it must not be local.
 """
 
 
@@ -33,21 +32,21 @@ Request = tuple[int, int, int]
 """Stream, first frame and number of frames of a block."""
 
 BLOCK = 64
-"""Frames rendered at a time; divides `world.CHUNK`, so no block needs two chunks."""
+"""Frames rendered at a time; divides `motions.CHUNK`, so no block needs two chunks."""
 
 _AHEAD = 3
-"""Blocks a process may be ahead of the writer."""
+"""Blocks that each process may render ahead of the writer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A simulated world: everything that the rest knows of it.
+    """A simulated world.
 
     Attributes:
-        config: what it can be told (keys `scene.*`).
-        open: makes its source.
-        preset: its configuration where none is chosen: name of a preset, or a .toml file.
-        packages: whose versions its frames depend on.
+        config: class of its configuration (keys `scene.*`).
+        open: opens its source.
+        preset: name of its default preset, or a .toml file.
+        packages: packages on whose versions its frames depend.
     """
 
     config: type[SceneConfig]
@@ -72,7 +71,7 @@ SCENES: Registry[Scene] = Registry(
 
 @dataclass(frozen=True, slots=True)
 class OpenScene:
-    """What a scene's source was opened from.
+    """The arguments with which a scene's source was opened.
 
     Attributes:
         name: of the scene.
@@ -85,15 +84,15 @@ class OpenScene:
     record: RecordConfig
 
     def table(self) -> dict[str, Any]:
-        """The scene's configuration as recordings state it.
+        """Return the scene's configuration as recordings state it.
 
-        Those of the first two scenes state the keys of both, so that they stay the same bytes.
+        Recordings of the first two scenes state the keys of both, to keep their bytes.
         """
         first = (IcubConfig, OscillatoryConfig)
-        tables = [section_table(config()) for config in first] if type(self.config) in first else []
-        return {
-            key: v for table in (*tables, section_table(self.config)) for key, v in table.items()
-        }
+        table: dict[str, Any] = {}
+        for config in first if type(self.config) in first else ():
+            table |= section_table(config())
+        return table | section_table(self.config)
 
 
 _OPEN: MutableMapping[FrameSource, OpenScene] = WeakKeyDictionary()
@@ -102,7 +101,7 @@ _OPEN: MutableMapping[FrameSource, OpenScene] = WeakKeyDictionary()
 def open_scene(
     name: str, config: SceneConfig | None = None, record: RecordConfig | None = None
 ) -> SeekableSource:
-    """A live source of a scene's streams.
+    """Open a live source of a scene's streams.
 
     Args:
         name: one of `SCENES`.
@@ -110,30 +109,26 @@ def open_scene(
         record: the clock of the frames.
 
     Raises:
-        UsageError: no such scene, the configuration of another, or one that cannot be built.
+        UsageError: no such scene, or one that cannot be built.
         CdmisfaError: the scene needs a simulator that is not installed.
     """
-    kind = SCENES[name].config
-    config = config if config is not None else kind()
-    if not isinstance(config, kind):
-        raise UsageError(f"the scene {name} takes {kind.__name__}, not {type(config).__name__}")
+    config = config or SCENES[name].config()
     scene = OpenScene(name, replace(config, seed=config.seed or 0), record or RecordConfig())
     source = SCENES[name].open(scene.config, scene.record)
-    with contextlib.suppress(TypeError):  # a class without weak references
-        _OPEN[source] = scene
+    _OPEN[source] = scene
     return source
 
 
 def scene_of(source: FrameSource) -> OpenScene | None:
-    """What `open_scene` opened a source from; None for any other source."""
+    """Return what `open_scene` opened a source from; None for any other source."""
     try:
         return _OPEN.get(source)
-    except TypeError:
+    except TypeError:  # a class without weak references
         return None
 
 
 def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
-    """All blocks still missing: by time, then by stream, so that no view gets far ahead.
+    """Yield all missing blocks, by time and then by stream, so that no view gets far ahead.
 
     Args:
         starts: the first missing frame of each stream.
@@ -150,7 +145,7 @@ def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
 def take_here(
     source: FrameSource, starts: dict[int, int], frames: int
 ) -> Generator[Block, None, None]:
-    """The missing blocks of some streams, one after the other, from one source.
+    """Yield the missing blocks of streams, one after the other, from one source.
 
     Args:
         source: can go back, or has not yet come to any of the missing frames.
@@ -170,7 +165,7 @@ def take_here(
         return
     if source.t > first:
         raise UsageError(
-            f"the source is at frame {source.t} and cannot go back to {first}: open it anew"
+            f"the source is at frame {source.t} and cannot go back to {first}: open it again"
         )
     step = max(1, min(BLOCK, int(source.spec.fps / 2)))  # so that files grow every second
     while source.t < frames:
@@ -185,7 +180,7 @@ def take_here(
 def render_in_processes(
     scene: OpenScene, starts: dict[int, int], frames: int, jobs: int
 ) -> Generator[Block, None, None]:
-    """The blocks of `take_here` in the same order, by `jobs` processes with a world each.
+    """Yield the blocks of `take_here` in the same order, by `jobs` processes with a world each.
 
     Raises:
         CdmisfaError: a process died, or could not open the scene.
@@ -204,24 +199,24 @@ def render_in_processes(
                 yield from pending.popleft().result()
     except WorkersError as error:
         raise CdmisfaError(
-            "a rendering process ended: go on with --resume; if it ends again, with --jobs 1 to "
-            "see why, or with more memory"
+            "a rendering process ended: continue with --resume; if it ends again, use --jobs 1 to "
+            "see why, or more memory"
         ) from error
 
 
 @cache
 def _source(opener: Opener, config: SceneConfig, record: RecordConfig) -> SeekableSource:
-    """The world of a rendering process, opened once."""
+    """Open the world of a rendering process, once."""
     return opener(config, record)
 
 
 def _render(opened: tuple[Opener, SceneConfig, RecordConfig], request: Request) -> list[Block]:
-    """Render a block; what a rendering process is asked for."""
+    """Render a block in a rendering process."""
     return list(_take(_source(*opened), request))
 
 
 def _take(source: SeekableSource, request: Request) -> Iterator[Block]:
-    """What a stream shows of a block's frames: all, or each stretch between its gaps."""
+    """Yield a block's frames: all of them, or each stretch between gaps."""
     stream, first, n = request
     for low, high in source.spans(stream, first, first + n):
         source.seek(low)

@@ -1,4 +1,4 @@
-"""What the iCub scene can be told (keys `scene.*`).
+"""Configuration of the iCub scene (keys `scene.*`).
 
 Lengths are metres and angles degrees. Positions of objects are in the paper's
 coordinates: x to the robot's back, y to its left.
@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 from cdmisfa.core.config import Section, key
 from cdmisfa.core.errors import UsageError
 from recorder.config import SceneConfig, check_view_names
-from recorder.world.icub.head import ROAM, SLOWEST_TURN
+from recorder.world.icub.head import ROAM
 
 Range = tuple[float, float]
 
@@ -63,9 +63,9 @@ class EyesConfig(Section):
         forward: of the eyes before the joint (m).
         up: of the eyes above it (m).
         half_distance: of the eyes from their middle (m).
-        near: what is nearer is not seen (m).
-        far: what is farther is not seen (m).
-        light: the direction that it comes from.
+        near: distance from which on bodies are drawn (m).
+        far: distance up to which bodies are drawn (m).
+        light: direction to the light, not zero.
         pitch: of the neck (degrees).
     """
 
@@ -92,8 +92,6 @@ class EyesConfig(Section):
                 "scene.eyes.views: give one for each"
             )
         check_view_names(self.views, "scene.eyes.views")
-        if not any(self.light):
-            raise UsageError("scene.eyes.light is zero: it must be a direction")
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,8 +171,8 @@ class IcubConfig(SceneConfig):
         noise: of the sensor at middle grey, standard deviation in grey levels.
         color: a frame shows red, green and blue beside one another.
         physics: objects slide and roll after where they are to be, instead of being put there.
-        transit: degrees that the head turns in a frame: who looks at another view loses the frames
-            of the turn. 0 where it jumps.
+        transit: degrees that the head turns in a frame: a change of view loses the frames of the
+            turn. Below 0.1 the head jumps.
         roam: another view, `roam`, is of a head that looks at one of the others for a while, then
             turns to the next.
         drift: share by which the light goes up and down, over minutes.
@@ -204,16 +202,11 @@ class IcubConfig(SceneConfig):
 
     def __post_init__(self) -> None:
         SceneConfig.__post_init__(self)
-        if 0 < self.transit < SLOWEST_TURN:
-            raise UsageError(
-                f"scene.transit is {self.transit}: 0, or {SLOWEST_TURN} degrees a frame or more"
-            )
-        if self.roam and ROAM in self.eyes.views:
-            raise UsageError(f"scene.eyes.views has a {ROAM}, as scene.roam would: rename it")
+        check_view_names(self.views, "scene.eyes.views")  # with `roam`
 
     @property
     def plain(self) -> bool:
-        """Whether objects over one endless table are all that there is to be drawn."""
+        """Whether the scene has nothing but objects over one endless table."""
         return all(
             getattr(self, f.name) == f.default
             for f in fields(self)

@@ -1,24 +1,134 @@
-"""What the robot's two eyes see of the plain scene.
+"""Cameras as matrices, column by column as OpenGL has them, and the eyes in the plain scene.
 
-Only the watched view is rendered. The table never changes, so each eye draws it once; a frame
-draws only the objects and puts them in front of that picture by depth: six times as fast.
+Only the attended view is rendered. The table never changes, so each eye draws it once; a frame
+draws only the objects and puts them in front of that image by depth: six times as fast.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.world.icub.config import EyesConfig
-from recorder.world.icub.matrices import Matrix, eye_matrix, grey, perspective
+from recorder.world.icub.head import bent
 from recorder.world.icub.world import World
+
+LUMA = (299, 587, 114)
+"""Thousandths of red, green and blue in grey (ITU-R BT.601); whole numbers round exactly."""
+
+Matrix = tuple[float, ...]
+
+
+def eye_matrix(eyes: EyesConfig, neck: FloatArray, yaw: float, side: int) -> Matrix:
+    """View matrix of an eye, column by column as OpenGL has it.
+
+    Args:
+        eyes: the head's measures.
+        neck: (3,) origin of the neck yaw joint, root frame (x back, y right, z up), where it is
+            with the neck bent.
+        yaw: of the head, degrees to the left.
+        side: +1 the left eye, -1 the right one.
+    """
+    turn, tilt = math.radians(yaw), math.radians(eyes.tilt)
+    forward = bent((-math.cos(turn), -math.sin(turn), 0.0), eyes.pitch)
+    left = bent((math.sin(turn), -math.cos(turn), 0.0), eyes.pitch)
+    up = bent((0.0, 0.0, 1.0), eyes.pitch)
+    place = neck + eyes.forward * forward + side * eyes.half_distance * left + eyes.up * up
+    gaze = math.cos(tilt) * forward + math.sin(tilt) * up
+    return look(place, place + gaze)
+
+
+def look(place: FloatArray, target: FloatArray) -> Matrix:
+    """View matrix of an upright camera at `place` that looks at `target`."""
+    gaze = (target - place) / np.linalg.norm(target - place)
+    right = np.cross(gaze, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, gaze)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, up, -gaze])
+    matrix[:3, 3] = -matrix[:3, :3] @ place
+    return tuple(matrix.T.ravel().tolist())
+
+
+def perspective(vertical_fov: float, aspect: float, near: float, far: float) -> Matrix:
+    """Projection matrix of a camera, column by column; degrees and metres."""
+    scale = 1.0 / math.tan(math.radians(vertical_fov) / 2)
+    depth = near - far
+    columns = (
+        (scale / aspect, 0.0, 0.0, 0.0),
+        (0.0, scale, 0.0, 0.0),
+        (0.0, 0.0, (near + far) / depth, -1.0),
+        (0.0, 0.0, 2 * near * far / depth, 0.0),
+    )
+    return tuple(value for column in columns for value in column)
+
+
+def grey(colours: ByteArray) -> ByteArray:
+    """Colours, (..., 3 or 4), as grey, (...): BT.601, rounded."""
+    red, green, blue = (colours[..., i].astype(np.uint32) for i in range(3))
+    mixed = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+    return ((mixed + 500) // 1000).astype(np.uint8)
+
+
+def from_afar(half: float) -> Matrix:
+    """Projection matrix of a camera `AFAR` metres away that sees so many metres to each side.
+
+    The renderer knows no camera without perspective.
+    """
+    scale = AFAR / half
+    near, far = AFAR - 5.0, AFAR + 5.0
+    return (
+        *(scale, 0.0, 0.0, 0.0),
+        *(0.0, scale, 0.0, 0.0),
+        *(0.0, 0.0, (near + far) / (near - far), -1.0),
+        *(0.0, 0.0, 2 * near * far / (near - far), 0.0),
+    )
+
+
+AFAR = 100.0
+"""Metres from which light is as good as parallel."""
+
+
+def seen_from(view: Matrix, places: FloatArray) -> FloatArray:
+    """(3, ...) places, root frame, in a camera's frame: to its right, up, and behind it.
+
+    Element by element, so that the sums are the same on every processor.
+    """
+    x, y, z = places
+    return np.stack(
+        [view[i] * x + view[4 + i] * y + view[8 + i] * z + view[12 + i] for i in range(3)]
+    )
+
+
+def rays(
+    view: Matrix, projection: Matrix, height: int, width: int
+) -> tuple[FloatArray, FloatArray]:
+    """The place of a camera, (3, 1, 1), and what its pixels look at, root frame.
+
+    Returns:
+        That place, and for each pixel, (3, height, width), what is to be added for a metre's depth.
+    """
+    across = ((np.arange(width) + 0.5) / width * 2 - 1) / projection[0]
+    up = (1 - (np.arange(height) + 0.5) / height * 2) / projection[5]
+    x, y = np.broadcast_arrays(across[None, :], up[:, None])
+    turn = [view[4 * k : 4 * k + 3] for k in range(3)]
+    a, b, c = view[12:15]
+    place = np.array([-(r * a + u * b + back * c) for r, u, back in turn])
+    return place[:, None, None], np.stack([r * x + u * y - back for r, u, back in turn])
+
+
+def metres(depth: NDArray[Any], projection: Matrix) -> FloatArray:
+    """Depth of a picture, 0 to 1, as metres in front of a camera."""
+    return projection[14] / (2 * np.asarray(depth, np.float64) - 1 + projection[10])
 
 
 class Eyes:
-    """Renders what both eyes see in each view, side by side.
+    """Renders the images of both eyes in each view, side by side.
 
     Hides the world's table for good, since it is already in every eye's background.
 
@@ -35,42 +145,35 @@ class Eyes:
         self.shape = eyes.height, 2 * eyes.width
         aspect = eyes.width / eyes.height
         self._projection = perspective(eyes.vertical_fov, aspect, eyes.near, eyes.far)
-        self._matrices = [
-            [eye_matrix(eyes, world.neck, yaw, side) for side in (1, -1)] for yaw in eyes.yaw
-        ]
-        self._tables = [[self._draw_table(m) for m in view] for view in self._matrices]
+        self._views = []
+        for yaw in eyes.yaw:
+            matrices = [eye_matrix(eyes, world.neck, yaw, side) for side in (1, -1)]
+            drawn = map(self._draw, matrices)
+            tables = [(grey(colours), depth.copy()) for colours, depth in drawn]
+            self._views.append((matrices, tables))
         world.hide_table()
 
     def look(self, view: int, t: int, positions: FloatArray, yaw: Sequence[float]) -> ByteArray:
-        """What a view shows from frame t on, (n, height, width of both eyes).
+        """Render a view from frame t on, (n, height, width of both eyes).
 
         Args:
             view: number of the view.
-            t: no matter here: only where the objects are makes a difference.
+            t: not used: a plain scene depends on the places of objects only.
             positions: (n, objects, ...) of the objects, see `World.place`.
-            yaw: of the head at each frame, degrees; in a plain scene a view has one.
+            yaw: not used: in a plain scene the head never turns within a view.
         """
         del t, yaw
         frames = np.empty((len(positions), *self.shape), np.uint8)
+        width = self._eyes.width
         for frame, places in zip(frames, positions, strict=True):
             self._world.place(places)
-            self._see(view, frame)
+            for eye, (matrix, table) in enumerate(zip(*self._views[view], strict=True)):
+                colours, depth = self._draw(matrix)
+                half = frame[:, eye * width : (eye + 1) * width]
+                half[...] = table[0]
+                nearer = np.nonzero(depth < table[1])
+                half[nearer] = grey(colours[nearer])
         return frames
-
-    def _see(self, view: int, out: ByteArray) -> None:
-        width = self._eyes.width
-        for eye, matrix in enumerate(self._matrices[view]):
-            colours, depth = self._draw(matrix)
-            table, table_depth = self._tables[view][eye]
-            half = out[:, eye * width : (eye + 1) * width]
-            half[...] = table
-            seen = np.nonzero(depth < table_depth)
-            half[seen] = grey(colours[seen])
-
-    def _draw_table(self, matrix: Matrix) -> tuple[ByteArray, NDArray[np.float32]]:
-        """The grey picture and the depth of the table, to be drawn over."""
-        colours, depth = self._draw(matrix)
-        return grey(colours), depth.copy()
 
     def _draw(self, matrix: Matrix) -> tuple[ByteArray, NDArray[np.float32]]:
         eyes = self._eyes

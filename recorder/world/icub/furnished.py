@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.world.icub.config import IcubConfig
+from recorder.world.icub.eyes import Matrix, eye_matrix, grey, metres, perspective, rays
 from recorder.world.icub.lens import SAMPLES, Lens
-from recorder.world.icub.matrices import Matrix, eye_matrix, grey, metres, perspective, rays
 from recorder.world.icub.room import room_of
 from recorder.world.icub.shadows import LAMP, TEXEL, ObjectShadow, RoomShadows
 from recorder.world.icub.world import World

@@ -1,18 +1,130 @@
-"""What stands in the furnished room, by `room.toml`, and how the objects on the table look."""
+"""The furnished room by `room.toml`, the looks of the objects on the table, and their meshes.
+
+Meshes have few triangles, and textures in their true size: Bullet's own shapes show a quarter.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import resources
 from typing import Any
 
+import numpy as np
+
 from cdmisfa.core.arrays import ByteArray
 from recorder.world.icub.config import TABLE_FROM, TABLE_TO, IcubConfig
-from recorder.world.icub.meshes import PERIOD, Mesh, ball_mesh, box_mesh, can_mesh
 from recorder.world.icub.textures import texture
+
+PERIOD = 1.6
+"""Metres after which the texture of a box repeats."""
+
+AROUND = 16
+"""Corners of a circle."""
+
+_STEPS = np.array(
+    sorted(itertools.product(range(-3, 4), repeat=3), key=lambda steps: sum(map(abs, steps))),
+    np.float32,
+)
+"""Steps of a last digit to try in x, y and z, the smallest first."""
+
+
+@dataclass(slots=True)
+class Mesh:
+    """What Bullet takes of a mesh: triangles by their corners, each with normal and texture."""
+
+    vertices: list[list[float]] = field(default_factory=list)
+    normals: list[list[float]] = field(default_factory=list)
+    uvs: list[list[float]] = field(default_factory=list)
+    indices: list[int] = field(default_factory=list)
+
+    def arguments(self) -> dict[str, Any]:
+        """For `createVisualShape`."""
+        return asdict(self)
+
+
+def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) -> Mesh:
+    """A box around the origin, fibres of its texture along an axis.
+
+    Args:
+        half: of its three sides, metres.
+        along: "x", "y" or "z".
+        period: metres of a texture; 0 shows a whole one on each side.
+    """
+    mesh, fibres = Mesh(), "xyz".index(along)
+    for axis in range(3):
+        others = [i for i in range(3) if i != axis]
+        u, v = sorted(others, key=lambda i: i == fibres)
+        for side in (-1, 1):
+            first = len(mesh.vertices)
+            for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+                corner, normal = [0.0] * 3, [0.0] * 3
+                corner[axis], corner[u], corner[v] = side * half[axis], a * half[u], b * half[v]
+                normal[axis] = float(side)
+                mesh.vertices.append(corner)
+                mesh.normals.append(normal)
+                size = (period / 2 / half[u], period / 2 / half[v]) if period else (1, 1)
+                mesh.uvs.append([(a + 1) / 2 / size[0], (b + 1) / 2 / size[1]])
+            # Seen from outside, corners go round against the clock.
+            straight = side * (1 if (v - u) % 3 == 1 else -1) > 0
+            turns = (0, 1, 2, 0, 2, 3) if straight else (0, 2, 1, 0, 3, 2)
+            mesh.indices += [first + i for i in turns]
+    return mesh
+
+
+def round_mesh(rings: Sequence[tuple[float, float, float, float, float]]) -> Mesh:
+    """A body of revolution about z, from the bottom up, its texture once around.
+
+    Args:
+        rings: radius, height, the normal's parts outward and upward, and the place in the texture.
+    """
+    mesh = Mesh()
+    for i, (radius, height, out, up, v) in enumerate(rings):
+        for j in range(AROUND + 1):
+            turn = 2 * math.pi * (j % AROUND) / AROUND
+            c, s = round(math.cos(turn), 9), round(math.sin(turn), 9)
+            mesh.vertices.append([radius * c, radius * s, height])
+            mesh.normals.append(steady((out * c, out * s, up)))
+            mesh.uvs.append([j / AROUND, v])
+            if i and j:
+                a = i * (AROUND + 1) + j
+                b = a - AROUND - 1
+                mesh.indices += [b - 1, b, a, b - 1, a, a - 1]
+    return mesh
+
+
+def steady(normal: Sequence[float]) -> list[float]:
+    """The normal of float32 near a unit normal that stays as it is when it is normalised again.
+
+    Bullet's renderer does so in place each time that it draws a corner. Others go to and fro by a
+    last digit, and what is seen then depends on how often it was drawn before.
+    """
+    near = np.asarray(normal, np.float32)
+    for steps in _STEPS:
+        found = near + np.spacing(near) * steps * (near != 0)
+        x, y, z = found * found
+        if x + y + z == x + z + y == y + z + x == 1:
+            return [float(part) for part in found]
+    raise ValueError(f"{normal} is no unit normal")
+
+
+def can_mesh(radius: float, height: float) -> Mesh:
+    """A can: its side, and its lid; the bottom is never seen."""
+    half = height / 2
+    side = [(radius, -half, 1.0, 0.0, 0.0), (radius, half, 1.0, 0.0, 0.9)]
+    return round_mesh([*side, (radius, half, 0.0, 1.0, 0.95), (0.0, half, 0.0, 1.0, 1.0)])
+
+
+def ball_mesh(radius: float) -> Mesh:
+    """A ball of eight rings."""
+    turns = [math.pi * (i / 8 - 0.5) for i in range(9)]
+    sides = [(round(math.cos(turn), 9), round(math.sin(turn), 9)) for turn in turns]
+    return round_mesh([(radius * c, radius * s, c, s, i / 8) for i, (c, s) in enumerate(sides)])
+
 
 Place = tuple[float, float, float]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
-from recorder.world.icub.matrices import AFAR, Matrix, from_afar, look, metres, seen_from
+from recorder.world.icub.eyes import AFAR, Matrix, from_afar, look, metres, seen_from
 from recorder.world.icub.room import Room
 from recorder.world.icub.world import World
 

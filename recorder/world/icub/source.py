@@ -15,8 +15,8 @@ from recorder.world.icub.eyes import Eyes
 from recorder.world.icub.furnished import FurnishedEyes
 from recorder.world.icub.head import YAW, Roaming, quaternion, turns
 from recorder.world.icub.lens import light
-from recorder.world.icub.physics import PhysicalMotions
-from recorder.world.icub.world import Motions, World
+from recorder.world.icub.motions import Motions, PhysicalMotions
+from recorder.world.icub.world import World
 
 TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
 """Columns of ground truth: the objects' positions in the paper's coordinates, metres."""

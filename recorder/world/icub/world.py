@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import itertools
 import math
 import os
 import sys
@@ -20,101 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
+from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.head import ARMS
 from recorder.world.icub.room import Piece, Room
-
-CHUNK = 4096
-"""Frames drawn at a time."""
-
-_WORLD = 0x1C0B
-"""Spawn key of the world: the learner may spawn its own generators from the same seed."""
-
-
-Motion = Iterator[FloatArray]
-"""Positions of one object, (CHUNK, 2), chunk after chunk."""
-
-
-def toggling_motion(config: BoxConfig, generator: np.random.Generator) -> Motion:
-    """X uniform and independent; y one of two places, changing every so many frames."""
-    for t in itertools.count(0, CHUNK):
-        x = _uniform(generator.random(CHUNK), config.x)
-        phase = (t + np.arange(CHUNK)) // config.toggle_every % 2
-        yield np.stack([x, np.asarray(config.y)[phase]], axis=1)
-
-
-def uniform_motion(config: CylinderConfig, generator: np.random.Generator) -> Motion:
-    """X and y uniform and independent of the frame before."""
-    while True:
-        units = generator.random((CHUNK, 2))
-        yield np.stack([_uniform(units[:, 0], config.x), _uniform(units[:, 1], config.y)], axis=1)
-
-
-def walking_motion(config: SphereConfig, generator: np.random.Generator) -> Motion:
-    """A Gaussian random walk, reflected at the borders; starts anywhere within them."""
-    borders = (config.x, config.y)
-    last = np.stack([_uniform(generator.random(1), limits) for limits in borders], axis=1)
-    for chunk in itertools.count():
-        steps = generator.standard_normal((CHUNK, 2)) * (config.step_x, config.step_y)
-        if chunk == 0:
-            steps[0] = 0.0
-        steps[0] += last[0]
-        free = np.cumsum(steps, axis=0)
-        path = np.stack([reflect(free[:, i], limits) for i, limits in enumerate(borders)], axis=1)
-        last = path[-1:]
-        yield path
-
-
-def reflect(values: FloatArray, limits: Range) -> FloatArray:
-    """A free walk, (n,), as one that turns round at the limits."""
-    low, high = limits
-    width = high - low
-    if width == 0:
-        return np.full_like(values, low)
-    return np.clip(low + width - np.abs((values - low) % (2 * width) - width), low, high)
-
-
-class Motions:
-    """Where all objects of a scene are at every frame, as a seed moves them."""
-
-    def __init__(self, scene: IcubConfig, seed: int) -> None:
-        self._scene, self._seed = scene, seed
-        self._restart()
-
-    def positions(self, start: int, n: int) -> FloatArray:
-        """(n, objects, 2) x and y at n frames from `start` on, the paper's coordinates, metres."""
-        parts = []
-        while n > 0:
-            chunk, first = divmod(start, CHUNK)
-            parts.append(self._draw(chunk)[first : first + n])
-            start, n = start + len(parts[-1]), n - len(parts[-1])
-        return np.concatenate(parts)
-
-    def _draw(self, chunk: int) -> FloatArray:
-        """The positions of a chunk: draws on when it lies ahead, from the start when behind."""
-        if chunk < self._chunk:
-            self._restart()
-        while self._chunk < chunk:
-            self._positions = np.stack([next(motion) for motion in self._motions], axis=1)
-            self._chunk += 1
-        return self._positions
-
-    def _restart(self) -> None:
-        seeds = [np.random.SeedSequence(self._seed, spawn_key=(_WORLD, i)) for i in range(3)]
-        box, cylinder, sphere = (np.random.Generator(np.random.PCG64(seed)) for seed in seeds)
-        self._motions = (
-            toggling_motion(self._scene.object1, box),
-            uniform_motion(self._scene.object2, cylinder),
-            walking_motion(self._scene.object3, sphere),
-        )
-        self._chunk = -1
-
-
-def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
-    return limits[0] + (limits[1] - limits[0]) * unit
-
 
 NECK_YAW, NECK_PITCH = b"neck_yaw", b"neck_pitch"
 """The joints that turn the head to the left, the last of the neck, and bend it upwards."""
@@ -127,11 +35,11 @@ class World:
     """Robot, table and objects in a PyBullet server of their own, without a window.
 
     Args:
-        scene: what stands where.
+        scene: the robot, the table and the objects.
 
     Raises:
         CdmisfaError: PyBullet or the robot models are not installed.
-        UsageError: no such robot, or a view the neck cannot turn to.
+        UsageError: no such robot, a robot without a neck, or a view the neck cannot turn to.
 
     Attributes:
         neck: (3,) origin of the neck yaw joint in the root frame, metres.
@@ -153,14 +61,17 @@ class World:
                 flags=bullet.ER_NO_SEGMENTATION_MASK,
             )
             try:
-                self._build(scene, _robot_file(models, scene.robot))
-            except BaseException as error:
+                self._build(scene, str(models.get_model_file(scene.robot)))
+            except (bullet.error, FileNotFoundError, KeyError) as error:
                 self.close()
-                if not isinstance(error, bullet.error):
-                    raise
-                raise CdmisfaError(
-                    f"PyBullet cannot build the scene: {error}; check scene.robot"
+                known = ", ".join(sorted(models.get_robot_names()))
+                raise UsageError(
+                    f"scene.robot is {scene.robot}, which cannot be built ({one_line(error)}): "
+                    f"choose one with a neck; icub-models has {known}"
                 ) from error
+            except BaseException:
+                self.close()
+                raise
 
     def place(self, positions: NDArray[np.float64]) -> None:
         """Put the objects at (objects, 2) positions, x and y in the paper's coordinates.
@@ -184,8 +95,8 @@ class World:
         """Put a furnished room's pieces and objects in place of the plain ones.
 
         Args:
-            room: what there is.
-            arms: the robot rests its arms on the table.
+            room: the pieces and objects.
+            arms: whether the robot rests its arms on the table.
         """
         for body in (self._table, *self._objects):
             self._bullet.removeBody(body)
@@ -193,11 +104,14 @@ class World:
             self._pieces = [self._piece(piece, folder) for piece in room.pieces]
             self._objects = [self._piece(piece, folder) for piece in room.objects]
         self._shown = range(len(room.objects))
-        if arms:
-            self._rest_arms()
+        bullet = self._bullet
+        for joint in range(bullet.getNumJoints(self._robot)) if arms else ():
+            angle = ARMS.get(bullet.getJointInfo(self._robot, joint)[1].decode()[2:])
+            if angle is not None:
+                bullet.resetJointState(self._robot, joint, math.radians(angle))
 
     def show_room(self, pieces: Collection[int], *, robot: bool) -> None:
-        """Show these of what stands still, and the robot or not; what is hidden takes no time."""
+        """Show these pieces of the room, and the robot or not; hidden bodies take no time."""
         for number, body in enumerate(self._pieces):
             self._show(body, -1, shown=number in pieces)
         for body, link in self._colours:
@@ -236,13 +150,6 @@ class World:
             bullet.changeVisualShape(body, -1, textureUniqueId=bullet.loadTexture(file))
         return body
 
-    def _rest_arms(self) -> None:
-        bullet = self._bullet
-        for joint in range(bullet.getNumJoints(self._robot)):
-            angle = ARMS.get(bullet.getJointInfo(self._robot, joint)[1].decode()[2:])
-            if angle is not None:
-                bullet.resetJointState(self._robot, joint, math.radians(angle))
-
     def render(
         self,
         view: tuple[float, ...],
@@ -252,7 +159,7 @@ class World:
         light: tuple[float, float, float],
         **lighting: float,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """What a camera sees: (height, width, 4) colours and (height, width) depth.
+        """Render a camera's image: (height, width, 4) colours and (height, width) depth.
 
         Raises:
             CdmisfaError: the simulator refuses.
@@ -284,8 +191,6 @@ class World:
         for link in (-1, *joints):
             bullet.changeVisualShape(self._robot, link, rgbaColor=(0, 0, 0, 0))
         found = {info[1]: info for info in (bullet.getJointInfo(self._robot, i) for i in joints)}
-        if not {NECK_YAW, NECK_PITCH} <= found.keys():
-            raise UsageError(f"scene.robot {scene.robot} has no neck: choose a whole robot")
         neck_joint, eyes = found[NECK_YAW][0], scene.eyes
         for key, angles in ((NECK_YAW, eyes.yaw), (NECK_PITCH, (eyes.pitch,))):
             low, high = (math.degrees(limit) for limit in found[key][8:10])
@@ -356,7 +261,7 @@ def _flush() -> None:
 
 
 def start_simulator() -> tuple[Any, Any]:
-    """A PyBullet server without a window, and the package of the robots' models."""
+    """Start a PyBullet server without a window; return it and the package of robot models."""
     try:
         import icub_models
         import pybullet
@@ -368,10 +273,3 @@ def start_simulator() -> tuple[Any, Any]:
             "recordings and the oscillatory scene work without it"
         ) from error
     return bullet_client.BulletClient(pybullet.DIRECT), icub_models
-
-
-def _robot_file(models: Any, name: str) -> str:
-    if name not in models.get_robot_names():
-        known = ", ".join(sorted(models.get_robot_names()))
-        raise UsageError(f"scene.robot is {name}: icub-models has {known}")
-    return str(models.get_model_file(name))

@@ -1,19 +1,107 @@
-"""Objects that slide and roll over the table, drawn by magnets that move as the paper says.
+"""Where the objects are: as the paper moves them, or as physics drags them behind that.
 
-The physics is a server of its own, stepped frame after frame from the first on; where the objects
-were is kept, so that going back costs nothing.
+Physics has a server of its own, stepped frame after frame from the first on. Positions are stored,
+so that going back costs nothing.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from cdmisfa.core.arrays import FloatArray
-from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.world import Motions, silenced, start_simulator
+from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
+from recorder.world.icub.world import silenced, start_simulator
+
+CHUNK = 4096
+"""Frames drawn at a time."""
+
+_WORLD = 0x1C0B
+"""Spawn key of the world: the learner may spawn its own generators from the same seed."""
+
+
+def toggling_motion(config: BoxConfig, generator: np.random.Generator) -> Iterator[FloatArray]:
+    """Yield chunks (CHUNK, 2): x uniform and independent; y toggles between two places."""
+    for t in itertools.count(0, CHUNK):
+        x = _uniform(generator.random(CHUNK), config.x)
+        phase = (t + np.arange(CHUNK)) // config.toggle_every % 2
+        yield np.stack([x, np.asarray(config.y)[phase]], axis=1)
+
+
+def uniform_motion(config: CylinderConfig, generator: np.random.Generator) -> Iterator[FloatArray]:
+    """Yield chunks (CHUNK, 2): x and y uniform and independent of the frame before."""
+    while True:
+        units = generator.random((CHUNK, 2))
+        yield np.stack([_uniform(units[:, 0], config.x), _uniform(units[:, 1], config.y)], axis=1)
+
+
+def walking_motion(config: SphereConfig, generator: np.random.Generator) -> Iterator[FloatArray]:
+    """Yield chunks (CHUNK, 2) of a Gaussian random walk, reflected at the borders."""
+    borders = (config.x, config.y)
+    last = np.stack([_uniform(generator.random(1), limits) for limits in borders], axis=1)
+    for chunk in itertools.count():
+        steps = generator.standard_normal((CHUNK, 2)) * (config.step_x, config.step_y)
+        if chunk == 0:
+            steps[0] = 0.0
+        steps[0] += last[0]
+        free = np.cumsum(steps, axis=0)
+        path = np.stack([reflect(free[:, i], limits) for i, limits in enumerate(borders)], axis=1)
+        last = path[-1:]
+        yield path
+
+
+def reflect(values: FloatArray, limits: Range) -> FloatArray:
+    """Reflect a free walk, (n,), at the limits."""
+    low, high = limits
+    width = high - low
+    if width == 0:
+        return np.full_like(values, low)
+    return np.clip(low + width - np.abs((values - low) % (2 * width) - width), low, high)
+
+
+class Motions:
+    """Positions of all objects of a scene at every frame, for a seed."""
+
+    def __init__(self, scene: IcubConfig, seed: int) -> None:
+        self._scene, self._seed = scene, seed
+        self._restart()
+
+    def positions(self, start: int, n: int) -> FloatArray:
+        """Return (n, objects, 2) x and y from frame `start` on, the paper's coordinates, metres."""
+        parts = []
+        while n > 0:
+            chunk, first = divmod(start, CHUNK)
+            parts.append(self._draw(chunk)[first : first + n])
+            start, n = start + len(parts[-1]), n - len(parts[-1])
+        return np.concatenate(parts)
+
+    def _draw(self, chunk: int) -> FloatArray:
+        """Return the positions of a chunk; for an earlier one, draw from the start again."""
+        if chunk < self._chunk:
+            self._restart()
+        while self._chunk < chunk:
+            self._positions = np.stack([next(motion) for motion in self._motions], axis=1)
+            self._chunk += 1
+        return self._positions
+
+    def _restart(self) -> None:
+        seeds = [np.random.SeedSequence(self._seed, spawn_key=(_WORLD, i)) for i in range(3)]
+        box, cylinder, sphere = (np.random.Generator(np.random.PCG64(seed)) for seed in seeds)
+        self._motions = (
+            toggling_motion(self._scene.object1, box),
+            uniform_motion(self._scene.object2, cylinder),
+            walking_motion(self._scene.object3, sphere),
+        )
+        self._chunk = -1
+
+
+def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
+    return limits[0] + (limits[1] - limits[0]) * unit
+
 
 STEPS = 30
 """Steps of 1/240 s in a frame: the objects have an eighth of a second to follow."""
@@ -35,10 +123,10 @@ _FRICTION, _OF_TABLE = 0.4, 0.5
 
 
 class PhysicalMotions:
-    """Where the objects of a scene are as they follow `Motions`.
+    """Poses of the objects of a scene that follow `Motions`.
 
-    Box and cylinder never tip or turn, as if led by a rail: tumbling is chaos, which ends
-    differently on every kind of processor. The ball rolls.
+    Box and cylinder never tip or turn, as if led by a rail: tumbling is chaotic, and differs
+    between kinds of processors. The ball rolls.
     """
 
     def __init__(self, scene: IcubConfig, seed: int) -> None:
@@ -71,7 +159,7 @@ class PhysicalMotions:
         ]
 
     def positions(self, start: int, n: int) -> FloatArray:
-        """(n, objects, 7) poses at n frames from `start` on.
+        """Return (n, objects, 7) poses from frame `start` on.
 
         X and y in the paper's coordinates, z, and the quaternion in the root frame.
         """
@@ -90,7 +178,7 @@ class PhysicalMotions:
     def _body(
         self, shape: dict[str, Any], half: float, mass: float, place: list[float], *, rolls: bool
     ) -> tuple[int, int, float]:
-        """An object, the magnet that draws it, and the height of that."""
+        """Add an object; return it, the magnet that draws it, and the magnet's height."""
         bullet, (x, y) = self._bullet, place
         body = bullet.createMultiBody(
             mass, bullet.createCollisionShape(**shape), basePosition=(x, -y, self._top + half)
@@ -108,7 +196,7 @@ class PhysicalMotions:
         return body, magnet, height
 
     def _step(self, start: int) -> FloatArray:
-        """Poses at the next frames, which start there."""
+        """Step the physics and return the poses from frame `start` on."""
         bullet, poses = self._bullet, np.empty((_AHEAD, len(self._bodies), 7))
         for targets, row in zip(self._targets.positions(start, _AHEAD), poses, strict=True):
             for (_, magnet, height), (x, y) in zip(self._bodies, targets.tolist(), strict=True):
@@ -118,7 +206,7 @@ class PhysicalMotions:
             for (body, _, _), pose in zip(self._bodies, row, strict=True):
                 (x, y, z), turn = bullet.getBasePositionAndOrientation(body)
                 pose[:] = [round(part, _DIGITS) for part in (x, -y, z, *turn)]
-                # It goes on from what was rounded, so that what differs does not add up.
+                # The next frame starts from rounded values: differences do not add up.
                 speeds = bullet.getBaseVelocity(body)
                 x, y, *rest = pose.tolist()
                 bullet.resetBasePositionAndOrientation(body, (x, -y, rest[0]), rest[1:])
