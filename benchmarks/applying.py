@@ -25,7 +25,7 @@ from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
 from replay.arrays import ArrayLog
 from replay.export.applied import written
-from replay.export.frames import write_film
+from replay.export.frames import write_video
 from replay.inputs import open_log
 from replay.runs.modules import save_modules
 from replay.stored import StoredSource
@@ -107,7 +107,7 @@ def throughput(folder: Path, rounds: int) -> tuple[Rows, Rows]:
     """
     film = folder / "film.mp4"
     shown = ArrayLog({"cam": np.stack(pictures(FILMED, *VGA))}, InputOptions(size=VGA))
-    write_film(shown, 0, film, lossless=False)
+    write_video(shown, 0, film, lossless=False)
     cpu: Rows = []
     wall: Rows = []
     for outputs in OUTPUTS:

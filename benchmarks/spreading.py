@@ -23,7 +23,7 @@ from benchmarks.report import middle, save
 from cdmisfa.experiments.apply_logs import apply_to_logs
 from recorder.images.options import InputOptions
 from replay.arrays import ArrayLog
-from replay.export.frames import write_film
+from replay.export.frames import write_video
 
 LOGS, FRAMES = 16, 500
 
@@ -69,7 +69,7 @@ def main(*, quick: bool = False) -> None:
         run, logs = make_run(Path(place) / "run", OUTPUTS[-1]), Path(place) / "logs"
         logs.mkdir()
         shown = ArrayLog({"cam": np.stack(pictures(FRAMES, *VGA))}, InputOptions(size=VGA))
-        write_film(shown, 0, logs / "0.mp4", lossless=False)
+        write_video(shown, 0, logs / "0.mp4", lossless=False)
         for number in range(1, LOGS):
             shutil.copyfile(logs / "0.mp4", logs / f"{number}.mp4")
         clusters = {n: stack.enter_context(cluster(n)) for n in (1, 2)}

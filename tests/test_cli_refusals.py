@@ -66,7 +66,6 @@ CASES: dict[str, tuple[str, ...]] = {
     "view RUN --save x.mp4": ("x.mp4: the view is a file of Rerun, name it x.rrd",),
     "view RUN --screenshot x.rrd": ("x.rrd: the screenshot is a PNG, name it x.png",),
     "compare RUN RUN --save x.png": ("x.png: the view is a file of Rerun, name it x.rrd",),
-    "export RUN --to parquet -o z.csv": ("z.csv: parquet is written, name it z.parquet",),
     "export REC --to images -o z.csv": ("z.csv: a folder is written, name it without .csv",),
     "export REC --to mp4 -o z.parquet": ("z.parquet: a folder is written",),
     "recover REC/x1.mcap -o x.csv": ("x.csv: the log is an MCAP file, name it x.mcap",),

@@ -1,4 +1,4 @@
-"""Every form gives back the numbers of the log, with what they are."""
+"""A run's signals as Parquet, npz and CSV hold the numbers of its log and their metadata."""
 
 from __future__ import annotations
 
@@ -23,44 +23,41 @@ def run(tmp_path, monkeypatch):
     return tmp_path, write_run(tmp_path / "run.mcap", VECTOR, 20)
 
 
-def of_table(path):
-    """Values of each signal, what is said of it, and of the run."""
+def read_parquet(path):
+    """Return values and metadata of each signal, and the manifest of the run."""
     table = pq.read_table(path)
     values = {name: table.column(name).to_pylist() for name in table.column_names}
-    said = {name: table.schema.field(name).metadata for name in values}
-    about = {name: {k.decode(): v.decode() for k, v in said[name].items()} for name in values}
-    return values, about, table.schema.metadata[b"cdmisfa.manifest"]
+    fields = {name: table.schema.field(name).metadata for name in values}
+    facts = {name: {k.decode(): v.decode() for k, v in fields[name].items()} for name in values}
+    return values, facts, table.schema.metadata[b"cdmisfa.manifest"]
 
 
-def of_arrays(path):
-    """The same of NumPy's arrays, which are filled up with NaN."""
+def read_npz(path):
     with np.load(path) as arrays:
-        assert np.isnan(arrays["band_mean"][0]).all()
+        assert np.isnan(arrays["band_mean"][0]).all()  # no module yet
         values = {name: arrays[name] for name in arrays.files if not name.startswith("_")}
-        return (
-            values,
-            json.loads(str(arrays["_signals"])),
-            json.loads(str(arrays["_run"]))["manifest"],
-        )
+        facts, run = (json.loads(str(arrays[name])) for name in ("_signals", "_run"))
+        return values, facts, run["manifest"]
 
 
-@pytest.mark.parametrize(("form", "read"), [("parquet", of_table), ("npz", of_arrays)])
-def test_every_number_is_there_and_what_it_is(form, read, run):
+@pytest.mark.parametrize(("form", "read"), [("parquet", read_parquet), ("npz", read_npz)])
+def test_a_file_holds_every_number_and_its_metadata(form, read, run):
     folder, records = run
     assert export(folder, folder / f"run.{form}", form) == 20
-    values, about, manifest = read(folder / f"run.{form}")
+    values, facts, manifest = read(folder / f"run.{form}")
     assert list(values) == list(SIGNALS)
     for name, signal in SIGNALS.items():
-        for found, signals in zip(values[name], records, strict=True):
+        for value, signals in zip(values[name], records, strict=True):
             expected = np.asarray(getattr(signals, name))
             if form == "npz":
-                found = found[tuple(slice(size) for size in expected.shape)]
-            else:
-                found = np.asarray(found, signal.dtype)  # null becomes NaN
-            np.testing.assert_array_equal(np.reshape(found, expected.shape), expected)
-        assert (about[name]["unit"], about[name]["symbol"]) == (signal.unit, signal.symbol)
-    if form != "npz":
-        assert about["eta"]["dims"] == SIGNALS["eta"].dims
+                value = value[tuple(slice(size) for size in expected.shape)]
+            value = np.asarray(value, signal.dtype)  # null becomes NaN
+            np.testing.assert_array_equal(np.reshape(value, expected.shape), expected)
+        assert [facts[name][key] for key in ("unit", "symbol", "dims")] == [
+            signal.unit,
+            signal.symbol,
+            signal.dims,
+        ]
     assert json.loads(manifest)["config"]["learner"]["tau"] == 40
 
 
@@ -92,13 +89,12 @@ def test_csv_reads_back_exactly(run):
     assert rows[0]["band_mean[1,0]"] == "nan"
 
 
-def test_an_existing_file_is_kept(run):
+def test_an_existing_file_is_replaced_only_by_force(run):
     folder, _ = run
     (folder / "run.csv").write_text("mine")
     with pytest.raises(UsageError, match="--force"):
         export(folder, folder / "run.csv", "csv")
+    with pytest.raises(UsageError, match="one run: name a run"):
+        export([folder, folder], folder / "two.csv", "csv")
     assert (folder / "run.csv").read_text() == "mine"
-    export(folder, folder / "run.csv", "csv", force=True)
-    with pytest.raises(UsageError, match="xlsx"):
-        export(folder, folder / "run.xlsx", "xlsx")
-    assert sorted(p.name for p in folder.iterdir()) == ["run.csv", "run.mcap"]
+    assert export(folder, folder / "run.csv", "csv", force=True) == 20

@@ -114,7 +114,6 @@ def test_a_dataset_has_the_published_layout(dataset):
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     videos = {f"videos/observation.images.{v}/chunk-000/file-000.mp4" for v in ("left", "right")}
     assert files == videos | {
-        "README.md",
         "data/chunk-000/file-000.parquet",
         "meta/episodes/chunk-000/file-000.parquet",
         "meta/info.json",
@@ -218,7 +217,7 @@ def test_several_recordings_become_episodes_of_a_dataset(cdmisfa, tmp_path):
     assert export(paths, out, "lerobot", force=True, lossless=True) == 2 * FRAMES
     assert contents(out) == before
     record_images(tmp_path / "three", (24, 42))
-    with pytest.raises(UsageError, match="three: its frame_shape is"):
+    with pytest.raises(UsageError, match="three has the frame_shape"):
         export([paths[0], tmp_path / "three"], tmp_path / "wrong", "lerobot")
     assert not (tmp_path / "wrong").exists()
 
@@ -260,30 +259,32 @@ def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(frames, "_pictures", full)
-    for form in ("mp4", "lerobot"):
+    monkeypatch.setattr(frames, "_video_frames", full)
+    for log, out, form in (
+        ("r", "out", "mp4"),
+        ("r", "out", "lerobot"),
+        ("r/left.mcap", "out.mp4", "mp4"),
+    ):
         with pytest.raises(CdmisfaError, match="No space left on device"):
-            export(tmp_path / "r", tmp_path / "out", form)
-    with pytest.raises(CdmisfaError, match="No space left on device"):
-        export(tmp_path / "r" / "left.mcap", tmp_path / "out.mp4", "mp4")
+            export(tmp_path / log, tmp_path / out, form)
     assert [p.name for p in tmp_path.iterdir()] == ["r"]
 
 
 REFUSED = {
-    "several views": ("mp4", "one.mp4", {}),
-    "loses nothing": ("images", "out", {"lossless": True}),
+    "has 2 streams: name a folder": ("mp4", "one.mp4", {}),
     "convert --rate": ("lerobot", "out", {}),
-    r"there\.png exists": ("images", "there.png", {}),
+    r"there\.mp4 exists": ("mp4", "there.mp4", {}),
+    "did you mean npz": ("npy", "out", {}),
     r"mine holds other files, such as thesis\.tex": ("lerobot", "mine", {"force": True}),
     r"pip install 'cdmisfa\[video\]'": ("mp4", "out", {}),
 }
 
 
 @pytest.mark.parametrize("why", REFUSED)
-def test_what_cannot_be_exported_is_said_and_nothing_is_touched(why, tmp_path, monkeypatch):
+def test_an_error_names_the_reason_and_leaves_every_file(why, tmp_path, monkeypatch):
     form, out, options = REFUSED[why]
     record_images(tmp_path / "r", fps=29.97)
-    (tmp_path / "there.png").write_text("mine")
+    (tmp_path / "there.mp4").write_text("mine")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("mine")
     if "pip" in why:

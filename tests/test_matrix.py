@@ -45,7 +45,7 @@ FORMATS = (
 )
 COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "index")
 REFUSED = {
-    ("export", "run"): "name the recording",
+    ("export", "run"): "is a run, not a recording",
     ("export", "table"): "holds no images",
     ("learn", "run"): "is a run, not a recording",
     ("convert", "run"): "is a run, not a recording",

@@ -175,4 +175,4 @@ def test_commands_take_tables_and_say_what_was_left_out(cdmisfa: Cdmisfa, tmp_pa
         "export", path, "--set", "input.time=t", "--to", "npz", "-o", tmp_path / "a.npz"
     )
     assert refused.code == 2
-    assert f"{path} is no run, npz is for the signals of one: choose images or mp4" in refused.err
+    assert "npz holds the signals of one run: name a run" in refused.err

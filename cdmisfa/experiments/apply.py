@@ -381,7 +381,7 @@ def follow(
     try:
         for block in applied:
             for sink in sinks:
-                sink.add(block)
+                sink(block)
             totals.add(block)
             progress()
     except LogDamagedError as error:

@@ -1,15 +1,15 @@
-"""What frozen modules give on the frames of a log, written for other programs as it comes."""
+"""Outputs of frozen modules on the frames of a log: as a table, an MCAP file or JSON lines."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from google.protobuf import descriptor_pb2
@@ -19,13 +19,13 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.clock import times_of
 from cdmisfa.modules import Module, columns_of
-from recorder.log.files import atomic_write, refuse_special, refuse_taken
+from recorder.log.files import atomic_write, refuse_taken
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, VectorEncoder, varint, view_topic
 from replay.runs.codec import define_message
 
 ROWS: Final = 8192
-"""Rows of a table that are written at once."""
+"""Rows that a table writes at once: a Parquet file with fewer rows a group is much larger."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 OUTPUT_SCHEMA: Final = "cdmisfa.ModuleOutput"
@@ -44,15 +44,15 @@ _, OUTPUT_DEFINITION = define_message(
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """What M modules with R outputs together give on frames that follow one another.
+    """Outputs of M modules, R in all, on a block of consecutive frames of one stream.
 
     Attributes:
-        block: of one stream, no longer than a block of the run that learned the modules.
-        y: (n, R) outputs of all modules, one beside the other.
-        slowness: (R,) of each output within the block, 1/frame; infinite where it stands still.
-        alive: (M,) whether the module's first output varies there as where it was learned.
-        novelty: (M,) how much else than there it gives, 1 at the bound from which it does not
-            know the block.
+        block: the frames, no more than a block of the run that learned the modules.
+        y: (n, R) outputs of all modules, side by side.
+        slowness: (R,) of each output within the block, 1/frame; infinite if it is constant.
+        alive: (M,) whether the module's first output varies as where it was learned.
+        novelty: (M,) difference from the stream that the module learned; it knows the block
+            below 1.
     """
 
     block: Block
@@ -62,107 +62,154 @@ class Applied:
     novelty: FloatArray
 
 
-class AppliedSink(Protocol):
-    """Takes what modules give, block by block."""
-
-    def add(self, applied: Applied) -> None:
-        """Take a block in."""
-
-    def close(self) -> None:
-        """Let go; what was taken in is written."""
+AppliedSink = Callable[[Applied], None]
+"""Takes the outputs block by block."""
 
 
-class TableSink:
-    """A table with a row a frame of a stream, Parquet or CSV by the name of the file.
-
-    What has no value is null, or nothing between two commas.
+@contextlib.contextmanager
+def written(
+    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool, log: str | None = None
+) -> Iterator[AppliedSink]:
+    """Open a file for outputs; it has its name once the body has ended without an error.
 
     Args:
-        path: of the file.
-        form: "parquet" or "csv".
-        spec: of the frames.
-        modules: in their order.
-        log: what is said in a first column, where the table is one of many logs' tables.
+        out: the file, .parquet, .csv or .mcap.
+        spec: the spec of the source.
+        modules: the modules in their order.
+        force: replace an existing file.
+        log: value of a first column `log`, for a table that is one of many logs' tables.
+
+    Raises:
+        UsageError: the file exists.
+        LogWriteError: the file cannot be written.
     """
+    refuse_taken(out, force=force)
+    if out.suffix.lower() == ".mcap":
+        with _log_sink(out, spec, modules, force=force) as sink:
+            yield sink
+    else:
+        with atomic_write(out) as partial, _table_sink(partial, out, spec, modules, log) as sink:
+            yield sink
 
-    def __init__(
-        self, path: Path, form: str, spec: SourceSpec, modules: Sequence[Module], log: str | None
-    ) -> None:
-        import pyarrow as pa
-        import pyarrow.csv as pacsv
-        import pyarrow.parquet as pq
 
-        self._pa, self._spec, self._log = pa, spec, log
-        self._modules = list(columns_of(modules))
-        fields = [("log_time", pa.int64()), ("t", pa.int64()), ("stream", pa.string())]
-        if log is not None:
-            fields.insert(0, ("log", pa.string()))
-        plain = ["log_time", "t"]
-        for module, own in self._modules:
-            name, outputs = f"module{module.index}", range(own.stop - own.start)
-            fields += [(f"{name}_y{j}", pa.float64()) for j in outputs]
-            plain += [f"{name}_y{j}" for j in outputs]
-            fields += [(f"{name}_slowness{j}", pa.float64()) for j in outputs]
-            fields += [(f"{name}_alive", pa.bool_()), (f"{name}_novelty", pa.float64())]
-        self._schema = pa.schema(fields)
-        self._writer: Any
-        if form == "parquet":
-            of_blocks = [name for name, _ in fields if name not in plain]
-            self._writer = pq.ParquetWriter(
-                path, self._schema, compression="zstd", use_dictionary=of_blocks
-            )
-        else:
-            self._writer = pacsv.CSVWriter(path, self._schema)
-        self._waiting: list[Applied] = []
-        self._count = 0
+@contextlib.contextmanager
+def _table_sink(
+    path: Path, out: Path, spec: SourceSpec, modules: Sequence[Module], log: str | None
+) -> Iterator[AppliedSink]:
+    """Write a table with a row a frame of a stream, Parquet or CSV by the ending of `out`."""
+    import pyarrow.csv as pacsv
+    import pyarrow.parquet as pq
 
-    def add(self, applied: Applied) -> None:
-        """See `AppliedSink`."""
-        self._waiting.append(applied)
-        self._count += len(applied.block)
-        if self._count >= ROWS:
-            self._write()
+    waiting: list[Applied] = []
+    schema = _batch(waiting, spec, modules, log).schema
+    if out.suffix.lower() == ".parquet":
+        # Dictionaries save space in columns with one value a block, which repeats.
+        of_frames = {"log_time", "t", *(name for name in schema.names if "_y" in name)}
+        of_blocks = [name for name in schema.names if name not in of_frames]
+        writer = pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=of_blocks)
+    else:
+        writer = pacsv.CSVWriter(path, schema)
 
-    def close(self) -> None:
-        """See `AppliedSink`."""
-        self._write()
-        self._writer.close()
+    def write() -> None:
+        writer.write_batch(_batch(waiting, spec, modules, log))
+        waiting.clear()
 
-    def _write(self) -> None:
-        if not self._waiting:
-            return
-        pa, waiting, spec = self._pa, self._waiting, self._spec
-        lengths = [len(one.block) for one in waiting]
-        t = np.concatenate(
-            [np.arange(one.block.t, one.block.t + len(one.block)) for one in waiting]
-        )
-        names = np.array(spec.streams, object)[[one.block.stream for one in waiting]]
+    def add(applied: Applied) -> None:
+        waiting.append(applied)
+        if sum(len(each.block) for each in waiting) >= ROWS:
+            write()
 
-        def of_block(values: Any) -> Any:
-            each = np.repeat(np.stack(values), lengths, axis=0)
-            return each if each.dtype == bool else np.where(np.isfinite(each), each, np.nan)
+    with contextlib.closing(writer):
+        yield add
+        if waiting:
+            write()
 
-        y = np.concatenate([one.y for one in waiting])
-        slowness = of_block([one.slowness for one in waiting])
-        alive = of_block([one.alive for one in waiting])
-        novelty = of_block([one.novelty for one in waiting])
-        columns: list[Any] = [] if self._log is None else [pa.repeat(self._log, len(t))]
-        columns += [pa.array(times_of(t, spec.fps, spec.start_ns)), pa.array(t)]
-        columns.append(pa.array(np.repeat(names, lengths), pa.string()))
-        for i, (_, own) in enumerate(self._modules):
-            columns += [pa.array(y[:, j]) for j in range(own.start, own.stop)]
-            columns += [
-                pa.array(slowness[:, j], from_pandas=True) for j in range(own.start, own.stop)
-            ]
-            columns.append(pa.array(alive[:, i]))
-            columns.append(pa.array(novelty[:, i], from_pandas=True))
-        self._writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=self._schema))
-        self._waiting, self._count = [], 0
+
+def _batch(
+    waiting: Sequence[Applied], spec: SourceSpec, modules: Sequence[Module], log: str | None
+) -> Any:
+    """Return outputs as rows of a table; a slowness or novelty that is not finite is null."""
+    import pyarrow as pa
+
+    columns, outputs = list(columns_of(modules)), sum(len(module.phi) for module in modules)
+    blocks = [applied.block for applied in waiting]
+    lengths = [len(block) for block in blocks]
+    numbers = (np.arange(block.t, block.t + len(block)) for block in blocks)
+    t = np.concatenate([np.empty(0, np.int64), *numbers])
+    y = np.concatenate([np.empty((0, outputs)), *(applied.y for applied in waiting)])
+
+    def repeated(name: str, width: int, dtype: type) -> NDArray[Any]:
+        values: Any = np.array([getattr(applied, name) for applied in waiting], dtype)
+        rows = np.repeat(values.reshape(len(waiting), width), lengths, axis=0)
+        return np.where(np.isfinite(rows), rows, np.nan) if dtype is float else rows
+
+    slowness = repeated("slowness", outputs, float)
+    alive = repeated("alive", len(modules), bool)
+    novelty = repeated("novelty", len(modules), float)
+    streams = np.repeat(np.array([block.stream for block in blocks], int), lengths)
+    table: dict[str, Any] = {} if log is None else {"log": pa.repeat(log, len(t))}
+    table["log_time"] = pa.array(times_of(t, spec.fps, spec.start_ns))
+    table["t"] = pa.array(t)
+    table["stream"] = pa.array(np.array(spec.streams, object)[streams], pa.string())
+    for i, (module, own) in enumerate(columns):
+        name = f"module{module.index}"
+        for kind, values in (("y", y), ("slowness", slowness)):
+            for j, column in enumerate(values[:, own].T):
+                table[f"{name}_{kind}{j}"] = pa.array(column, from_pandas=kind == "slowness")
+        table[f"{name}_alive"] = pa.array(alive[:, i])
+        table[f"{name}_novelty"] = pa.array(novelty[:, i], from_pandas=True)
+    return pa.RecordBatch.from_pydict(table)
+
+
+@contextlib.contextmanager
+def _log_sink(
+    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool
+) -> Iterator[AppliedSink]:
+    """Write an MCAP file with the frames of each stream, and a topic per module and stream.
+
+    The file is readable while it is written; an error leaves a readable NAME.partial.
+    """
+    encoders: list[Any] = [VectorEncoder() for _ in spec.streams]
+    if spec.images:
+        height, width = spec.frame_shape
+        encoders = [ImageEncoder(height, width, name) for name in spec.streams]
+    log = LogFile(out, force=force, compression="lz4", aside=True)
+
+    def channel(topic: str, schema: str, definition: bytes) -> int:
+        return log.add_channel(topic, log.add_schema(schema, ENCODING, definition))
+
+    views = [
+        channel(view_topic(name), encoder.schema, encoder.schema_data())
+        for name, encoder in zip(spec.streams, encoders, strict=True)
+    ]
+    topics = [
+        [channel(f"/module{m.index}/{name}", OUTPUT_SCHEMA, OUTPUT_DEFINITION) for m in modules]
+        for name in spec.streams
+    ]
+
+    def add(applied: Applied) -> None:
+        block, s = applied.block, applied.block.stream
+        times = spec.times(block.t, block.t + len(block)).tolist()
+        messages = [
+            (views[s], at, encoders[s](at, frame), at, 0)
+            for at, frame in zip(times, block.frames, strict=True)
+        ]
+        for i, (_, own) in enumerate(columns_of(modules)):
+            rows = zip(times, _encoded(applied, i, own), strict=True)
+            messages += [(topics[s][i], at, row, at, 0) for at, row in rows]
+        log.write_all(messages)
+
+    try:
+        yield add
+    except BaseException:
+        log.abandon()
+        raise
+    log.finish()
 
 
 def _encoded(applied: Applied, module: int, own: slice) -> list[bytes]:
-    """The messages `cdmisfa.ModuleOutput` of a module on a block, all laid out alike."""
-    rows = np.repeat(_row(own.stop - own.start), len(applied.block))
+    """Return the message `cdmisfa.ModuleOutput` of a module for each frame of a block."""
+    rows = np.repeat(_message(own.stop - own.start), len(applied.block))
     rows["y"], rows["slowness"] = applied.y[:, own], applied.slowness[own]
     rows["alive"], rows["novelty"] = applied.alive[module], applied.novelty[module]
     rows["frame"] = applied.block.t + np.arange(len(rows))
@@ -171,80 +218,37 @@ def _encoded(applied: Applied, module: int, own: slice) -> list[bytes]:
 
 
 @cache
-def _row(count: int) -> NDArray[np.void]:
-    """The message of a module with so many outputs, (1,), in which only the values are missing."""
-    head = varint(8 * count)
-    tags = {"y": b"\x0a" + head, "slowness": b"\x12" + head}
-    tags |= {"alive": b"\x18", "novelty": b"\x21", "frame": b"\x29"}
-    kinds = (f"({count},)<f8", f"({count},)<f8", "u1", "<f8", "<i8")
-    fields = []
-    for (name, tag), kind in zip(tags.items(), kinds, strict=True):
-        fields += [(f"{name}_tag", f"V{len(tag)}"), (name, kind)]
-    row = np.zeros(1, np.dtype(fields))
-    for name, tag in tags.items():
+def _message(count: int) -> NDArray[np.void]:
+    """Return the message of a module with so many outputs, (1,), without its values.
+
+    All messages have this layout, so that NumPy fills a block of them at once; protobuf takes ten
+    times as long.
+    """
+    length = varint(8 * count)
+    fields: list[tuple[str, bytes, str]] = [
+        ("y", b"\x0a" + length, f"({count},)<f8"),
+        ("slowness", b"\x12" + length, f"({count},)<f8"),
+        ("alive", b"\x18", "u1"),
+        ("novelty", b"\x21", "<f8"),
+        ("frame", b"\x29", "<i8"),
+    ]
+    types: list[Any] = []
+    for name, tag, kind in fields:
+        types += [(f"{name}_tag", f"V{len(tag)}"), (name, kind)]
+    row = np.zeros(1, np.dtype(types))
+    for name, tag, _ in fields:
         row[f"{name}_tag"] = np.void(tag)
     return row
 
 
-class LogSink:
-    """An MCAP file with the frames of each stream and a topic per module and stream.
-
-    The file is readable while it is written.
-    """
-
-    def __init__(
-        self, path: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool = False
-    ) -> None:
-        self._spec, self._modules = spec, list(columns_of(modules))
-        self._encoders: list[Any] = [VectorEncoder() for _ in spec.streams]
-        if spec.images:
-            height, width = spec.frame_shape
-            self._encoders = [ImageEncoder(height, width, name) for name in spec.streams]
-        self._log = LogFile(path, force=force, compression="lz4", aside=True)
-
-        def channel(topic: str, schema: str, definition: bytes) -> int:
-            return self._log.add_channel(topic, self._log.add_schema(schema, ENCODING, definition))
-
-        self._views = [
-            channel(view_topic(name), encoder.schema, encoder.schema_data())
-            for name, encoder in zip(spec.streams, self._encoders, strict=True)
-        ]
-        self._outputs = [
-            [
-                channel(f"/module{module.index}/{name}", OUTPUT_SCHEMA, OUTPUT_DEFINITION)
-                for module, _ in self._modules
-            ]
-            for name in spec.streams
-        ]
-
-    def add(self, applied: Applied) -> None:
-        """See `AppliedSink`."""
-        block = applied.block
-        times = self._spec.times(block.t, block.t + len(block)).tolist()
-        encode, view = self._encoders[block.stream], self._views[block.stream]
-        found = [
-            (view, at, encode(at, frame), at, 0)
-            for at, frame in zip(times, block.frames, strict=True)
-        ]
-        for i, (_, own) in enumerate(self._modules):
-            topic = self._outputs[block.stream][i]
-            rows = _encoded(applied, i, own)
-            found += [(topic, at, row, at, 0) for at, row in zip(times, rows, strict=True)]
-        self._log.write_all(found)
-
-    def close(self) -> None:
-        """See `AppliedSink`."""
-        self._log.finish()
-
-    def abandon(self) -> None:
-        """Leave a readable NAME.partial."""
-        self._log.abandon()
-
-
-def _as_json(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> Mapping[str, Any]:
-    """A block as JSON values; what is no finite number is null."""
+def line(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> str:
+    """Return the outputs on a block as a line of JSON; a number that is not finite is null."""
     block = applied.block
-    return {
+
+    def numbers(values: Any) -> list[float | None]:
+        return [value if math.isfinite(value) else None for value in values]
+
+    document = {
         "log_time": spec.time_ns(block.t),
         "t": block.t,
         "frames": len(block),
@@ -253,74 +257,11 @@ def _as_json(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> M
             {
                 "module": module.index,
                 "y": applied.y[:, own].tolist(),
-                "slowness": [_number(value) for value in applied.slowness[own].tolist()],
+                "slowness": numbers(applied.slowness[own].tolist()),
                 "alive": bool(applied.alive[i]),
-                "novelty": _number(float(applied.novelty[i])),
+                "novelty": numbers([float(applied.novelty[i])])[0],
             }
             for i, (module, own) in enumerate(columns_of(modules))
         ],
     }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-class LinesSink:
-    """JSON lines, one a block, each handed on at once.
-
-    Args:
-        write: takes a line, without its end.
-        spec: of the frames.
-        modules: in their order.
-    """
-
-    def __init__(self, write: Any, spec: SourceSpec, modules: Sequence[Module]) -> None:
-        self._write, self._spec, self._modules = write, spec, modules
-
-    def add(self, applied: Applied) -> None:
-        """See `AppliedSink`."""
-        self._write(json.dumps(_as_json(applied, self._spec, self._modules), allow_nan=False))
-
-    def close(self) -> None:
-        """See `AppliedSink`."""
-
-
-@contextlib.contextmanager
-def written(
-    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool, log: str | None = None
-) -> Iterator[AppliedSink]:
-    """A file for what modules give, whole when the body has ended.
-
-    Args:
-        out: the file, .parquet, .csv or .mcap.
-        spec: of the source.
-        modules: in their order.
-        force: replace an existing file.
-        log: see `TableSink`.
-
-    Raises:
-        UsageError: it exists.
-        LogWriteError: it cannot be written.
-    """
-    form = out.suffix.lower().removeprefix(".")
-    refuse_special(out)
-    refuse_taken(out, force=force)
-    if form == "mcap":
-        sink = LogSink(out, spec, modules, force=force)
-        try:
-            yield sink
-        except BaseException:
-            sink.abandon()
-            raise
-        sink.close()
-        return
-    with atomic_write(out) as partial:
-        table = TableSink(partial, form, spec, modules, log)
-        try:
-            yield table
-        except BaseException:
-            with contextlib.suppress(Exception):  # the first error counts
-                table.close()
-            raise
-        table.close()
+    return json.dumps(document, allow_nan=False)

@@ -1,4 +1,4 @@
-"""Write a run's signals or a recording's frames for other programs, in one of several forms."""
+"""Export of a run's signals or of recorded frames, in one of several forms."""
 
 from __future__ import annotations
 
@@ -9,31 +9,20 @@ from typing import Final
 
 from cdmisfa.core.errors import UsageError, did_you_mean
 from recorder.images.options import InputOptions
-from recorder.log.files import atomic_write, refuse_named_as_file, refuse_special, refuse_unless
-from replay.camera_logs.opening import only_foreign
-from replay.export.frames import write_film, write_films, write_images
+from recorder.log.files import atomic_write, refuse_existing, refuse_taken
+from replay.export.frames import write_images, write_video, write_videos
 from replay.export.lerobot import write_dataset
-from replay.export.tables import TABLES, export_signals
-from replay.inputs import About, Logged, holds_run, open_to_look
-from replay.recordings.source import RecordedSource
-from replay.recordings.view_file import NoRecordingError
-from replay.storage.opening import no_such
+from replay.export.tables import TABLES
+from replay.inputs import About, Logged, holds_run, is_recording, open_to_look
 
-_ALIKE: Final = ("streams", "frame_shape", "dtype", "truth", "fps")
-"""What recordings have in common that become one dataset."""
+FORMS: Final = (*TABLES, "images", "mp4", "lerobot")
+"""Forms of the signals of a run, and forms of frames."""
 
+EQUAL: Final = ("streams", "frame_shape", "dtype", "truth", "fps")
+"""Attributes that must be equal in the logs that become one dataset."""
 
-RECORDED: Final = ("images", "mp4", "lerobot")
-"""Forms of the frames of a recording; the others are of the signals of a run."""
-
-LOSSY: Final = ("mp4", "lerobot")
-"""Forms that may change pixels a little."""
-
-FORMS: Final = (*TABLES, *RECORDED)
-"""Every form."""
-
-WRITTEN = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
-"""Endings of the files that exports of recordings write; a folder with others is not theirs."""
+WRITTEN: Final = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
+"""Endings of exported files: `force` replaces a folder only if it holds no others."""
 
 
 def export(
@@ -47,147 +36,90 @@ def export(
     task: str | None = None,
     about: About = lambda source: None,
 ) -> int:
-    """Write a run's signals, or recordings' frames, in another form.
+    """Write a run's signals, or the frames of a recording or of other logs, in another form.
 
     Args:
-        path: a run; for a form of recordings a recording, or camera logs; for LeRobot several
-            folders of recordings, too.
-        out: the file; for those forms the folder, or for one view's video a file *.mp4.
+        path: a run for a table; a recording or logs for the other forms. Several folders of
+            recordings become episodes of one LeRobot dataset.
+        out: file of a table or of the video of one stream, *.mp4; folder of the other forms.
         form: one of `FORMS`.
         force: replace an existing file, or an earlier export in a folder.
-        lossless: keep every value of images that become a video.
-        inputs: which streams of camera logs; by default all of images.
-        task: for LeRobot, what is done, in words.
-        about: given a recording or camera logs before they are written, to say what they are.
+        lossless: keep every value of images in a video.
+        inputs: options of logs; by default all streams of images.
+        task: task of a LeRobot dataset, in words; by default what the log states.
+        about: called with the opened recording or logs.
 
     Returns:
-        The number of iterations, or of images or frames, written.
+        The number of iterations, images or frames written.
 
     Raises:
-        UsageError: no such run or form, `out` exists and `force` is not set, or it holds other
-            files than exports write.
-        LogDamagedError: the run cannot be read.
-        CdmisfaError: the file cannot be written.
+        UsageError: there is no such run, log or form; `out` exists and `force` is not set, or it
+            holds files that no export wrote.
+        LogDamagedError: the input cannot be read.
+        CdmisfaError: `out` cannot be written.
     """
+    paths = [path] if isinstance(path, Path) else list(path)
     if form not in FORMS:
         raise UsageError(f"no form {form!r} for --to: {did_you_mean(form, FORMS)}")
-    if lossless and form not in LOSSY:
-        raise UsageError(f"{form} loses nothing: --lossless is for {' and '.join(LOSSY)}")
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
-    refuse_special(out)
-    paths = [path] if isinstance(path, Path) else list(path)
-    if task is not None and form != "lerobot":
-        raise UsageError(f"{form} has no word for a task: --task is for lerobot")
-    for named in paths:
-        if not named.exists():
-            raise no_such(named)
-    if form in RECORDED:
-        if form != "mp4" or out.suffix != ".mp4":
-            refuse_named_as_file(out)
-        if holds_run(paths[0]):
-            raise UsageError(f"{paths[0]} is a run, {form} is for recordings: name the recording")
-        if form == "lerobot":
-            return _export_dataset(paths, out, inputs, about, lossless=lossless, task=task)
-        return _export_images(paths, out, form, inputs, about, lossless=lossless)
-    refuse_unless(out, f"{form} is written", f".{form}", "")
-    if out.is_dir():
-        raise UsageError(f"{out} is a folder: name the file to write")
-    if not all(map(holds_run, paths)):
-        raise UsageError(
-            f"{paths[0]} is no run, {form} is for the signals of one: choose "
-            f"{' or '.join(RECORDED)} with --to"
-        )
-    if len(paths) > 1:
-        raise UsageError(f"signals are of one run, {len(paths)} were named")
-    return export_signals(paths[0], out, form)
-
-
-def _export_images(
-    paths: list[Path],
-    out: Path,
-    form: str,
-    inputs: InputOptions | None,
-    about: About,
-    *,
-    lossless: bool,
-) -> int:
-    """Write every view as PNG files or as a video."""
-    with contextlib.closing(open_to_look(paths, inputs)) as source:
-        if not source.spec.images:
-            raise UsageError(f"{paths[0]} holds no images: its frames are values")
-        film = form == "mp4" and out.suffix == ".mp4" and not out.is_dir()
-        if film and len(source.spec.streams) > 1:
-            raise UsageError(f"{paths[0]} has several views: name a folder, not {out.name}")
-        _refuse_others(out)
-        about(source)
+    if form in TABLES:
+        refuse_taken(out, force=force)
+        if len(paths) > 1 or not holds_run(paths[0]):
+            raise UsageError(
+                f"{form} holds the signals of one run: name a run, or choose images, mp4 or "
+                "lerobot with --to"
+            )
         with atomic_write(out) as place:
-            if form == "images":
-                return write_images(source, place)
-            if not film:
-                return write_films(source, place, lossless=lossless)
-            write_film(source, 0, place, lossless=lossless)
-            return source.frames
+            return TABLES[form](paths[0], place)
+    single = form == "mp4" and out.suffix == ".mp4"
+    if single:
+        refuse_taken(out, force=force)
+    else:
+        refuse_existing(out, force=force, goes_on=False)
+        _refuse_other_files(out)
+    logs = _opened(paths, form, inputs, about, single=single)
+    with contextlib.closing(logs), atomic_write(out) as place:
+        if form == "lerobot":
+            return write_dataset(logs, place, lossless=lossless, task=task)
+        source = next(logs)
+        if form == "images":
+            return write_images(source, place)
+        if single:
+            return write_video(source, 0, place, lossless=lossless)
+        return write_videos(source, place, lossless=lossless)
 
 
-def _export_dataset(
-    paths: list[Path],
-    out: Path,
-    inputs: InputOptions | None,
-    about: About,
-    *,
-    lossless: bool,
-    task: str | None,
-) -> int:
-    """Write a LeRobot dataset; several folders of recordings are logs of their own in it."""
-    _refuse_others(out)
-    logs = [[path] for path in paths] if _are_recordings(paths) else [paths]
-    with (
-        contextlib.closing(_opened_in_turn(logs, inputs, about)) as opened,
-        atomic_write(out) as place,
-    ):
-        return write_dataset(opened, place, name=out.name, lossless=lossless, task=task)
-
-
-def _are_recordings(paths: Sequence[Path]) -> bool:
-    """Whether these are several folders of recordings, each with episodes of its own."""
-    if len(paths) < 2 or not all(path.is_dir() and not only_foreign(path) for path in paths):
-        return False
-    try:
-        for path in paths:
-            RecordedSource(path).close()
-    except NoRecordingError:
-        return False
-    return True
-
-
-def _opened_in_turn(
-    logs: Sequence[Sequence[Path]], inputs: InputOptions | None, about: About
+def _opened(
+    paths: list[Path], form: str, inputs: InputOptions | None, about: About, *, single: bool
 ) -> Generator[Logged]:
-    """Yield each log, open until the next is asked for.
+    """Yield each log, open until the next one.
 
     Raises:
-        UsageError: one has other streams, sizes or rates than the first, or as for `open_to_look`.
+        UsageError: its frames do not fit the form or are unlike those of the first log, or as for
+            `open_to_look`.
         LogDamagedError: one is damaged.
     """
+    separate = form == "lerobot" and all(p.is_dir() and is_recording([str(p)]) for p in paths)
     first = None
-    for paths in logs:
-        with contextlib.closing(open_to_look(paths, inputs)) as source:
+    for log in [[path] for path in paths] if separate else [paths]:
+        with contextlib.closing(open_to_look(log, inputs)) as source:
+            spec, why = source.spec, ""
+            first = first or spec
+            if form != "lerobot" and not spec.images:
+                why = "holds no images: its frames are numbers"
+            elif single and len(spec.streams) > 1:
+                why = f"has {len(spec.streams)} streams: name a folder for their videos"
+            for name in EQUAL:
+                if (a := getattr(first, name)) != (b := getattr(spec, name)):
+                    why = f"has the {name} {b}, not {a} as {paths[0]}: export it separately"
+            if why:
+                raise UsageError(f"{log[0]} {why}")
             about(source)
-            first = first or source.spec
-            for what in _ALIKE:
-                one, other = getattr(first, what), getattr(source.spec, what)
-                if one != other:
-                    raise UsageError(
-                        f"{paths[0]}: its {what} is {other}, that of {logs[0][0]} {one}: export "
-                        "them by themselves, or convert them first"
-                    )
             yield source
 
 
-def _refuse_others(out: Path) -> None:
-    """Refuse to replace a folder with other files than exports write."""
-    for file in out.rglob("*") if out.is_dir() else ():
+def _refuse_other_files(folder: Path) -> None:
+    """Refuse to replace a folder with files that no export wrote."""
+    for file in folder.rglob("*"):
         if not file.is_dir() and file.suffix not in WRITTEN:
-            other = f"{out} holds other files, such as {file.relative_to(out)}"
+            other = f"{folder} holds other files, such as {file.relative_to(folder)}"
             raise UsageError(f"{other}: export into a new folder")

@@ -1,8 +1,7 @@
-"""A recording's frames piece by piece, as PNG files, and as videos: H.264 in MP4, by PyAV.
+"""Frames of recordings and logs in pieces, as PNG files, and as videos: H.264 in MP4, by PyAV.
 
-Gray goes into the luma channel at its full range, so that a decoder gives back the very
-values that were encoded; only the compression itself loses something, and with `lossless`
-it does not either.
+Gray values become luma at its full range, so that a decoder returns the values that were encoded.
+Only the compression loses something, and with `lossless` nothing.
 """
 
 from __future__ import annotations
@@ -26,81 +25,76 @@ from replay.inputs import Logged
 from replay.recordings.view_file import intersection
 from replay.stored import Span
 
-PIECE = 1000
-"""Most frames that are held at once."""
-
-PIECE_BYTES = 64 * 2**20
-"""Most bytes of frames that are held at once, unless one frame has more."""
+PIECE, PIECE_BYTES = 1000, 64 * 2**20
+"""Most frames and bytes in memory at once, unless one frame is larger."""
 
 LOSSY = {"crf": "18", "preset": "medium"}
-"""Compression at which a difference is hardly seen."""
+"""x264's quality at which a difference is hardly visible."""
 
 EXACT = {"qp": "0", "preset": "medium"}
-"""Compression that keeps every value."""
+"""x264's lossless mode."""
 
 NEUTRAL = 128
 """Chroma of gray."""
 
 FULL_RANGE = 2
-"""FFmpeg's number for luma from 0 to 255."""
+"""FFmpeg's AVCOL_RANGE_JPEG: luma from 0 to 255."""
 
 
 def pieces(source: Logged, stream: int, spans: Sequence[Span] | None = None) -> Iterator[Block]:
-    """The frames of one view in order: all that it has, or those of some spans.
+    """Yield the frames of one stream in order: all that it has, or those of some spans.
 
-    The source's clock is moved.
+    This moves the clock of the source.
     """
     frame = math.prod(source.spec.frame_shape) * np.dtype(source.spec.dtype).itemsize
     size = max(1, min(PIECE, PIECE_BYTES // max(1, frame)))
-    for low, high in _held(source, stream) if spans is None else spans:
+    for low, high in _spans(source, stream) if spans is None else spans:
         for t in range(low, high, size):
             source.seek(t)
             yield source.take(stream, min(size, high - t))
 
 
-def count(source: Logged) -> int:
-    """Frames of all views."""
-    streams = range(len(source.spec.streams))
-    return sum(high - low for stream in streams for low, high in _held(source, stream))
-
-
 def shared_spans(source: Logged) -> list[Span]:
-    """The unbroken stretches of frames that every view has; one of a source without gaps.
+    """Return the spans of frames without gaps in any stream.
 
     Raises:
         UsageError: there is none.
     """
-    held = [_held(source, stream) for stream in range(len(source.spec.streams))]
-    shared = functools.reduce(intersection, held)
+    streams = range(len(source.spec.streams))
+    shared = functools.reduce(intersection, (_spans(source, stream) for stream in streams))
     if not shared:
-        raise UsageError("its views have gaps, and no frame in common: export each by itself")
+        raise UsageError("its streams have gaps and no frame in common: export each separately")
     return shared
 
 
-def _held(source: Logged, stream: int) -> list[Span]:
+def _spans(source: Logged, stream: int) -> list[Span]:
     first = source.first_frame
     return source.spans(stream, first, first + source.frames)
 
 
 def write_images(source: Logged, folder: Path) -> int:
-    """Write every frame of every view as VIEW/FRAME.png, and return how many there are."""
+    """Write every frame of every stream as STREAM/FRAME.png, and return their number."""
+    count = 0
     for stream, name in enumerate(stream_names(source.spec.streams)):
         (folder / name).mkdir(parents=True)
         for block in pieces(source, stream):
-            for i, frame in enumerate(block.frames):
-                Image.fromarray(frame).save(folder / name / f"{block.t + i:08d}.png")
-    return count(source)
+            for t, frame in enumerate(block.frames, start=block.t):
+                Image.fromarray(frame).save(folder / name / f"{t:08d}.png")
+                count += 1
+    return count
 
 
-def write_films(source: Logged, folder: Path, *, lossless: bool) -> int:
-    """Write each view as VIEW.mp4, see `write_film`, and return how many frames they have."""
+def write_videos(source: Logged, folder: Path, *, lossless: bool) -> int:
+    """Write each stream as STREAM.mp4, and return the number of frames; see `write_video`."""
     folder.mkdir()
-    for stream, name in enumerate(stream_names(source.spec.streams)):
-        write_film(source, stream, folder / f"{name}.mp4", lossless=lossless)
-    return count(source)
+    names = stream_names(source.spec.streams)
+    return sum(
+        write_video(source, stream, folder / f"{name}.mp4", lossless=lossless)
+        for stream, name in enumerate(names)
+    )
 
 
-def write_film(
+def write_video(
     source: Logged,
     stream: int,
     file: Path,
@@ -108,27 +102,27 @@ def write_film(
     lossless: bool,
     key_every: int = 0,
     spans: Sequence[Span] | None = None,
-) -> None:
-    """Write one view as a video of the recording's frame rate.
+) -> int:
+    """Write one stream as a video at the frame rate of its source, and return its frames.
 
-    The file's comment holds, as JSON, the view, its first frame and that frame's log time,
-    and what was recorded.
+    The comment of the file holds, as JSON, the name of the stream, its first frame with its log
+    time, and the scene.
 
     Args:
-        source: the recording.
-        stream: the view.
-        file: where to; replaced.
+        source: the recording or log.
+        stream: number of the stream.
+        file: the new file.
         lossless: keep every value.
-        key_every: frames from one that can be decoded alone to the next; 0 leaves it open.
-        spans: write these frames one after the other; by default all, each at its time.
+        key_every: frames from one key frame to the next; 0 leaves that to x264.
+        spans: write these frames without pauses; by default all, each at its time.
 
     Raises:
         UsageError: PyAV is not installed.
         CdmisfaError: the file cannot be written.
     """
-    av, spec = pyav("writing videos"), source.spec
+    av, spec, count = pyav("writing videos"), source.spec, 0
     first = source.first_frame if spans is None else spans[0][0]
-    about = {
+    comment = {
         "view": spec.streams[stream],
         "first_frame": first,
         "first_time_ns": spec.time_ns(first),
@@ -138,25 +132,27 @@ def write_film(
     options = {**(EXACT if lossless else LOSSY), **({"g": str(key_every)} if key_every else {})}
     try:
         with av.open(str(file), "w", format="mp4") as container:
-            container.metadata["comment"] = json.dumps(about)
+            container.metadata["comment"] = json.dumps(comment)
             video = container.add_stream("libx264", rate=rate, options=options)
             video.height, video.width = spec.frame_shape
             video.pix_fmt = pixel_format(spec.frame_shape)
-            video.max_b_frames = 0  # no B-frames: file order is display order
+            video.max_b_frames = 0  # the file's order is the order of display
             video.codec_context.color_range = FULL_RANGE
-            for number, (t, picture) in enumerate(_pictures(av, source, stream, spans)):
-                picture.pts = t - first if spans is None else number
-                picture.time_base = 1 / rate
-                container.mux(video.encode(picture))
+            for t, image in _video_frames(av, source, stream, spans):
+                image.pts = t - first if spans is None else count
+                image.time_base = 1 / rate
+                container.mux(video.encode(image))
+                count += 1
             container.mux(video.encode(None))
     except (OSError, ValueError, av.FFmpegError) as error:
         raise CdmisfaError(f"{file} cannot be written: {error}") from error
+    return count
 
 
-def _pictures(
+def _video_frames(
     av: Any, source: Logged, stream: int, spans: Sequence[Span] | None
 ) -> Iterator[tuple[int, Any]]:
-    """The frames of a view with their numbers, as PyAV's, in one buffer."""
+    """Yield the frames of a stream with their numbers, as PyAV's, in one buffer."""
     height, width = source.spec.frame_shape
     kind = pixel_format(source.spec.frame_shape)
     shape = (3, height, width) if kind == "yuv444p" else (height * 3 // 2, width)
@@ -165,11 +161,11 @@ def _pictures(
     for block in pieces(source, stream, spans):
         for t, frame in enumerate(block.frames, start=block.t):
             luma[:] = frame
-            picture = av.VideoFrame.from_ndarray(planes, format=kind)
-            picture.color_range = FULL_RANGE
-            yield t, picture
+            image = av.VideoFrame.from_ndarray(planes, format=kind)
+            image.color_range = FULL_RANGE
+            yield t, image
 
 
 def pixel_format(shape: tuple[int, ...]) -> str:
-    """A video's pixels: half the chroma, which every player knows, needs even sides."""
+    """Return yuv420p, which every player knows but which needs even sides, or else yuv444p."""
     return "yuv444p" if shape[0] % 2 or shape[1] % 2 else "yuv420p"

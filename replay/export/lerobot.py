@@ -1,8 +1,8 @@
-"""Recordings as a LeRobot dataset, layout v3.0: views as videos, an episode without gaps.
+"""Recordings as a LeRobot dataset, layout v3.0: streams of images as videos, episodes without gaps.
 
-The layout is written as it is published (github.com/huggingface/lerobot), with PyArrow and
-PyAV: the `lerobot` package itself pins a Rerun older than the viewer's and cannot be
-installed beside it. `LeRobotDataset("name", root=FOLDER)` and Rerun open the folder.
+The layout is as published (github.com/huggingface/lerobot), written with PyArrow and PyAV: the
+package `lerobot` pins a Rerun older than the viewer's and cannot be installed beside it.
+`LeRobotDataset("name", root=FOLDER)` and Rerun open the folder.
 """
 
 from __future__ import annotations
@@ -21,16 +21,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.names import ACTION, BEGINS, JOINT, counted, stream_names
-from replay.export.frames import pieces, pixel_format, shared_spans, write_film
-from replay.export.statistics import (
-    Stats,
-    aggregated,
-    as_lists,
-    image_stats,
-    number_stats,
-    values_shown,
-)
+from cdmisfa.core.names import ACTION, BEGINS, JOINT, stream_names
+from replay.export.frames import pieces, pixel_format, shared_spans, write_video
 from replay.inputs import Logged
 from replay.recordings.source import RecordedSource
 from replay.stored import Span
@@ -38,177 +30,106 @@ from replay.stored import Span
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 FILES = 1000
-"""Most files of a folder. A log is a video a view, whatever its episodes; numbers are one table."""
+"""LeRobot's limit for files in a folder. Each log is one video a stream; numbers are one table."""
 
 KEY_EVERY = 2
-"""Frames from a key frame to the next, as in LeRobot: training reads single frames."""
+"""Frames from one key frame to the next, as in LeRobot: training reads single frames."""
 
 ACTIONS, STATE, WORLD = "action", "observation.state", "observation.environment_state"
-"""LeRobot's names for what is done, for what a robot or an agent knows, and for ground truth."""
+"""LeRobot's names of actions, of the state of a robot or an agent, and of other ground truth."""
 
-ABOUT = """# {name}
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
-Made by cdmisfa, as a LeRobot dataset ({version}): {episodes}, {frames} in all, at {fps} frames per
-second. `meta/info.json` names its features.
+Columns = dict[str, tuple[NDArray[Any], list[str] | None]]
+"""Values (n,) or (n, k) of each feature, and the names of its k numbers."""
 
-```python
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-dataset = LeRobotDataset("cdmisfa/{name}", root="{name}")
-```
-"""
-
-Columns = dict[str, NDArray[Any]]
-Feature = dict[str, Any]
+Stats = dict[str, NDArray[Any]]
 
 
 def write_dataset(
-    logs: Iterable[Logged],
-    folder: Path,
-    *,
-    name: str,
-    lossless: bool,
-    task: str | None = None,
+    logs: Iterable[Logged], folder: Path, *, lossless: bool, task: str | None = None
 ) -> int:
-    """Write recordings as a LeRobot dataset, and return how many frames it has.
+    """Write recordings as a LeRobot dataset, and return its number of frames.
 
-    An episode is a stretch of frames that every view has; where an episode of a recorded task
-    begins, another one does. Images become videos `observation.images.VIEW`, a file a log; values
-    become `observation.VIEW`; ground truth becomes `action`, `observation.state` and
-    `observation.environment_state`. Numbers are float32, as LeRobot's own.
+    An episode is a stretch of frames that every stream has; it ends where an episode of a recorded
+    task ends. Images become videos `observation.images.STREAM`, numbers `observation.STREAM`, and
+    ground truth `action`, `observation.state` and `observation.environment_state`, all float32.
 
     Args:
-        logs: each open until the next is asked for; of the same streams, shape and rate.
-        folder: where to.
-        name: what the dataset's card calls it.
+        logs: logs with equal streams, shapes and rates, each open until the next one.
+        folder: the new folder.
         lossless: keep every pixel.
-        task: what is done in it, in words; by default what each log says it shows.
+        task: what is done, in words; by default what each log states.
 
     Raises:
-        UsageError: there is no frame, logs do not show the same, the frame rate is not a whole
-            number, which LeRobot's format asks for, or PyAV is not installed.
+        UsageError: no frame is in every stream, the frame rate is not a whole number, or PyAV is
+            not installed.
         CdmisfaError: a file cannot be written.
     """
-    with contextlib.closing(_Dataset(folder, lossless=lossless)) as dataset:
-        for source in logs:
-            dataset.add(source, _episodes(source), task or _task(source))
-        return dataset.finish(name)
-
-
-class _Dataset:
-    """A dataset that is written log by log; what is kept of each episode is its row and statistics.
-
-    Raises:
-        UsageError, CdmisfaError: as `write_dataset`.
-    """
-
-    def __init__(self, folder: Path, *, lossless: bool) -> None:
-        self._folder = folder
-        self._film: dict[str, Any] = {"lossless": lossless, "key_every": KEY_EVERY}
-        self._table: pq.ParquetWriter | None = None
-        self._logs = self._fps = 0
-        self._tasks: dict[str, int] = {}
-        self._features: dict[str, Feature] = {}
-        self._rows: list[dict[str, Any]] = []
-        self._stats: list[dict[str, Stats]] = []
-
-    @property
-    def _frames(self) -> int:
-        return int(self._rows[-1]["dataset_to_index"]) if self._rows else 0
-
-    def add(self, source: Logged, spans: Sequence[Span], task: str) -> None:
-        """Write the episodes of one more log, the frames [start, stop) of each."""
-        self._fps = fps = _whole_rate(source.spec)
-        ends = np.cumsum([0, *(high - low for low, high in spans)]).tolist()
-        parts = list(itertools.pairwise(ends))
-        columns = _numbers(source, spans, self._features)
-        within = np.concatenate([np.arange(high - low) for low, high in spans])
-        clock = {
-            "timestamp": (within / fps).astype(np.float32),
-            "frame_index": within,
-            "episode_index": len(self._rows) + np.repeat(np.arange(len(spans)), np.diff(ends)),
-            "index": self._frames + np.arange(ends[-1]),
-            "task_index": np.full(ends[-1], self._tasks.setdefault(task, len(self._tasks))),
-        }
-        for key, values in clock.items():
-            columns[key] = _described(self._features, key, values, None)
-        rows = [
-            {
-                "episode_index": len(self._rows) + i,
-                "tasks": [task],
-                "length": high - low,
-                **_numbered("data", 0),
-                "dataset_from_index": self._frames + low,
-                "dataset_to_index": self._frames + high,
-            }
-            for i, (low, high) in enumerate(parts)
-        ]
-        stats = [{key: number_stats(own[low:high]) for key, own in columns.items()}
-                 for low, high in parts]  # fmt: skip
-        for stream, key in enumerate(_videos(source.spec)):
-            self._features[key] = _video_feature(source.spec.frame_shape, fps)
-            file = _place(self._folder / "videos" / key, self._logs, "mp4")
-            write_film(source, stream, file, spans=spans, **self._film)
-            for (low, high), span, row, own in zip(parts, spans, rows, stats, strict=True):
-                row |= _numbered(f"videos/{key}", self._logs)
-                row[f"videos/{key}/from_timestamp"] = low / fps
-                row[f"videos/{key}/to_timestamp"] = high / fps
-                own[key] = image_stats(values_shown(source, stream, span), high - low)
-        table = _table(columns, self._features)
-        if self._table is None:
-            self._table = pq.ParquetWriter(
-                _place(self._folder / "data", 0, "parquet"), table.schema
-            )
-        self._table.write_table(table)
-        self._logs += 1
-        self._rows += rows
-        self._stats += stats
-
-    def finish(self, name: str) -> int:
-        """Write what describes all of it, and return how many frames there are."""
-        self.close()
-        meta = self._folder / "meta"
-        pq.write_table(self._episodes(), _place(meta / "episodes", 0, "parquet"))
-        pq.write_table(_tasks(self._tasks), meta / "tasks.parquet")
-        frames, episodes = self._frames, len(self._rows)
-        info = _info(episodes, frames, len(self._tasks), self._fps, self._features)
-        _write_json(meta / "info.json", info)
-        stats = {key: aggregated([own[key] for own in self._stats]) for key in self._features}
-        _write_json(meta / "stats.json", {key: as_lists(own) for key, own in stats.items()})
-        about = {"name": name, "version": VERSION, "episodes": counted(episodes, "episode")}
-        card = ABOUT.format(**about, frames=counted(frames, "frame"), fps=self._fps)
-        (self._folder / "README.md").write_text(card, "utf-8")
-        return frames
-
-    def close(self) -> None:
-        """Close the table of numbers."""
-        if self._table is not None:
-            self._table.close()
-
-    def _episodes(self) -> pa.Table:
-        """The table of episodes, a row each, with the statistics of each."""
-        return pa.Table.from_pylist(
-            [
-                row
-                | {f"stats/{k}/{n}": v for k, s in own.items() for n, v in as_lists(s).items()}
-                | _numbered("meta/episodes", 0)
-                for row, own in zip(self._rows, self._stats, strict=True)
-            ]
-        )
+    features: dict[str, dict[str, Any]] = {}
+    tasks: dict[str, int] = {}
+    episodes: list[dict[str, Any]] = []
+    stats: list[dict[str, Stats]] = []
+    fps = start = 0
+    with contextlib.ExitStack() as stack:
+        table: pq.ParquetWriter | None = None
+        for log, source in enumerate(logs):
+            fps, spans = _whole_rate(source.spec), _episodes(source)
+            name = task or _task(source)
+            number = tasks.setdefault(name, len(tasks))
+            columns = _numbers(source, spans) | _clock(spans, fps, start, len(episodes), number)
+            features |= {key: _feature(*column) for key, column in columns.items()}
+            rows: list[dict[str, Any]] = []
+            log_stats: list[dict[str, Stats]] = []
+            begin = 0
+            for length in (high - low for low, high in spans):
+                end = begin + length
+                rows.append(
+                    {
+                        "episode_index": len(episodes) + len(rows),
+                        "tasks": [name],
+                        "length": length,
+                        **_file_number("data", 0),
+                        "dataset_from_index": start + begin,
+                        "dataset_to_index": start + end,
+                    }
+                )
+                log_stats.append({k: number_stats(v[begin:end]) for k, (v, _) in columns.items()})
+                begin = end
+            for stream, key in enumerate(_video_keys(source.spec)):
+                features[key] = _video_feature(source.spec.frame_shape, fps)
+                file = _path(folder / "videos" / key, log, "mp4")
+                how: dict[str, Any] = {"lossless": lossless, "key_every": KEY_EVERY}
+                write_video(source, stream, file, spans=spans, **how)
+                for row, episode_stats, span in zip(rows, log_stats, spans, strict=True):
+                    row |= _file_number(f"videos/{key}", log)
+                    for edge in ("from", "to"):
+                        frame = row[f"dataset_{edge}_index"] - start
+                        row[f"videos/{key}/{edge}_timestamp"] = frame / fps
+                    episode_stats[key] = image_stats(source, stream, span)
+            arrow = _table(columns)
+            if table is None:
+                file = _path(folder / "data", 0, "parquet")
+                table = stack.enter_context(pq.ParquetWriter(file, arrow.schema))
+            table.write_table(arrow)
+            episodes += rows
+            stats += log_stats
+            start += begin
+    _write_meta(folder / "meta", episodes, stats, tasks, features, fps)
+    return start
 
 
 def _whole_rate(spec: SourceSpec) -> int:
-    fps = round(spec.fps)
-    if fps != spec.fps or fps < 1:
+    if spec.fps != round(spec.fps) or spec.fps < 1:
         raise UsageError(
             f"LeRobot knows whole frame rates only, not {spec.fps:g} per second: "
             "change it with cdmisfa convert --rate"
         )
-    return fps
+    return round(spec.fps)
 
 
 def _task(source: Logged) -> str:
-    """What is done in a log, in words: the tasks that were played, or the scene that was seen."""
+    """Return the tasks that were recorded, in words, or else the scene."""
     tasks = source.origin().get("tasks") if isinstance(source, RecordedSource) else None
     if isinstance(tasks, list) and tasks:
         return " and ".join(map(str, tasks))
@@ -216,66 +137,64 @@ def _task(source: Logged) -> str:
 
 
 def _episodes(source: Logged) -> list[Span]:
-    """Return the spans of frames that every view has, cut where a recorded task begins again."""
+    """Return the spans of frames that every stream has, cut where a recorded task begins again."""
     begins = [i for i, name in enumerate(source.spec.truth) if name.startswith(BEGINS)]
-    found: list[Span] = []
+    spans: list[Span] = []
     for low, high in shared_spans(source):
         edges = {low, high}
         for block in pieces(source, 0, [(low, high)]) if begins else ():
             edges |= {block.t + int(i) for i in np.flatnonzero(block.truth[:, begins].any(axis=1))}
-        found += itertools.pairwise(sorted(edges))
-    return found
+        spans += itertools.pairwise(sorted(edges))
+    return spans
 
 
-def _numbers(source: Logged, spans: Sequence[Span], features: dict[str, Feature]) -> Columns:
-    """What is known of each frame, and frames that are no images, (n,) or (n, k) float32."""
-    spec, found = source.spec, Columns()
+def _numbers(source: Logged, spans: Sequence[Span]) -> Columns:
+    """Return ground truth and frames that are no images, as float32."""
+    spec, columns = source.spec, Columns()
     if spec.truth:
         truth = np.concatenate([block.truth for block in pieces(source, 0, spans)])
         of_task = any(name.startswith(BEGINS) for name in spec.truth)
-        keys = [_known_as(name, of_task=of_task) for name in spec.truth]
-        for key in filter(None, dict.fromkeys(keys)):
-            own = [i for i, known_as in enumerate(keys) if known_as == key]
-            found[key] = _described(features, key, truth[:, own], [spec.truth[i] for i in own])
-    for stream, view in enumerate(() if spec.images else stream_names(spec.streams)):
+        groups: dict[str, list[int]] = {}
+        for i, name in enumerate(spec.truth):
+            if name.startswith(ACTION):
+                groups.setdefault(ACTIONS, []).append(i)
+            elif not name.startswith(BEGINS):
+                state = of_task or name.startswith(JOINT)
+                groups.setdefault(STATE if state else WORLD, []).append(i)
+        for key, group in groups.items():
+            columns[key] = truth[:, group], [spec.truth[i] for i in group]
+    for stream, name in enumerate(() if spec.images else stream_names(spec.streams)):
         frames = np.concatenate([block.frames for block in pieces(source, stream, spans)])
-        names = [f"x{i + 1}" for i in range(frames.shape[1])]
-        found[f"observation.{view}"] = _described(features, f"observation.{view}", frames, names)
-    return found
+        columns[f"observation.{name}"] = frames, [f"x{i + 1}" for i in range(frames.shape[1])]
+    return {
+        key: ((values[:, 0] if values.shape[1] == 1 else values).astype(np.float32), names)
+        for key, (values, names) in columns.items()
+    }
 
 
-def _known_as(truth: str, *, of_task: bool) -> str:
-    """The feature that a truth is one of the numbers of; "" of none."""
-    if truth.startswith(BEGINS):
-        return ""
-    if truth.startswith(ACTION):
-        return ACTIONS
-    return STATE if of_task or truth.startswith(JOINT) else WORLD
+def _clock(spans: Sequence[Span], fps: int, start: int, episode: int, task: int) -> Columns:
+    """Return the columns that number frames, episodes and tasks."""
+    lengths = [high - low for low, high in spans]
+    within = np.concatenate([np.arange(length) for length in lengths])
+    columns = {
+        "timestamp": (within / fps).astype(np.float32),
+        "frame_index": within,
+        "episode_index": episode + np.repeat(np.arange(len(spans)), lengths),
+        "index": start + np.arange(len(within)),
+        "task_index": np.full(len(within), task),
+    }
+    return {key: (values, None) for key, values in columns.items()}
 
 
-def _described(
-    features: dict[str, Feature], key: str, values: NDArray[Any], names: list[str] | None
-) -> NDArray[Any]:
-    """Numbers as LeRobot has them, (n,) or (n, k), whose feature is told."""
-    values = values.astype(np.float32) if names is not None else values
-    values = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
-    shape = list(values.shape[1:]) or [1]
-    features[key] = {"dtype": str(values.dtype), "shape": shape, "names": names}
-    return values
+def _feature(values: NDArray[Any], names: list[str] | None) -> dict[str, Any]:
+    return {"dtype": str(values.dtype), "shape": list(values.shape[1:]) or [1], "names": names}
 
 
-def _videos(spec: SourceSpec) -> list[str]:
-    views = stream_names(spec.streams) if spec.images else ()
-    return [f"observation.images.{view}" for view in views]
+def _video_keys(spec: SourceSpec) -> list[str]:
+    return [f"observation.images.{n}" for n in stream_names(spec.streams)] if spec.images else []
 
 
-def _numbered(what: str, number: int) -> dict[str, int]:
-    """Which file of its kind it is."""
-    chunk, file = divmod(number, FILES)
-    return {f"{what}/chunk_index": chunk, f"{what}/file_index": file}
-
-
-def _video_feature(shape: tuple[int, ...], fps: int) -> Feature:
+def _video_feature(shape: tuple[int, ...], fps: int) -> dict[str, Any]:
     height, width = shape
     return {
         "dtype": "video",
@@ -294,61 +213,121 @@ def _video_feature(shape: tuple[int, ...], fps: int) -> Feature:
     }
 
 
-def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Feature]) -> pa.Table:
+def _table(columns: Columns) -> pa.Table:
     arrays = {}
-    for key, values in columns.items():
+    for key, (values, _) in columns.items():
         flat = pa.array(np.ascontiguousarray(values).reshape(-1))
-        width = features[key]["shape"][0]
-        arrays[key] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+        wide = values.ndim > 1
+        arrays[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if wide else flat
     return pa.table(arrays)
 
 
-def _tasks(tasks: Mapping[str, int]) -> pa.Table:
-    """The table of tasks as pandas writes it: the text is the index of the row."""
-    index = "__index_level_0__"
-    text = {"name": None, "field_name": index, "pandas_type": "unicode", "metadata": None}
-    number = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64"}
-    pandas = {
-        "index_columns": [index],
-        "column_indexes": [],
-        "columns": [
-            {**number, "numpy_type": "int64", "metadata": None},
-            {**text, "numpy_type": "object"},
-        ],
-        "creator": {"library": "pyarrow", "version": pa.__version__},
-        "pandas_version": "2.0.0",
-    }
-    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks)})
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+def _file_number(kind: str, number: int) -> dict[str, int]:
+    return {f"{kind}/chunk_index": number // FILES, f"{kind}/file_index": number % FILES}
 
 
-def _info(
-    episodes: int, frames: int, tasks: int, fps: int, features: Mapping[str, Feature]
-) -> dict[str, Any]:
+def _path(folder: Path, number: int, ending: str) -> Path:
+    name = FILE.format(chunk_index=number // FILES, file_index=number % FILES)
+    path = folder / f"{name}.{ending}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _write_meta(
+    meta: Path,
+    episodes: Sequence[Mapping[str, Any]],
+    stats: Sequence[Mapping[str, Stats]],
+    tasks: Mapping[str, int],
+    features: Mapping[str, Mapping[str, Any]],
+    fps: int,
+) -> None:
+    """Write the files that describe a dataset: episodes, tasks, info and statistics."""
+    rows = [
+        {
+            **row,
+            **{f"stats/{k}/{n}": v.tolist() for k, s in own.items() for n, v in s.items()},
+            **_file_number("meta/episodes", 0),
+        }
+        for row, own in zip(episodes, stats, strict=True)
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), _path(meta / "episodes", 0, "parquet"))
+    pq.write_table(_tasks(tasks), meta / "tasks.parquet")
     videos = any(feature["dtype"] == "video" for feature in features.values())
-    return {
+    info = {
         "codebase_version": VERSION,
         "robot_type": None,
-        "total_episodes": episodes,
-        "total_frames": frames,
-        "total_tasks": tasks,
+        "total_episodes": len(episodes),
+        "total_frames": episodes[-1]["dataset_to_index"],
+        "total_tasks": len(tasks),
         "chunks_size": FILES,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": fps,
-        "splits": {"train": f"0:{episodes}"},
+        "splits": {"train": f"0:{len(episodes)}"},
         "data_path": f"data/{FILE}.parquet",
         "video_path": f"videos/{{video_key}}/{FILE}.mp4" if videos else None,
         "features": features,
     }
+    (meta / "info.json").write_text(json.dumps(info, indent=4), "utf-8")
+    whole = {key: aggregated([episode[key] for episode in stats]) for key in features}
+    lists = {key: {n: v.tolist() for n, v in values.items()} for key, values in whole.items()}
+    (meta / "stats.json").write_text(json.dumps(lists, indent=4), "utf-8")
 
 
-def _place(folder: Path, number: int, ending: str) -> Path:
-    chunk, file_of_it = divmod(number, FILES)
-    file = folder / f"{FILE.format(chunk_index=chunk, file_index=file_of_it)}.{ending}"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    return file
+def _tasks(tasks: Mapping[str, int]) -> pa.Table:
+    """Return the table of tasks as pandas writes it: the text is the index of the row."""
+    index = "__index_level_0__"
+    kind = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    columns = [{"name": None, "field_name": index, **kind}]
+    pandas = {"index_columns": [index], "column_indexes": [], "columns": columns}
+    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks)})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _write_json(file: Path, document: Mapping[str, Any]) -> None:
-    file.write_text(json.dumps(document, indent=4), "utf-8")
+def number_stats(values: NDArray[Any]) -> Stats:
+    """Return LeRobot's statistics of (n,) or (n, k) numbers."""
+    rows = values.astype(np.float64).reshape(len(values), -1)
+    return {
+        "min": rows.min(axis=0),
+        "max": rows.max(axis=0),
+        "mean": rows.mean(axis=0),
+        "std": rows.std(axis=0),
+        "count": np.array([len(rows)]),
+        **{key: np.quantile(rows, q, axis=0) for key, q in QUANTILES.items()},
+    }
+
+
+def image_stats(source: Logged, stream: int, span: Span) -> Stats:
+    """Return LeRobot's statistics of pixels from 0 to 1, (3, 1, 1) each, from a histogram."""
+    counts = np.zeros(256, dtype=np.int64)
+    for block in pieces(source, stream, [span]):
+        counts += np.bincount(block.frames.reshape(-1), minlength=256)
+    levels, total, below = np.arange(256) / 255, counts.sum(), np.cumsum(counts)
+    mean = (levels * counts).sum() / total
+    values = {
+        "min": levels[counts > 0][0],
+        "max": levels[counts > 0][-1],
+        "mean": mean,
+        "std": np.sqrt(((levels - mean) ** 2 * counts).sum() / total),
+        **{key: levels[np.searchsorted(below, q * total)] for key, q in QUANTILES.items()},
+    }
+    stats = {key: np.full((3, 1, 1), value) for key, value in values.items()}
+    return {**stats, "count": np.array([span[1] - span[0]])}
+
+
+def aggregated(parts: Sequence[Stats]) -> Stats:
+    """Return the statistics of all from those of parts; as LeRobot's, quantiles are means."""
+    counts = np.array([float(part["count"][0]) for part in parts])
+
+    def mean(values: list[NDArray[Any]]) -> NDArray[Any]:
+        return np.average(values, axis=0, weights=counts)
+
+    centre = mean([part["mean"] for part in parts])
+    return {
+        "min": np.min([part["min"] for part in parts], axis=0),
+        "max": np.max([part["max"] for part in parts], axis=0),
+        "mean": centre,
+        "std": np.sqrt(mean([part["std"] ** 2 + (part["mean"] - centre) ** 2 for part in parts])),
+        "count": np.array([int(counts.sum())]),
+        **{key: mean([part[key] for part in parts]) for key in QUANTILES},
+    }

@@ -1,9 +1,8 @@
-"""A run's signals as a table that other tools read: a row an iteration, a column a signal.
+"""A run's signals as a table for other programs: a row an iteration, a column a signal.
 
-Every table is made from the one table of signals. What is missing is null in Parquet,
-and NaN in npz and CSV. Parquet carries each signal's symbol, equation, unit and dimensions as the
-column's metadata, and the run's configuration as the table's; npz has both as JSON in the arrays
-`_signals` and `_run`.
+A missing value is null in Parquet, and NaN in npz and CSV. Parquet holds symbol, equation, unit
+and dimensions of each signal in the metadata of its column, and the configuration of the run in
+the metadata of the table; npz holds both as JSON in the arrays `_signals` and `_run`.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -23,96 +22,17 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, Signal
-from recorder.log.files import atomic_write
 from replay.runs.columns import padded, whole_signals
 from replay.runs.log import RunHeader, read_columns, read_header
 
-TABLES = ("csv", "parquet", "npz")
-"""What a run's signals can be written as."""
-
 CSV_LEAVES_OUT = tuple(s.name for s in SIGNALS.values() if "T" in s.dims)
-"""Signals of every frame, for which a row an iteration has no room."""
-
-_ARROW = {"float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}
+"""Signals with a value for each frame: a row of an iteration would need thousands of cells."""
 
 
-def export_signals(run: Path, out: Path, form: str) -> int:
-    """Write a run's signals to a file, and return how many iterations there are.
-
-    CSV leaves out the outputs frame by frame; npz fills arrays that grow with the modules up
-    with NaN.
-
-    Args:
-        run: the folder of the run.
-        out: the file; replaced.
-        form: one of `TABLES`.
-
-    Raises:
-        UsageError: no such run.
-        LogDamagedError: the run cannot be read.
-        LogWriteError: the file cannot be written.
-    """
-    header = read_header(run)
-    write = {"csv": _write_csv, "npz": _write_npz, "parquet": _write_parquet}[form]
-    with atomic_write(out) as partial:
-        return write(run, header, partial)
-
-
-def signals_table(run: Path, names: Sequence[str] = tuple(SIGNALS)) -> pa.Table:
-    """Some signals of a run as an Arrow table, a row an iteration; what is missing is null.
-
-    Raises:
-        UsageError: no such run.
-        LogDamagedError: the run cannot be read.
-    """
-    header = read_header(run)
-    schema = _arrow_schema(header, names)
-    return pa.Table.from_batches(_batches(run, header, schema), schema)
-
-
-def _arrow_schema(header: RunHeader, names: Sequence[str] = tuple(SIGNALS)) -> pa.Schema:
-    """The table's columns, nested one list a dimension, with what each signal is."""
-    fields = []
-    for signal in map(SIGNALS.__getitem__, names):
-        kind = _ARROW[signal.dtype]
-        for _ in signal.dims:
-            kind = pa.list_(kind)
-        missing = signal.dtype == "float64" and not signal.dims
-        fields.append(pa.field(signal.name, kind, nullable=missing, metadata=_about(signal)))
-    about = {f"cdmisfa.{name}": value for name, value in _run(header).items()}
-    return pa.schema(fields, metadata=about)
-
-
-def _about(signal: Signal) -> dict[str, str]:
-    return {name: str(value) for name, value in asdict(signal).items() if name != "show"}
-
-
-def _run(header: RunHeader) -> dict[str, str]:
-    return {
-        "schema": str(SCHEMA_VERSION),
-        "spec": json.dumps(asdict(header.spec)),
-        "manifest": json.dumps(header.manifest),
-    }
-
-
-def _nested(values: NDArray[Any]) -> pa.Array:
-    """(n, ...) values as n rows of nested lists, NaN as null."""
-    array: pa.Array = pa.array(values.reshape(-1), from_pandas=True)
-    for dim in range(values.ndim - 1, 0, -1):
-        lists = math.prod(values.shape[:dim])
-        offsets = np.arange(lists + 1, dtype=np.int32) * values.shape[dim]
-        array = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), array)
-    return array
-
-
-def _batches(run: Path, header: RunHeader, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
-    for piece in read_columns(run, header):
-        arrays = [_nested(piece[name]) for name in schema.names]
-        yield pa.RecordBatch.from_arrays(arrays, schema=schema)
-
-
-def _write_parquet(run: Path, header: RunHeader, out: Path) -> int:
-    rows, schema = 0, _arrow_schema(header)
+def write_parquet(run: Path, out: Path) -> int:
+    """Write all signals as Parquet, and return the number of iterations."""
+    header, rows = read_header(run), 0
+    schema = _schema(header, tuple(SIGNALS))
     with pq.ParquetWriter(out, schema, compression="zstd") as writer:
         for batch in _batches(run, header, schema):
             writer.write_batch(batch)
@@ -120,16 +40,26 @@ def _write_parquet(run: Path, header: RunHeader, out: Path) -> int:
     return rows
 
 
-def _write_npz(run: Path, header: RunHeader, out: Path) -> int:
+def write_npz(run: Path, out: Path) -> int:
+    """Write all signals as NumPy arrays, and return the number of iterations.
+
+    Arrays that grow with the number of modules begin with NaN.
+    """
+    header = read_header(run)
     arrays = whole_signals(read_columns(run, header), tuple(SIGNALS))
-    about = {name: _about(signal) for name, signal in SIGNALS.items()}
-    notes = {"_signals": np.array(json.dumps(about)), "_run": np.array(json.dumps(_run(header)))}
+    signals = {name: _facts(signal) for name, signal in SIGNALS.items()}
+    notes = {
+        "_signals": np.array(json.dumps(signals)),
+        "_run": np.array(json.dumps(_run_facts(header))),
+    }
     with open(out, "wb") as file:
         np.savez_compressed(file, **arrays, **notes)  # type: ignore[arg-type]
     return len(arrays["iteration"])
 
 
-def _write_csv(run: Path, header: RunHeader, out: Path) -> int:
+def write_csv(run: Path, out: Path) -> int:
+    """Write all signals but `CSV_LEAVES_OUT` as CSV, and return the number of iterations."""
+    header = read_header(run)
     signals = [s for s in SIGNALS.values() if s.name not in CSV_LEAVES_OUT]
     modules = max((piece["band_sd"].shape[1] for piece in read_columns(run, header)), default=0)
     rows = 0
@@ -139,7 +69,7 @@ def _write_csv(run: Path, header: RunHeader, out: Path) -> int:
             cells = [padded(signal, piece[signal.name], modules) for signal in signals]
             if not rows:
                 writer.writerow(
-                    signal.name + _place(place)
+                    signal.name + (f"[{','.join(map(str, place))}]" if place else "")
                     for signal, values in zip(signals, cells, strict=True)
                     for place in np.ndindex(values.shape[1:])
                 )
@@ -149,5 +79,66 @@ def _write_csv(run: Path, header: RunHeader, out: Path) -> int:
     return rows
 
 
-def _place(index: tuple[int, ...]) -> str:
-    return f"[{','.join(map(str, index))}]" if index else ""
+TABLES: dict[str, Callable[[Path, Path], int]] = {
+    "csv": write_csv,
+    "parquet": write_parquet,
+    "npz": write_npz,
+}
+"""Function that writes each form of a run's signals.
+
+Args: the run and the new file. Raises: UsageError without such a run, LogDamagedError if it cannot
+be read.
+"""
+
+
+def signals_table(run: Path, names: Sequence[str]) -> pa.Table:
+    """Return some signals of a run as an Arrow table, a row an iteration.
+
+    Raises:
+        UsageError: there is no such run.
+        LogDamagedError: the run cannot be read.
+    """
+    header = read_header(run)
+    schema = _schema(header, names)
+    return pa.Table.from_batches(_batches(run, header, schema), schema)
+
+
+def _schema(header: RunHeader, names: Sequence[str]) -> pa.Schema:
+    """Return the columns, nested one list a dimension, with their metadata."""
+    fields = []
+    for signal in map(SIGNALS.__getitem__, names):
+        kind = pa.from_numpy_dtype(signal.dtype)
+        for _ in signal.dims:
+            kind = pa.list_(kind)
+        nullable = signal.dtype == "float64" and not signal.dims
+        fields.append(pa.field(signal.name, kind, nullable=nullable, metadata=_facts(signal)))
+    metadata = {f"cdmisfa.{name}": value for name, value in _run_facts(header).items()}
+    return pa.schema(fields, metadata=metadata)
+
+
+def _facts(signal: Signal) -> dict[str, str]:
+    return {name: str(value) for name, value in asdict(signal).items() if name != "show"}
+
+
+def _run_facts(header: RunHeader) -> dict[str, str]:
+    return {
+        "schema": str(SCHEMA_VERSION),
+        "spec": json.dumps(asdict(header.spec)),
+        "manifest": json.dumps(header.manifest),
+    }
+
+
+def _batches(run: Path, header: RunHeader, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
+    for piece in read_columns(run, header):
+        arrays = [_nested(piece[name]) for name in schema.names]
+        yield pa.RecordBatch.from_arrays(arrays, schema=schema)
+
+
+def _nested(values: NDArray[Any]) -> pa.Array:
+    """Return (n, ...) values as n rows of nested lists, NaN as null."""
+    array: pa.Array = pa.array(values.reshape(-1), from_pandas=True)
+    for dim in range(values.ndim - 1, 0, -1):
+        lists = math.prod(values.shape[:dim])
+        offsets = np.arange(lists + 1, dtype=np.int32) * values.shape[dim]
+        array = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), array)
+    return array

@@ -18,7 +18,7 @@ from replay.view.layouts import NEAR, blueprint, images, lines
 from replay.view.rows import MOST_STREAMS, Rows, label, part
 
 if TYPE_CHECKING:
-    from replay.export.applied import Applied
+    from replay.export.applied import Applied, AppliedSink
 
 # Frames from one image that is shown to the next; values are all shown.
 EVERY = 10
@@ -43,7 +43,7 @@ class ViewSink:
         self._rows, self._modules = Rows(recording, spec), list(columns_of(modules))
 
     def add(self, applied: Applied) -> None:
-        """See `AppliedSink`."""
+        """Write the outputs on a block."""
         block, s = applied.block, applied.block.stream
         stream = part(self._spec.streams, s)
         frames = np.arange(block.t, block.t + len(block))
@@ -62,7 +62,7 @@ class ViewSink:
             self._rows.lines(path, outputs, (frames, None), applied.y[:, own], gap=1)
 
     def close(self) -> None:
-        """See `AppliedSink`."""
+        """Write what waits, and the layout of the view."""
         self._rows.flush()
         tabs = [self._tab(s) for s in range(min(len(self._spec.streams), MOST_STREAMS))]
         self._recording.send_blueprint(blueprint(*tabs, name="Applied modules", length=self._end))
@@ -86,7 +86,7 @@ class ViewSink:
 @contextlib.contextmanager
 def written_view(
     out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool
-) -> Iterator[ViewSink]:
+) -> Iterator[AppliedSink]:
     """Yield a sink that writes a view of modules' outputs, whole when the body has ended.
 
     Args:
@@ -101,5 +101,5 @@ def written_view(
     """
     with recording_to(out, out.stem, out, force=force) as recording:
         view = ViewSink(recording, spec, modules)
-        yield view
+        yield view.add
         view.close()

@@ -208,7 +208,7 @@ def applied(
     """Apply modules to an open source, into its file and to where blocks go as they come."""
     from cdmisfa.experiments.apply import Totals, follow
     from cdmisfa.experiments.apply_logs import written_to
-    from replay.export.applied import LinesSink
+    from replay.export.applied import line
 
     live = hasattr(source, "stop")
     if hasattr(source, "stop"):
@@ -221,7 +221,7 @@ def applied(
         if place is not None:
             sinks.append(stack.enter_context(written_to(place, spec, modules, force=force)))
         if lines:
-            sinks.append(LinesSink(print_line, spec, modules))
+            sinks.append(lambda block: print_line(line(block, spec, modules)))
         blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))
         total = None if spec.length is None else spec.length * len(spec.streams)
         follow(blocks, sinks, totals, lambda: shown.update(totals.frames, total))
