@@ -1,7 +1,8 @@
-"""What was learned, judged on the last frames of a log, which the learner was not shown."""
+"""Modules judged on the last frames of a log, which the learner does not see."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -11,53 +12,56 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
+from cdmisfa.experiments.sources import OF_CAMERAS, Configuration
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.modules import Module
 from replay.storage.identity import LoggedSource
 from replay.stored import StoredSource
 
 PIECE = 256
-"""Frames that are held at once."""
+"""Frames that are in memory at once."""
 
 
 HOLDOUT = 0.1
-"""Share of a camera log that is held out by default."""
+"""Default share of a camera log that is held out."""
 
 FEWEST = 200
-"""Frames that tell how slow an output is; where fewer would be held out, none are."""
+"""Fewest frames that estimate the slowness of an output; of a shorter share none are held out."""
 
 
 class _StoppedError(Exception):
-    """The run is to end."""
+    """The user stops the run."""
 
 
-def hold_out(source: FrameSource, share: float | None, *, judged: bool) -> None:
-    """Keep the last frames of a camera log from what learns, which is judged on them at its end.
+def hold_out(source: FrameSource, configuration: Configuration) -> None:
+    """Keep the last frames of a log from the progress learner, which is judged on them at its end.
 
     Args:
         source: what it learns from.
-        share: of the frames; None for `HOLDOUT` where there is something to hold out.
-        judged: whether the learner is one that is judged.
+        configuration: its `input.holdout` is the share; without one `HOLDOUT`, where possible.
 
     Raises:
         UsageError: a share is given, and nothing can be held out.
     """
+    share = None if configuration.inputs is None else configuration.inputs.holdout
     if share == 0.0:
         return
-    logged = source if isinstance(source, LoggedSource) and source.to_judge else None
-    if not judged or logged is None or logged.spec.length is None:
+    by_progress = configuration.learner.algorithm == OF_CAMERAS
+    logged = isinstance(source, LoggedSource) and source.to_judge
+    if not by_progress or not logged or source.spec.length is None:
         if share is not None:
             raise UsageError(
                 "input.holdout is for camera logs that the progress learner learns from once: "
                 "leave it out, or leave out --loop and --algorithm"
             )
         return
-    count = int(logged.frames * (HOLDOUT if share is None else share))
+    assert isinstance(source, LoggedSource)
+    count = int(source.frames * (HOLDOUT if share is None else share))
     if count >= FEWEST:
-        logged.hold_out(count)
+        source.hold_out(count)
     else:
-        said = f"{count} of {logged.frames} frames are too few to judge on: none are held out"
-        logged.notes = (*logged.notes, f"{said} (input.holdout)")
+        few = f"{count} of {source.frames} frames are too few to judge on: none are held out"
+        source.notes = (*source.notes, f"{few} (input.holdout)")
 
 
 def judged(
@@ -66,21 +70,20 @@ def judged(
     components: int,
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any] | None:
-    """How slow the outputs of each module are on the frames that were held out.
+    """Judge each module by the slowness of its outputs on the frames that were held out.
 
-    Beside them stands what batch SFA, with as many outputs, gives on the same frames; it is fitted
-    to the frames of the module's stream that the run went over.
+    The result has beside them the slowness of batch SFA with as many outputs on the same frames;
+    batch SFA is fitted to the frames of the module's stream that the run used.
 
     Args:
         source: as the learner left it.
-        modules: what was learned.
-        components: of the learner, and of batch SFA.
-        stop: asked before every piece; true ends it without a result.
+        modules: the learned modules.
+        components: whitening components of the learner, and of batch SFA.
+        stop: called before every piece; true ends it without a result.
 
     Returns:
         The frames [start, stop) held out and those fitted to, and for each module its slowness and
-        batch SFA's, (J,) each, as JSON values. Nothing where nothing was held out, None where it
-        was stopped.
+        batch SFA's, (J,) each, as JSON values. Empty if nothing was held out, None if stopped.
 
     Raises:
         LogDamagedError: the log is damaged there.
@@ -92,8 +95,21 @@ def judged(
     rows: dict[int, dict[str, Any]] = {}
     try:
         for stream in sorted({module.stream_index for module in modules}):
-            own = [module for module in modules if module.stream_index == stream]
-            rows |= _of_stream(source, own, components, fitted, held, stop)
+            ours = [module for module in modules if module.stream_index == stream]
+            pieces = functools.partial(_pieces, source, ours[0], stop)
+            outputs = len(ours[0].phi)
+            phi, mean, _ = batch_outputs(
+                pieces(*fitted), fitted[1] - fitted[0], components, outputs
+            )
+            weights = [(module.phi, module.mean) for module in ours]
+            *slow, of_batch = following_slowness(pieces(*held), [*weights, (phi, mean)])
+            for module, slowness in zip(ours, slow, strict=True):
+                rows[module.index] = {
+                    "module": module.index,
+                    "stream": module.stream,
+                    "slowness": slowness.tolist(),
+                    "of_batch": of_batch.tolist(),
+                }
     except _StoppedError:
         return None
     return {
@@ -103,37 +119,15 @@ def judged(
     }
 
 
-def _of_stream(
-    source: StoredSource,
-    modules: Sequence[Module],
-    components: int,
-    fitted: tuple[int, int],
-    held: tuple[int, int],
-    stop: Callable[[], bool],
-) -> dict[int, dict[str, Any]]:
-    """The rows of the modules of one stream, by their index."""
-
-    def pieces(span: tuple[int, int]) -> Iterator[tuple[NDArray[Any], bool]]:
-        after = span[0]
-        for block in source.pieces(modules[0].stream_index, *span, PIECE):
-            if stop():
-                raise _StoppedError
-            x = block.frames.reshape(len(block), -1)
-            if not np.isfinite(x).all():
-                continue  # as a learner does not take them either
-            yield expand(modules[0].expansion, x), block.t != after
+def _pieces(
+    source: StoredSource, module: Module, stop: Callable[[], bool], start: int, end: int
+) -> Iterator[tuple[NDArray[Any], bool]]:
+    """Yield the frames [start, end) of a module's stream, expanded, and whether a gap precedes."""
+    after = start
+    for block in source.pieces(module.stream_index, start, end, PIECE):
+        if stop():
+            raise _StoppedError
+        x = block.frames.reshape(len(block), -1)
+        if np.isfinite(x).all():  # a learner skips other blocks, too
+            yield expand(module.expansion, x), block.t != after
             after = block.t + len(block)
-
-    outputs = len(modules[0].phi)
-    batch = batch_outputs(pieces(fitted), fitted[1] - fitted[0], components, outputs)
-    each = [(module.phi, module.mean) for module in modules] + [batch[:2]]
-    slow = following_slowness(pieces(held), each)
-    return {
-        module.index: {
-            "module": module.index,
-            "stream": module.stream,
-            "slowness": own.tolist(),
-            "of_batch": slow[-1].tolist(),
-        }
-        for module, own in zip(modules, slow, strict=False)
-    }

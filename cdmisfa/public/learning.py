@@ -7,32 +7,25 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cdmisfa.core.blocks import FrameSource, description
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 from cdmisfa.experiments.holdout import hold_out
 from cdmisfa.experiments.run_folder import command_of
 from cdmisfa.experiments.session import run as run_to_its_end
 from cdmisfa.experiments.sources import (
-    OF_CAMERAS,
     Configuration,
     configure_for,
-    is_scene,
     open_source,
     read_inputs,
 )
-from cdmisfa.public.recording import Given, Recording
+from cdmisfa.public.recording import Given, Recording, as_words
 from cdmisfa.public.run import Run
-from recorder.cameras.words import is_live
 from recorder.images.options import OPTIONS, Centre, InputOptions
 from replay.arrays import ArrayLog
-from replay.stored import StoredSource
+from replay.stored import centre_as
 
 
 def learn(
@@ -89,48 +82,41 @@ def learn(
         LogDamagedError: a log is damaged.
         LogExhaustedError: the source has not enough frames for a single block.
     """
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise UsageError(f"seed is {seed!r}: give a whole number from 0 on")
-    if misplaced := {field.name for field in fields(InputOptions)} & settings.keys():
-        name = min(misplaced)
-        raise UsageError(f"{name} is of a recording: learn(Recording(source, {name}=...))")
-    seed = int(seed)
     words = [f"learner.{name}={value}" for name, value in settings.items()]
     if algorithm is not None:
         words.append(f"learner.algorithm={algorithm}")
     words += InputOptions(holdout=holdout, centre=centre).settings()
-    how: dict[str, Any] = {"preset": preset, "settings": words, "seed": seed}
-    limits: dict[str, Any] = {"max_iterations": max_iterations, "max_modules": max_modules}
+    how: dict[str, Any] = {"preset": preset, "settings": words, "seed": int(seed)}
+    limits = {"max_iterations": max_iterations, "max_modules": max_modules}
     logs: dict[str, Any] = {"loop": loop, "episodes": episodes}
-    with _opened(source, logs, how) as (frames, configuration, told), _folder(out) as folder:
-        by_progress = configuration.learner.algorithm == OF_CAMERAS
-        share = None if configuration.inputs is None else configuration.inputs.holdout
-        hold_out(frames, share, judged=by_progress)
+    with _opened(source, logs, how) as (frames, configuration, command), _folder(out) as folder:
+        hold_out(frames, configuration)
+        if command is not None:
+            command = command_of(command[0], {**how, **limits, **command[1]}, folder)
         run_to_its_end(
             frames,
             configuration.learner,
             folder,
-            seed=seed,
+            seed=how["seed"],
             sections=configuration.tables(),
-            command=command_of(told[0], {**how, **limits, **told[1]}, folder) if told else None,
+            command=command,
             force=force,
             rerun=view,
             sinks=sinks,
             stop=stop,
-            max_iterations=max_iterations,
-            max_modules=max_modules,
+            **limits,
         )
-        found = Run(folder)
-        if told is None and isinstance(frames, ArrayLog):
-            found._learned_from = Recording.of(source)  # of arrays the folder holds only hashes
+        run = Run(folder)
+        if command is None and isinstance(frames, ArrayLog):
+            run._learned_from = Recording.of(source)  # the folder has only hashes of arrays
         if out is None:
-            weakref.finalize(found, shutil.rmtree, folder.parent, ignore_errors=True)
-    return found
+            weakref.finalize(run, shutil.rmtree, folder.parent, ignore_errors=True)
+    return run
 
 
 @contextlib.contextmanager
 def _folder(out: str | Path | None) -> Iterator[Path]:
-    """The folder of a run; a temporary one is removed where learning fails."""
+    """Yield the folder of a run; a temporary one is removed if learning fails."""
     if out is not None:
         yield Path(out)
         return
@@ -142,62 +128,45 @@ def _folder(out: str | Path | None) -> Iterator[Path]:
         raise
 
 
-Told = tuple[Sequence[str], dict[str, Any]] | None
-"""Words and options that name a source on the command line, where there are any."""
-
-
 @contextlib.contextmanager
 def _opened(
     source: Given, logs: dict[str, Any], how: dict[str, Any]
-) -> Iterator[tuple[FrameSource, Configuration, Told]]:
-    """A source, open, with its configuration and what names it; closed unless it was open."""
-    words = [str(source)] if isinstance(source, str | Path) else []
-    if isinstance(source, list | tuple) and all(isinstance(one, str | Path) for one in source):
-        words = list(map(str, source))
-    if words and not all(map(is_live, words)):
-        found, configuration = open_source(words, **how, **logs)
-        with contextlib.closing(found):
-            yield found, configuration, (words, {} if is_scene(words) else logs)
-        return
-    if logs["episodes"]:
-        if isinstance(source, Recording):
-            raise UsageError("episodes is of a recording: learn(Recording(source, episodes=True))")
-        raise UsageError("episodes is for logs: record or write what is shown first")
-    if words:
-        streams, configuration = open_source(words, **how)
-        with contextlib.closing(streams):
-            yield streams, configuration, (words, {})
-        return
+) -> Iterator[tuple[FrameSource, Configuration, Any]]:
+    """Open a source; yield it with its configuration, and with the words and options of a command.
+
+    The command is None where the command line cannot name the source. An open source stays open.
+    """
     if isinstance(source, FrameSource):
         yield source, _configured(source, how), None
         return
-    streamed = {"stream": source} if isinstance(source, Iterator) else source
-    if isinstance(streamed, Mapping) and any(isinstance(s, Iterator) for s in streamed.values()):
+    streams = {"stream": source} if isinstance(source, Iterator) else source
+    if isinstance(streams, Mapping) and any(isinstance(s, Iterator) for s in streams.values()):
         from recorder.cameras.stepped import ArraySource
 
-        with ArraySource(streamed) as made:
+        with ArraySource(streams) as made:
             yield made, _configured(made, how), None
+        return
+    if words := as_words(source):
+        opened, configuration = open_source(words, **how, **logs)
+        with contextlib.closing(opened):
+            yield opened, configuration, (words, logs)
         return
     recording = Recording.of(source)
     with recording.source(loop=logs["loop"]) as frames:
         how["settings"] = [*recording.inputs.settings(), *how["settings"]]
         configuration = _configured(frames, how, recording.inputs)
-        options = {"loop": logs["loop"] or recording.loop, "salvage": recording.salvage}
-        options |= {"episodes": recording.episodes}
-        options |= {
-            name: getattr(recording.inputs, name) for name in recording.inputs.chosen(OPTIONS)
-        }
+        options: dict[str, Any] = {"loop": logs["loop"] or recording.loop}
+        options |= {"salvage": recording.salvage, "episodes": recording.episodes}
+        for name in recording.inputs.chosen(OPTIONS):
+            options[name] = getattr(recording.inputs, name)
         yield frames, configuration, (recording.words, options) if recording.words else None
 
 
 def _configured(
     source: FrameSource, how: dict[str, Any], inputs: InputOptions | None = None
 ) -> Configuration:
-    """The configuration of an open source, which shows its frames as keys `input.*` say."""
+    """Return the configuration of an open source, and centre its frames as `input.centre` says."""
     inputs = read_inputs(inputs, how["preset"], how["settings"])
-    if inputs.centre != "run":
-        if not isinstance(source, StoredSource):
-            raise UsageError("centre is for logs: record or write what is shown first")
-        source.centre_by(inputs.centre)
+    centre_as(inputs.centre, source, "this source")
     described = description(source, at_once=True)
     return configure_for(source.spec, described, **how, inputs=inputs)

@@ -23,6 +23,12 @@ Given: TypeAlias = Any
 names of scenes, words of live streams, or an open source."""
 
 
+def as_words(given: Given) -> tuple[str, ...]:
+    """Return the words of paths, patterns or names; () of arrays."""
+    several = given if isinstance(given, list | tuple) else (given,)
+    return tuple(map(str, several)) if all(isinstance(w, str | Path) for w in several) else ()
+
+
 class Recording(Shown):
     """A recording, logs of others, or arrays, to be looked at and learned from.
 
@@ -59,17 +65,12 @@ class Recording(Shown):
         known = [field.name for field in fields(InputOptions)]
         if unknown := [name for name in options if name not in known]:
             raise UsageError(f"no option {unknown[0]}: {did_you_mean(unknown[0], known)}")
-        if not given:
-            raise UsageError("nothing given: name a log, or give an array")
         self.inputs = InputOptions(**options)
-        self._given = given
         self.loop, self.salvage, self.episodes = loop, salvage, episodes
-        words = all(isinstance(one, str | Path) for one in given)
-        self.words: tuple[str, ...] = tuple(map(str, given)) if words else ()
-        if episodes and not words:
-            raise UsageError("episodes are logs: name them, or give one array")
-        if not words and len(given) > 1:
-            raise UsageError("several arrays given: name each, as {'left': one, 'right': two}")
+        self.words = as_words(given)
+        if not self.words and len(given) != 1:
+            raise UsageError("give one array, or several by name: {'left': one, 'right': two}")
+        self._given = given[0]
         with self.source() as source:
             self.spec: SourceSpec = source.spec
 
@@ -78,8 +79,7 @@ class Recording(Shown):
         """A recording as it is, or of paths in a list, of one path or of arrays."""
         if isinstance(given, cls):
             return given
-        paths = isinstance(given, list | tuple) and all(isinstance(w, str | Path) for w in given)
-        return cls(*given) if paths and given else cls(given)
+        return cls(*given) if isinstance(given, list | tuple) and as_words(given) else cls(given)
 
     def source(self, *, loop: bool = False) -> Any:
         """Its streams, open to be read, for `with`: a `SeekableSource`.
@@ -91,7 +91,7 @@ class Recording(Shown):
         if self.words:
             how: dict[str, Any] = {"loop": loop, "salvage": self.salvage}
             return open_logs(self.words, inputs=self.inputs, episodes=self.episodes, **how)
-        (given,) = self._given
+        given = self._given
         streams = given if isinstance(given, Mapping) else {"stream": given}
         source = ArrayLog(streams, self.inputs, loop=loop)
         source.centre_by(self.inputs.centre)

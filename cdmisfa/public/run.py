@@ -17,7 +17,7 @@ from cdmisfa.core.learning import Learner
 from cdmisfa.core.shown import Shown
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.resume import Recomputation
-from cdmisfa.public.recording import Recording
+from cdmisfa.public.recording import Recording, as_words
 from cdmisfa.public.shown import view, watched
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
 from replay.runs.modules import SlowFeatures
@@ -172,14 +172,13 @@ class Run(Shown, replay.runs.run.Run):
                 keyframe every some hundred iterations, needs none.
             NotReproducedError: learning again gives other signals than its log holds.
         """
-        source = self._learned_from if isinstance(source, tuple) and not source else source
-        words = [source] if isinstance(source, str | Path) else source
+        if isinstance(source, tuple) and not source:
+            source = self._learned_from
+        words = as_words(source)
         with contextlib.ExitStack() as opened:
-            if isinstance(words, list | tuple) and all(isinstance(w, str | Path) for w in words):
-                found = tuple(map(str, words))
-            else:
-                found = opened.enter_context(Recording.of(source).source())
-            with Recomputation.after(self.log, iterations, found) as again:
+            if not words and not isinstance(source, tuple):
+                source = opened.enter_context(Recording.of(source).source())
+            with Recomputation.after(self.log, iterations, words or source) as again:
                 return again.learner
 
     def summary(self) -> str:

@@ -165,7 +165,7 @@ def opened_logs(
         inputs: how images of others become frames.
     """
     from cdmisfa.experiments.holdout import hold_out
-    from cdmisfa.experiments.sources import OF_CAMERAS, is_scene, open_source
+    from cdmisfa.experiments.sources import is_scene, open_source
 
     vain = [f"--{name}" for name in ("loop", "salvage") if told[name]]
     if vain and is_scene(source):
@@ -182,9 +182,7 @@ def opened_logs(
             **{name: told[name] for name in OPENED},
         )
     with contextlib.closing(frames):
-        progress = configuration.learner.algorithm == OF_CAMERAS
-        share = None if configuration.inputs is None else configuration.inputs.holdout
-        hold_out(frames, share, judged=progress)
+        hold_out(frames, configuration)
         say_about(frames)
         try:
             yield frames, configuration

@@ -75,8 +75,18 @@ class Findings:
         self.claims.append({"claim": claim, "holds": holds, "detail": detail})
 
     def claim_all(self, claim: str, good: int, n: int) -> None:
-        """Add that all of n trials did what is named."""
+        """Add a statement that holds where all of n trials are good."""
         self.claim(claim, good == n, f"{good} of {n} trials")
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the results as JSON values."""
+        return {
+            "reproduced": all(claim["holds"] is not False for claim in self.claims),
+            "claims": self.claims,
+            "table": self.lines,
+            "tables": self.tables,
+            "notes": self.notes,
+        }
 
 
 class Experiment(ABC):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import Block, SeekableSource
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.documents import plain, write_json
@@ -227,12 +227,12 @@ def learn_and_judge(
     """Learn up to a frame, or for `ITERATIONS`; return a row that judges modules on what follows.
 
     Raises:
-        UsageError: there are not enough frames for a block.
+        LogExhaustedError: there are not enough frames for a block.
     """
     learner = open_learner(config, source.spec, seed)
     iterations = min(ITERATIONS, frames // learner.tau)
     if iterations < 1:
-        raise UsageError(f"too few frames: {HELD_OUT} are held out, record more than these")
+        raise LogExhaustedError(f"too few frames: {HELD_OUT} are held out, record more than these")
     learn_blocks(source, learner, sinks, max_iterations=iterations, max_modules=iterations)
     return {
         **module_row(learner.modules),

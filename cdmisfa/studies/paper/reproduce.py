@@ -1,7 +1,7 @@
 """Reproduce the paper: run the missing trials of an experiment, judge, tabulate, draw.
 
-DIR/rows.jsonl holds each finished trial, DIR/results.json and the figures what all of them came
-to. A trial is known by its settings and the code that ran it: a stopped reproduction resumes, and a
+DIR/rows.jsonl holds each finished trial, DIR/results.json and the figures the results of all. A
+trial is identified by its settings and the code that ran it: a stopped reproduction resumes, and a
 change of the code starts it again.
 """
 
@@ -17,7 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError, did_you_mean
+from cdmisfa.core.errors import (
+    CdmisfaError,
+    LogDamagedError,
+    NotReproducedError,
+    UsageError,
+    did_you_mean,
+)
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
 from cdmisfa.experiments.store import StoredTrial, answer, code, read_rows, run_trials, trial_id
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Trial
@@ -38,6 +44,17 @@ FIRST_SEED = 28_000
 """Seed of an experiment's first trials: no reading was chosen on these, see docs/decisions."""
 
 
+def load(name: str) -> Experiment:
+    """Return an experiment by its name.
+
+    Raises:
+        UsageError: there is none of this name.
+    """
+    if name not in EXPERIMENTS:
+        raise UsageError(f"no experiment {name!r}: {did_you_mean(name, (*EXPERIMENTS, 'all'))}")
+    return EXPERIMENTS[name]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperTrial(StoredTrial):
     """A trial of one of `EXPERIMENTS`; its settings are its point."""
@@ -53,8 +70,8 @@ def reproduce(
     quick: bool = False,
     recording: Path | None = None,
     jobs: int = 1,
+    scheduler: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-    **where: Any,
 ) -> dict[str, Any]:
     """Run an experiment's missing trials, and write and return their results.
 
@@ -62,41 +79,37 @@ def reproduce(
         name: of the experiment.
         folder: of the results.
         trials: per condition; by default the paper's number.
-        quick: a few instead, enough to test the claim.
+        quick: run a few instead, enough to test the claim.
         recording: of the iCub scene; by default one beside the folder, made if it is missing.
         jobs: processes.
-        progress: called with the finished trials and all.
-        where: scheduler, see `run_trials`.
+        scheduler: see `run_trials`.
+        progress: called with the number of finished trials and of all.
 
     Raises:
-        UsageError: no such experiment, or matplotlib is missing.
+        UsageError: there is no such experiment, or matplotlib is missing.
         CdmisfaError: a trial failed; the others are kept.
     """
-    if name not in EXPERIMENTS:
-        raise UsageError(f"no experiment {name!r}: {did_you_mean(name, (*EXPERIMENTS, 'all'))}")
+    experiment, version = load(name), code()
     if find_spec("matplotlib") is None:
         raise UsageError("reproduce draws figures: pip install 'cdmisfa[paper]'")
-    experiment, version = EXPERIMENTS[name], code()
     if experiment.sees and recording is None:
         recording = make_recording(folder.parent / "icub-recording", FIRST_SEED, jobs)
-    seeds = range(FIRST_SEED, FIRST_SEED + (trials or experiment.trials[quick]))
-    tasks = [
-        PaperTrial(
-            id=trial_id(name, point, version), point=point, seed=seed, code=version, experiment=name
-        )
-        for condition in experiment.conditions(quick, recording)
-        for seed in seeds
-        for point in [{**condition, "seed": seed}]
-    ]
+    tasks = []
+    for condition in experiment.conditions(quick, recording):
+        for seed in range(FIRST_SEED, FIRST_SEED + (trials or experiment.trials[quick])):
+            point = {**condition, "seed": seed}
+            number = trial_id(name, point, version)
+            task = PaperTrial(id=number, point=point, seed=seed, code=version, experiment=name)
+            tasks.append(task)
     report = run_trials(
         tasks,
         folder,
         compute_trial,
         jobs=jobs,
+        scheduler=scheduler,
         retry_failed=True,
         begin=lambda missing: progress(len(tasks) - len(missing), len(tasks)),
         progress=lambda done, failed, total: progress(done, total),
-        **where,
     )
     for row in report.failed:
         raise CdmisfaError(f"{name} trial {row['point']}: {row['error']}; the others are kept")
@@ -104,7 +117,6 @@ def reproduce(
     finished = [_finished(folder, rows[task.id]) for task in tasks]
     found = Findings()
     experiment.evaluate(finished, found)
-    drawn = experiment.draw(finished, folder)
     document: dict[str, Any] = plain(
         {
             "schema": 2,
@@ -112,12 +124,8 @@ def reproduce(
             "title": experiment.title,
             "quick": quick,
             "trials": len(finished),
-            "reproduced": all(claim["holds"] is not False for claim in found.claims),
-            "claims": found.claims,
-            "table": found.lines,
-            "tables": found.tables,
-            "notes": found.notes,
-            "figures": [figure.name for figure in drawn],
+            **found.as_json(),
+            "figures": [figure.name for figure in experiment.draw(finished, folder)],
             "code": version,
             "versions": versions(),
         }
@@ -127,15 +135,15 @@ def reproduce(
 
 
 def compute_trial(trial: PaperTrial) -> Mapping[str, Any]:
-    """Compute one trial: its row and arrays, or under "error" why there are none."""
+    """Compute one trial; return its row and arrays, or under "error" why there are none."""
+    return answer(trial, code(), _compute)
 
-    def compute(trial: PaperTrial) -> dict[str, Any]:
-        row, arrays = EXPERIMENTS[trial.experiment].run(trial.point)
-        file = io.BytesIO()
-        np.savez_compressed(file, **dict[str, Any](arrays))
-        return {"row": plain(row), "arrays": base64.b64encode(file.getvalue()).decode()}
 
-    return answer(trial, code(), compute)
+def _compute(trial: PaperTrial) -> dict[str, Any]:
+    row, arrays = load(trial.experiment).run(trial.point)
+    file = io.BytesIO()
+    np.savez_compressed(file, **dict[str, Any](arrays))
+    return {"row": plain(row), "arrays": base64.b64encode(file.getvalue()).decode()}
 
 
 def _finished(folder: Path, row: Mapping[str, Any]) -> Trial:
@@ -144,17 +152,17 @@ def _finished(folder: Path, row: Mapping[str, Any]) -> Trial:
         file = io.BytesIO(base64.b64decode(row["result"]["arrays"]))
         with np.load(file, allow_pickle=False) as arrays:
             return Trial(row["point"], row["result"]["row"], dict(arrays))
-    except Exception as error:
-        raise UsageError(
-            f"{folder}: the row of trial {row['id']} is damaged: delete it, and it is run again"
+    except Exception as error:  # NumPy and zipfile raise many kinds
+        raise LogDamagedError(
+            f"{folder}: the row of trial {row['id']} is damaged: remove it to run the trial again"
         ) from error
 
 
 def check_claims(document: Mapping[str, Any]) -> None:
-    """Complain, naming them, when claims of the paper did not come out.
+    """Raise an error that names the claims of the paper that did not come out.
 
     Raises:
-        NotReproducedError: one did not.
+        NotReproducedError: there are some.
     """
     failed = [c for c in document["claims"] if c["holds"] is False]
     if failed:
@@ -165,7 +173,7 @@ def check_claims(document: Mapping[str, Any]) -> None:
 HEAD = ("quantity", "paper", "ours", "SD", "95 % interval", "n")
 
 VERDICTS = {True: "yes", False: "**no**", None: "*not judged*"}
-"""Whether a statement came out, in words."""
+"""Words for whether a statement came out."""
 
 
 def markdown_tables(document: Mapping[str, Any]) -> str:
