@@ -41,15 +41,6 @@ def test_every_set_shows_streams_that_can_be_made() -> None:
     assert not any(parse(word)[0].learnable for word in tuned & reported)
 
 
-@pytest.mark.parametrize("camera", pictures.CAMERAS)
-def test_cameras_keep_the_number_of_frames(camera: str) -> None:
-    plain = pictures.waves(np.random.default_rng(0), 60)
-    seen, again = (pictures.CAMERAS[camera](np.random.default_rng(1), plain) for _ in range(2))
-    assert seen.frames.shape == plain.frames.shape
-    assert len(seen.state) == 60
-    np.testing.assert_array_equal(seen.frames, again.frames)
-
-
 def test_modules_are_judged_against_batch_sfa() -> None:
     source = ArenaSource(WORDS, 0)
     good, _ = source.reference("x1", *TERMS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from recorder.images.messages import decoder_of
 from recorder.images.options import InputOptions
 from recorder.images.videos import frame_colors
 from replay.camera_logs.hue import hue_varies
-from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 
 HEIGHT, WIDTH, COUNT = 12, 16, 60
@@ -35,25 +35,23 @@ def beside(images: np.ndarray) -> np.ndarray:
     return np.concatenate([images[..., c] for c in range(3)], axis=-1)
 
 
-def decoded(message: bytes) -> np.ndarray:
-    decode = decoder_of(RAW, InputOptions(color=True))
-    assert decode is not None
-    return decode(message)
+PATTERN = np.array([[10, 200, 11], [101, 30, 0], [1, 2, 3]])
 
 
 @pytest.mark.parametrize(
-    ("encoding", "places"), [("rgb8", (0, 1, 2)), ("bgr8", (2, 1, 0)), ("bgra8", (2, 1, 0, 0))]
+    ("pixels", "encoding", "expected"),
+    [
+        (colors(1)[0], "rgb8", colors(1)[0]),
+        (colors(1)[0][:, :, ::-1], "bgr8", colors(1)[0]),
+        (colors(1)[0][:, :, [2, 1, 0, 0]], "bgra8", colors(1)[0]),
+        (PATTERN.astype("u1"), "bayer_grbg8", [[[200, 20, 101]]]),
+        ((PATTERN << 8).astype("<u2"), "bayer_grbg16", [[[200, 20, 101]]]),
+    ],
 )
-def test_pixels_keep_their_colours(encoding: str, places: tuple[int, ...]) -> None:
-    image = colors(1)[0]
-    assert (decoded(raw(image[:, :, list(places)], encoding)) == image).all()
-
-
-@pytest.mark.parametrize("bits", [8, 16])
-def test_two_by_two_pixels_of_a_bayer_pattern_are_one_in_colours(bits: int) -> None:
-    pattern = np.array([[10, 200, 11], [101, 30, 0], [1, 2, 3]]) << (bits - 8)
-    shown = decoded(raw(pattern.astype(f"<u{bits // 8}"), f"bayer_grbg{bits}"))
-    assert shown.tolist() == [[[200, 20, 101]]]
+def test_pixels_keep_their_colours(pixels: np.ndarray, encoding: str, expected: Any) -> None:
+    decode = decoder_of(RAW, InputOptions(color=True))
+    assert decode is not None
+    np.testing.assert_array_equal(decode(raw(np.ascontiguousarray(pixels), encoding)), expected)
 
 
 def test_gray_images_are_shown_three_times_among_colours() -> None:
@@ -78,20 +76,6 @@ def test_colours_of_a_video_are_those_that_ffmpeg_shows(form: str) -> None:
     assert np.abs(ours - theirs)[inner].mean() < 2
 
 
-def test_colours_of_other_formats_are_taken(tmp_path: Path) -> None:
-    av = pytest.importorskip("av")
-    image = colors(1)[0]
-    (tmp_path / "pngs").mkdir()
-    for i in range(3):
-        Image.fromarray(image).save(tmp_path / "pngs" / f"{i}.png")
-    with ForeignSource(tmp_path / "pngs", rate=5, color=True) as source:
-        assert source.spec.frame_shape == (HEIGHT, 3 * WIDTH)
-        assert (source.take(0, 1).frames[0] == beside(image)).all()
-    for form in ("rgb24", "gray"):
-        frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=form)
-        assert frame_colors(frame).ndim == (2 if form == "gray" else 3)
-
-
 def test_colours_are_learned_from_recorded_and_replayed_alike(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
@@ -105,25 +89,6 @@ def test_colours_are_learned_from_recorded_and_replayed_alike(
     assert gray["signals_sha256"] != run["signals_sha256"]
     with RecordedSource(tmp_path / "rec") as source:
         assert (source.take(0, COUNT).frames == beside(colors())).all()
-
-
-def test_a_scene_is_recorded_and_learned_in_colours(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    pytest.importorskip("pybullet")
-    small = ("--color", "--set", "scene.eyes.width=8", "--set", "scene.eyes.height=6")
-    rec = tmp_path / "rec"
-    done = cdmisfa("record", "icub", *small, "--frames", "80", "-o", rec)
-    assert done.code == 0, done.err
-    runs = []
-    for source, *how in ((rec,), ("icub", *small)):
-        words = ("--algorithm", "progress", "--max-iterations", "2", "--json", "--no-rerun")
-        runs.append(cdmisfa("learn", source, *how, *words).json)
-    assert runs[0]["signals_sha256"] == runs[1]["signals_sha256"]
-    with RecordedSource(rec) as source:
-        assert source.spec.frame_shape == (6, 3 * 2 * 8)
-        red, green, blue = np.split(source.take(0, 1).frames[0].astype(int), 3, axis=1)
-    assert red.mean() > green.mean() > blue.mean()  # the table is brown
-    refused = cdmisfa("record", "oscillatory", "--color", "-o", tmp_path / "none")
-    assert (refused.code, "unknown key scene.color" in refused.err) == (2, True)
 
 
 N, H, W = 120, 24, 32

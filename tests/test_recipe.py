@@ -108,19 +108,6 @@ def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) 
     assert module.transform([*pictures[:5], *larger]).shape == (10, len(y[0]))
 
 
-def test_a_recording_of_a_log_keeps_its_recipe(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    pictures = np.repeat(of_type("u1", 12, 16, 3), 60, 0)
-    log = logged(tmp_path / "a.mcap", pictures, "rgb8")
-    cdmisfa(
-        "convert", log, "--color", "--size", "8x8", "--set", "input.fit=pad", "-o", tmp_path / "rec"
-    )
-    learned = (*("learn", tmp_path / "rec", "-o", tmp_path / "run"), "--no-rerun")
-    assert cdmisfa(*learned, "--set", "learner.tau=40", "--max-iterations", 12).code == 0
-    module = Run(tmp_path / "run").modules
-    recipe = Recipe((8, 24), "pad", color=True)
-    assert {one.recipe for one in module} <= {recipe}
-
-
 @pytest.mark.parametrize(
     ("recipe", "given", "why"),
     [

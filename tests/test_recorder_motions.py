@@ -1,12 +1,10 @@
 """The objects' motions: the paper's statistics, and frame t whatever came before."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdmisfa.core.errors import UsageError
-from recorder.world.icub.config import BoxConfig, IcubConfig, SphereConfig
+from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.motions import CHUNK, Motions, reflect
 
 SCENE = IcubConfig()
@@ -51,11 +49,6 @@ def test_object_3_walks_within_its_limits_y_slower_than_x():
     assert np.corrcoef(path[1:, 1], path[:-1, 1])[0, 1] > 0.99
 
 
-def test_one_object_never_changes_another():
-    other = IcubConfig(object1=BoxConfig(toggle_every=7), object3=SphereConfig(step_x=0.01))
-    np.testing.assert_array_equal(Motions(other, 3).positions(0, 200)[:, 1], WHOLE[:200, 1])
-
-
 def test_the_motions_share_no_random_numbers_with_who_spawns_from_the_same_seed():
     drawn = (WHOLE[:20, 1, 0] + 0.8) / 0.2
     for child in np.random.SeedSequence(3).spawn(8):
@@ -70,8 +63,3 @@ def test_a_walk_turns_round_at_its_limits():
         atol=1e-12,
     )
     np.testing.assert_array_equal(reflect(np.array([5.0, -5.0]), (0.3, 0.3)), [0.3, 0.3])
-
-
-def test_limits_the_wrong_way_round_are_named():
-    with pytest.raises(UsageError, match=r"scene\.object3\.y.*the smaller first"):
-        SphereConfig(y=(0.2, 0.1))

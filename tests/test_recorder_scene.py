@@ -11,7 +11,6 @@ from foxglove_schemas_protobuf import CameraCalibration_pb2, FrameTransforms_pb2
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.json_format import MessageToDict
 from mcap.reader import make_reader
-from rerun.chunk import McapReader
 
 from cdmisfa.core.config import section_table
 from recorder.log.scenery import scenery_of, times, turned
@@ -86,17 +85,6 @@ def test_transforms_lead_from_the_root_to_each_eye(recorded, view):
         camera = CameraCalibration_pb2.CameraCalibration.FromString(data)
         assert camera.frame_id == f"{view}/{side}"
         assert list(camera.K) == [eye.focal, 0, 32, 0, eye.focal, 24, 0, 0, 1]
-
-
-def test_rerun_reads_cameras_and_frames_without_us(recorded):
-    read = {}
-    for chunk in McapReader(str(recorded / "left.mcap")).stream():
-        names = chunk.to_record_batch().schema.names
-        read.setdefault(chunk.entity_path, set()).update(names)
-    assert "Pinhole:image_from_camera" in read["/calibration/left/left_eye"]
-    assert {"Transform3D:quaternion", "Transform3D:child_frame"} <= read["/tf"]
-    assert "/scene" in read
-    assert "Image:format" in read["/view/left"]
 
 
 def class_of(schema_name, descriptors):

@@ -122,15 +122,6 @@ def test_a_switch_costs_the_same_frames_live_and_from_the_log(scene, tmp_path):
         assert again.signals_sha256 == live.signals_sha256
 
 
-def test_a_log_that_ends_within_a_turn_ends_the_run(scene, tmp_path):
-    recording = tmp_path / "recording"
-    record_scene("icub", recording, SMALL, frames=60)
-    with contextlib.closing(RecordedSource(recording)) as source:
-        ended = run(source, LEARNER, None, max_iterations=25)
-    assert ended.ended == "log_exhausted"
-    assert 2 < ended.iterations < 8
-
-
 def test_a_roaming_view_shows_what_the_others_do_while_it_dwells_there():
     pytest.importorskip("pybullet")
     from recorder.world.icub.source import IcubSource

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from cdmisfa.core.config import build, load_preset, section_table
-from cdmisfa.core.errors import UsageError
-from cdmisfa.experiments.sources import configure
 from recorder.config import RecordConfig
 from recorder.world.icub.config import EyesConfig, IcubConfig
 from recorder.world.icub.lens import SAMPLES, Lens, light
@@ -55,13 +53,6 @@ def test_what_came_later_is_off_and_unstated_in_the_plain_scene():
         assert changed.plain == (key == "transit")  # which changes no frame
         assert section_table(changed)[key] == value
         assert build(IcubConfig, "scene", section_table(changed)) == changed
-
-
-def test_the_preset_is_for_the_progress_learner():
-    assert configure("icub", "icub-real").learner.algorithm == "progress"
-    assert configure("icub").scene.plain
-    with pytest.raises(UsageError, match=r"scene\.noise is 100\.0"):
-        configure("icub", "icub-real", ["scene.noise=100"])
 
 
 def test_every_view_shows_a_room_and_its_moving_object():

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures
-from conftest import Cdmisfa
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from message_files import START, STEP, every, learned_alike, write_mcap
+from message_files import START, STEP, every, write_mcap
 from test_foreign import raw_json
 from test_numbers import joint_state
 
@@ -84,11 +83,3 @@ def test_ros_says_it_in_the_header_that_a_message_begins_with(ros1: bool) -> Non
     with pytest.raises(LogDamagedError, match="cut short"):
         stamp(bytes(pack(message, name))[:9])
     assert stamp_of(kind._replace(definition=b"# of\nfloat64 a\nHeader header")) is None
-
-
-def test_learning_by_headers_is_the_same_from_the_conversion(
-    cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    what, messages = LOGS["protobuf"]
-    path = write_mcap(tmp_path / "a.mcap", what, {"/cam": every(STEP, messages())})
-    learned_alike(cdmisfa, tmp_path, path, "--set", "input.stamp=header")

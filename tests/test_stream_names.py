@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cdmisfa.core.names import stream_name, stream_names
-from recorder.cameras.words import live_names
 
 TOPICS = ("/camera/left/image_raw", "/camera/right é/image_raw")
 NAMES = ("camera_left_image_raw", "camera_right_e_image_raw")
@@ -62,20 +61,6 @@ def test_what_is_learned_from_has_one_name(cdmisfa: Cdmisfa, tmp_path: Path, way
     assert done.code == 0, done.err
     assert done.json["undecided"] == list(NAMES)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["streams"] == list(NAMES)
-
-
-@pytest.mark.parametrize(
-    ("words", "names"),
-    [
-        ([f"foxglove://robot:8765{topic}" for topic in TOPICS], NAMES),
-        ([f"foxglove://127.0.0.1:8765/view/{name}" for name in NAMES], NAMES),
-        (["foxglove://robot/camera/right%20e/image_raw"], NAMES[1:]),
-        ([f"av:films/{name}.mp4" for name in NAMES], NAMES),
-        ([f"rtsp://10.0.0.1/{name}" for name in NAMES], NAMES),
-    ],
-)
-def test_a_live_stream_has_the_name_of_its_log(words: list[str], names: tuple[str, ...]) -> None:
-    assert live_names(words) == names
 
 
 @pytest.mark.parametrize(
