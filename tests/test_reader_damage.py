@@ -218,7 +218,7 @@ def test_nothing_is_lost_with_the_summary_alone(tmp_path: Path) -> None:
     whole = KINDS["zstd"]
     path.write_bytes(whole)
     with LogReader(path) as reader:
-        end = reader._structure.data_end + 13
+        end = reader.data_end + 13
     flipped = bytearray(whole)
     flipped[end + 20] ^= 8
     for number, damaged in enumerate((whole[: end + 40], whole[:-20], bytes(flipped))):

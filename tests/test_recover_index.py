@@ -86,7 +86,7 @@ def test_no_message_is_lost_where_the_summary_is_damaged_too(tmp_path: Path, kin
     raw, path, out = LOGS[kind], tmp_path / "log.mcap", tmp_path / "out.mcap"
     segments, true = chunks(raw, path), messages(path)
     with LogReader(path) as reader:
-        end = reader._structure.data_end + 13
+        end = reader.data_end + 13
     indexes = [at for c in segments for at in range(c.data_offset + c.stored, c.stop)]
     rng = Random(kind)
     for number in range(40):

@@ -1,6 +1,6 @@
-"""Reading any MCAP file, strictly: whole or cut, with or without an index.
+"""Read any MCAP file, strictly: whole or cut, with or without an index.
 
-It gives every message that is there, in file order, and never one whose checksum does not
+A reader gives every message that is there, in file order, and never one whose checksum does not
 match. Memory holds a few chunks.
 """
 
@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 import numpy as np
-from mcap.records import Channel, Schema
+from mcap.records import Channel, Schema, Statistics
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.chunks import Chunks, MessageTable, Pairs
@@ -23,7 +23,6 @@ from recorder.mcap.records import (
     Attachment,
     MalformedRecord,
     Message,
-    Problem,
     Segment,
     crc32,
 )
@@ -32,10 +31,10 @@ from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]
 
-NO_CHECKSUMS = "it has no checksums, nothing vouches for its bytes"
+NO_CHECKSUMS: Final = "it has no checksums, nothing vouches for its bytes"
 
 
-class LogReader:
+class LogReader(LogStructure):
     """An MCAP file, read by its content and not by what its index claims.
 
     Damage is an error that names the file, the chunk and its time range. With
@@ -44,20 +43,6 @@ class LogReader:
     for every message, only what is asked for is read: each chunk is checked when it is, and the
     checksum over all data where all of it is read (`check`, `sha256`) or a chunk has none of its
     own.
-
-    Attributes:
-        path: the file.
-        problems: what was found damaged and left out (with `salvage`), and an index that
-            contradicts its chunk.
-        by_index: only the summary was read, and no chunk before it is asked for.
-        profile: the writer's profile, as "ros2".
-        library: what wrote the file.
-        complete: the file has its end.
-        first_damage: place of the first damaged record that stands outside chunks, or None.
-        data_complete: every message is there, if not the summary behind them.
-        metadata: the metadata records.
-        statistics: what the summary says the file holds, or None.
-        file: its bytes.
     """
 
     def __init__(
@@ -70,7 +55,7 @@ class LogReader:
         """Open a log.
 
         Args:
-            log: path of a file, or what has its bytes, which is closed with the reader.
+            log: path of a file, or its bytes, which are closed with the reader.
             salvage: leave out what is damaged.
             check: "chunks" believes a summary that accounts for every message; "data" looks at
                 every record of a file and at the checksum over its data; "pass" leaves to
@@ -81,28 +66,28 @@ class LogReader:
             UsageError: it cannot be opened.
             LogDamagedError: not an MCAP file, or its structure is damaged.
         """
-        self.salvage = salvage
-        self.problems: list[Problem] = []
         self._failed: set[int] = set()
         self._defined = self._searched = self._checked = False
         if not isinstance(log, Store):
             log = OnePass(Path(log)) if check == "pass" else Store(Path(log))
-        self.file = log
-        self.path = self.file.path
+        check = check or ("data" if salvage else "chunks")
         try:
-            check = check or ("data" if salvage else "chunks")
             by_index = check == "chunks" or (check == "pass" and not salvage)
-            found = LogStructure(self.file, self._refuse, by_index=by_index, resync=salvage)
-            self._structure = found
-            note = None if check == "chunks" else self._note
-            self._chunks = Chunks(self.file, found.definitions, note, self._check_unproven)
-            self._settle()
+            super().__init__(log, salvage=salvage, by_index=by_index)
+            note = None if check == "chunks" else self.note
+            self._chunks = Chunks(log, self.definitions, note, self._check_unproven)
+            if self.torn is not None and self.torn in self.segments:
+                # The header of a chunk that was still open states no times yet.
+                table = self.table(self.torn)
+                if table is not None and len(table):
+                    times = table.log_time
+                    self.torn.start, self.torn.end = int(times.min()), int(times.max())
             if not self.by_index and check != "pass":
                 self._check_data()
         except BaseException as error:
-            self.file.close()
+            log.close()
             if isinstance(error, MalformedRecord):
-                raise LogDamagedError(f"{self.path}: {error}") from None
+                raise LogDamagedError(f"{log.path}: {error}") from None
             raise
 
     # What the file holds
@@ -113,52 +98,37 @@ class LogReader:
         return self.file.size
 
     @property
-    def missing(self) -> str:
-        """What a file that was cut lacks, in words; "" for a whole one."""
-        structure = self._structure
-        if structure.tail is not None and not self.salvage and structure.tail.crc:
-            return f"{structure.missing}; recover can save part of the last chunk, unverified"
-        return structure.missing
+    def data_complete(self) -> bool:
+        """Whether every message is there, if not the summary behind them."""
+        return self.data_crc is not None
+
+    @property
+    def statistics(self) -> Statistics | None:
+        """The statistics in the summary, or None."""
+        return self.summary.statistics if self.summary else None
 
     @property
     def warnings(self) -> list[str]:
         """What is missing, was left out or is unproven, a line each that names the file."""
         problems = [f"{p.where}: {p.what}" for p in self.problems]
-        said = (f"{self.path}: {text}" for text in (self.missing, *problems) if text)
-        return [*said, *self.unproven()]
+        lines = (f"{self.path}: {text}" for text in (self.missing, *problems) if text)
+        return [*lines, *self.unproven()]
 
     def unproven(self) -> list[str]:
-        """What nothing vouches for, a line that names the file."""
+        """Return a line that names the file if nothing vouches for its bytes."""
         return [f"{self.path}: {NO_CHECKSUMS}"] if self.crc_absent() else []
-
-    @property
-    def segments(self) -> list[Segment]:
-        """Chunks, and messages outside chunks, in file order."""
-        tail = self._structure.tail
-        if tail is None or (tail.crc and not self.salvage):
-            return self._structure.segments
-        return [*self._structure.segments, tail]
-
-    @property
-    def attachments(self) -> list[Attachment]:
-        """The attachments; their CRCs were checked."""
-        try:
-            self._structure.load_attachments()
-        except MalformedRecord as error:
-            self._refuse("attachments", str(error))
-        return self._structure.attachments
 
     @property
     def channels(self) -> Mapping[int, Channel]:
         """Every channel of the file; reads the chunks where nothing else names them."""
         self._define()
-        return self._structure.definitions.channels
+        return self.definitions.channels
 
     @property
     def schemas(self) -> Mapping[int, Schema]:
         """Every schema of the file; reads the chunks where nothing else names them."""
         self._define()
-        return self._structure.definitions.schemas
+        return self.definitions.schemas
 
     def attachment_data(self, attachment: Attachment) -> bytes:
         """Read an attachment's bytes; a LogDamagedError where that is too much at once."""
@@ -172,10 +142,10 @@ class LogReader:
     def crc_absent(self) -> int:
         """Count the segments that no checksum protects.
 
-        Of a file opened by its index, which states none of all data, the first chunk stands for
-        all.
+        Of a file opened by its index without a checksum over all data, the first chunk stands for
+        all: reading the head of each would take as long as reading the file.
         """
-        if self._structure.data_crc:
+        if self.data_crc:
             return 0
         segments = self.segments
         if self.by_index:
@@ -190,7 +160,7 @@ class LogReader:
             counted: called with the number of each further bytes that were hashed.
         """
         sha256, crc, at = hashlib.sha256(), 0, 0
-        end = self._structure.data_end if self._structure.data_crc else 0
+        end = self.data_end if self.data_crc else 0
         for block in self.file.blocks(0, self.file.size):
             sha256.update(block)
             crc = crc32(block[: max(end - at, 0)], crc)
@@ -202,7 +172,7 @@ class LogReader:
     def tail(self) -> Iterator[bytes]:
         """Yield the bytes from the data end record on, where the file was opened by its index."""
         if self.by_index:
-            yield from self.file.blocks(self._structure.data_end, self.file.size)
+            yield from self.file.blocks(self.data_end, self.file.size)
 
     # Messages
 
@@ -245,7 +215,7 @@ class LogReader:
                 yield segment, table.select(table.log_time >= np.uint64(start)) if start else table
 
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
-        """Give every chunk in file order, None for one that is damaged and left out.
+        """Yield every chunk in file order, None for one that is damaged and left out.
 
         Without `salvage` each byte is read once, and every record is looked at on the way. The
         checksum over all of the data is checked at the end. The log was opened with check "pass".
@@ -256,18 +226,17 @@ class LogReader:
         file = self.file
         assert isinstance(file, OnePass)
         if self.by_index:
-            for segment in self._structure.walk(file):
+            for segment in self.walk():
                 yield segment, self.table(segment)
-            self._settle()
         else:
             file.start(file.size)
             for segment in self.segments:
                 file.pass_to(segment.offset)
                 yield segment, self.table(segment)
-        self._check_data(file.crc_to(self._structure.data_end))
+        self._check_data(file.crc_to(self.data_end))
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
-        """Say which chunks, or only `indexes` of them, will be read one after the other."""
+        """Announce the chunks, or only `indexes` of them, that will be read one after the other."""
         self._chunks.expect(() if indexes else segments)
         spans = ((s.data_end if indexes else s.offset, s.stop) for s in segments)
         self.file.expect(list(spans))
@@ -288,7 +257,7 @@ class LogReader:
         except MalformedRecord as error:
             self._failed.add(segment.offset)
             if not (segment.cut and self.salvage):  # that the file ends in it is said anyway
-                self._refuse(segment.name, str(error))
+                self.refuse(segment.name, str(error))
             return None
 
     def index(self, segment: Segment, channels: Collection[int] | None = None) -> Pairs:
@@ -308,85 +277,58 @@ class LogReader:
 
     # Inside
 
-    def _refuse(self, where: str, what: str) -> None:
-        if not self.salvage:
-            raise LogDamagedError(
-                f"{self.path}: {where}: {what}; save the rest with cdmisfa recover (from a "
-                "recording, cdmisfa learn --salvage learns without it)"
-            )
-        self._note(where, what)
-
-    def _note(self, where: str, what: str) -> None:
-        problem = Problem(where, what)
-        self.problems += [problem] if problem not in self.problems else []
-
-    def _settle(self) -> None:
-        """Take over what the walk found, with the times of a chunk whose header states none yet."""
-        structure = self._structure
-        self.by_index, self.complete = structure.by_index, structure.complete
-        self.first_damage = structure.first_damage
-        self.profile, self.library = structure.profile, structure.library
-        self.data_complete, self.metadata = structure.data_crc is not None, structure.metadata
-        self.statistics = structure.summary.statistics if structure.summary else None
-        tail = structure.tail
-        if tail is not None and tail in self.segments:
-            table = self.table(tail)
-            if table is not None and len(table):
-                tail.start, tail.end = int(table.log_time.min()), int(table.log_time.max())
-
     def _check_data(self, crc: int | None = None) -> None:
         """Compare the checksum over all data that the log states with theirs, once.
 
         Args:
             crc: of the data, where they were read; by default they are read now.
         """
-        stated, end = self._structure.data_crc, self._structure.data_end
-        if not stated or self._checked:
+        if not self.data_crc or self._checked:
             return
         self._checked = True
-        if (self.file.crc(0, end) if crc is None else crc) != stated:
+        if (self.file.crc(0, self.data_end) if crc is None else crc) != self.data_crc:
             if not self.salvage:
                 self._search()  # an error that names the chunk says more
-            self._refuse("data section", "its CRC does not match: damaged")
+            self.refuse("data section", "its CRC does not match: damaged")
 
     def _check_unproven(self) -> None:
         """Check the data for a chunk that has no checksum of its own."""
-        if self._structure.by_index:
+        if self.by_index:
             self._check_data()
 
     def _channel(self, number: int, segment: Segment) -> Channel | None:
-        known = self._structure.definitions
+        """Return the channel of messages in a chunk; some writers define it in a later chunk."""
         for search in (False, True):
             if search:
                 self._search()
-            channel = known.channels.get(number)
-            if channel and (not channel.schema_id or channel.schema_id in known.schemas):
+            channel = self.definitions.channels.get(number)
+            schemas = {0, *self.definitions.schemas}
+            if channel and channel.schema_id in schemas:
                 return channel
         what = f"it holds messages of channel {number}, never defined"
         if channel is not None:
             what = f"schema {channel.schema_id} of {channel.topic!r} is never defined"
-        self._refuse(segment.name, what)
+        self.refuse(segment.name, what)
         return channel
 
     def _define(self) -> None:
         """Decode chunks until every channel that has messages is known."""
-        definitions, segments = self._structure.definitions, self.segments
-        known, counted = definitions.channels, set[int]()
         if self._defined:
             return
+        known, counted = self.definitions.channels, set[int]()
         # A summary that is believed defines every channel of which it counts messages.
-        for segment in () if self.by_index else segments:
+        for segment in () if self.by_index else self.segments:
             counts = segment.channel_counts()
             if counts is None or not counts.keys() <= known.keys():
                 self.table(segment)
             counted.update(counts or ())
         self._defined = True
-        schemas = {0, *definitions.schemas}
+        schemas = {0, *self.definitions.schemas}
         if not (counted <= known.keys() and {c.schema_id for c in known.values()} <= schemas):
             self._search()
 
     def _search(self) -> None:
-        """Decode every chunk: a definition may stand in one that holds no message of it."""
+        """Decode every chunk: a definition may be in one that holds no message of it."""
         if not self._searched:
             self._searched = True
             for segment in self.segments:

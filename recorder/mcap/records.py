@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -111,9 +111,21 @@ Refuse = Callable[[str, str], None]
 class IndexPart:
     """The message index of one channel in one chunk: `count` pairs at `offset` in the file."""
 
+    HEAD: ClassVar = struct.Struct("<HI")
+
     channel: int
     offset: int
     count: int
+
+    @classmethod
+    def of_record(cls, content: int, length: int, head: bytes) -> IndexPart:
+        """Parse the head of a message index record, whose content is at a place in the file."""
+        if len(head) < cls.HEAD.size:
+            raise MalformedRecord("a message index is cut short")
+        channel, size = cls.HEAD.unpack(head)
+        if size + cls.HEAD.size > length or size % 16:
+            raise MalformedRecord("a message index lies about its length")
+        return cls(channel, content + cls.HEAD.size, size // 16)
 
 
 @dataclass(slots=True)
@@ -156,6 +168,12 @@ class Segment:
         crc, compression, stored = fields.read4(), fields.read_prefixed_string(), fields.read8()
         data = offset + RECORD_HEADER.size + fields.count
         return cls(offset, data, stored, size, compression, crc, start, end, chunked=True)
+
+    def within(self, end: int) -> Segment:
+        """Return a chunk whose data must not run over the end of its record."""
+        if self.data_end > end:
+            raise MalformedRecord("a chunk's length is not that of its data")
+        return self
 
     def head(self, crc: int) -> bytes:
         """The bytes of a chunk before its records, given their CRC."""

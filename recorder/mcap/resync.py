@@ -1,14 +1,14 @@
-"""Finding the next sound chunk of a damaged log."""
+"""Find the next sound record of a damaged log."""
 
 from __future__ import annotations
 
 import contextlib
 import re
-from bisect import bisect_left
 from typing import Final
 
 from mcap.opcode import Opcode
 
+from recorder.mcap.chunks import check_size
 from recorder.mcap.records import (
     CHUNK_HEADER,
     CHUNK_PEEK,
@@ -19,16 +19,20 @@ from recorder.mcap.records import (
 )
 from recorder.mcap.store import Store
 
+# Opcode, length, times and the low half of the size, its high half, CRC, compression, stored bytes:
+# lengths below 4 GiB have four zero bytes, which random data hardly has at all of these places.
 _CHUNK: Final = re.compile(
     rb"(?=\x06[\s\S]{4}\0{4}[\s\S]{20}\0{4}[\s\S]{4}(\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)[\s\S]{4}\0{4})"
-    # Opcode, length, times and the low half of the size, its high half, CRC, compression, bytes.
 )
+# The length that some writers state in a chunk until they have finished it.
+_OPEN_LENGTH: Final = 2**64 - 1
 _BLOCK: Final = 1 << 20
 _OVERLAP: Final = 64
+"""Bytes that blocks share, more than the pattern and the stored bytes' length take."""
 
 
-def stands(file: Store, at: int, stop: int) -> bool:
-    """Whether a known record begins at `at` and ends before `stop`."""
+def is_record(file: Store, at: int, stop: int) -> bool:
+    """Return whether a known record begins at `at` and ends before `stop`."""
     head = file.read(at, RECORD_HEADER.size)
     if len(head) < RECORD_HEADER.size:
         return at == stop
@@ -36,41 +40,48 @@ def stands(file: Store, at: int, stop: int) -> bool:
     return bool(1 <= opcode <= Opcode.DATA_END and at + RECORD_HEADER.size + length <= stop)
 
 
-def own_end(file: Store, opcode: int, content: int) -> int | None:
-    """The place at which a chunk or a message index ends by what it holds; None for others."""
+def inner_end(file: Store, opcode: int, content: int) -> int | None:
+    """Return where a chunk or a message index ends by the lengths within it; None for others."""
     if opcode == Opcode.MESSAGE_INDEX:
         return content + 6 + int.from_bytes(file.peek(content + 2, 4), "little")
     if opcode == Opcode.CHUNK:
         with contextlib.suppress(MalformedRecord):
-            chunk = Segment.of_chunk(content - RECORD_HEADER.size, file.peek(content, CHUNK_PEEK))
-            return chunk.data_offset + chunk.stored
+            at = content - RECORD_HEADER.size
+            return Segment.of_chunk(at, file.peek(content, CHUNK_PEEK)).data_end
     return None
 
 
-def leave_chunks(named: list[int], opcode: int, at: int, end: int) -> None:
-    """See that the record in [at, end) leaves the chunks alone that the summary names, in order.
+def cut_chunk(file: Store, content: int, length: int, limit: int) -> Segment | None:
+    """Return the part of a chunk before the end of the file, if its head is there.
 
-    Raises:
-        MalformedRecord: it does not.
+    Args:
+        file: the log.
+        content: place of the record's content.
+        length: of the content, as the record states it.
+        limit: end of the file.
     """
-    place = bisect_left(named, at)
-    if opcode == Opcode.CHUNK or place == len(named):
-        return
-    if named[place] == at:
-        raise MalformedRecord("no chunk where the summary names one")
-    if named[place] < end:
-        raise MalformedRecord("a record runs over the chunk behind it")
+    try:
+        head = file.peek(content, min(limit - content, CHUNK_PEEK))
+        tail = Segment.of_chunk(content - RECORD_HEADER.size, head)
+        check_size(tail.compression, 0)
+    except MalformedRecord:
+        return None
+    if length == _OPEN_LENGTH:
+        tail.size, tail.crc = MAX_CHUNK, 0
+    else:
+        tail.within(content + length)
+    tail.stored, tail.cut = limit - tail.data_offset, True
+    return tail
 
 
 def next_chunk(file: Store, at: int, stop: int) -> int | None:
-    """The first place in [at, stop) where a chunk with consistent lengths begins, or None."""
+    """Return the first place in [at, stop) where a chunk with consistent lengths begins."""
     while at < stop:
         block = file.read(at, min(_BLOCK + _OVERLAP, stop - at))
-        for found in _CHUNK.finditer(block):
-            place = found.start()
+        for match in _CHUNK.finditer(block):
+            place = match.start()
             _, length, start, end, size, _ = CHUNK_HEADER.unpack_from(block, place)
-            name = place + CHUNK_HEADER.size
-            after = name + len(found[1])
+            after = place + CHUNK_HEADER.size + len(match[1])
             stored = int.from_bytes(block[after : after + 8], "little")
             agrees = place + RECORD_HEADER.size + length == after + 8 + stored
             fits = size <= MAX_CHUNK and at + after + 8 + stored <= stop
@@ -78,10 +89,3 @@ def next_chunk(file: Store, at: int, stop: int) -> int | None:
                 return at + place
         at += _BLOCK
     return None
-
-
-def fitting(chunk: Segment, end: int) -> Segment:
-    """A chunk whose data must not run over the end of its record."""
-    if chunk.data_offset + chunk.stored > end:
-        raise MalformedRecord("a chunk's length is not that of its data")
-    return chunk

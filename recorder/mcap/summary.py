@@ -10,6 +10,7 @@ import contextlib
 import functools
 import operator
 import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -95,6 +96,16 @@ class Summary:
             and all(c.keys() <= known for c in counts)
         )
         return found if accounted else None
+
+    def contradictions(self, segments: Sequence[Segment]) -> Iterator[str]:
+        """Yield where it names other chunks than those of a walk, or other numbers of messages."""
+        if self.named and [s.offset for s in segments if s.chunked] != self.named:
+            yield "its chunk index does not name the chunks that are there"
+        counts = [s.channel_counts() for s in segments]
+        present = sum(sum(count.values()) for count in counts if count)
+        stated = self.statistics.message_count if self.statistics else present
+        if stated != present and None not in counts:
+            yield f"it states {stated} messages, there are {present}"
 
     def ranges(self, opcode: int) -> list[tuple[int, int]]:
         """The bytes [start, stop) of the file where it says that attachments or metadata are.

@@ -1,13 +1,14 @@
-"""The structure of a log: found by a walk over its outer records, or stated by its summary.
+"""Read the structure of a log: by a walk over its outer records, or from its summary.
 
 The walk needs no index: it finds chunks, loose messages, metadata and attachments in
-whole files, in files without a summary, and in files that were cut anywhere. What the
-summary claims is compared with what was found.
+whole files, in files without a summary, and in files that were cut anywhere. The
+summary is compared with them.
 """
 
 from __future__ import annotations
 
 import struct
+from bisect import bisect_left
 from collections.abc import Iterator
 from typing import Final
 
@@ -15,7 +16,6 @@ from mcap.opcode import Opcode
 from mcap.records import Header, Metadata
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.mcap.chunks import check_size
 from recorder.mcap.records import (
     CHUNK_PEEK,
     MAGIC,
@@ -27,112 +27,126 @@ from recorder.mcap.records import (
     Fields,
     IndexPart,
     MalformedRecord,
-    Refuse,
+    Problem,
     Segment,
     no_log,
 )
-from recorder.mcap.resync import fitting, leave_chunks, next_chunk, own_end, stands
+from recorder.mcap.resync import cut_chunk, inner_end, is_record, next_chunk
 from recorder.mcap.store import OnePass, Store
 from recorder.mcap.summary import Summary, read_summary
 
+# Messages outside chunks are decoded about this many bytes at once, as many as a chunk has.
 LOOSE_BYTES: Final = 1024 * 1024
-"""Messages outside chunks are read about this many bytes at once."""
 _LOOSE: Final = struct.Struct("<HIQ")
-_INDEX: Final = struct.Struct("<HI")
-DATA_END_BYTES: Final = RECORD_HEADER.size + 4
-_OPEN_LENGTH: Final = 2**64 - 1
+_DATA_END_BYTES: Final = RECORD_HEADER.size + 4
+# Most bytes of an attachment's names.
 _BEFORE_DATA: Final = 1024 * 1024
+# The first opcode of records that writers may define themselves.
 _PRIVATE: Final = 0x80
-"""The first opcode that writers may give records of their own."""
 
 
 class LogStructure:
-    """What the walk found, or what the summary names.
+    """The outer records of a log.
 
     Args:
         file: the log.
-        refuse: told of every damage.
+        salvage: note damage in `problems`, and continue at the next sound chunk; else raise.
         by_index: believe a summary that accounts for every message, and read no chunk.
-        resync: where a record is damaged, look for the next chunk that is none.
 
     Attributes:
+        problems: the damage.
         by_index: the summary was believed.
         segments: chunks and messages outside them, in file order.
-        tail: the segment within which the file ends, or None.
+        torn: the chunk within which the file ends, or None.
         complete: the file has its end, and nothing is missing.
-        missing: what a file that was cut lacks, in words; "" for a whole one.
+        missing: the end that a cut file lacks, in words; "" for a whole one.
         data_crc: CRC of the data section, 0 for none, None where the file ends before it.
         data_end: place where the data section ends.
         first_damage: place of the first record that is damaged, None where none is.
     """
 
-    def __init__(
-        self, file: Store, refuse: Refuse, *, by_index: bool = False, resync: bool = False
-    ) -> None:
-        self._file, self._resync = file, resync
-        self._sure = len(MAGIC)
-        self.by_index = False
-        self._tell = refuse
+    def __init__(self, file: Store, *, salvage: bool, by_index: bool) -> None:
+        self.file, self.path, self.salvage = file, file.path, salvage
+        self.problems: list[Problem] = []
+        self.by_index = self.complete = False
         self.first_damage: int | None = None
-        self.definitions = Definitions(refuse)
+        self.definitions = Definitions(self.refuse)
         self.segments: list[Segment] = []
-        self.tail: Segment | None = None
+        self.torn: Segment | None = None
         self.metadata: list[Metadata] = []
-        self.attachments: list[Attachment] = []
-        self.profile = self.library = ""
-        self.summary: Summary | None = None
-        self.complete, self.missing = False, ""
+        self.profile = self.library = self.missing = ""
         self.data_crc: int | None = None
         self.data_end = 0
-        self._limit: int | None = None
+        self._attachments: list[Attachment] = []
         self._attachment_ranges: list[tuple[int, int]] = []
-        self._metadata_bytes = self._inside = 0
+        self._metadata_bytes = 0
         self._loose: Segment | None = None
         self._last_chunk: Segment | None = None
-        self._at = len(MAGIC)
+        # The place of the record, the place up to which records are sound, the end of an inner one.
+        self._at = self._sure = len(MAGIC)
+        self._inside = 0
         if not (start := file.read(0, len(MAGIC))):
             raise LogDamagedError(f"{file.path}: empty, nothing was written")
         if start != MAGIC:
             raise no_log(file.path)
-        self._read_end()
+        self.summary: Summary | None = read_summary(file, self.definitions, self.refuse)
+        # The damage in a footer may be in the place where it says that the data ends.
+        lies = salvage and self.summary is not None and self.summary.broken
+        self._limit = self.summary.begin if self.summary and not lies else None
         if not by_index or not self._take_index():
             self._walk_data()
 
-    def walk(self, file: OnePass) -> Iterator[Segment]:
-        """Walk over every record of a log that was opened by its index.
+    @property
+    def attachments(self) -> list[Attachment]:
+        """The attachments; their CRCs were checked."""
+        spans, self._attachment_ranges = self._attachment_ranges, []
+        try:
+            for start, stop in spans:
+                self._record_at(start, stop, Opcode.ATTACHMENT)
+        except MalformedRecord as error:
+            self.refuse("attachments", str(error))
+        return self._attachments
 
-        Args:
-            file: the log, which is read on to each record.
+    def refuse(self, where: str, what: str) -> None:
+        """Raise an error for damage at a place, or note it with `salvage`."""
+        if not self.salvage:
+            raise LogDamagedError(
+                f"{self.path}: {where}: {what}; save the rest with cdmisfa recover (from a "
+                "recording, cdmisfa learn --salvage learns without it)"
+            )
+        self.note(where, what)
+
+    def note(self, where: str, what: str) -> None:
+        """Note a problem at a place once."""
+        problem = Problem(where, what)
+        self.problems += [problem] if problem not in self.problems else []
+
+    def walk(self) -> Iterator[Segment]:
+        """Walk over every record of a log that was opened by its index, in one pass.
 
         Yields:
-            Each chunk that the index names, before the walk goes on to the record behind it.
+            Each chunk that the index names, before the walk continues to the record behind it.
         """
         assert self._limit is not None
-        file.start(self._limit)
-        self._file = file
-        stated, self.segments, self.attachments = self.segments, [], []
+        assert isinstance(self.file, OnePass)
+        self.file.start(self._limit)
+        stated, self.segments, self._attachments = self.segments, [], []
         self.metadata, self._metadata_bytes, self._attachment_ranges = [], 0, []
         self.by_index, self.complete = False, False
         self._at, self.data_crc = len(MAGIC), None
         for segment in stated:
             self._walk_data(segment.offset)
-            file.pass_to(segment.offset)
+            self.file.pass_to(segment.offset)
             yield segment
         self._walk_data()
 
-    def _refuse(self, where: str, what: str) -> None:
+    def _damaged(self, where: str, what: str) -> None:
         if self.first_damage is None:
             self.first_damage = self._at
-        self._tell(where, what)
-
-    def load_attachments(self) -> None:
-        """Read the attachments that the summary names, and check them."""
-        spans, self._attachment_ranges = self._attachment_ranges, []
-        for start, stop in spans:
-            self._record_at(start, stop, Opcode.ATTACHMENT)
+        self.refuse(where, what)
 
     def _take_index(self) -> bool:
-        """Take the chunks from the summary; whether it accounts for every message."""
+        """Take the chunks from the summary; return whether it accounts for every message."""
         summary = self.summary
         if summary is None:
             return False
@@ -142,10 +156,11 @@ class LogStructure:
                 return False
             attachments = summary.ranges(Opcode.ATTACHMENT_INDEX)
             self._record_at(len(MAGIC), None, Opcode.HEADER)
-            self._record_at(summary.begin - DATA_END_BYTES, summary.begin, Opcode.DATA_END)
+            self._record_at(summary.begin - _DATA_END_BYTES, summary.begin, Opcode.DATA_END)
             for start, stop in summary.ranges(Opcode.METADATA_INDEX):
                 self._record_at(start, stop, Opcode.METADATA)
         except MalformedRecord:
+            # A summary that lies is not used: the walk finds what is in the file.
             self._at, self.data_crc = len(MAGIC), None
             self.metadata, self._metadata_bytes = [], 0
             return False
@@ -155,23 +170,23 @@ class LogStructure:
 
     def _record_at(self, start: int, stop: int | None, opcode: Opcode) -> None:
         """Read a record that the summary names."""
-        head = self._file.peek(start, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
-        found, length = RECORD_HEADER.unpack(head)
-        if found != opcode or stop not in (None, start + RECORD_HEADER.size + length):
+        head = self.file.peek(start, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
+        present, length = RECORD_HEADER.unpack(head)
+        if present != opcode or stop not in (None, start + RECORD_HEADER.size + length):
             raise MalformedRecord(f"at byte {start} is no {opcode.name} record")
         self._at = start
-        self._take(found, start + RECORD_HEADER.size, length)
+        self._take(present, start + RECORD_HEADER.size, length)
 
     def _walk_data(self, stop: int | None = None) -> None:
         """Walk over the records up to a place, or to the end of the data."""
         while self.data_crc is None and (stop is None or self._at < stop):
-            limit = self._file.size if self._limit is None else self._limit
+            limit = self.file.size if self._limit is None else self._limit
             where = f"byte {self._at}"
             try:
                 if not self._step(limit) and not self._resume_after_cut():
                     break
             except MalformedRecord as error:
-                self._refuse(where, str(error))
+                self._damaged(where, str(error))
                 if not self._resume_after():
                     self.missing = f"everything from byte {self._at} on is unreadable"
                     break
@@ -182,29 +197,39 @@ class LogStructure:
             self.missing = "cut short: its summary is not all there, every message is"
         self.complete = self._limit is not None and self.data_crc is not None
         if self.complete and self.summary:
-            self._compare_with(self.summary)
+            for what in self.summary.contradictions(self.segments):
+                self._damaged("summary", what)
+        if self.torn is not None and not self._unverifiable(self.torn):
+            self.segments.append(self.torn)
+
+    def _unverifiable(self, tail: Segment) -> bool:
+        """Return whether a cut chunk is left out: its CRC is that of records that are not there."""
+        return bool(tail.crc) and not self.salvage
 
     # The outer records
 
     def _step(self, limit: int) -> bool:
-        head = self._file.peek(self._at, RECORD_HEADER.size) if self._at < limit else b""
+        """Read the next record; return whether the file does not end there."""
+        head = self.file.peek(self._at, RECORD_HEADER.size) if self._at < limit else b""
         if len(head) < RECORD_HEADER.size or self._at + RECORD_HEADER.size > limit:
             return self._cut("the end of the file and its index are missing", limit)
         opcode, length = RECORD_HEADER.unpack(head)
         content = self._at + RECORD_HEADER.size
         end = content + length
         if opcode == 0:
-            rest = self._file.blocks(self._at, self._file.size)
+            # Some file systems leave zeros where data did not reach the disk before a power cut.
+            rest = self.file.blocks(self._at, self.file.size)
             if self._limit is None and not any(map(any, rest)):
                 return self._cut(f"from byte {self._at} on there are only zeros", limit)
             raise MalformedRecord("no record (opcode 0)")
-        own = own_end(self._file, opcode, content) if self._resync else None
-        if own is not None and own < end and stands(self._file, own, limit):
-            self._refuse(f"byte {self._at}", "a record's length is not that of what it holds")
-            end, length = own, own - content
+        inner = inner_end(self.file, opcode, content) if self.salvage else None
+        if inner is not None and inner < end and is_record(self.file, inner, limit):
+            # Only the record's own length is damaged: what it holds ends where a record begins.
+            self._damaged(f"byte {self._at}", "a record's length is not that of what it holds")
+            end, length = inner, inner - content
         if end > limit:
             if opcode == Opcode.CHUNK and self._limit is None:
-                self._cut_chunk(content, length, limit)
+                self.torn = cut_chunk(self.file, content, length, limit)
             return self._cut(
                 f"the file ends within a record at byte {self._at}, {limit - self._at} bytes of it "
                 "are there",
@@ -212,10 +237,16 @@ class LogStructure:
             )
         if self._at == len(MAGIC) and opcode != Opcode.HEADER:
             raise MalformedRecord("the file does not begin with a header record")
-        if self._resync and self.summary:
-            leave_chunks(self.summary.named, opcode, self._at, end)
+        if self.salvage and self.summary and opcode != Opcode.CHUNK:
+            # A damaged length would jump over sound chunks: the summary says where these begin.
+            named = self.summary.named
+            place = bisect_left(named, self._at)
+            if place < len(named) and named[place] == self._at:
+                raise MalformedRecord("no chunk where the summary names one")
+            if place < len(named) and named[place] < end:
+                raise MalformedRecord("a record runs over the chunk behind it")
         self._take(opcode, content, length)
-        if end in (own, self._inside):
+        if end in (inner, self._inside):
             self._sure = end
         self._at = end
         return True
@@ -234,7 +265,8 @@ class LogStructure:
             return
         self._close_loose()
         if opcode == Opcode.CHUNK:
-            self._last_chunk = self._chunk(content, length)
+            head = self.file.peek(content, min(length, CHUNK_PEEK))
+            self._last_chunk = Segment.of_chunk(self._at, head).within(content + length)
             self.segments.append(self._last_chunk)
         elif opcode == Opcode.METADATA:
             self._take_metadata(self._definition(content, length))
@@ -247,69 +279,44 @@ class LogStructure:
             self.profile, self.library = header.profile, header.library
         elif opcode == Opcode.DATA_END:
             self.data_end = self._at
-            crc = Fields(self._file.peek(content, min(length, 4)), "the data end").read4()
-            if self._resync and self._limit is None and length != 4:
+            crc = Fields(self.file.peek(content, min(length, 4)), "the data end").read4()
+            if self.salvage and self._limit is None and length != 4:
                 raise MalformedRecord("a data end of another length than its own")
             if self._limit is not None and content + length != self._limit:
                 raise MalformedRecord("the data section does not end where the summary starts")
             self.data_crc = crc
         elif opcode <= max(Opcode):
             raise MalformedRecord(f"a {Opcode(opcode).name} record among the data")
-        elif self._resync and opcode < _PRIVATE:
+        elif self.salvage and opcode < _PRIVATE:
             raise MalformedRecord(f"no record of the format (opcode {opcode})")
 
     def _definition(self, content: int, length: int) -> bytes:
         """Read a record that is kept in memory."""
         if length > MAX_DEFINITION:
             raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
-        return self._file.read(content, length)
-
-    def _chunk(self, content: int, length: int) -> Segment:
-        head = self._file.peek(content, min(length, CHUNK_PEEK))
-        return fitting(Segment.of_chunk(self._at, head), content + length)
-
-    def _cut_chunk(self, content: int, length: int, limit: int) -> None:
-        try:
-            head = self._file.peek(content, min(limit - content, CHUNK_PEEK))
-            tail = Segment.of_chunk(self._at, head)
-            check_size(tail.compression, 0)
-        except MalformedRecord:
-            return
-        if length == _OPEN_LENGTH:
-            tail.size, tail.crc = MAX_CHUNK, 0
-        else:
-            fitting(tail, content + length)
-        tail.stored, tail.cut = limit - tail.data_offset, True
-        self.tail = tail
+        return self.file.read(content, length)
 
     def _message_index(self, content: int, length: int) -> None:
-        chunk = self._last_chunk
-        if chunk is None:
+        if self._last_chunk is None:
             raise MalformedRecord("a message index without its chunk")
-        head = self._file.peek(content, min(length, _INDEX.size))
-        if len(head) < _INDEX.size:
-            raise MalformedRecord("a message index is cut short")
-        number, size = _INDEX.unpack(head)
-        if size + _INDEX.size > length or size % 16:
-            raise MalformedRecord("a message index lies about its length")
-        chunk.indexes.append(IndexPart(number, content + _INDEX.size, size // 16))
+        head = self.file.peek(content, min(length, IndexPart.HEAD.size))
+        self._last_chunk.indexes.append(IndexPart.of_record(content, length, head))
 
     def _loose_message(self, content: int, length: int) -> None:
+        """Add a message outside chunks to the messages before it."""
         if length < _LOOSE.size + 8:
             raise MalformedRecord("a message is shorter than its own header")
         if length > MAX_CHUNK:
             raise MalformedRecord(f"a message of {length} bytes, above the limit of {MAX_CHUNK}")
-        number, _, time = _LOOSE.unpack(self._file.peek(content, _LOOSE.size))
+        number, _, time = _LOOSE.unpack(self.file.peek(content, _LOOSE.size))
         end = content + length
-        loose = self._loose
-        if loose is not None and end - loose.offset > LOOSE_BYTES:
+        if self._loose is not None and end - self._loose.offset > LOOSE_BYTES:
             self._close_loose()
-            loose = None
-        if loose is None:
-            loose = self._loose = Segment(
-                self._at, self._at, 0, 0, "", 0, time, time, chunked=False, counts={}
-            )
+        if self._loose is None:
+            places = self._at, self._at, 0, 0
+            self._loose = Segment(*places, "", 0, time, time, chunked=False, counts={})
             self._last_chunk = None
+        loose = self._loose
         loose.stored = loose.size = end - loose.offset
         loose.start, loose.end = min(loose.start, time), max(loose.end, time)
         assert loose.counts is not None
@@ -329,7 +336,7 @@ class LogStructure:
         self._inside = self._at + RECORD_HEADER.size + fields.count
 
     def _attachment(self, content: int, length: int) -> None:
-        fields = Fields(self._file.read(content, min(length, _BEFORE_DATA)), "an attachment")
+        fields = Fields(self.file.read(content, min(length, _BEFORE_DATA)), "an attachment")
         log_time, create_time = fields.read8(), fields.read8()
         name, media_type = fields.read_prefixed_string(), fields.read_prefixed_string()
         size = fields.read8()
@@ -337,12 +344,12 @@ class LogStructure:
             raise MalformedRecord("an attachment lies about its length")
         data = content + fields.count
         self._inside = data + size + 4
-        crc = int.from_bytes(self._file.read(data + size, 4), "little")
-        found = Attachment(name, media_type, log_time, create_time, data, size, crc)
-        if crc and self._file.crc(content, data + size) != crc:
-            self._refuse(f"attachment {name[:80]!r}", "its CRC does not match: damaged")
+        crc = int.from_bytes(self.file.read(data + size, 4), "little")
+        if crc and self.file.crc(content, data + size) != crc:
+            self._damaged(f"attachment {name[:80]!r}", "its CRC does not match: damaged")
             return
-        self.attachments.append(found)
+        times = log_time, create_time
+        self._attachments.append(Attachment(name, media_type, *times, data, size, crc))
 
     # The end of the file
 
@@ -354,47 +361,34 @@ class LogStructure:
                 else "the data section has no end record"
             )
         self.missing = f"cut short: {what}"
+        if self.torn is not None and self._unverifiable(self.torn):
+            self.missing += "; recover can save part of the last chunk, unverified"
         return False
 
     def _resume_after(self) -> bool:
-        """Continue at the next chunk that the summary names, else at the next that is found."""
+        """Continue at the next chunk that the summary names, else at the next that looks sound."""
         self._close_loose()
         self._last_chunk = None
-        found = None
+        place = None
         if self.summary and self.summary.named:
-            found = next((c for c in self.summary.named if c > self._at), None)
-        elif self._resync:
-            stop = self._file.size if self._limit is None else self._limit
-            found = next_chunk(self._file, self._sure + (self._sure == self._at), stop)
-        if found is None:
+            place = next((c for c in self.summary.named if c > self._at), None)
+        elif self.salvage:
+            stop = self.file.size if self._limit is None else self._limit
+            place = next_chunk(self.file, self._sure + (self._sure == self._at), stop)
+        if place is None:
             return False
-        self.segments = [s for s in self.segments if s.offset < found]
-        self.attachments = [a for a in self.attachments if a.offset < found]
-        self._at = found
+        # Records behind the last sound one may have been read at wrong places.
+        self.segments = [s for s in self.segments if s.offset < place]
+        self._attachments = [a for a in self._attachments if a.offset < place]
+        self._at = place
         return True
 
     def _resume_after_cut(self) -> bool:
-        """Continue where it was a length that made the file look cut."""
+        """Continue where it was a damaged length that made the file look cut."""
         what = self.missing.removeprefix("cut short: ")
-        torn = self.tail is None and self._at < self._file.size
-        if not (self._resync and torn and self._resume_after()):
+        more = self.torn is None and self._at < self.file.size
+        if not (self.salvage and more and self._resume_after()):
             return False
         self.missing = ""
-        self._refuse(f"byte {self._sure}", what)
+        self._damaged(f"byte {self._sure}", what)
         return True
-
-    def _read_end(self) -> None:
-        self.summary = read_summary(self._file, self.definitions, self._tell)
-        # What is wrong in a footer may be the place that it says the data to end at.
-        lies = self._resync and self.summary is not None and self.summary.broken
-        self._limit = self.summary.begin if self.summary and not lies else None
-
-    def _compare_with(self, summary: Summary) -> None:
-        """Refuse a summary that tells of other chunks, or of another number of messages."""
-        if summary.named and [s.offset for s in self.segments if s.chunked] != summary.named:
-            self._refuse("summary", "its chunk index does not name the chunks that are there")
-        counts = [s.channel_counts() for s in self.segments]
-        there = sum(sum(count.values()) for count in counts if count)
-        stated = summary.statistics.message_count if summary.statistics else there
-        if stated != there and None not in counts:
-            self._refuse("summary", f"it states {stated} messages, there are {there}")

@@ -23,7 +23,6 @@ from recorder.mcap.chunks import UNUSED, MessageTable, check_size, decompressed,
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segment, crc32
 from recorder.mcap.store import PARTIAL, Store
-from recorder.mcap.walk import LogStructure
 from replay.camera_logs.opening import only_foreign
 from replay.integrity.info import ChannelCount, problems_of
 from replay.integrity.report import SCHEMA
@@ -122,7 +121,7 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
         reader = stack.enter_context(LogReader(src, salvage=True))
         repaired: list[Problem] = []
         if reader.problems:
-            store = repair(src)
+            store = repair(reader)
             repaired = [Problem(f"{src}: {p.where}", p.what) for p in store.repaired]
             reader = stack.enter_context(LogReader(store, salvage=True))
         content = reader.channels or reader.metadata or reader.attachments
@@ -273,13 +272,12 @@ class RepairedStore(Store):
         return bytes(data)
 
 
-def repair(path: Path) -> RepairedStore:
+def repair(reader: LogReader) -> RepairedStore:
     """Return a damaged log with the heads and message indexes of its chunks repaired."""
-    store = RepairedStore(path)
-    structure = LogStructure(store, lambda *_: None, resync=True)
-    stated = structure.summary.sound_chunks() if structure.summary else []
-    chunks = stated or [segment for segment in structure.segments if segment.chunked]
-    ends = [chunk.offset for chunk in chunks[1:]] + [structure.data_end or store.size]
+    store = RepairedStore(reader.path)
+    stated = reader.summary.sound_chunks() if reader.summary else []
+    chunks = stated or [s for s in reader.segments if s.chunked and not s.cut]
+    ends = [chunk.offset for chunk in chunks[1:]] + [reader.data_end or store.size]
     for chunk, end in zip(chunks, ends, strict=False):
         try:
             if chunk.stated:  # the summary says everything of a chunk's head but its CRC
