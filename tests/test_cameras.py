@@ -31,7 +31,7 @@ BOTH = ("--topic", "/cam_left", "--topic", "/cam_right")
 
 NO_IMAGES = "holds no images; numbers are taken with --field"
 REFUSED = {
-    "learn oscillatory --topic /left": "is a scene: --topic is for cameras",
+    "learn oscillatory --topic /left": "is a scene: --topic is for logs and cameras",
     "learn pictures": "--rate",
     "learn a.mcap --topic /cam_* --rate 25": "50 images a second, not 25",
     "learn a.mcap --topic /cam_* --start 12 --end 5": "--start 12 is no earlier than --end 5",
