@@ -15,7 +15,8 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.processes import Submit, workers
 from cdmisfa.experiments.sources import configure
-from cdmisfa.experiments.sweep import compute, plan
+from cdmisfa.experiments.store import compute
+from cdmisfa.experiments.sweep import plan
 from recorder.world.oscillatory import OscillatorySource
 
 STREAMS = (10, 100, 1000, 10_000)

@@ -32,12 +32,12 @@ def die_while_sending(size: int, seconds: float) -> bytes:
     return bytes(size)
 
 
-def apply_or_die(trial: Any) -> Any:
+def apply_or_die(modules: Any, name: str, files: list[str], *how: Any) -> Any:
     """Apply modules to a log, unless that kills its worker, as its name says; notes each death."""
-    from cdmisfa.experiments.apply_logs import compute
+    from cdmisfa.experiments.apply_logs import apply_to_log
 
-    if "deadly" in trial.name:
-        with open(trial.files[0] + ".deaths", "a") as file:
+    if "deadly" in name:
+        with open(files[0] + ".deaths", "a") as file:
             file.write(".")
         os.kill(os.getpid(), signal.SIGKILL)
-    return compute(trial)
+    return apply_to_log(modules, name, files, *how)

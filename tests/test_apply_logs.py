@@ -27,6 +27,7 @@ from cdmisfa import Run
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.processes import WorkersError
 from cdmisfa.experiments import apply_logs as applying
+from cdmisfa.experiments import store
 from cdmisfa.experiments.apply_logs import STORE, AppliedLogs, apply_to_logs
 from recorder.recording import record
 from replay.arrays import ArrayLog
@@ -121,7 +122,7 @@ def test_a_log_that_kills_its_worker_ends_the_work_and_the_rest_is_kept(
 ) -> None:
     deadly = camera(logs / "zz-deadly.mcap", 30)
     with monkeypatch.context() as patched:
-        patched.setattr(applying, "compute", apply_or_die)
+        patched.setattr(applying, "apply_to_log", apply_or_die)
         with pytest.raises(WorkersError, match="what is finished is kept"):
             apply_to_logs(run, [str(logs)], tmp_path / "out", jobs=2)
     assert Path(f"{deadly}.deaths").read_text() == "."
@@ -162,7 +163,7 @@ def test_only_what_is_missing_or_has_changed_is_done(
     assert again() == (1, 4)
     assert files(out)["a.mcap.parquet"] == whole["a.mcap.parquet"]
 
-    monkeypatch.setattr(applying, "code", lambda *more: "0.0+other")
+    monkeypatch.setattr(store, "code", lambda *more: "0.0+other")
     assert again() == (5, 0)
 
 

@@ -119,17 +119,6 @@ def test_a_trial_that_breaks_or_is_damaged_is_named(
     assert "'seed': 28000}: it broke; the others are kept" in done.err
 
 
-OTHERS: dict[str, Any] = {
-    "nu": 0.03, "tau": 50, "sigma": 0.005, "delta": 1e-5, "beta": 0.1, "components": 4,
-    "outputs": 2, "expansion": "none",
-    "epsilon_start": 0.9, "epsilon_decay": 0.99, "epsilon_knee": 0.9,
-    "epsilon_tail_decay": 0.9, "gamma": 0.3, "mean_window": 100, "slowness_window": 60,
-    "eta_dot_window": 20, "gate_window": 5, "warm_up": 40, "min_variance": 10.0,
-    "novel_share": 0.0, "patience": 100, "alpha": 0.5, "roc_centres": 3, "roc_radius": 1.0,
-    "roc_memory": 10, "roc_error": 0.01,
-}  # fmt: skip
-
-
 def trials_with(midpoints: dict[float, float], spread: float = 0.0) -> list[Trial]:
     """A trial a sigma, epsilon^c and each of ten seeds, which turn one after the other."""
     return [

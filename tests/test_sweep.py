@@ -29,6 +29,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.processes import WorkersError, run_all
 from cdmisfa.experiments import results as reading
+from cdmisfa.experiments import store
 from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import open_source
@@ -72,15 +73,15 @@ def test_a_trial_is_named_by_what_it_depends_on(monkeypatch: pytest.MonkeyPatch)
         number(settings=["scene.streams=x1,x2"]),
         number(max_iterations=10),
     }
-    monkeypatch.setattr(sweeping, "code", lambda: "0.0.0+another")
+    monkeypatch.setattr(store, "code", lambda *more: "0.0.0+another")
     others.add(number())
     assert len(others | {number(max_modules=1)}) == 7
 
 
 def test_a_worker_with_other_code_refuses() -> None:
     (trial,) = plan("oscillatory", grid={}, seeds=[0], max_iterations=5)
-    assert "error" not in sweeping.compute(trial)
-    refused = sweeping.compute(dataclasses.replace(trial, code="0.0.0+another"))
+    assert "error" not in store.compute(trial)
+    refused = store.compute(dataclasses.replace(trial, code="0.0.0+another"))
     assert "not 0.0.0+another" in refused["error"]
 
 
@@ -110,10 +111,10 @@ def test_cameras_are_swept_with_the_learner_that_learn_takes(tmp_path: Path) -> 
     source, learned = open_source([log])
     source.close()
     (trial,) = plan([log], grid={}, seeds=[0])
-    assert trial.configuration == learned
+    assert trial.call.args[1] == learned
     assert learned.learner.algorithm == "progress"
     (chosen,) = plan([log], grid={"learner.algorithm": ["2.0"]}, seeds=[0])
-    assert chosen.configuration.learner.algorithm == "2.0"
+    assert chosen.call.args[1].learner.algorithm == "2.0"
     report = sweep([log], tmp_path / "sweep", seeds=[0], max_iterations=2)
     assert (report.computed, report.failed) == (1, ())
 
@@ -146,7 +147,7 @@ def test_only_trials_of_other_code_are_computed_again(
     assert (report.trials, report.skipped, report.computed) == (4, 2, 2)
     assert calls == [(3, 0, 4), (4, 0, 4)]
     assert len((tmp_path / ROWS).read_bytes().splitlines()) == 4
-    monkeypatch.setattr(sweeping, "code", lambda: "0.0+other")
+    monkeypatch.setattr(store, "code", lambda *more: "0.0+other")
     words = ("sweep", "oscillatory", "--seeds", "0:5", "--max-iterations", "30", "-o", tmp_path)
     for computed in (5, 0):
         assert cdmisfa(*words, "--json").json["computed"] == computed
@@ -156,18 +157,18 @@ def test_failed_trials_are_listed_and_retried_when_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     computed: list[int] = []
-    healthy = sweeping.compute
+    healthy = sweeping.run_one
 
-    def flaky(trial: sweeping.SweepTrial) -> dict[str, Any]:
-        computed.append(trial.seed)
-        return {"error": "no luck"} if trial.seed == 1 else healthy(trial)
+    def flaky(*what: Any, seed: int, **limits: Any) -> dict[str, Any]:
+        computed.append(seed)
+        return {"error": "no luck"} if seed == 1 else healthy(*what, seed=seed, **limits)
 
-    monkeypatch.setattr(sweeping, "compute", flaky)
+    monkeypatch.setattr(sweeping, "run_one", flaky)
     first = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     assert [(row["seed"], row["error"]) for row in first.failed] == [(1, "no luck")]
     second = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     assert (second.skipped, len(second.failed)) == (3, 1)
-    monkeypatch.setattr(sweeping, "compute", healthy)
+    monkeypatch.setattr(sweeping, "run_one", healthy)
     third = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30, retry_failed=True)
     assert (third.skipped, third.computed, third.failed) == (2, 1, ())
     assert computed == [0, 1, 2]

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,16 +20,7 @@ from cdmisfa.core.names import stream_name
 from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.apply import Application, Totals, follow
 from cdmisfa.experiments.documents import plain, write_json, writing
-from cdmisfa.experiments.store import (
-    FAILED,
-    ROWS,
-    StoredTrial,
-    answer,
-    code,
-    read_rows,
-    run_trials,
-    trial_id,
-)
+from cdmisfa.experiments.store import FAILED, ROWS, Trial, make_trial, read_rows, run_trials
 from cdmisfa.modules import Module
 from recorder.images.options import InputOptions
 from recorder.log.files import (
@@ -54,27 +46,6 @@ COMPUTED: Final = ("cdmisfa/modules", "cdmisfa/experiments/apply", "replay/expor
 
 _LONGEST: Final = 48
 """Most letters of a log's name that become part of a file's name."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ApplyTrial(StoredTrial):
-    """One log that modules are applied to; `log` is the file of the outputs.
-
-    Attributes:
-        name: the log's name, relative to the folder of all logs.
-        files: the log's files.
-        application: the modules.
-        part: where the file is written until it is complete.
-        options: arguments of `Application.open`.
-        frames: end after this many.
-    """
-
-    name: str
-    files: tuple[str, ...]
-    application: Application
-    part: Path
-    options: Mapping[str, Any]
-    frames: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,8 +115,8 @@ def apply_to_logs(
     application, out = Application(run), Path(out).resolve()
     inputs = inputs or InputOptions()
     options = {"inputs": inputs, "loop": loop, "salvage": salvage}
-    depends = plain(options | {"form": form, "frames": frames, "inputs": asdict(inputs)})
-    request = {"schema": 1, "modules": application.identity, "options": depends}
+    chosen = plain(options | {"form": form, "frames": frames, "inputs": asdict(inputs)})
+    request = {"schema": 1, "modules": application.identity, "options": chosen}
     folder, parts = out / STORE, out / STORE / "parts"
     if not folder.exists():
         refuse_existing(out, force=force, goes_on=False)
@@ -160,56 +131,58 @@ def apply_to_logs(
         trials = []
         for name, log in _find_logs(words, folder / INDEX, root, out, indexing, where):
             file = _file_name(name, form)
-            version = code(*COMPUTED)
-            trial = ApplyTrial(
-                id=trial_id(name, log.states, application.identity, depends, version),
-                point={"log": name},
-                seed=0,
-                code=version,
-                log=out / file,
-                name=name,
-                files=tuple(f if "://" in f else os.path.normpath(f) for f in log.files),
-                application=application,
-                part=parts / file,
-                options=options,
-                frames=frames,
+            files = [f if "://" in f else os.path.normpath(f) for f in log.files]
+            call = partial(apply_to_log, application, name, files, parts / file, options, frames)
+            depends = [name, log.states, application.identity, chosen]
+            trial = make_trial(
+                call, *depends, point={"log": name}, modules=COMPUTED, log=out / file
             )
             trials.append(trial)
 
-        def begin(missing: Sequence[ApplyTrial]) -> None:
+        def begin(missing: Sequence[Trial]) -> None:
             write_json(folder / REQUEST, {**request, "root": relative_path(root, folder)})
             for trial in missing:
-                (out / trial.part.name).unlink(missing_ok=True)  # the log or the code has changed
+                if trial.log is not None:
+                    trial.log.unlink(missing_ok=True)  # the log or the code has changed
 
-        report = run_trials(trials, folder, compute, begin=begin, **where)
+        report = run_trials(trials, folder, begin=begin, **where)
         rows = {row["id"]: row for row in read_rows(folder)}
-    outcome = [_outcome(trial, rows[trial.id]) for trial in trials]
+    outcome = [_outcome(rows[trial.id], trial.log) for trial in trials]
     return AppliedLogs(out, outcome, report.trials - report.skipped, report.skipped)
 
 
-def compute(trial: ApplyTrial) -> Mapping[str, Any]:
-    """Apply modules to one log; return the outcome, or under "error" why there is none."""
-    return answer(trial, code(*COMPUTED), _compute)
+def apply_to_log(
+    application: Application,
+    name: str,
+    files: Sequence[str],
+    part: Path,
+    options: Mapping[str, Any],
+    frames: int | None,
+) -> dict[str, Any]:
+    """Apply modules to one log, write the file of its outputs, and return the outcome.
 
-
-def _compute(trial: ApplyTrial) -> dict[str, Any]:
-    application = trial.application
-    column = trial.name if trial.part.suffix in (".parquet", ".csv") else None
-    with contextlib.closing(application.open(trial.files, **trial.options)) as source:
-        totals = Totals(source.spec, application.modules)
+    Args:
+        application: the modules.
+        name: the log's name, relative to the folder of all logs; a column of a table.
+        files: the log's files.
+        part: where the file is written until it is complete; it moves two folders up.
+        options: arguments of `Application.open`.
+        frames: end after this many.
+    """
+    column = name if part.suffix in (".parquet", ".csv") else None
+    modules, out = application.modules, part.parents[2] / part.name
+    with contextlib.closing(application.open(files, **options)) as source:
+        totals = Totals(source.spec, modules)
         with (
-            written_to(
-                trial.part, source.spec, application.modules, force=True, log=column
-            ) as sink,
-            contextlib.closing(application.to(source, trial.frames)) as blocks,
+            written_to(part, source.spec, modules, force=True, log=column) as sink,
+            contextlib.closing(application.to(source, frames)) as blocks,
         ):
             follow(blocks, [sink], totals)
         warnings = [*getattr(source, "warnings", ()), *getattr(source, "changes", {}).values()]
         warnings += getattr(source, "salvaged", list)()
-    assert trial.log is not None
-    with writing(trial.log):
-        os.replace(trial.part, trial.log)
-        to_disk(trial.log.parent)
+    with writing(out):
+        os.replace(part, out)
+        to_disk(out.parent)
     damaged = None if totals.damaged is None else str(totals.damaged)
     return {"frames": totals.frames, "damaged": damaged, "warnings": warnings}
 
@@ -305,15 +278,16 @@ def _file_name(log: str, form: str) -> str:
     return f"{name}.{form}"
 
 
-def _outcome(trial: ApplyTrial, row: Mapping[str, Any]) -> dict[str, Any]:
+def _outcome(row: Mapping[str, Any], out: Path | None) -> dict[str, Any]:
     """Return the outcome of a log as `apply --json` prints it, and its exit code."""
+    name = row["point"]["log"]
     if row["status"] == FAILED:
         failed = {"error": row["error"], "exit_code": row.get("exit_code", 1)}
-        return {"log": trial.name, "out": None, "frames": 0, "warnings": [], **failed}
+        return {"log": name, "out": None, "frames": 0, "warnings": [], **failed}
     result = row["result"]
     return {
-        "log": trial.name,
-        "out": str(trial.log),
+        "log": name,
+        "out": str(out),
         "frames": result["frames"],
         "warnings": result["warnings"],
         "error": result["damaged"],

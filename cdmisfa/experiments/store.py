@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import run_all
@@ -50,32 +50,61 @@ def code(*more: str) -> str:
     return f"{metadata.version('cdmisfa')}+{digest.hexdigest()[:12]}"
 
 
-def trial_id(*depends: Any) -> str:
-    """Return the name of a trial: a hash of the JSON values that decide its result."""
-    text = json.dumps(depends, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoredTrial:
-    """What the store needs of a trial; a subclass adds what a worker needs to compute it.
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A trial: what identifies it, and the call that computes it in any process.
 
     Attributes:
         id: hash of everything the result depends on.
+        call: computes the result, a mapping of JSON values; pickled for workers.
         point: the settings that differ from trial to trial.
         seed: the seed.
-        code: version of the code that the hash includes; workers must have the same.
+        code: the version of the code; a worker must have the same.
+        modules: see `code`.
         log: a file that the trial writes, or None.
     """
 
     id: str
+    call: Callable[[], Mapping[str, Any]]
     point: Mapping[str, Any]
     seed: int
     code: str
-    log: Path | None = None
+    modules: tuple[str, ...]
+    log: Path | None
 
 
-Task = TypeVar("Task", bound=StoredTrial)
+def make_trial(
+    call: Callable[[], Mapping[str, Any]],
+    *depends: Any,
+    point: Mapping[str, Any],
+    seed: int = 0,
+    modules: tuple[str, ...] = (),
+    log: Path | None = None,
+) -> Trial:
+    """Return a trial, identified by the JSON values that its result depends on, and by the code."""
+    version = code(*modules)
+    text = json.dumps([*depends, version], sort_keys=True, separators=(",", ":"))
+    number = hashlib.sha256(text.encode()).hexdigest()[:32]
+    return Trial(number, call, point, seed, version, modules, log)
+
+
+def compute(trial: Trial) -> Mapping[str, Any]:
+    """Return the result of a trial, or under "error" why there is none.
+
+    Raises:
+        LogWriteError: the disk refuses a file, and would refuse those of other trials too.
+    """
+    version = code(*trial.modules)
+    if trial.code != version:
+        return {"error": f"the worker has cdmisfa {version}, not {trial.code}: install the same"}
+    try:
+        return trial.call()
+    except LogWriteError:
+        raise
+    except CdmisfaError as error:
+        return {"error": str(error), "exit_code": error.exit_code}
+    except Exception as error:  # one trial must not end a sweep of thousands
+        return {"error": f"{type(error).__name__}: {error}"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,14 +126,13 @@ class SweepReport:
 
 
 def run_trials(
-    trials: Sequence[Task],
+    trials: Sequence[Trial],
     folder: Path,
-    compute: Callable[[Task], Mapping[str, Any]],
     *,
     jobs: int = 1,
     scheduler: str | None = None,
     retry_failed: bool = False,
-    begin: Callable[[Sequence[Task]], None] = lambda missing: None,
+    begin: Callable[[Sequence[Trial]], None] = lambda missing: None,
     progress: Callable[[int, int, int], None] = lambda finished, failed, total: None,
 ) -> SweepReport:
     """Compute the trials that have no row in a folder yet.
@@ -112,7 +140,6 @@ def run_trials(
     Args:
         trials: all trials that are asked for.
         folder: the folder of the rows; made where it does not exist.
-        compute: returns a trial's result, or under "error" why there is none; importable.
         jobs: local processes.
         scheduler: address of a dask scheduler, whose workers compute instead.
         retry_failed: compute trials again that failed before.
@@ -129,7 +156,7 @@ def run_trials(
     refuse_named_as_file(folder)
     refuse_special(folder, path)
 
-    def is_missing(trial: Task) -> bool:
+    def is_missing(trial: Trial) -> bool:
         row = rows.get(trial.id)
         if row is None or (retry_failed and row["status"] == FAILED):
             return True
@@ -167,7 +194,7 @@ def run_trials(
     return SweepReport(folder, len(trials), skipped, done, failures)
 
 
-def _row(trial: StoredTrial, result: Mapping[str, Any]) -> Row:
+def _row(trial: Trial, result: Mapping[str, Any]) -> Row:
     failed = "error" in result
     return {
         "id": trial.id,
@@ -228,28 +255,3 @@ def _read(path: Path) -> tuple[dict[str, Row], int]:
         if not row.get("run") or writers[Path(row["run"]).name] == row["id"]
     }
     return current, size
-
-
-def answer(
-    trial: Task, version: str, compute: Callable[[Task], Mapping[str, Any]]
-) -> Mapping[str, Any]:
-    """Return the result of a trial, or under "error" why there is none.
-
-    Args:
-        trial: the trial.
-        version: of the code that is here.
-        compute: computes the result; whatever it raises is the answer.
-
-    Raises:
-        LogWriteError: the disk refuses a file, and would refuse those of other trials too.
-    """
-    if trial.code != version:
-        return {"error": f"the worker has cdmisfa {version}, not {trial.code}: install the same"}
-    try:
-        return compute(trial)
-    except LogWriteError:
-        raise
-    except CdmisfaError as error:
-        return {"error": str(error), "exit_code": error.exit_code}
-    except Exception as error:  # one trial must not end a sweep of thousands
-        return {"error": f"{type(error).__name__}: {error}"}

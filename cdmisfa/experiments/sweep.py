@@ -12,7 +12,7 @@ import hashlib
 import inspect
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,14 +30,7 @@ from cdmisfa.experiments.sources import (
     open_logs,
     read_inputs,
 )
-from cdmisfa.experiments.store import (
-    StoredTrial,
-    SweepReport,
-    answer,
-    code,
-    run_trials,
-    trial_id,
-)
+from cdmisfa.experiments.store import SweepReport, Trial, make_trial, run_trials
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
 from recorder.images.options import InputOptions
 from recorder.world.oscillatory import OscillatoryConfig
@@ -45,23 +38,6 @@ from replay.runs.folders import REQUEST
 
 UNKEPT = ("schema", "run", "source", "seed", "signals_sha256", "undecided")
 """Keys of a run's result that a trial's row has elsewhere, or not at all."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SweepTrial(StoredTrial):
-    """One run of a sweep, and everything a worker needs to compute it.
-
-    Attributes:
-        source: a scene's name, or the paths of logs.
-        configuration: preset, settings, the grid's point and the seed together.
-        how: `loop` and `inputs` of `open_logs`.
-        limits: `max_iterations` and `max_modules`.
-    """
-
-    source: tuple[str, ...]
-    configuration: Configuration
-    how: Mapping[str, Any]
-    limits: Mapping[str, Any]
 
 
 def sweep(
@@ -92,19 +68,18 @@ def sweep(
         WorkersError: a worker died, or no scheduler answers.
     """
     folder, grid = Path(folder).resolve(), grid or {}
+    words = (source,) if isinstance(source, str | Path) else tuple(source)
     trials = plan(source, grid=grid, **how)
     request = {
         "schema": 1,
-        "source": list(trials[0].source) if trials else [],
+        "source": [str(word) for word in words],
         "grid": {key: list(values) for key, values in grid.items()},
         "seeds": sorted({trial.seed for trial in trials}),
-        "code": code(),
         "trials": [{"id": trial.id, "point": dict(trial.point)} for trial in trials],
     }
     return run_trials(
         trials,
         folder,
-        compute,
         jobs=jobs,
         scheduler=scheduler,
         retry_failed=retry_failed,
@@ -123,7 +98,7 @@ def plan(
     loop: bool = False,
     inputs: InputOptions | None = None,
     **limits: int | None,
-) -> list[SweepTrial]:
+) -> list[Trial]:
     """Return every trial of a sweep, in the grid's order, seeds innermost; check all settings.
 
     Args:
@@ -152,8 +127,9 @@ def plan(
         ) as logs:
             recorded, spec = dict(logs.describe()), logs.spec
     inputs = inputs or InputOptions()
+    opening = {"loop": loop, "inputs": inputs}
     seeds, ends = tuple(seeds), [limits.get("max_iterations"), limits.get("max_modules")]
-    trials: dict[str, SweepTrial] = {}
+    trials: dict[str, Trial] = {}
     for values in itertools.product(*grid.values()):
         point = dict(zip(grid, values, strict=True))
         with_point = (*settings, *(f"{key}={value}" for key, value in point.items()))
@@ -169,16 +145,8 @@ def plan(
                 depends.append(configuration.tables())
             if inputs != InputOptions():
                 depends.append(dataclasses.asdict(inputs))
-            trial = SweepTrial(
-                id=trial_id(depends, seed, recorded, ends, code()),
-                source=paths,
-                configuration=configuration,
-                point=point,
-                seed=seed,
-                how={"loop": loop, "inputs": inputs},
-                limits=limits,
-                code=code(),
-            )
+            call = partial(run_one, paths, configuration, opening, seed=seed, **limits)
+            trial = make_trial(call, depends, seed, recorded, ends, point=point, seed=seed)
             trials.setdefault(trial.id, trial)
     return list(trials.values())
 
@@ -191,20 +159,30 @@ def _user_code(algorithm: str) -> str:
     return hashlib.sha256(Path(module).read_bytes()).hexdigest()
 
 
-def compute(trial: SweepTrial) -> Mapping[str, Any]:
-    """Compute one trial; return its result, or under "error" why there is none."""
-    return answer(trial, code(), _compute)
+def run_one(
+    source: Sequence[str],
+    configuration: Configuration,
+    opening: Mapping[str, Any],
+    *,
+    seed: int,
+    **limits: Any,
+) -> dict[str, Any]:
+    """Run one trial: an oscillatory one as a whole in C where the learner can, others as `learn`.
 
-
-def _compute(trial: SweepTrial) -> dict[str, Any]:
-    """Compute an oscillatory trial as a whole in C where the learner can, others as `learn`."""
-    configuration, live = trial.configuration, is_scene(trial.source)
-    source = configuration.open_scene() if live else open_logs(trial.source, **trial.how)
-    with contextlib.closing(source):
-        if trial.source == ("oscillatory",) and has_whole_trials(configuration.learner):
+    Args:
+        source: a scene's name, or the paths of logs.
+        configuration: preset, settings, the grid's point and the seed together.
+        opening: `loop` and `inputs` of `open_logs`.
+        seed: the seed.
+        limits: `max_iterations` and `max_modules`.
+    """
+    live = is_scene(source)
+    opened = configuration.open_scene() if live else open_logs(source, **opening)
+    with contextlib.closing(opened):
+        if source == ("oscillatory",) and has_whole_trials(configuration.learner):
             streams = cast(OscillatoryConfig, configuration.scene).streams
-            result = run_trial(configuration.learner, streams, seed=trial.seed, **trial.limits)
-            modules = with_recipes(result.modules, source, source.describe())
+            result = run_trial(configuration.learner, streams, seed=seed, **limits)
+            modules = with_recipes(result.modules, opened, opened.describe())
             return {
                 "iterations": result.iterations,
                 "frames": result.frames,
@@ -213,13 +191,6 @@ def _compute(trial: SweepTrial) -> dict[str, Any]:
                 "epsilon": result.epsilon,
                 "ended": result.ended,
             }
-        sections = configuration.tables()
-        learned = run(
-            source,
-            configuration.learner,
-            seed=trial.seed,
-            sections=sections,
-            rerun=False,
-            **trial.limits,
-        )
+        how: dict[str, Any] = {"seed": seed, "sections": configuration.tables(), "rerun": False}
+        learned = run(opened, configuration.learner, **how, **limits)
     return {key: value for key, value in learned.as_json().items() if key not in UNKEPT}

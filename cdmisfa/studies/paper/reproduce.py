@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,8 @@ from cdmisfa.core.errors import (
     did_you_mean,
 )
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
-from cdmisfa.experiments.store import StoredTrial, answer, code, read_rows, run_trials, trial_id
-from cdmisfa.studies.paper.experiment import Experiment, Findings, Trial
+from cdmisfa.experiments.store import code, make_trial, read_rows, run_trials
+from cdmisfa.studies.paper.experiment import Experiment, Findings, Settings, Trial
 from cdmisfa.studies.paper.icub import Icub, make_recording
 from cdmisfa.studies.paper.nonstationary import NonStationary
 from cdmisfa.studies.paper.oscillatory import FiveStreams, Oscillatory, Stability
@@ -53,13 +53,6 @@ def load(name: str) -> Experiment:
     if name not in EXPERIMENTS:
         raise UsageError(f"no experiment {name!r}: {did_you_mean(name, (*EXPERIMENTS, 'all'))}")
     return EXPERIMENTS[name]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PaperTrial(StoredTrial):
-    """A trial of one of `EXPERIMENTS`; its settings are its point."""
-
-    experiment: str
 
 
 def reproduce(
@@ -89,7 +82,7 @@ def reproduce(
         UsageError: there is no such experiment, or matplotlib is missing.
         CdmisfaError: a trial failed; the others are kept.
     """
-    experiment, version = load(name), code()
+    experiment = load(name)
     if find_spec("matplotlib") is None:
         raise UsageError("reproduce draws figures: pip install 'cdmisfa[paper]'")
     if experiment.sees and recording is None:
@@ -98,13 +91,11 @@ def reproduce(
     for condition in experiment.conditions(quick, recording):
         for seed in range(FIRST_SEED, FIRST_SEED + (trials or experiment.trials[quick])):
             point = {**condition, "seed": seed}
-            number = trial_id(name, point, version)
-            task = PaperTrial(id=number, point=point, seed=seed, code=version, experiment=name)
-            tasks.append(task)
+            call = partial(run_one, name, point)
+            tasks.append(make_trial(call, name, point, point=point, seed=seed))
     report = run_trials(
         tasks,
         folder,
-        compute_trial,
         jobs=jobs,
         scheduler=scheduler,
         retry_failed=True,
@@ -126,7 +117,7 @@ def reproduce(
             "trials": len(finished),
             **found.as_json(),
             "figures": [figure.name for figure in experiment.draw(finished, folder)],
-            "code": version,
+            "code": code(),
             "versions": versions(),
         }
     )
@@ -134,13 +125,9 @@ def reproduce(
     return document
 
 
-def compute_trial(trial: PaperTrial) -> Mapping[str, Any]:
-    """Compute one trial; return its row and arrays, or under "error" why there are none."""
-    return answer(trial, code(), _compute)
-
-
-def _compute(trial: PaperTrial) -> dict[str, Any]:
-    row, arrays = load(trial.experiment).run(trial.point)
+def run_one(name: str, settings: Settings) -> dict[str, Any]:
+    """Run one trial of an experiment; return its row and arrays as JSON values."""
+    row, arrays = load(name).run(settings)
     file = io.BytesIO()
     np.savez_compressed(file, **dict[str, Any](arrays))
     return {"row": plain(row), "arrays": base64.b64encode(file.getvalue()).decode()}
