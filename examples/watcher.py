@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.blank import signals_of_block
+from cdmisfa.agents.inputs import signals_of_block
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.signals import BlockSignals

@@ -16,8 +16,7 @@ from benchmarks.arena.__main__ import LEARNERS, main
 from benchmarks.arena.judging import Course, Saved, judge, probe
 from benchmarks.arena.rules import RULES, Attentive
 from benchmarks.arena.streams import GROUPS, SETS, STREAMS, ArenaSource, Showing, parse
-from cdmisfa.agents.progress.attention import RECENT, Situation
-from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.agents.progress.attention import RECENT, ProgressConfig, Situation
 
 WORDS = ("x1", "x2", "vector-noise")
 TERMS = (5, "quadratic")

@@ -1,4 +1,4 @@
-"""The contracts of learners, features, cameras and exports hold for those of this package.
+"""The contracts of learners and cameras hold for those of this package.
 
 Those of sources and sinks are derived from where these are tested.
 """
@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts.learners import FeatureContract, LearnerContract
+from contracts.learners import LearnerContract
 from contracts.sources import CameraContract
 
-from cdmisfa.agents.blank import signals_of_block
+from cdmisfa.agents.inputs import signals_of_block
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.agents.progress.attention import ProgressConfig
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import SIGNALS, values
-from cdmisfa.features.incsfa import Feature, IncrementalFeature
+from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.recursive import RecursiveFeature
 from recorder.cameras.readers import Camera
 from recorder.cameras.words import CAMERAS
@@ -45,14 +45,24 @@ class TestProgress(LearnerContract):
         return open_learner(ProgressConfig(), spec, seed)
 
 
-class TestIncSFA(FeatureContract):
-    def open(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> Feature:
-        return IncrementalFeature(config, n_inputs, rng)
+@pytest.mark.parametrize("kind", [IncrementalFeature, RecursiveFeature])
+def test_what_is_written_into_the_state_of_a_feature_restores_it(kind: type[Any]) -> None:
+    def opened() -> Any:
+        if kind is RecursiveFeature:
+            return RecursiveFeature(3, components=3)
+        config = LearnerConfig(expansion="none")
+        return IncrementalFeature(config, 3, np.random.default_rng(5))
 
-
-class TestRecursiveSFA(FeatureContract):
-    def open(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> Feature:
-        return RecursiveFeature(n_inputs, components=n_inputs, outputs=config.outputs)
+    t = np.arange(130)[:, None] / np.array([40.0, 7.0, 3.0])
+    frames = np.sin(t) + 0.1 * np.random.default_rng(0).standard_normal(t.shape)
+    one, two = opened(), opened()
+    assert one.update(frames[:50]).shape == (50,)
+    one.update(frames[50:70], gap=True)
+    for array, stored in zip(two.state, one.state, strict=True):
+        array[...] = stored.copy()
+    np.testing.assert_array_equal(one.update(frames[70:]), two.update(frames[70:]))
+    assert one.phi.tobytes() == two.phi.tobytes()
+    assert one.mean.tobytes() == two.mean.tobytes()
 
 
 class TestVideo(CameraContract):

@@ -1,10 +1,10 @@
-"""An expansion and a feature of somebody else, added without editing a file."""
+"""An expansion of the user, added without editing a file."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +12,8 @@ from conftest import Cdmisfa
 from numpy.typing import NDArray
 from test_trial import QUICK, assert_equal, step_by_step
 
-from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import EXPANSIONS, Expansion
 from cdmisfa.experiments.trial import run_trial
-from cdmisfa.features.incsfa import Feature
-from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import load_modules
 
 STREAMS = ("x1", "x2", "x3")
@@ -35,30 +31,6 @@ def cubic(frames: NDArray[Any]) -> NDArray[np.float64]:
 def many(frames: NDArray[Any]) -> NDArray[np.float64]:
     """So many inputs that IncSFA takes its other kernel."""
     return np.hstack([np.cos(k * frames) / (1 + k) for k in range(MANY_INPUTS // 2 + 1)])
-
-
-class Settled(NamedTuple):
-    mean: NDArray[np.float64]
-    phi: NDArray[np.float64]
-
-
-class PlainFeature:
-    """Learns nothing but the mean, and says so: a feature in Python."""
-
-    def __init__(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> None:
-        self.state = Settled(np.zeros(n_inputs), rng.standard_normal((config.outputs, n_inputs)))
-
-    @property
-    def phi(self) -> NDArray[np.float64]:
-        return self.state.phi
-
-    @property
-    def mean(self) -> NDArray[np.float64]:
-        return self.state.mean
-
-    def update(self, frames: NDArray[Any], gap: bool = False) -> NDArray[np.float64]:
-        self.state.mean[...] += 0.1 * (frames.mean(axis=0) - self.state.mean)
-        return np.full(len(frames), 0.01)
 
 
 @pytest.fixture(autouse=True)
@@ -96,19 +68,3 @@ def test_its_modules_transform_frames(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     x = np.random.default_rng(0).random((7, 2))
     expected = (cubic(x) - module.mean) @ module.phi.T
     np.testing.assert_allclose(module.transform(x), expected, rtol=1e-12)
-
-
-def test_a_feature_of_ones_own_is_learned_with_and_restored() -> None:
-    source = OscillatorySource()
-    config = dataclasses.replace(QUICK, expansion="none", components=2)
-    learner, copy = (CuriousLearner(config, source.spec, 3, feature=PlainFeature) for _ in range(2))
-    assert isinstance(learner.abstraction, Feature)
-    for _ in range(20):
-        learner.step(source.take(learner.stream, learner.tau))
-    copy.restore(learner.state)
-    block = source.take(learner.stream, learner.tau)
-    one, two = learner.step(block), copy.step(block)
-    assert one.novel
-    np.testing.assert_array_equal(one.y, two.y)
-    expected = (block.frames - learner.abstraction.mean) @ learner.phi.T
-    np.testing.assert_allclose(one.y, expected, rtol=1e-9, atol=1e-12)

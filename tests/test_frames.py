@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.agents.learners import open_learner
-from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.arrays import as_frames
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
@@ -21,7 +16,6 @@ from cdmisfa.core.expansion import expand, quadratic
 from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.outputs import project
 from cdmisfa.kernels import lib
-from recorder.world.oscillatory import OscillatorySource
 
 SMALL, LARGE = 5, lib.MANY_INPUTS + 50
 CONFIG = LearnerConfig(components=3)
@@ -99,19 +93,6 @@ def test_only_uint8_are_pixels(kind: str) -> None:
     for call in (as_frames, quadratic, abstraction(SMALL).update):
         with pytest.raises(UsageError, match=f"frames of {kind} given: give uint8 pixels or"):
             call(frames)  # type: ignore[operator]
-
-
-@pytest.mark.parametrize("t", [2**70, -1, 1.5, "3"])
-@pytest.mark.parametrize("config", [LearnerConfig(), ProgressConfig()])
-def test_a_block_of_no_frame_number_is_refused_before_anything_is_drawn(
-    t: Any, config: Any
-) -> None:
-    source = OscillatorySource()
-    learner = open_learner(config, source.spec, 0)
-    block, before = source.take(learner.stream, learner.tau), learner.state.policy_rng
-    with pytest.raises(UsageError, match="frames have numbers from 0 on"):
-        learner.step(replace(block, t=t))
-    assert learner.state.policy_rng == before
 
 
 def test_a_block_of_another_order_in_memory_gives_the_same_bits() -> None:

@@ -14,7 +14,6 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import IncrementalFeature, IncSFAState, new_state
 from cdmisfa.features.outputs import project
-from cdmisfa.features.recursive import RecursiveFeature
 from cdmisfa.features.sfa import batch_sfa, slowness
 from recorder.world.oscillatory import OscillatorySource, one_period
 
@@ -335,22 +334,3 @@ def test_arrays_of_another_shape_or_order_are_refused():
     for wrong in (state.w[:, ::-1], state.w[:, :3], state.w.astype(np.float32), [[1.0] * 4]):
         with pytest.raises(UsageError, match=r"^w "):
             kernels.incsfa(state._replace(w=wrong), 0.1, 10)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: IncrementalFeature(config_of(3, 1), 6, np.random.default_rng(0)),
-        lambda: RecursiveFeature(6, components=3),
-    ],
-)
-def test_a_state_that_is_set_is_learned_from(make):
-    frames = np.random.default_rng(0).standard_normal((60, 6))
-    sfa, other = make(), make()
-    for each in (sfa, other):
-        each.update(frames[:20])
-    before = type(sfa.state)(*(array.copy() for array in sfa.state))
-    sfa.update(frames[20:40])
-    sfa.state = before
-    np.testing.assert_array_equal(sfa.update(frames[40:]), other.update(frames[40:]))
-    np.testing.assert_array_equal(sfa.phi, other.phi)

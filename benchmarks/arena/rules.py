@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.progress.attention import HALF, RECENT, Situation, exploring
+from cdmisfa.agents.progress.attention import HALF, RECENT, ProgressConfig, Situation, exploring
 from cdmisfa.agents.progress.candidate import Candidate
-from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.agents.progress.learner import ProgressLearner
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import SourceSpec

@@ -32,26 +32,29 @@ def _record_type(kind: str) -> np.dtype[np.void]:
     return made
 
 
+# Numbers that the agent remembers:
+# iteration    iterations so far
+# module       abstraction being learned, from 1
+# stream       stream to watch next
+# last_stream, last_action   before and at the last decision; -1 before the first
+# fed_stream, fed_until      stream of the last novel block (-1: none), and the frame after it
+# novel_blocks since the abstraction was created
+# rewards      t of the running reward function
+# scale        divides the sums to give R; 0 before the first reward
+# roc_error    CD-MISFA 1.0: running mean of the clustering error
+# xi           mean change of the weights in the last novel block
+# share        running share of novel blocks of the stream of the block before
+# epsilon      probability of a random action
+# idle         iterations with epsilon practically 0
 MEMORY = _record_type("memory")
-"""Numbers that the agent remembers.
 
-iteration: iterations so far. module: abstraction being learned, from 1. stream: to watch next.
-last_stream: before the last action, -1 before the first. last_action. fed_stream: of the last novel
-block, -1 for none. fed_until: frame after that. novel_blocks: since the abstraction was created.
-rewards: t of the running reward function. scale: what the sums are divided by to give R, 0 before
-the first reward. roc_error: CD-MISFA 1.0, running mean of the clustering error. xi: mean change of
-the weights in the last novel block. share: running share of novel blocks of the stream of the block
-before. epsilon. idle: iterations with epsilon practically 0.
-"""
-
+# Outcome of an iteration: signals of `BlockSignals` by their names.
 OUTCOME = _record_type("outcome")
-"""What an iteration came to: signals of `BlockSignals` by their names."""
 
+# Verdicts of the gate: no frozen module knows the block, or it carries nothing to learn. Positive
+# verdicts are the module's index.
 NOVEL: int = kernels.lib.NOVEL
-"""Verdict: no frozen module knows the block. Positive verdicts are the module's index."""
-
 CONSTANT: int = kernels.lib.CONSTANT
-"""Verdict: the block carries nothing to learn."""
 
 
 class Agent(NamedTuple):

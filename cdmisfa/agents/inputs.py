@@ -1,8 +1,12 @@
-"""What a learner takes in: the number of its inputs, and the block that it asked for."""
+"""Blocks in, signals out: what all learners of this package share.
+
+`count_inputs` and `rows_of` check what a learner takes in; `signals_of_block` makes the record of
+an iteration for learners that have only some of the signals.
+"""
 
 from __future__ import annotations
 
-from numbers import Integral
+import math
 from typing import Any
 
 import numpy as np
@@ -11,26 +15,22 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expanded_size
+from cdmisfa.core.signals import DENSE_STREAMS, NO_STATE, SIGNALS, BlockSignals
 
-LAST_FRAME = 2**62
-"""Frames are numbered up to this: what follows a block has a number of 64 bits, too."""
-
+# Squares and products of values up to this, and their sums, are finite.
 LARGEST_VALUE = 1e100
-"""Squares and products of values up to this, and their sums, are finite."""
 
+# An abstraction of more inputs than this (a grey image of 1400 x 1400) is refused.
 MAX_INPUTS = 2_000_000
-"""An abstraction of more inputs than this (a grey image of 1400 x 1400) is refused."""
 
 
 def count_inputs(expansion: str, spec: SourceSpec) -> int:
-    """Number of inputs after expansion.
+    """Return the number of inputs after expansion.
 
     Raises:
-        UsageError: too many to hold, or this is no spec.
+        UsageError: there is no such expansion, or there are too many inputs to hold.
     """
-    if not isinstance(spec, SourceSpec):
-        raise UsageError(f"{type(spec).__name__} given as spec: give the source's, source.spec")
-    values = int(np.prod(spec.frame_shape))
+    values = math.prod(spec.frame_shape)
     inputs = expanded_size(expansion, values)
     if inputs > MAX_INPUTS:
         raise UsageError(
@@ -41,46 +41,65 @@ def count_inputs(expansion: str, spec: SourceSpec) -> int:
 
 
 def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[Any]:
-    """The frames of a block as rows, (tau, values).
-
-    A block that was not asked for is refused, as is one that would spoil every estimate.
+    """Return the frames of a block as rows, (tau, values).
 
     Args:
-        block: as a source gave it.
+        block: the block that the source returned.
         spec: of that source.
-        stream: the stream that was asked for.
-        tau: the frames that were asked for.
+        stream: the stream that the learner asked for.
+        tau: the number of frames that it asked for.
 
     Raises:
-        UsageError: it is no block, or of no frame number.
         ValueError: the block is of another stream, length, frame shape or type.
-        CdmisfaError: it holds a value that is no finite number.
+        CdmisfaError: it holds a value that would spoil every estimate.
     """
-    if not isinstance(block, Block):
-        raise UsageError(
-            f"{type(block).__name__} given: a learner takes the blocks of a source, as "
-            "source.take(learner.stream, learner.tau) gives them"
+    frames = block.frames
+    given = len(frames), block.stream, frames.shape[1:], frames.dtype
+    wanted = tau, stream, spec.frame_shape, np.dtype(spec.dtype)
+    if given != wanted:
+        words = (
+            f"{n} frames of stream {s}, {shape} {dtype}" for n, s, shape, dtype in (wanted, given)
         )
-    if not isinstance(block.t, Integral) or not 0 <= block.t <= LAST_FRAME:
-        raise UsageError(f"a block at frame {block.t!r} given: frames have numbers from 0 on")
-    if block.stream != stream or len(block) != tau:
-        raise ValueError(
-            f"the learner asked for {tau} frames of stream {stream}, "
-            f"not {len(block)} of stream {block.stream}"
-        )
-    shape, dtype = block.frames.shape[1:], block.frames.dtype
-    if shape != spec.frame_shape or dtype != spec.dtype:
-        raise ValueError(
-            f"the learner asked for frames of {spec.frame_shape} {spec.dtype}, not {shape} {dtype}"
-        )
-    if dtype.kind == "f" and not (  # also true of NaN; without an array as large as the frames
-        block.frames.max(initial=0) <= LARGEST_VALUE
-        and block.frames.min(initial=0) >= -LARGEST_VALUE
+        raise ValueError(f"the learner asked for {', not '.join(words)}")
+    if frames.dtype.kind == "f" and not (  # also true of NaN; without an array as large as frames
+        frames.max(initial=0) <= LARGEST_VALUE and frames.min(initial=0) >= -LARGEST_VALUE
     ):
-        finite = np.isfinite(block.frames).all()
+        finite = np.isfinite(frames).all()
         what = f"larger than {LARGEST_VALUE:g}" if finite else "no finite number"
         raise CdmisfaError(
-            f"stream {spec.streams[block.stream]} holds a value that is {what} "
-            f"in frames {block.t} to {block.t + len(block) - 1}: learn from frames without it"
+            f"stream {spec.streams[stream]} holds a value that is {what} "
+            f"in frames {block.t} to {block.t + tau - 1}: learn from frames without it"
         )
-    return block.frames.reshape(len(block), -1)
+    return frames.reshape(tau, -1)
+
+
+def signals_of_block(
+    block: Block, spec: SourceSpec, iteration: int, *, outputs: int, modules: int, **given: Any
+) -> BlockSignals:
+    """Return the signals of a block; numbers that are not given are NaN.
+
+    Args:
+        block: the watched block.
+        spec: of its source.
+        iteration: from 0.
+        outputs: J of the learner's abstraction.
+        modules: M, the number of modules saved before.
+        given: signals by their names.
+    """
+    n = {"T": len(block), "J": outputs, "M": modules, "S": len(spec.streams), "A": 2}
+    signals: dict[str, Any] = {
+        "iteration": iteration,
+        "t": block.t,
+        "log_time": spec.time_ns(block.t),
+        "stream": block.stream,
+        "next_stream": block.stream,
+        "module": modules + 1,
+    }
+    blank: dict[str, Any] = {"bool": False, "int64": 0, "float64": math.nan}
+    for signal in SIGNALS.values():
+        value = NO_STATE if signal.name == "state" else blank[signal.dtype]
+        shape = tuple(n[dim] for dim in signal.dims)
+        signals.setdefault(signal.name, np.full(shape, value) if shape else value)
+    if len(spec.streams) > DENSE_STREAMS:
+        signals["R"] = np.empty((0, 2, 0))
+    return BlockSignals(**{**signals, **given})

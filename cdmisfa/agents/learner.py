@@ -1,6 +1,6 @@
 """`CuriousLearner`: blocks in, signals out.
 
-The learner knows neither where its blocks come from nor where its signals go. The same
+The learner knows neither the origin of its blocks nor the destination of its signals. The same
 blocks give the same signals, bit for bit.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from cdmisfa import kernels
 from cdmisfa.agents.agent import (
-    NOVEL,
     OUTCOME,
     as_struct,
     begin_abstraction,
@@ -32,35 +30,31 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.signals import NO_STATE, BlockSignals
-from cdmisfa.features.incsfa import Feature, IncrementalFeature, MakeFeature
+from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.modules import Module
 
+# Spawn keys of the learner's two random generators, beneath the run's seed.
 POLICY_KEY, WEIGHTS_KEY = 1, 2
-"""Spawn keys of the learner's two random generators, beneath the run's seed."""
 
 
 class CuriousLearner:
     """The paper's agent: adaptive abstraction, gating system and curiosity-driven learner.
 
     Args:
-        config: what it is told.
+        config: its configuration.
         spec: the source it learns from.
-        seed: where its random generators start.
-        feature: makes its adaptive abstractions.
+        seed: seed of its random generators.
 
     Attributes:
-        config: what it was told.
-        spec: the source it learns from.
-        seed: where its random generators started.
-        modules: what it learned so far.
-        events: what the last iteration brought, one line each.
+        modules: the saved modules.
+        events: what happened in the last iteration, one line each.
         scale: factor from a frame's values to the learner's (1/255 for pixels).
         policy_rng: three draws an iteration, whatever is done with them.
-        rules: the configuration's numbers, as the agent goes by them.
+        rules: the numbers of the configuration that the agent uses.
         agent: memory of the agent; changed in place.
         abstraction: the adaptive abstraction.
         frozen: the modules in one stack.
-        out: (1,) of `OUTCOME`, what the last iteration came to.
+        out: (1,) of `OUTCOME`, of the last iteration.
 
     Example:
         >>> from recorder.world.oscillatory import OscillatorySource
@@ -73,20 +67,10 @@ class CuriousLearner:
 
     configuration = LearnerConfig
 
-    def __init__(
-        self,
-        config: LearnerConfig,
-        spec: SourceSpec,
-        seed: int,
-        *,
-        feature: MakeFeature = IncrementalFeature,
-    ) -> None:
-        self.config = config
-        self.spec = spec
-        self.seed = seed
+    def __init__(self, config: LearnerConfig, spec: SourceSpec, seed: int) -> None:
+        self.config, self.spec, self.seed = config, spec, seed
         self.modules: list[Module] = []
         self.events: tuple[str, ...] = ()
-        self._feature = feature
         self._n_inputs = inputs = count_inputs(config.expansion, spec)
         if config.components > inputs:
             raise UsageError(
@@ -107,17 +91,6 @@ class CuriousLearner:
         self._no_state = freeze(np.full(n_streams, NO_STATE))
         self._freeze()
         self.abstraction = self._new_abstraction()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without what has pointers of this process."""
-        pointers = ("_agent", "_frozen")
-        return {name: value for name, value in vars(self).items() if name not in pointers}
-
-    def __setstate__(self, state: Mapping[str, Any]) -> None:
-        """See `__getstate__`."""
-        vars(self).update(state)
-        self._agent = as_struct(self.agent, self.rules, self.out)
-        self._frozen = self.frozen.struct
 
     @property
     def tau(self) -> int:
@@ -155,12 +128,6 @@ class CuriousLearner:
     def phi(self) -> FloatArray:
         """Weights of the adaptive abstraction, (J, I), a copy."""
         return self.abstraction.phi.copy()
-
-    @property
-    def kernel(self) -> kernels.Struct | None:
-        """The adaptive abstraction as the kernels take it; None where they cannot."""
-        kernel = getattr(self.abstraction, "kernel", None)
-        return kernel if isinstance(kernel, kernels.Struct) else None
 
     @property
     def arithmetic(self) -> int:
@@ -208,7 +175,6 @@ class CuriousLearner:
             block: tau frames of the stream the learner asked for.
 
         Raises:
-            UsageError: it is no block.
             ValueError: the block is of another stream, length, frame shape or type.
             CdmisfaError: it holds a value that is no finite number.
         """
@@ -217,12 +183,9 @@ class CuriousLearner:
         expanded = expand(self.config.expansion, frames)
         if expanded is not frames:
             x = kernels.frames_of(expanded, self._n_inputs)
-        kernel, uniforms = self.kernel, self.policy_rng.random(3)
-        if kernel is not None:
-            told = kernels.iterate(self._agent, self._frozen, kernel, shown, x, block.t, uniforms)
-        else:
-            told = self._iterate(shown, x, expanded, block.t, uniforms)
-        signals = self._signals(block, *told)
+        uniforms, kernel = self.policy_rng.random(3), self.abstraction.kernel
+        results = kernels.iterate(self._agent, self._frozen, kernel, shown, x, block.t, uniforms)
+        signals = self._signals(block, *results)
         self.events = ()
         if self.out["saved"][0]:
             self.save_abstraction()
@@ -232,21 +195,6 @@ class CuriousLearner:
                 f"policy {module.policy.tolist()}",
             )
         return signals
-
-    def _iterate(
-        self, shown: kernels.Struct, x: kernels.Struct, expanded: Any, t: int, uniforms: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """`kernels.iterate` with a feature of somebody else, which learns in Python."""
-        told = kernels.recognise(self._agent, self._frozen, shown, x)
-        memory, xi = self.agent.memory[0], np.full(self.tau, np.nan)
-        y = np.full((self.tau, self.config.outputs), np.nan)
-        if self.out["known_by"][0] == NOVEL:
-            gap = memory["fed_stream"] != memory["stream"] or memory["fed_until"] != t
-            xi = self.abstraction.update(expanded, bool(gap))
-            phi = self.abstraction.phi
-            y = kernels.outputs(phi, kernels.mean_output(phi, self.abstraction.mean), expanded)
-        kernels.think(self._agent, xi, y, t, uniforms)
-        return y, *told
 
     def repeat(
         self,
@@ -268,9 +216,7 @@ class CuriousLearner:
         Returns:
             Iterations done: until an abstraction is to be saved, swap or end is due, or n.
         """
-        kernel = self.kernel
-        if kernel is None:
-            raise UsageError("it learns with a feature in Python: have it step")
+        kernel = self.abstraction.kernel
         return kernels.iterations(
             self._agent, self._frozen, kernel, shown, x, uniforms, swap_below, kept
         )
@@ -359,12 +305,7 @@ class CuriousLearner:
         self.frozen = frozen_modules(self.modules, self.agent, self._n_inputs)
         self._frozen = self.frozen.struct
 
-    def _new_abstraction(self) -> Feature:
-        key = (WEIGHTS_KEY, len(self.modules))
-        seed = np.random.SeedSequence(self.seed, spawn_key=key)
+    def _new_abstraction(self) -> IncrementalFeature:
+        seed = np.random.SeedSequence(self.seed, spawn_key=(WEIGHTS_KEY, len(self.modules)))
         rng = np.random.Generator(np.random.PCG64(seed))
-        abstraction = self._feature(self.config, self._n_inputs, rng)
-        shape = (self.config.outputs, self._n_inputs)
-        if abstraction.phi.shape != shape:
-            raise UsageError(f"the feature has phi of {abstraction.phi.shape}: it must be {shape}")
-        return abstraction
+        return IncrementalFeature(self.config, self._n_inputs, rng)

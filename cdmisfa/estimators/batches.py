@@ -16,7 +16,7 @@ from cdmisfa.agents.inputs import LARGEST_VALUE
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import MAX_COMPONENTS, LearnerConfig
 from cdmisfa.core.errors import UsageError
-from cdmisfa.features.incsfa import Feature, IncrementalFeature
+from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.outputs import project
 from cdmisfa.features.recursive import PIECE, RecursiveFeature
 from cdmisfa.kernels import mean_output, multiply
@@ -117,7 +117,7 @@ class _SlowFeatures(_Estimator):
     def _n_features_out(self) -> int:
         return len(self._feature.phi)
 
-    def _begin(self, n_features: int) -> Feature:
+    def _begin(self, n_features: int) -> Any:
         raise NotImplementedError
 
     def _follow(self, x: FloatArray, gap: bool) -> None:
@@ -212,7 +212,7 @@ class RecursiveSFA(_SlowFeatures):
         patterns = multiply(state.weights * state.variance, state.basis)
         return np.asarray(multiply(np.ascontiguousarray(Y), patterns) + self.mean_)
 
-    def _begin(self, n_features: int) -> Feature:
+    def _begin(self, n_features: int) -> Any:
         whitened = min(self.n_whitened, n_features)
         return RecursiveFeature(n_features, whitened, self.n_components, self.window)
 
@@ -273,7 +273,7 @@ class IncSFA(_SlowFeatures):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.sqrt(moves / (square - mean * mean)) / (2 * np.pi))
 
-    def _begin(self, n_features: int) -> Feature:
+    def _begin(self, n_features: int) -> Any:
         if not isinstance(self.nu, Real) or not 0 <= self.nu <= 1:
             raise ValueError(f"nu={self.nu!r} given: it is a learning rate, from 0 to 1")
         config = LearnerConfig(

@@ -20,7 +20,7 @@ import numpy as np
 
 from cdmisfa import kernels
 from cdmisfa.agents.progress.candidate import log_ratio
-from cdmisfa.agents.progress.judging import PRESENT, STRANGE
+from cdmisfa.agents.progress.judging import CHANGED, PRESENT
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, unbroken
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
@@ -317,7 +317,7 @@ class _Judge:
             steps = np.diff(first, axis=0)
             sizes = np.sqrt((steps * steps).mean(axis=0)).tolist()
             for i, learned in self._step_sizes.items():
-                novelty[i] = abs(log_ratio(sizes[i], learned)) / STRANGE
+                novelty[i] = abs(log_ratio(sizes[i], learned)) / CHANGED
         return Applied(block, y, slowness, alive, novelty)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
-from cdmisfa.core.learning import Learner
 from cdmisfa.experiments.loop import ending
 from cdmisfa.modules import Module
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
@@ -73,12 +72,8 @@ class TrialResult:
 
 
 def has_whole_trials(config: Any) -> bool:
-    """Whether the learner of a configuration, and what it learns with, can learn in C alone."""
-    return _learns_in_c(open_learner(config, OscillatorySource().spec, 0))
-
-
-def _learns_in_c(learner: Learner) -> TypeGuard[CuriousLearner]:
-    return isinstance(learner, CuriousLearner) and learner.kernel is not None
+    """Return whether the learner of a configuration can run whole trials in C."""
+    return isinstance(open_learner(config, OscillatorySource().spec, 0), CuriousLearner)
 
 
 def run_trial(
@@ -103,10 +98,10 @@ def run_trial(
         curves: keep what every iteration came to.
 
     Raises:
-        UsageError: the learner, or the feature it learns with, is in Python.
+        UsageError: the learner is in Python.
     """
     learner = open_learner(config, OscillatorySource(streams).spec, seed)
-    if not _learns_in_c(learner):
+    if not isinstance(learner, CuriousLearner):
         raise UsageError(
             f"learner.algorithm {config.algorithm} has no whole trials: use learn for it"
         )

@@ -1,4 +1,4 @@
-"""Adaptive abstractions: what a learner learns with, and `IncrementalFeature`, the paper's.
+"""`IncrementalFeature`: the adaptive abstraction of the paper's learner.
 
 Sources: candid covariance-free incremental PCA (CCIPCA): Weng, Zhang and Hwang 2003;
 minor component analysis (MCA) by sequential addition: Peng and Yi 2006; the two joined
@@ -7,9 +7,8 @@ as IncSFA: Kompella, Luciw and Schmidhuber 2012. How it is computed: `kernels/in
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,42 +16,6 @@ from numpy.typing import NDArray
 from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
-
-
-@runtime_checkable
-class Feature(Protocol):
-    """Slow features that are learned frame by frame: y = phi (x - mean).
-
-    One that also has `kernel`, a record of its arrays as `IncrementalFeature` has it, is learned
-    with in C.
-    """
-
-    def update(self, frames: NDArray[Any], gap: bool = False) -> FloatArray:
-        """Learn from consecutive frames.
-
-        Args:
-            frames: (n, I) uint8 pixels, which count 1/255 each, or float64 values, expanded.
-            gap: the first frame does not follow the last one learned from.
-
-        Returns:
-            xi, (n,): change of phi at each frame, NaN where there is none to tell.
-        """
-
-    @property
-    def phi(self) -> FloatArray:
-        """Weights of the centred input, (J, I)."""
-
-    @property
-    def mean(self) -> FloatArray:
-        """Mean of the input, (I,)."""
-
-    @property
-    def state(self) -> Any:
-        """Every array that changes, as a named tuple; restored by writing into them."""
-
-
-MakeFeature = Callable[[LearnerConfig, int, np.random.Generator], Feature]
-"""How a learner makes a feature: configuration, length of an expanded frame, where to draw."""
 
 
 class IncSFAState(NamedTuple):
@@ -108,7 +71,10 @@ def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) ->
 
 
 class IncrementalFeature:
-    """Incremental slow feature analysis, frame by frame.
+    """Incremental slow feature analysis, frame by frame: y = phi (x - mean).
+
+    Attributes:
+        state: every array of it; write into them to restore another state.
 
     Example:
         >>> sfa = IncrementalFeature(LearnerConfig(), 5, np.random.default_rng(0))
@@ -119,16 +85,6 @@ class IncrementalFeature:
     def __init__(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> None:
         self.state = new_state(rng, n_inputs, config)
         self._nu, self._window = config.nu, config.mean_window
-
-    @property
-    def state(self) -> IncSFAState:
-        """Every array the abstraction consists of; others may be set in their place."""
-        return self._state
-
-    @state.setter
-    def state(self, state: IncSFAState) -> None:
-        self._state = state
-        vars(self).pop("kernel", None)  # it is of the arrays of before
 
     @cached_property
     def kernel(self) -> kernels.Struct:

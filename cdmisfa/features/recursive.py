@@ -21,8 +21,8 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
 
+# Frames taken in at once; longer blocks are cut into pieces of so many.
 PIECE: int = kernels.lib.PIECE
-"""Frames taken in at once; longer blocks are cut into pieces of so many."""
 
 _TINY = 1e-300
 
@@ -78,6 +78,9 @@ class RecursiveFeature:
         outputs: J.
         window: frames of the exponential window; the first so many all count the same.
 
+    Attributes:
+        state: every array of it; write into them to restore another state.
+
     Example:
         >>> t = np.arange(2000.0)
         >>> sfa = RecursiveFeature(2, components=2)
@@ -126,16 +129,6 @@ class RecursiveFeature:
             UsageError: these are no frames of I values.
         """
         return kernels.recursive_update(self._record, frames, gap)
-
-    @property
-    def state(self) -> RecursiveState:
-        """Every array it consists of; others may be set in their place."""
-        return self._state
-
-    @state.setter
-    def state(self, state: RecursiveState) -> None:
-        self._state = state
-        vars(self).pop("_record", None)  # it is of the arrays of before
 
     @cached_property
     def _record(self) -> kernels.Struct:

@@ -1,12 +1,8 @@
-"""What every `Learner`, `Feature` and `Sink` promises, as tests: say what to open.
+"""What every `Learner` and `Sink` promises, as tests: say what to open.
 
 class TestMine(LearnerContract):
     def open(self, spec, seed) -> Learner:
         return Mine(MineConfig(), spec, seed)
-
-class TestMyFeature(FeatureContract):
-    def open(self, config, n_inputs, rng) -> Feature:
-        return MyFeature(config, n_inputs, rng)
 
 class TestDigest(SinkContract):
     def open(self, folder, source, learner) -> Sink:
@@ -23,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
@@ -31,10 +26,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.experiments.loop import Digest, learn_blocks
-from cdmisfa.features.incsfa import Feature
 from recorder.world.oscillatory import OscillatorySource
-
-INPUTS = 3
 
 CONFIG = LearnerConfig(
     tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0
@@ -126,60 +118,6 @@ class LearnerContract:
                 with pytest.raises(ValueError, match=r".+"):
                     learner.step(block)
         assert learner.iteration == 0
-
-
-def seen(n: int, seed: int = 0) -> NDArray[np.float64]:
-    """Values that change slowly, with noise, (n, 3)."""
-    t = np.arange(n)[:, None] / np.array([40.0, 7.0, 3.0])
-    noise = np.random.default_rng(seed).standard_normal((n, INPUTS))
-    return np.asarray(np.sin(t) + 0.1 * noise)
-
-
-class FeatureContract:
-    """The tests; a subclass opens a fresh feature in `open`.
-
-    Attributes:
-        config: of the learner that it is for.
-    """
-
-    config = LearnerConfig(expansion="none")
-
-    def open(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> Feature:
-        """Open a fresh feature of the kind under test."""
-        raise NotImplementedError
-
-    def _open(self) -> Feature:
-        return self.open(self.config, INPUTS, np.random.default_rng(5))
-
-    def test_it_is_a_feature(self) -> None:
-        feature = self._open()
-        assert isinstance(feature, Feature)
-        assert feature.phi.shape == (self.config.outputs, INPUTS)
-        assert feature.mean.shape == (INPUTS,)
-
-    def test_it_says_how_much_each_frame_changed_it(self) -> None:
-        feature = self._open()
-        assert feature.update(seen(50)).shape == (50,)
-        xi = feature.update(seen(20, 1), gap=True)
-        assert xi.shape == (20,)
-        assert np.isnan(xi).all() or (xi[~np.isnan(xi)] >= 0).all()
-
-    def test_the_same_frames_give_the_same_bits(self) -> None:
-        one, two = self._open(), self._open()
-        for feature in (one, two):
-            feature.update(seen(60))
-        assert one.phi.tobytes() == two.phi.tobytes()
-        assert one.mean.tobytes() == two.mean.tobytes()
-
-    def test_what_is_written_into_its_state_restores_it(self) -> None:
-        one, two = self._open(), self._open()
-        one.update(seen(60))
-        stored: dict[str, NDArray[Any]] = {k: v.copy() for k, v in one.state._asdict().items()}
-        for name, array in two.state._asdict().items():
-            array[...] = stored[name]
-        more = seen(60, 1)
-        np.testing.assert_array_equal(one.update(more), two.update(more))
-        assert one.phi.tobytes() == two.phi.tobytes()
 
 
 class SinkContract:

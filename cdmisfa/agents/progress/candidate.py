@@ -15,34 +15,33 @@ from cdmisfa.core.learning import overwrite
 from cdmisfa.features.outputs import slowness_by_moments, window_rate
 from cdmisfa.features.recursive import RecursiveFeature, RecursiveState
 
+# Slowness of white noise.
 WHITE_NOISE = math.sqrt(2.0) / (2.0 * math.pi)
-"""Slowness of white noise."""
 
+# With fewer slow features than this there is no typical one; white noise stands for it.
 FEWEST = 4
-"""With fewer slow features than this there is no typical one; white noise stands for it."""
 
+# Blocks whose learning error is kept.
 ERRORS = 90
-"""Blocks whose learning error is kept."""
 
+# Most candidates held at once, and the bytes that they may take together: where frames are large
+# fewer are held. Those of other streams begin again when they are watched.
 HELD = 32
-"""At most; those of other streams are begun anew when they are watched."""
-
 MEMORY = 2 * 1024**3
-"""Bytes that they may take together; where frames are large fewer of them are held."""
+
+# Learning error of a block before anything was tested: larger than any that is.
+UNTESTED = 3.0
 
 _TINY = 1e-12
 
-UNTESTED = 3.0
-"""Learning error of a block before anything was tested: more than any that is."""
-
 
 def log_ratio(a: float, b: float) -> float:
-    """ln(a / b) of two slownesses, finite where one of them is 0."""
+    """Return ln(a / b) of two slownesses, finite where one of them is 0."""
     return kernels.log(max(a, _TINY) / max(b, _TINY))
 
 
 def learning_error(change: float, tested: float, fitted: float) -> float:
-    """How much the outputs change yet, and how little is known of them: e = c + |ln(test / fit)|.
+    """Return the learning error, e = c + |ln(test / fit)|.
 
     Equation: P2
 
@@ -55,7 +54,7 @@ def learning_error(change: float, tested: float, fitted: float) -> float:
 
 
 class Candidate:
-    """What is being learned of a stream.
+    """The slow features that are being learned of a stream.
 
     Args:
         n_inputs: I.

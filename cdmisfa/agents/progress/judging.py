@@ -1,4 +1,8 @@
-"""What is kept of each stream, and what is decided of it from its candidate."""
+"""The decisions of the progress learner: on a candidate, and on a stream, in the table of streams.
+
+The thresholds do not depend on the units, the contrast or the noise of a stream; decision records
+0025 to 0029 say how they were found.
+"""
 
 from __future__ import annotations
 
@@ -9,82 +13,74 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.agents.progress.attention import ProgressConfig
 from cdmisfa.agents.progress.candidate import Candidate, log_ratio
-from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.signals import STATES
 from cdmisfa.features.outputs import window_rate
 from cdmisfa.modules import Module
 
+# Windows of tests after which an output is settled at `learner.settled`; until then the threshold
+# grows with the square of their number.
 FULL = 4.5
-"""Windows of tests after which an output counts as settled at `learner.settled`; until then the
-threshold grows with the square of their number."""
 
-STILL_GAINING = 0.1
-"""Regret above which nothing is settled, however little the output changes with a block."""
+# Windows of tests before a candidate may be rejected, and after which one without recent progress
+# is.
+EARLY = 0.24
+PATIENCE = 8
 
-HOPELESS = (CONSTANT, NOTHING_SLOW, NO_PROGRESS) = (
+# Variance of an output on frames not yet learned from, where its mean and scale hold.
+VARIANCE_BOUNDS = (0.5, 2.0)
+
+# Variance of a module's output, which had 1, on a stream that shows what it encodes.
+PRESENT = (0.1, 10.0)
+
+# Improvement, the log of the slowness that the candidate of a window ago has now over its own:
+# above the first nothing is settled, below the second nothing was gained recently.
+STILL_IMPROVING, NO_IMPROVEMENT = 0.1, 0.03
+
+# Change over `learner.settled` from which an output has no direction at all.
+NO_DIRECTION = 4.0
+
+# Shares of the typical slowness: below the first, what was fitted is slow; above the second, it is
+# no slower than the rest.
+FITTED_SLOW, FITTED_FLAT = 0.65, 0.7
+
+# Why a candidate is rejected.
+REJECTIONS = (CONSTANT, NOTHING_SLOW, NO_PROGRESS) = (
     "it is constant",
     "nothing in it is slow",
     "it made no progress",
 )
-"""Why a candidate is given up."""
 
-EARLY = 0.24
-"""Windows of tests before a candidate may be given up."""
-
-PATIENCE = 8
-"""Windows of tests after which a candidate that has made no progress of late is given up."""
-
-LIVELY = (0.5, 2.0)
-"""Variance of an output on frames not yet learned from, where its mean and scale hold."""
-
-PASSED_ON = 0.03
-"""Regret below which nothing was gained of late, however much the output changes."""
-
-TURNING = 4.0
-"""Change over `learner.settled` from which an output has no direction at all."""
-
-SLOW_AGAIN = 0.65
-"""Share of the typical slowness below which what was fitted counts as slow."""
-
-TOO_EVEN = 0.7
-"""Share of the typical slowness above which what was fitted counts as no slower than the rest."""
-
-PRESENT = (0.1, 10.0)
-"""Variance of a module's output, which had 1, on a stream that shows what it encodes."""
-
+# Correlation from which outputs are the same, see `Likeness`.
 SAME = 0.8
-"""Correlation from which outputs are the same, see `Likeness`."""
 
-ALIKE = 0.65
-"""Correlation of mean pictures from which they may be of one world."""
-
-EVEN = 0.03
-"""Variance of a mean picture over that of frames, below which it is even."""
-
+# Slowness of a module over the candidate's, up to which it is as slow.
 AS_SLOW = 1.25
-"""Slowness of a module over the candidate's, up to which it is as slow."""
 
-FAINT = 0.003
-"""Variance below which a stream does not show what its own module encodes at all."""
+# Correlation of mean images from which they may be of one world, and variance of a mean image over
+# that of frames, below which it is flat.
+MEAN_CORRELATION, FLAT_MEAN = 0.65, 0.03
 
-WEAK, STILL_SAME = 0.05, 0.6
-"""Variance and correlation from which a stream still shows what its own module encodes."""
+# A stream no longer shows what its own module encodes at a variance below the first, or below the
+# second where the correlation is below `STILL_SAME`.
+ABSENT, WEAK = 0.003, 0.05
+STILL_SAME = 0.6
 
-STRANGE = 0.8
-"""|ln| of the slowness of a stream's module over that of then, from which it gives other things."""
-
+# |ln| of the slowness of a stream's module over the slowness at the decision, from which the module
+# encodes other things there.
+CHANGED = 0.8
 
 LEARNING, LEARNED, KNOWN, GIVEN_UP = range(len(STATES))
 
-REASONS = ("", *HOPELESS)
-"""Why a stream was given up, by the code that is kept."""
+# Why a stream was rejected, by the code that is stored.
+REASONS = ("", *REJECTIONS)
 
+# Reported of a stream that was learned, but hardly varied within a window of tests.
 TOO_SLOW = (
     "slower than tests can tell, so it may hold for these frames only; for what takes longer to "
     "come and go raise learner.test_frames and learner.window, both as many times"
 )
-"""Said of a stream that was learned, but hardly varied within a window of tests."""
 
 STREAM = np.dtype(
     [
@@ -126,7 +122,7 @@ def disagreement(candidate: Candidate) -> float:
 
 def slow_outputs(candidate: Candidate, config: ProgressConfig) -> NDArray[np.int64]:
     """(J,) 1 where an output is slow on new frames too, and alive; the slowest was judged so."""
-    low, high = LIVELY
+    low, high = VARIANCE_BOUNDS
     tested, fitted = candidate.tested, candidate.sfa.state.spectrum[: len(candidate.variance)]
     apart = [abs(log_ratio(float(a), float(b))) for a, b in zip(tested, fitted, strict=True)]
     alive = (low < candidate.variance) & (candidate.variance < high)
@@ -148,17 +144,17 @@ def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
     firm = candidate.change < config.settled * (grown * grown)
     turning = (
         windows >= FULL
-        and candidate.change < TURNING * config.settled
-        and abs(candidate.regret) < PASSED_ON
+        and candidate.change < NO_DIRECTION * config.settled
+        and abs(candidate.regret) < NO_IMPROVEMENT
     )
-    low, high = LIVELY
+    low, high = VARIANCE_BOUNDS
     return (
         (firm or turning)
-        and not candidate.regret > STILL_GAINING
+        and not candidate.regret > STILL_IMPROVING
         and disagreement(candidate) < config.agreement
         and low < float(candidate.variance[0]) < high
         and gain(candidate) < config.slow
-        and flatness(candidate) < SLOW_AGAIN
+        and flatness(candidate) < FITTED_SLOW
     )
 
 
@@ -169,7 +165,7 @@ def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
     if (
         candidate.tests >= EARLY * candidate.test_window
         and gain(candidate) > config.even
-        and flatness(candidate) > TOO_EVEN
+        and flatness(candidate) > FITTED_FLAT
     ):
         return NOTHING_SLOW
     if candidate.blocks >= PATIENCE * candidate.test_window:
@@ -194,39 +190,26 @@ def promising(candidate: Candidate, config: ProgressConfig) -> bool:
         candidate.alive
         and candidate.tests >= EARLY * candidate.test_window
         and gain(candidate) < config.slow
-        and flatness(candidate) < SLOW_AGAIN
+        and flatness(candidate) < FITTED_SLOW
     )
-
-
-def alike(module: Module, candidate: Candidate) -> bool:
-    """Whether a stream looks in the mean as that of a module, where that says anything.
-
-    It says nothing of values that are no pictures, nor of pictures that are even in the mean.
-    """
-    if len(module.frame_shape) < 2:
-        return True
-    a, b = (mean - mean.mean() for mean in (module.mean, candidate.sfa.mean))
-    one, other, shared = ((x * y).sum() for x, y in ((a, a), (b, b), (a, b)))
-    even = max(one, other) < EVEN * candidate.sfa.state.variance.sum()
-    return bool(even or shared > ALIKE * math.sqrt(one * other))
 
 
 def known_by(
     candidate: Candidate, modules: list[Module], own: int, frames: NDArray[Any]
 ) -> int | None:
-    """Index in `modules` of the one that gives what the candidate found, its own first, if any.
+    """Return the index of the module that gives what a candidate found, the stream's own first.
 
-    That is as slow there as what is learned must be, and the streams look `alike`: a smooth
-    weighting follows many a thing, of other worlds, too.
+    Such a module is as slow on the stream as what is learned must be, and the streams look alike
+    in the mean: a smooth weighting follows many a thing, also in other worlds.
 
     Args:
-        candidate: what was found.
+        candidate: of the stream.
         modules: frozen.
         own: index of the stream's own module, -1 where it has none.
         frames: (n, I) the last block of the stream, see `RecursiveFeature.compare`.
     """
     low, high = PRESENT
-    near = [index for index, module in enumerate(modules) if alike(module, candidate)]
+    near = [index for index, module in enumerate(modules) if _alike(module, candidate)]
     for index in sorted(near, key=lambda index: index != own):
         variance, eta, rho = candidate.sfa.compare(modules[index].phi[0], frames)
         if low < variance < high and rho > SAME and eta <= AS_SLOW * candidate.fitted:
@@ -236,108 +219,100 @@ def known_by(
     return None
 
 
+def _alike(module: Module, candidate: Candidate) -> bool:
+    """Return whether a stream looks in the mean as that of a module, where that says anything.
+
+    It says nothing of values that are no images, nor of images that are flat in the mean.
+    """
+    if len(module.frame_shape) < 2:
+        return True
+    a, b = (mean - mean.mean() for mean in (module.mean, candidate.sfa.mean))
+    one, other, shared = ((x * y).sum() for x, y in ((a, a), (b, b), (a, b)))
+    flat = max(one, other) < FLAT_MEAN * candidate.sfa.state.variance.sum()
+    return bool(flat or shared > MEAN_CORRELATION * math.sqrt(one * other))
+
+
 def _still_there(candidate: Candidate, module: Module, frames: NDArray[Any]) -> bool:
-    """Whether a stream shows what its own module encodes, at times less and differently."""
+    """Return whether a stream shows what its own module encodes, if less and differently."""
     like = candidate.sfa.compare(module.phi[0], frames)
     if like.rho > SAME:
-        return like.variance > FAINT
-    itself = abs(log_ratio(like.slowness, float(module.eta[0]))) < STRANGE
-    if not itself and like.slowness > AS_SLOW * candidate.fitted:
+        return like.variance > ABSENT
+    unchanged = abs(log_ratio(like.slowness, float(module.eta[0]))) < CHANGED
+    if not unchanged and like.slowness > AS_SLOW * candidate.fitted:
         return False
-    return like.variance > (FAINT if like.rho > STILL_SAME else WEAK)
-
-
-def strange(steps: float, power: float, blocks: int, window: int) -> bool:
-    """Whether a stream's module gives something else there than when the stream was decided.
-
-    A quick, rough test: the stream is then learned again, and only that decides whether it
-    shows anything new.
-
-    Args:
-        steps: recent mean square of the differences of its output, over that of then.
-        power: recent mean square of its output, over that of then.
-        blocks: blocks behind both.
-        window: blocks of a window of tests.
-    """
-    low, high = PRESENT
-    if blocks < EARLY * window:
-        return False
-    return not low < power < high or 0.5 * abs(log_ratio(steps, 1.0)) > STRANGE
+    return like.variance > (ABSENT if like.rho > STILL_SAME else WEAK)
 
 
 def new_streams(n: int) -> NDArray[Any]:
-    """The table of n streams of which nothing is known, (n,) of `STREAM`."""
+    """Return the table of n streams that were never watched, (n,) of `STREAM`."""
     streams = np.zeros(n, STREAM)
     streams["module"] = streams["next"] = -1
     streams["slowness"] = np.nan
     return streams
 
 
-def decide(own: Any, state: int, module: int, slowness: float, why: int = 0) -> None:
-    """Note what a stream has come to, now."""
-    own["state"], own["module"], own["why"] = state, module, why
-    own["decided"], own["slowness"] = own["visits"], slowness
+def decide(row: Any, state: int, module: int, slowness: float, why: int = 0) -> None:
+    """Write the outcome of a stream into its row of the table."""
+    row["state"], row["module"], row["why"] = state, module, why
+    row["decided"], row["slowness"] = row["visits"], slowness
 
 
-def begin_watching(own: Any, power: float, slowness: float) -> None:
-    """Note the mean square and the slowness of the output of a stream's module, to compare with."""
+def begin_watching(row: Any, power: float, slowness: float) -> None:
+    """Store mean square and slowness of the output of a stream's module, for `differs`."""
     turn = 2.0 * math.pi * slowness
-    own["then_power"], own["then_steps"] = power, power * (turn * turn)
-    own["watched"] = 0
+    row["then_power"], row["then_steps"] = power, power * (turn * turn)
+    row["watched"] = 0
 
 
-def take_output(own: Any, y: NDArray[np.float64], window: int) -> None:
-    """Take the output of a stream's module on a block in, (n,)."""
-    own["watched"] += 1
-    rate = window_rate(window, int(own["watched"]))
-    own["power"] += rate * (float(np.mean(y * y)) - own["power"])
-    own["steps"] += rate * (float(np.mean(np.diff(y) ** 2)) - own["steps"])
+def take_output(row: Any, y: NDArray[np.float64], window: int) -> None:
+    """Average the output of a stream's module on a block, (n,)."""
+    row["watched"] += 1
+    rate = window_rate(window, int(row["watched"]))
+    row["power"] += rate * (float(np.mean(y * y)) - row["power"])
+    row["steps"] += rate * (float(np.mean(np.diff(y) ** 2)) - row["steps"])
 
 
-def differs(own: Any, window: int) -> bool:
-    """Whether a stream's module gives something else there than it did; see `strange`."""
-    power, steps = own["power"] / own["then_power"], own["steps"] / own["then_steps"]
-    return strange(float(steps), float(power), int(own["watched"]), window)
+def differs(row: Any, window: int) -> bool:
+    """Return whether a stream's module gives something else there than at the decision.
+
+    A quick, rough test: the stream is then learned again, and only that decides whether it
+    shows anything new.
+    """
+    power, steps = float(row["power"] / row["then_power"]), float(row["steps"] / row["then_steps"])
+    if row["watched"] < EARLY * window:
+        return False
+    low, high = PRESENT
+    return not low < power < high or 0.5 * abs(log_ratio(steps, 1.0)) > CHANGED
 
 
 def outcomes(
-    names: Sequence[str], streams: NDArray[Any], held: Mapping[int, Candidate], test_frames: int
+    names: Sequence[str],
+    streams: NDArray[Any],
+    candidates: Mapping[int, Candidate],
+    test_frames: int,
 ) -> list[dict[str, Any]]:
-    """The `outcome` of every stream.
+    """Return the outcome of every stream, as JSON values.
 
     Args:
         names: of the S streams.
         streams: their table, (S,) of `STREAM`.
-        held: the candidates that there are, by their stream.
-        test_frames: see `outcome`.
+        candidates: by their streams.
+        test_frames: frames of a window of tests, within which a slow output must vary visibly.
     """
-    return [
-        outcome(name, streams[place], held.get(place), test_frames)
-        for place, name in enumerate(names)
-    ]
-
-
-def outcome(name: str, own: Any, candidate: Candidate | None, test_frames: int) -> dict[str, Any]:
-    """What became of a stream, as JSON values.
-
-    Args:
-        name: of the stream.
-        own: its row of the table.
-        candidate: of it, if one is held.
-        test_frames: frames of a window of tests, within which a slow output must be seen to vary.
-    """
-    slowness, module = float(own["slowness"]), int(own["module"])
-    learning = int(own["state"]) == LEARNING
-    if learning and candidate is not None:
-        slowness = float(candidate.tested[0])
-    why = REASONS[int(own["why"])]
-    if int(own["state"]) == LEARNED and slowness * test_frames < 1.0:
-        why = TOO_SLOW
-    return {
-        "stream": name,
-        "state": STATES[int(own["state"])],
-        "module": module + 1 if module >= 0 else None,
-        "blocks": int(own["visits" if learning else "decided"]),
-        "slowness": slowness if math.isfinite(slowness) else None,
-        "why": why,
-    }
+    table = []
+    for place, (name, row) in enumerate(zip(names, streams, strict=True)):
+        state, module, slowness = int(row["state"]), int(row["module"]), float(row["slowness"])
+        if state == LEARNING and place in candidates:
+            slowness = float(candidates[place].tested[0])
+        unproven = state == LEARNED and slowness * test_frames < 1.0
+        table.append(
+            {
+                "stream": name,
+                "state": STATES[state],
+                "module": module + 1 if module >= 0 else None,
+                "blocks": int(row["visits" if state == LEARNING else "decided"]),
+                "slowness": slowness if math.isfinite(slowness) else None,
+                "why": TOO_SLOW if unproven else REASONS[int(row["why"])],
+            }
+        )
+    return table

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
-from cdmisfa.agents.blank import signals_of_block
-from cdmisfa.agents.inputs import count_inputs, rows_of
-from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, interest
+from cdmisfa.agents.inputs import count_inputs, rows_of, signals_of_block
+from cdmisfa.agents.progress import judging
+from cdmisfa.agents.progress.attention import RECENT, RULES, ProgressConfig, Situation, interest
 from cdmisfa.agents.progress.candidate import Candidate, Candidates
-from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.agents.progress.judging import (
     GIVEN_UP,
     KNOWN,
@@ -28,18 +27,7 @@ from cdmisfa.agents.progress.judging import (
     NO_PROGRESS,
     PATIENCE,
     REASONS,
-    begin_watching,
     decide,
-    differs,
-    hopeless,
-    known_by,
-    mastered,
-    new_streams,
-    outcomes,
-    promising,
-    slow_outputs,
-    stale,
-    take_output,
 )
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
@@ -48,14 +36,15 @@ from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.modules import Module
 
+# Fewest blocks of a window of tests, however long a block is.
 FEWEST_BLOCKS = 20
-"""Of a window of tests, however long a block is."""
 
+# Windows of tests over which the output of a decided stream's module is averaged.
 WATCHED = 0.4
-"""Windows of tests that the output of a decided stream's module is told over."""
 
+# To be raised when the rules decide otherwise than before: runs of another version are neither
+# continued nor checked.
 DECIDING = 4
-"""Rises when something else is decided than before, so that runs of then are not gone on with."""
 
 COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle", "i8")])
 
@@ -92,7 +81,7 @@ class ProgressLearner:
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
-        self._streams = new_streams(len(spec.streams))
+        self._streams = judging.new_streams(len(spec.streams))
         size = 8 * self._n_inputs * (2 * config.components + self._n_outputs + 4)
         self._candidates = Candidates(self._new_candidate, size)
         self.rule = RULES[config.attention]
@@ -186,7 +175,9 @@ class ProgressLearner:
         own["visits"] += 1
         counts["iteration"] += 1
         if int(own["module"]) >= 0:
-            take_output(own, y_frozen[:, int(own["module"]) * self._n_outputs], self._watched)
+            judging.take_output(
+                own, y_frozen[:, int(own["module"]) * self._n_outputs], self._watched
+            )
         self.events = self._judge(stream, candidate, frames) + self._look_again()
         counts["idle"] = 0 if self._learning.any() else counts["idle"] + 1
         interesting, explored = self._choose(self._rng.random(2))
@@ -231,7 +222,7 @@ class ProgressLearner:
         return {
             "final_policy": self._policy.tolist(),
             "epsilon": self.config.explore,
-            "streams": outcomes(
+            "streams": judging.outcomes(
                 self.spec.streams, self._streams, self._candidates, self.config.test_frames
             ),
         }
@@ -259,12 +250,12 @@ class ProgressLearner:
         """Decide what the stream has come to; the lines that say so."""
         own = self._streams[stream]
         state, module = int(own["state"]), int(own["module"])
-        if mastered(candidate, self.config):
+        if judging.mastered(candidate, self.config):
             del self._candidates[stream]
             return self._settle(stream, candidate, frames)
         if state == LEARNING:
-            why = hopeless(candidate, self.config)
-            if not why and stale(candidate, self.config):
+            why = judging.hopeless(candidate, self.config)
+            if not why and judging.stale(candidate, self.config):
                 del self._candidates[stream]
                 if own["visits"] - own["decided"] < PATIENCE * self._window:
                     return self._say(stream, "is begun anew: what was slow in it has come to rest")
@@ -275,10 +266,12 @@ class ProgressLearner:
                 decide(own, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
                 return self._say(stream, f"is given up after {own['decided']} blocks: {why}")
         elif state == GIVEN_UP:
-            if REASONS[int(own["why"])] != NO_PROGRESS and promising(candidate, self.config):
+            if REASONS[int(own["why"])] != NO_PROGRESS and judging.promising(
+                candidate, self.config
+            ):
                 self._learn_again(stream, -1)
                 return self._say(stream, "is learned after all: something in it is slow")
-        elif differs(own, self._watched):
+        elif judging.differs(own, self._watched):
             self._learn_again(stream, module)
             return self._say(stream, f"no longer fits module {module + 1}")
         if state != LEARNING and candidate.blocks >= PATIENCE * self._window:
@@ -292,7 +285,7 @@ class ProgressLearner:
         own = self._streams[stream]
         state, before = int(own["state"]), int(own["module"])
         if index is None:
-            index = known_by(candidate, self.modules, before, frames)
+            index = judging.known_by(candidate, self.modules, before, frames)
         new = index is None
         if index is None:
             self.modules.append(self._module(stream, candidate))
@@ -300,7 +293,7 @@ class ProgressLearner:
             index = len(self.modules) - 1
         module = self.modules[index]
         given = candidate.sfa.compare(module.phi[0], frames)
-        begin_watching(own, given.variance, given.slowness)
+        judging.begin_watching(own, given.variance, given.slowness)
         if index == before and state != LEARNING:
             return ()
         eta = float(candidate.tested[0]) if new else given.slowness
@@ -349,7 +342,7 @@ class ProgressLearner:
             policy=self._policy,
             expansion=self._expansion,
             scale=self._scale,
-            slow=slow_outputs(candidate, self.config),
+            slow=judging.slow_outputs(candidate, self.config),
             frame_shape=self.spec.frame_shape,
         )
 
