@@ -240,19 +240,6 @@ def test_tasks_become_states_actions_and_episodes(cdmisfa, tmp_path):
     assert task == {"task_index": 0, "__index_level_0__": "CartPole-v1"}
 
 
-def test_values_become_a_dataset_without_videos(oscillatory_recording, tmp_path):
-    assert export(oscillatory_recording, tmp_path / "robot", "lerobot") == 2000
-    info = json.loads((tmp_path / "robot/meta/info.json").read_text())
-    assert info["video_path"] is None
-    data = pq.read_table(tmp_path / "robot/data/chunk-000/file-000.parquet")
-    source = RecordedSource(oscillatory_recording)
-    for stream, name in enumerate(source.spec.streams):
-        source.seek(0)
-        expected = source.take(stream, 2000).frames.astype(np.float32)
-        np.testing.assert_array_equal(data[f"observation.{name}"].to_pylist(), expected)
-    source.close()
-
-
 def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
     record_images(tmp_path / "r")
 

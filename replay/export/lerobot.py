@@ -69,7 +69,6 @@ def write_dataset(
     features: dict[str, dict[str, Any]] = {}
     tasks: dict[str, int] = {}
     episodes: list[dict[str, Any]] = []
-    stats: list[dict[str, Stats]] = []
     fps = start = 0
     with contextlib.ExitStack() as stack:
         table: pq.ParquetWriter | None = None
@@ -79,43 +78,38 @@ def write_dataset(
             number = tasks.setdefault(name, len(tasks))
             columns = _numbers(source, spans) | _clock(spans, fps, start, len(episodes), number)
             features |= {key: _feature(*column) for key, column in columns.items()}
-            rows: list[dict[str, Any]] = []
-            log_stats: list[dict[str, Stats]] = []
-            begin = 0
-            for length in (high - low for low, high in spans):
-                end = begin + length
-                rows.append(
-                    {
-                        "episode_index": len(episodes) + len(rows),
-                        "tasks": [name],
-                        "length": length,
-                        **_file_number("data", 0),
-                        "dataset_from_index": start + begin,
-                        "dataset_to_index": start + end,
-                    }
-                )
-                log_stats.append({k: number_stats(v[begin:end]) for k, (v, _) in columns.items()})
-                begin = end
+            ends = list(itertools.accumulate((high - low for low, high in spans), initial=0))
+            rows: list[dict[str, Any]] = [
+                {
+                    "episode_index": len(episodes) + i,
+                    "tasks": [name],
+                    "length": end - begin,
+                    **_file_number("data", 0),
+                    "dataset_from_index": start + begin,
+                    "dataset_to_index": start + end,
+                    "stats": {k: number_stats(v[begin:end]) for k, (v, _) in columns.items()},
+                }
+                for i, (begin, end) in enumerate(itertools.pairwise(ends))
+            ]
             for stream, key in enumerate(_video_keys(source.spec)):
                 features[key] = _video_feature(source.spec.frame_shape, fps)
                 file = _path(folder / "videos" / key, log, "mp4")
                 how: dict[str, Any] = {"lossless": lossless, "key_every": KEY_EVERY}
                 write_video(source, stream, file, spans=spans, **how)
-                for row, episode_stats, span in zip(rows, log_stats, spans, strict=True):
+                for row, span in zip(rows, spans, strict=True):
                     row |= _file_number(f"videos/{key}", log)
                     for edge in ("from", "to"):
                         frame = row[f"dataset_{edge}_index"] - start
                         row[f"videos/{key}/{edge}_timestamp"] = frame / fps
-                    episode_stats[key] = image_stats(source, stream, span)
+                    row["stats"][key] = image_stats(source, stream, span)
             arrow = _table(columns)
             if table is None:
                 file = _path(folder / "data", 0, "parquet")
                 table = stack.enter_context(pq.ParquetWriter(file, arrow.schema))
             table.write_table(arrow)
             episodes += rows
-            stats += log_stats
-            start += begin
-    _write_meta(folder / "meta", episodes, stats, tasks, features, fps)
+            start += ends[-1]
+    _write_meta(folder / "meta", episodes, tasks, features, fps)
     return start
 
 
@@ -235,22 +229,18 @@ def _path(folder: Path, number: int, ending: str) -> Path:
 
 def _write_meta(
     meta: Path,
-    episodes: Sequence[Mapping[str, Any]],
-    stats: Sequence[Mapping[str, Stats]],
+    episodes: list[dict[str, Any]],
     tasks: Mapping[str, int],
     features: Mapping[str, Mapping[str, Any]],
     fps: int,
 ) -> None:
     """Write the files that describe a dataset: episodes, tasks, info and statistics."""
-    rows = [
-        {
-            **row,
-            **{f"stats/{k}/{n}": v.tolist() for k, s in own.items() for n, v in s.items()},
-            **_file_number("meta/episodes", 0),
-        }
-        for row, own in zip(episodes, stats, strict=True)
-    ]
-    pq.write_table(pa.Table.from_pylist(rows), _path(meta / "episodes", 0, "parquet"))
+    stats: list[dict[str, Stats]] = [row.pop("stats") for row in episodes]
+    for row, of_episode in zip(episodes, stats, strict=True):
+        for key, values in of_episode.items():
+            row |= {f"stats/{key}/{name}": value.tolist() for name, value in values.items()}
+        row |= _file_number("meta/episodes", 0)
+    pq.write_table(pa.Table.from_pylist(episodes), _path(meta / "episodes", 0, "parquet"))
     pq.write_table(_tasks(tasks), meta / "tasks.parquet")
     videos = any(feature["dtype"] == "video" for feature in features.values())
     info = {

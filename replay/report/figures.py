@@ -78,11 +78,11 @@ def timeline(outline: Outline, frames: str = "") -> Plot:
     left, right = blocks.starts[edges[:-1]], blocks.starts[edges[1:] - 1] + outline.tau
     for s, k in row_of.items():
         plot.boxes("lane", starts[0], outline.end, ROW * k, ROW * k + BAR)
-        changes = [(0, s, -1), *(c for c in outline.changes.tolist() if c[1] == s)]
-        stops = [*(block for block, *_ in changes[1:]), outline.iterations]
-        for (block, _, code), stop in zip(changes, stops, strict=True):
-            if code >= 0:
-                plot.boxes(f"state{code}", starts[block], starts[stop], ROW * k, ROW * k + BAR)
+        begins, _, codes = outline.changes[outline.changes[:, 1] == s].T
+        stops = np.append(begins[1:], outline.iterations)
+        for code in np.unique(codes[codes >= 0]).tolist():
+            spans = starts[begins[codes == code]], starts[stops[codes == code]]
+            plot.boxes(f"state{code}", *spans, ROW * k, ROW * k + BAR)
         watched = np.add.reduceat((blocks.streams == s).astype(int), edges[:-1])
         tall = np.rint(BAR * watched / np.diff(edges))
         foot, drawn = ROW * k + BAR, tall > 0

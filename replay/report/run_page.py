@@ -80,7 +80,8 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         "timeline": lanes,
         "states": [
             (f"state{code}", STATES[code].replace("_", " "))
-            for code in sorted({code for *_, code in outline.changes.tolist() if code >= 0})
+            for code in np.unique(outline.changes[:, 2]).tolist()
+            if code >= 0
         ],
         "rules": [(rule, rule_plot(outline, rule, pointed)) for rule in rules],
         "attempts": attempts(outline, rules),

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
 from operator import attrgetter
@@ -120,6 +120,14 @@ class Layout:
             return None
         records = np.frombuffer(data, self._rows)
         return {name: records[name].copy() for name in self.names}
+
+    def write(self, count: int, values: Mapping[str, Any]) -> list[bytes]:
+        """Return n messages of values by name, (n, *shape) or (*shape) for all messages."""
+        records = np.frombuffer(bytearray(self._template.tobytes() * count), self._rows)
+        for name in self.names:
+            records[name] = values[name]
+        data, size = records.tobytes(), records.itemsize
+        return [data[start : start + size] for start in range(0, len(data), size)]
 
 
 @lru_cache
