@@ -6,6 +6,7 @@ A run is resumed, forked, inspected at an iteration and checked in this way.
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -282,19 +283,12 @@ class Recomputation:
 
     def _difference_from(self, keyframe: Keyframe) -> Difference | None:
         """Return where a keyframe differs from the learner after as many iterations."""
-        last, state = keyframe.iteration - 1, self.learner.state
-        stored, computed = arrays_of(keyframe.state), arrays_of(state)
-        if stored.keys() != computed.keys():
-            return Difference(last, "keyframe", (), ", ".join(stored), ", ".join(computed))
-        for name, array in stored.items():
-            if (found := _first_element(array, computed[name])) is not None:
-                return Difference(last, f"keyframe {name}", *found)
-        for name, one, two in (
-            ("t", keyframe.t, self.t),
-            ("policy_rng", dict(keyframe.state.policy_rng), dict(state.policy_rng)),
-        ):
-            if one != two:
-                return Difference(last, f"keyframe {name}", (), repr(one), repr(two))
+        stored = _memory(keyframe.state, keyframe.t)
+        computed = _memory(self.learner.state, self.t)
+        for name in sorted({*stored, *computed}):
+            found = _first_element(stored.get(name, _NOTHING), computed.get(name, _NOTHING))
+            if found is not None:
+                return Difference(keyframe.iteration - 1, f"keyframe {name}", *found)
         return None
 
     def other_files(self) -> list[str]:
@@ -318,6 +312,15 @@ class Recomputation:
         self.close()
 
 
+_NOTHING = np.zeros(0, np.uint8)
+
+
+def _memory(state: LearnerState, t: int) -> dict[str, NDArray[Any]]:
+    """Return everything that a keyframe stores as arrays by name."""
+    rng = json.dumps(dict(state.policy_rng), sort_keys=True).encode()
+    return {**arrays_of(state), "t": np.array([t]), "policy_rng": np.frombuffer(rng, np.uint8)}
+
+
 def _first_element(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], str, str] | None:
     """Return place and values of the first element in which two arrays differ."""
     if (a.dtype, a.shape) != (b.dtype, b.shape):
@@ -338,8 +341,7 @@ def _first_element(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], s
 class Checked:
     """Result of computing the iterations [start, stop) of a run again.
 
-    `difference` is the first one of the log from the computed signals, `other_files` names files
-    that changed since the run learned from them.
+    `other_files` are those that changed since the run learned from them.
     """
 
     start: int

@@ -6,7 +6,7 @@ import contextlib
 import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -180,33 +180,24 @@ class RunResult:
 
     run: str | None
     source: Mapping[str, Any]
-    streams: tuple[str, ...]
     seed: int
     iterations: int
     frames: int
     signals_sha256: str
     modules: tuple[Module, ...]
     summary: Mapping[str, Any]
-    held_out: Mapping[str, Any] | None
+    held_out: Mapping[str, Any]
     ended: str
     undecided: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
         """Return the result as `learn --json` prints it."""
-        return {
-            "schema": 1,
-            "run": self.run,
-            "source": dict(self.source),
-            "seed": self.seed,
-            "iterations": self.iterations,
-            "frames": self.frames,
-            "signals_sha256": self.signals_sha256,
-            "modules": [module_table(module) for module in self.modules],
-            **self.summary,
-            **({"held_out": dict(self.held_out)} if self.held_out else {}),
-            "ended": self.ended,
-            "undecided": list(self.undecided),
-        }
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values["modules"] = [module_table(module) for module in self.modules]
+        values |= values.pop("summary")
+        if not self.held_out:
+            del values["held_out"]
+        return {"schema": 1, **values, "undecided": list(self.undecided)}
 
 
 def module_table(module: Module) -> dict[str, Any]:
@@ -256,7 +247,6 @@ def opened_log(
     *,
     force: bool,
     resumed: bool,
-    aside: Path | None,
     view: bool,
 ) -> Iterator[RunWriter]:
     """Open the log of a run, which is to be finished in the context, and lock its folder.
@@ -269,8 +259,7 @@ def opened_log(
         source: what it learns from.
         manifest: see `RunWriter`.
         force: replace the contents of the folder.
-        resumed: whether the run is resumed.
-        aside: its earlier log, where it holds anything, which is moved to `SET_ASIDE`.
+        resumed: whether the run is resumed; its earlier log is moved to `SET_ASIDE`.
         view: whether the run will have a view.
 
     Raises:
@@ -288,12 +277,13 @@ def opened_log(
         if others := [path for path in logs_in(folder) if path not in logs]:
             raise UsageError(f"{others[0]} is of no run: choose another folder")
         stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE, REPORT_FILE)]
-        if not resumed:  # the logs first, so that a kill leaves nothing that looks like a run
+        if resumed:
+            with writing(folder):
+                os.replace(log_to_resume(folder), logs[0])
+        else:  # the logs first, so that a kill leaves nothing that looks like a run
             stale = [*logs, *stale]
         with writing(folder):
             refuse_special(*stale)
-            if aside is not None:
-                os.replace(aside, logs[0])
             for path in stale:
                 path.unlink(missing_ok=True)
         log = RunWriter(finished, source.spec, manifest, force=force or resumed)
@@ -338,7 +328,7 @@ def write_results(
         "config": manifest["config"],
         "seed": result.seed,
         "source": dict(result.source),
-        "streams": list(result.streams),
+        "streams": list(log.spec.streams),
         "platform": machine(),
         "result": result.as_json(),
     }

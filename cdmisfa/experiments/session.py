@@ -127,7 +127,7 @@ class Session:
                 f"{self.manifest['source']['kind']} cannot go back to where the run was stopped: "
                 "resume from its recording, or start another run"
             )
-        log = log_to_resume(folder)
+        self.before = log = log_to_resume(folder)
         try:
             header = read_header(log)
         except (LogDamagedError, UsageError):
@@ -142,7 +142,6 @@ class Session:
         keyframe = read_keyframe(log)
         if (0 if keyframe is None else keyframe.iteration) < (header.forked_at or 0):
             raise UsageError(f"{folder} was cut before its fork: fork again with --force")
-        self.before = log
         if keyframe is not None:
             restore(self.learner, keyframe, source.spec)
             source.seek(keyframe.t)
@@ -277,7 +276,6 @@ class Session:
                         self.manifest,
                         force=self._force,
                         resumed=self._resumed,
-                        aside=self.before if self._resumed else None,
                         view=rerun,
                     )
                 )
@@ -304,11 +302,11 @@ class Session:
         return result
 
     def _result(self, ended: str, sha256: str, stop: Callable[[], bool]) -> RunResult:
-        learner, summary, held_out = self.learner, self.learner.summary(), None
+        learner, summary, held_out = self.learner, self.learner.summary(), dict[str, Any]()
         if ended != INTERRUPTED:
             components = self.manifest["config"]["learner"].get("components", 1)
-            held_out = judged(self.source, learner.modules, components, stop)
-            ended = INTERRUPTED if held_out is None else ended
+            judgement = judged(self.source, learner.modules, components, stop)
+            ended, held_out = (INTERRUPTED, {}) if judgement is None else (ended, judgement)
         # After an interrupt nothing is read that is as long as the source.
         described = description(self.source, at_once=ended == INTERRUPTED, told=self.hashing)
         streams, undecided = self.source.spec.streams, tuple[str, ...]()
@@ -321,7 +319,6 @@ class Session:
         return RunResult(
             run=str(self.folder) if self.folder is not None else None,
             source=described,
-            streams=streams,
             seed=self.manifest["seed"],
             iterations=learner.iteration,
             frames=learner.iteration * learner.tau,
@@ -339,31 +336,20 @@ class Session:
             before = log.path.parent / SET_ASIDE
         keyframe, self.keyframe = self.keyframe, None  # as large as the learner's memory
         if keyframe is not None:
-            for signals in log.copy_log(before, keyframe.iteration):
+            at, fork = keyframe.iteration, self.manifest.get(FORK, {})
+            for signals in log.copy_log(before, at):
                 digest.add(signals)
-            self._log_start(log, keyframe)
+            if self._resumed:
+                log.event(keyframe.t, max(at - 1, 0), f"resumed at iteration {at}")
+            else:
+                text = [f"fork of {fork['parent']} after {at} iterations"]
+                for name, (value_before, now) in fork["changed"].items():
+                    text.append(f"{name} is {now}, was {value_before}")
+                log.event(keyframe.t, max(at - 1, 0), "; ".join(text))
+                log.keyframe(keyframe, again=True)
         log.sync()
         if self._resumed:
             before.unlink()
-
-    def _log_start(self, log: RunWriter, keyframe: Keyframe) -> None:
-        """Write into the log where a run is resumed, or where a fork leaves its parent."""
-        at = keyframe.iteration
-        if not self._resumed:
-            fork = self.manifest[FORK]
-            text = [f"fork of {fork['parent']} after {at} iterations", *_changes(fork["changed"])]
-            log.event(keyframe.t, max(at - 1, 0), "; ".join(text))
-            log.keyframe(keyframe, again=True)
-            return
-        log.event(keyframe.t, max(at - 1, 0), f"resumed at iteration {at}")
-        then = keyframe.versions
-        changed = {k: [then.get(k), v] for k, v in self._versions.items() if then.get(k) != v}
-        if changed:
-            log.event(keyframe.t, max(at - 1, 0), "; ".join(_changes(changed)), "WARNING")
-
-
-def _changes(changed: Mapping[str, Sequence[Any]]) -> list[str]:
-    return [f"{name} is {now}, was {before}" for name, (before, now) in changed.items()]
 
 
 def run(
