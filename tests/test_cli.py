@@ -244,20 +244,6 @@ class TestRuns:
 
 
 class TestErrors:
-    def test_a_damaged_recording(
-        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
-    ) -> None:
-        path = Path(shutil.copy(oscillatory_recording / "x1.mcap", tmp_path))
-        flip(path)
-        done = cdmisfa("verify", path, "--json")
-        assert (done.code, done.json["ok"]) == (3, False)
-        assert all({"where", "what"} <= set(problem) for problem in done.json["problems"])
-        assert_one_line(cdmisfa("learn", path, "--max-iterations", 20), 3, str(path))
-        for words in (("view", "--save", tmp_path / "v.rrd"), ("export", "-o", tmp_path / "o.npz")):
-            refused = cdmisfa(*words, path)
-            assert refused.code in (2, 3)
-            assert "--salvage" not in refused.err or "cdmisfa learn --salvage" in refused.err
-
     def test_without_the_simulator(self, tmp_path: Path) -> None:
         stub = "raise ImportError('not installed')\n"
         (tmp_path / "pybullet.py").write_text(stub)

@@ -18,14 +18,6 @@ from cdmisfa.kernels import WIDE
 ROOT = Path(__file__).parents[1]
 
 
-def test_a_stub_is_not_recovered_as_an_empty_log(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    stub, out = tmp_path / "stub.mcap", tmp_path / "out.mcap"
-    stub.write_bytes(b"\x89MCAP0\r\n" + bytes([1]) + (100).to_bytes(8, "little") + b"cut")
-    done = cdmisfa("recover", stub, "-o", out)
-    assert (done.code, "nothing in it can be saved" in done.err) == (3, True), done.err
-    assert not out.exists()
-
-
 def test_doctor_says_how_to_get_each_extra(
     cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch
 ) -> None:

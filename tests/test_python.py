@@ -160,19 +160,6 @@ def test_files_of_arrays_are_logs_that_runs_find_again(cdmisfa: Cdmisfa, tmp_pat
     assert check_run(run.path).other_files == ("x.npz",)
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"PK\x03\x04" + bytes(90), b"\x93NUMPY\x01\x00", b"x" * 99]
-)
-@pytest.mark.parametrize("name", ["x.npz", "x.npy"])
-def test_a_damaged_file_of_arrays_is_one_line(
-    cdmisfa: Cdmisfa, name: str, content: bytes, tmp_path: Path
-) -> None:
-    (tmp_path / name).write_bytes(content)
-    found = cdmisfa("learn", tmp_path / name)
-    assert (found.code, found.err.count("\n")) == (3, 1), found.err
-    assert f"{name} is no file of NumPy's arrays" in found.err
-
-
 def test_a_run_gives_what_its_log_holds(tmp_path: Path) -> None:
     rewards: list[float] = []
 

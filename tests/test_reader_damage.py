@@ -12,12 +12,10 @@ from typing import Any
 
 import mcap_files as files
 import pytest
-from folders import flip
 from mcap.writer import CompressionType, IndexType
 
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.reader import LogReader
-from replay.integrity.recover import recover_log
 from replay.recordings.source import RecordedSource
 
 MESSAGES = 40
@@ -124,38 +122,6 @@ def test_a_chunk_still_open_when_the_writer_died_is_read(tmp_path: Path, compres
     assert 60 < len(times) < 90
 
 
-def test_a_file_that_is_not_there_is_a_wrong_path(tmp_path: Path) -> None:
-    for path in (tmp_path / "nothing.mcap", tmp_path):
-        with pytest.raises(UsageError, match=str(path)):
-            LogReader(path)
-
-
-def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    path.write_bytes(KINDS["zstd"])
-    with LogReader(path) as reader:
-        bad = reader.segments[1]
-    flip(path, bad.data_offset + bad.stored // 2)
-    with pytest.raises(LogDamagedError, match=rf"log time {bad.start} to {bad.end} ns"):
-        read_all(path)
-    lost = set(range(bad.start, bad.end + 1))
-    assert [m[1] for m in read_all(path, salvage=True)] == [
-        i for i in range(MESSAGES) if i not in lost
-    ]
-
-
-def test_reading_goes_on_behind_a_broken_length(tmp_path: Path) -> None:
-    raw, path = bytearray(KINDS["zstd"]), tmp_path / "log.mcap"
-    path.write_bytes(raw)
-    with LogReader(path) as reader:
-        bad = reader.segments[1]
-    raw[bad.offset + 1 : bad.offset + 9] = struct.pack("<Q", 2**60)
-    path.write_bytes(raw)
-    with pytest.raises(LogDamagedError, match=f"byte {bad.offset}"):
-        read_all(path)
-    assert len(read_all(path, salvage=True)) == MESSAGES
-
-
 def one_chunk(made: bytes) -> bytes:
     return files.finish(files.MAGIC + files.header() + made, crc=False)
 
@@ -211,23 +177,6 @@ def test_a_lying_file_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(LogDamagedError, match=r"log\.mcap"):
         read_all(path)
     assert len(read_all(path, salvage=True)) <= 1
-
-
-def test_nothing_is_lost_with_the_summary_alone(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    whole = KINDS["zstd"]
-    path.write_bytes(whole)
-    with LogReader(path) as reader:
-        end = reader.data_end + 13
-    flipped = bytearray(whole)
-    flipped[end + 20] ^= 8
-    for number, damaged in enumerate((whole[: end + 40], whole[:-20], bytes(flipped))):
-        path.write_bytes(damaged)
-        found = recover_log(path, tmp_path / f"{number}.mcap")
-        assert found.complete, (number, found.lost)
-        assert len(read_all(tmp_path / f"{number}.mcap")) == MESSAGES
-    path.write_bytes(whole[: end // 2])
-    assert not recover_log(path, tmp_path / "half.mcap").complete
 
 
 @pytest.mark.parametrize("places", [[(5, 0)], [(5, 2**50)], [(6, 42)], [(5, 42), (5, 42)], []])
