@@ -30,7 +30,7 @@ from replay.runs.run import Tally, read_outline
 from replay.view.layouts import blueprint, images, lines, scene
 from replay.view.modules import write_followed
 from replay.view.panels import run_layout
-from replay.view.rows import FRAME, MOST_STREAMS, Rows, label, part
+from replay.view.rows import MOST_STREAMS, Rows, label, part
 from replay.view.run import RunView
 from replay.view.scene import SceneView, scenery_of_recording
 from replay.view.summary import summary_text
@@ -193,8 +193,7 @@ def _write_recording(
         rows = Rows(recording, spec)
         world = None if scenery is None else SceneView(rows, scenery, every)
         for note in (*source.warnings, *(world.notes if world is not None else ())):
-            recording.set_time(FRAME, sequence=first)
-            recording.log("events", rr.TextLog(label(note), level="WARN"))
+            rows.event(first, None, note, "WARN")
         _write_frames(rows, source, every, world)
     properties: Any = {"frames": count, "streams": label(", ".join(spec.streams)), "fps": spec.fps}
     recording.send_property("recording", rr.AnyValues(**properties))

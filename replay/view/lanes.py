@@ -19,6 +19,7 @@ from cdmisfa.core.signals import ACTIONS, STATES
 from replay import palette
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
+from replay.runs.log import Batch
 from replay.view.rows import Rows, label, part
 
 # Gives the code of each block's state, (n,).
@@ -80,10 +81,13 @@ class Lanes:
             codes = partial(lambda s, c: c["policy"][:, s], s)
             lane(f"policy/{part(streams, s)}", codes, planned.__getitem__)
 
-    def add_blocks(self, columns: SignalColumns) -> None:
-        """Take the states of consecutive iterations."""
+    def take(self, batch: Batch) -> None:
+        """Write the states of some iterations."""
         for codes, lane in self._lanes:
-            lane.add_codes(columns.frames, columns.iterations, codes(columns), columns.tau)
+            for columns in batch.signals:
+                at = columns.frames, columns.iterations
+                lane.add_codes(*at, codes(columns), columns.tau)
+            lane.send_changes()
 
     def _states(self, s: int, columns: SignalColumns) -> IntArray:
         """Return codes of a stream's state; where it is known, with the module that knows it."""
@@ -98,10 +102,6 @@ class Lanes:
         """End all lanes with the run, at so many frames."""
         for _, lane in self._lanes:
             lane.end(frames, iteration)
-
-    def send_changes(self) -> None:
-        """Send the changes since the last time."""
-        for _, lane in self._lanes:
             lane.send_changes()
 
 

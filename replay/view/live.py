@@ -82,6 +82,7 @@ class LiveView(Sink):
         rows.log("summary", rr.TextDocument(SUMMARY))
         streams = begun.streams(MOST_STREAMS)
         self._view = RunView(rows, header, streams, folder, every=EVERY_FRAMES, piece=PIECE)
+        self._rows = rows
         has_scene = isinstance(self._view.world, SceneView)
         self._recording.send_blueprint(run_layout(begun, has_scene=has_scene))
         self._images = spec.images
@@ -114,11 +115,11 @@ class LiveView(Sink):
         """
         for batch in read_batches(run, every=EVERY_FRAMES):
             self._view.take(batch)
-            self._view.flush()
+            self._rows.flush()
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Log an event in words; see `Sink`."""
-        self._view.event(t, iteration, text, level)
+        self._rows.event(t, iteration, text, level)
 
     def finish(self) -> None:
         """Write the rest; viewers are served until `__exit__`."""
@@ -140,7 +141,7 @@ class LiveView(Sink):
             )
             self._view.take(batch)
             self._clear()
-        self._view.flush()
+        self._rows.flush()
         self._next = time.monotonic() + EVERY_SECONDS
 
     def __enter__(self) -> Self:

@@ -27,6 +27,8 @@ from replay.view.layouts import Panel
 from replay.view.rows import Rows, label
 from replay.view.wall import BETWEEN, hang, places_of, sheet_size
 
+PHI = "abstraction/phi"
+
 # Weights that are no image, and drawn as bars: more are a tensor.
 MOST_BARS = 256
 
@@ -89,6 +91,44 @@ def write_weights(rows: Rows, path: str, t: int, iteration: int, phi: FloatArray
         rows.log_at(path, t, iteration, rr.Tensor(phi.copy(), dim_names=("output", "input")))
 
 
+class Weights:
+    """Writes the weights of what learns from the watched stream, as far as the log has them.
+
+    In a run of the progress learner each stream has its candidate, and the log has the weights of
+    the candidate whose stream comes next. They are shown once that stream is watched; until then
+    those that its candidate had last, or none (white).
+
+    Args:
+        rows: of the recording.
+        by_progress: the run is one of the progress learner.
+    """
+
+    def __init__(self, rows: Rows, *, by_progress: bool) -> None:
+        self._rows, self._by_progress, self._stream = rows, by_progress, -1
+        self._phi: dict[int, FloatArray] = {}
+
+    def take(self, batch: Batch) -> None:
+        """Write the weights of some iterations."""
+        logged = dict(batch.phi)
+        for columns in batch.signals:
+            watched = columns["stream"]
+            owners = np.where(columns["saved"], watched, columns["next_stream"])
+            owners = owners if self._by_progress else watched
+            rows = (columns.frames, columns.iterations, watched, owners)
+            for t, iteration, s, owner in zip(*(row.tolist() for row in rows), strict=True):
+                phi, shown = logged.get(t), None
+                if self._by_progress and s != self._stream and self._phi:
+                    shown = self._phi.get(s, 0 * next(iter(self._phi.values())))
+                self._stream = s
+                if phi is not None:
+                    if not self._phi:
+                        hang_weights(self._rows, PHI, len(phi))
+                    self._phi[owner] = phi
+                    shown = phi if owner == s else shown
+                if shown is not None:
+                    write_weights(self._rows, PHI, t, iteration, shown)
+
+
 class ModulesView:
     """Writes the modules of a run.
 
@@ -97,18 +137,17 @@ class ModulesView:
         modules: of the run, where they are known.
 
     Attributes:
-        notes: which modules have no output on the run's frames, and why.
         sheets: modules with images of least to greatest output.
     """
 
     def __init__(self, rows: Rows, modules: Sequence[Module] = ()) -> None:
-        self._rows, self.notes, self.sheets = rows, list[str](), set[int]()
+        self._rows, self._notes, self.sheets = rows, list[str](), set[int]()
         known = [m for m in modules if m.stream_index < len(rows.spec.streams)]
         self._own = {module.index: OwnStream(module, rows.spec) for module in known}
         self._stream_of: dict[int, int] = {}
         self._tau = 0
 
-    def take_batch(self, batch: Batch) -> None:
+    def take(self, batch: Batch) -> None:
         """Write what a log holds of some iterations."""
         weights = dict(batch.phi)
         for columns in batch.signals:
@@ -127,10 +166,14 @@ class ModulesView:
                     self._output(number, t, batch.blocks.iteration(t), y)
             except UsageError as error:
                 del self._own[number]
-                self.notes.append(f"module {number} says nothing of these frames: {error}")
+                self._notes.append(f"module {number} says nothing of these frames: {error}")
 
-    def finish(self, outline: Outline) -> None:
-        """Write weights and frames of the modules that are known."""
+    def finish(self, outline: Outline) -> list[str]:
+        """Write weights and frames of the modules that are known.
+
+        Returns:
+            Which modules have no output on the run's frames, and why.
+        """
         saved = {save.module: save.t for save in outline.saved}
         for number, own in self._own.items():
             module, place = own.module, f"modules/{number}"
@@ -145,6 +188,7 @@ class ModulesView:
             if self._rows.spec.images and own.count:
                 self.sheets.add(number)
                 self._sheet(place, own.sheet())
+        return self._notes
 
     def _saved(self, columns: SignalColumns, weights: dict[int, FloatArray]) -> None:
         """Mark where modules were saved; show weights of those that are not known otherwise."""

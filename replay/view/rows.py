@@ -142,10 +142,16 @@ class Rows:
         """Log a value that holds at all times."""
         self.recording.log(path, value, static=True)
 
-    def log_at(self, path: str, t: int, iteration: int, value: Any) -> None:
-        """Log a value at a frame and an iteration."""
+    def event(self, t: int, iteration: int | None, text: str, level: str = "INFO") -> None:
+        """Log an event in words."""
+        level = "WARN" if level == "WARNING" else level
+        self.log_at("events", t, iteration, rr.TextLog(label(text), level=level))
+
+    def log_at(self, path: str, t: int, iteration: int | None, value: Any) -> None:
+        """Log a value at a frame, and an iteration where the source has any."""
         self.recording.set_time(FRAME, sequence=t)
-        self.recording.set_time(ITERATION, sequence=max(iteration, 0))
+        if iteration is not None:
+            self.recording.set_time(ITERATION, sequence=max(iteration, 0))
         at = np.datetime64(self.spec.time_ns(t), "ns")
         self.recording.set_time(LOG_TIME, timestamp=at)
         self.recording.log(path, value)

@@ -175,7 +175,7 @@ class SceneView:
         except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:
             self.notes = [f"the robot's body is not shown: {error}"]
 
-    def show_batch(self, batch: Batch) -> None:
+    def take(self, batch: Batch) -> None:
         """Write what a log holds of some iterations."""
         for columns in batch.signals:
             self._turn(columns)

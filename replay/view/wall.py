@@ -88,7 +88,7 @@ class WallView:
         for s, corner in self._corners.items():
             rows.log(self._paths[s], rr.Transform3D(translation=[*corner, 0.0]))
 
-    def show_batch(self, batch: Batch) -> None:
+    def take(self, batch: Batch) -> None:
         """Write what a log holds of some iterations."""
         for columns in batch.signals:
             self._frame(columns)
