@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_data import IMAGE, PROGRESS, VECTOR, write_run
+from run_data import IMAGE, PROGRESS, VECTOR, module_of, write_run
 from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
@@ -21,11 +21,10 @@ from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.eyes import eye_matrix
 from recorder.world.icub.head import NECK
 from recorder.world.icub.source import TRUTH
-from replay.following import OutputHistory, read_outputs
 from replay.palette import colour, packed
-from replay.runs.log import read_batches
-from replay.runs.run import read_outline
+from replay.runs.modules import save_modules
 from replay.view.build import build_view
+from replay.view.modules import LAST_BLOCKS
 from replay.view.wall import places_of
 
 CONFIG = section_table(IcubConfig())
@@ -94,31 +93,34 @@ def test_without_the_robots_models_there_is_the_rest_and_a_line_that_says_so(tmp
     assert "/scene/neck" not in rows
 
 
-def outputs_of(run: Path) -> tuple[OutputHistory, ...]:
-    pieces = [piece for batch in read_batches(run) for piece in batch.truth]
-    truth = np.concatenate([t for t, _ in pieces]), np.concatenate([v for _, v in pieces])
-    return read_outputs(run, read_outline(run), truth, 6, 20_000)
-
-
 def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
     records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
+    saves = [record for record in records if record.saved]
+    size = int(np.prod(VECTOR.frame_shape))
+    made = [
+        module_of(i, record.iteration, np.ones((1, size)), record.stream)
+        for i, record in enumerate(saves, 1)
+    ]
+    save_modules(tmp_path / "modules.npz", made)
     build_view(tmp_path, tmp_path / "run.rrd")
-    rows, names = View(tmp_path / "run.rrd").rows, View(tmp_path / "run.rrd").titles()
-    outputs = {o.module: o for o in outputs_of(tmp_path)}
-    assert set(outputs) == {1, 2, 3}
-    for number in (1, 2):
-        output = outputs[number]
-        found = output.best_fit(VECTOR.truth)
-        said = scalars(rows[f"/learned/{number}/output"])[:, 0]
-        frames = np.array(rows[f"/learned/{number}/output"]["frame"])
-        own = np.isfinite(said)
-        np.testing.assert_array_equal(frames[own], output.t)
-        np.testing.assert_array_equal(said[own], output.y)
-        followed = scalars(rows[f"/learned/{number}/followed"])[:, 0]
+    view = View(tmp_path / "run.rrd")
+    for number, save in enumerate(saves, 1):
+        own = [r for r in records if r.stream == save.stream]
+        before = [r for r in own if r.module == number and r.t <= save.t and np.isfinite(r.y).all()]
+        expected = {r.t: r.y[:, 0] for r in before[-LAST_BLOCKS:]}
+        expected |= {r.t: r.y_frozen[number - 1, :, 0] for r in own if r.t > save.t}
+        y = np.concatenate(list(expected.values()))
+        t = np.concatenate([start + np.arange(TAU) for start in expected])
+        output = view.rows[f"/learned/{number}/output"]
+        found = dict(zip(output["frame"], scalars(output)[:, 0], strict=True))
+        np.testing.assert_array_equal([found[frame] for frame in t.tolist()], y)
+        assert np.isfinite(list(found.values())).sum() == len(y)
+        followed = scalars(view.rows[f"/learned/{number}/followed"])[:, 0]
         assert len(followed) == len(records) * TAU
-        r = np.corrcoef(followed[np.isin(frames, output.t)], output.y)[0, 1]
-        assert r == pytest.approx(found.r)
-        assert [n for n in names if n.startswith(f"Module {number} on") and f"{found.r:.2f}" in n]
+        r = f"{np.corrcoef(followed[t], y)[0, 1]:.2f}"
+        titles = [name for name in view.titles() if name.startswith(f"Module {number} on")]
+        assert len(titles) == 1
+        assert r in titles[0]
 
 
 @pytest.mark.parametrize("algorithm", ["2.0", "progress"])

@@ -12,8 +12,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.signals import ACTIONS
@@ -22,7 +20,7 @@ from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure, open_source
 from cdmisfa.modules import Module
-from replay.following import OutputHistory
+from replay.following import fits
 
 SCENE, PRESET = "icub", "icub-real"
 
@@ -126,9 +124,7 @@ def followed_by(module: Module, source: SeekableSource) -> dict[str, Any]:
     source.seek(0)
     block = source.take(module.stream_index, SCORED_FRAMES)
     y = module.transform(block.frames)[:, 0]
-    times = np.arange(len(y))
-    shown = OutputHistory(module.index, module.stream_index, times, y, block.truth)
-    best = shown.best_fit(source.spec.truth)
+    best = next(iter(fits(source.spec.truth, block.truth, y)), None)
     return {
         "module": module.index,
         "view": module.stream,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.modules import Module
-from replay.following import Fit, OutputHistory
+from replay.following import Fit, fits
 from replay.outputs import OwnStream, Thinned
 from replay.runs.folders import read_run_json
 from replay.runs.log import (
@@ -83,12 +83,9 @@ class ModuleData:
         """Return which true quantities the first output follows, the best first."""
         if not self._spec.truth or not self.outputs.columns:
             return []
-        t, y, truth = self.outputs.columns
+        _, y, truth = self.outputs.columns
         known = np.isfinite(truth).all(axis=1)
-        history = OutputHistory(
-            self.frozen.index, self.frozen.stream_index, t[known], y[known, 0], truth[known]
-        )
-        return history.fits(self._spec.truth)
+        return fits(self._spec.truth, truth[known], y[known, 0])
 
     def correlation(self, other: ModuleData) -> float:
         """Return |r| of the first outputs of this module and another one, on this one's frames."""

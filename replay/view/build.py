@@ -24,11 +24,10 @@ from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.inputs import About, Logged, holds_run, open_to_look
 from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, run_log
-from replay.runs.log import Frames, read_batches, read_header
+from replay.runs.log import read_batches, read_header
 from replay.runs.modules import load_modules
 from replay.runs.run import Tally, read_outline
 from replay.view.layouts import blueprint, images, lines, scene
-from replay.view.modules import write_followed
 from replay.view.panels import run_layout
 from replay.view.rows import MOST_STREAMS, Rows, label, part
 from replay.view.run import RunView
@@ -154,12 +153,11 @@ def _write_run(recording: rr.RecordingStream, log: Path, every: int, tab: str | 
     known = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
     tally, rows = Tally(header), Rows(recording, header.spec)
     view = RunView(rows, header, streams, folder, every=every, modules=known)
-    truth, events = list[Frames](), list[str]()
+    events: list[str] = []
     for batch in read_batches(log, header, every=every):
         for columns in batch.signals:
             tally.add(columns)
         view.take(batch)
-        truth += batch.truth
         events += [event.text for event in batch.events]
     outline = tally.outline()
     view.finish(outline)
@@ -169,7 +167,7 @@ def _write_run(recording: rr.RecordingStream, log: Path, every: int, tab: str | 
         outline,
         rows,
         has_scene=isinstance(view.world, SceneView),
-        followed=write_followed(rows, log, outline, truth),
+        followed=view.modules.followed(outline),
         sheets=view.modules.sheets,
         tab=tab,
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import rerun as rr
@@ -17,7 +16,7 @@ import rerun as rr
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.modules import Module
-from replay.following import read_outputs
+from replay.following import fits
 from replay.outputs import OwnStream, Sheet
 from replay.palette import BRICK, DARK, GREY, MIST, Colour, Rgb, colour, faint, packed, shade
 from replay.runs.columns import SignalColumns
@@ -38,8 +37,11 @@ FOLLOWED = 6
 # Last frames of a run for which it is shown.
 FOLLOWED_FRAMES = 1_000_000
 
-# Widths of the line that is followed, and of the output.
-BROAD, NARROW = 4.0, 1.5
+# Blocks before the save whose output is shown: earlier ones are of an abstraction that changes.
+LAST_BLOCKS = 40
+
+# Width of the line that is followed, behind the output.
+BROAD = 4.0
 
 
 @cache
@@ -135,24 +137,32 @@ class ModulesView:
     Args:
         rows: of the recording.
         modules: of the run, where they are known.
+        by_progress: the run is one of the progress learner.
 
     Attributes:
         sheets: modules with images of least to greatest output.
     """
 
-    def __init__(self, rows: Rows, modules: Sequence[Module] = ()) -> None:
+    def __init__(self, rows: Rows, modules: Sequence[Module], *, by_progress: bool) -> None:
+        self._by_progress = by_progress
         self._rows, self._notes, self.sheets = rows, list[str](), set[int]()
         known = [m for m in modules if m.stream_index < len(rows.spec.streams)]
         self._own = {module.index: OwnStream(module, rows.spec) for module in known}
         self._stream_of: dict[int, int] = {}
         self._tau = 0
+        self._truth: list[Frames] = []
+        numbers = sorted(self._own)[:FOLLOWED] if rows.spec.truth else []
+        self._first: dict[int, list[tuple[int, FloatArray]]] = {n: [] for n in numbers}
 
     def take(self, batch: Batch) -> None:
         """Write what a log holds of some iterations."""
         weights = dict(batch.phi)
+        if self._first:
+            self._truth += batch.truth
         for columns in batch.signals:
             self._tau = columns.tau
             self._saved(columns, weights)
+            self._keep_first(columns)
             for number, stream in self._stream_of.items():
                 own = columns["stream"] == stream
                 if number not in self._own and number <= columns["y_frozen"].shape[1] and own.any():
@@ -213,6 +223,54 @@ class ModulesView:
         path = f"modules/{number}/output"
         self._rows.lines(path, names, (t, iterations), y[:, shown], rgbs, gap=self._tau)
 
+    def _keep_first(self, columns: SignalColumns) -> None:
+        """Keep first outputs in blocks of their own streams, of learning ones the last blocks."""
+        frozen = columns["y_frozen"]
+        for number, blocks in self._first.items():
+            own = columns["stream"] == self._own[number].module.stream_index
+            if number <= frozen.shape[1]:
+                blocks += zip(
+                    columns.frames[own].tolist(), frozen[own, number - 1, :, 0], strict=True
+                )
+                del blocks[: -FOLLOWED_FRAMES // columns.tau]
+            else:
+                own &= self._by_progress | (columns["module"] == number)
+                own &= np.isfinite(columns["y"]).all(axis=(1, 2))
+                blocks += zip(columns.frames[own].tolist(), columns["y"][own, :, 0], strict=True)
+                del blocks[:-LAST_BLOCKS]
+
+    def followed(self, outline: Outline) -> list[Panel]:
+        """Write what the first output of each known module follows best.
+
+        Returns:
+            A panel for each module that follows any true quantity.
+        """
+        spec, panels = self._rows.spec, list[Panel]()
+        if not self._truth:
+            return panels
+        parts = zip(*self._truth, strict=True)
+        frames, values = (np.concatenate(column)[-FOLLOWED_FRAMES:] for column in parts)
+        at = frames, outline.blocks.iteration(frames)
+        for number, blocks in self._first.items():
+            known = [(t, block) for t, block in blocks if t >= frames[0]]
+            t = np.ravel([np.arange(t, t + len(block)) for t, block in known]).astype(np.int64)
+            y = np.ravel([block for _, block in known])
+            best = next(iter(fits(spec.truth, values[np.searchsorted(frames, t)], y)), None)
+            if best is None:
+                continue
+            s, root = self._own[number].module.stream_index, f"learned/{number}"
+            stream, line = spec.streams[s], best(values[:, best.column])[:, None]
+            name = f"{best.function}, fitted to it"
+            self._rows.lines(f"{root}/followed", [name], at, line, [GREY], width=BROAD, gap=1)
+            where, name = (t, outline.blocks.iteration(t)), f"module {number} on {stream}"
+            self._rows.lines(f"{root}/output", [name], where, y[:, None], [colour(s)], gap=1)
+            words = f"{label(best.function)} (grey, |r| = {best.r:.2f})"
+            title = f"Module {number} on {label(stream)} has learned {words}"
+            entities = f"/{root}/followed", f"/{root}/output"
+            panels.append(Panel(title, entities, "near", fit=True, legend=False))
+        self._rows.flush()
+        return panels
+
     def _sheet(self, place: str, sheet: Sheet) -> None:
         """Hang frames of least, middle and greatest output below one another."""
         height, width = self._rows.spec.frame_shape
@@ -227,40 +285,3 @@ class ModulesView:
             words = f"{name}: {picks[0].y:.2f} to {picks[-1].y:.2f}"
             hang(self._rows, path, corner, strip.shape[::-1], words, GREY)
             self._rows.log(path, rr.Image(strip))
-
-
-def write_followed(rows: Rows, log: Path, outline: Outline, truth: Sequence[Frames]) -> list[Panel]:
-    """Write each module's output where its stream was watched, and what it follows at all frames.
-
-    Args:
-        rows: of the recording.
-        log: of the run.
-        outline: the run in short.
-        truth: ground truth of each frame, piece after piece.
-
-    Returns:
-        A panel for each module that follows anything.
-    """
-    names, spec, panels = outline.header.spec.streams, rows.spec, list[Panel]()
-    if not truth or not outline.saved:
-        return panels
-    frames, values = (np.concatenate(p)[-FOLLOWED_FRAMES:] for p in zip(*truth, strict=True))
-    at = frames, outline.blocks.iteration(frames)
-    for output in read_outputs(log, outline, (frames, values), FOLLOWED, FOLLOWED_FRAMES):
-        fit = output.best_fit(spec.truth)
-        if fit is None:
-            continue
-        y = np.full(len(frames), np.nan)
-        y[np.isin(frames, output.t)] = output.y[np.isin(output.t, frames)]
-        stream, root = names[output.stream], f"learned/{output.module}"
-        for path, name, line, rgb, width in (
-            ("followed", f"{fit.function}, fitted to it", fit(values[:, fit.column]), GREY, BROAD),
-            ("output", f"module {output.module} on {stream}", y, colour(output.stream), NARROW),
-        ):
-            rows.lines(f"{root}/{path}", [name], at, line[:, None], [rgb], width=width, gap=1)
-        followed = f"{label(fit.function)} (grey, |r| = {fit.r:.2f})"
-        title = f"Module {output.module} on {label(stream)} has learned {followed}"
-        entities = f"/{root}/followed", f"/{root}/output"
-        panels.append(Panel(title, entities, "near", fit=True, legend=False))
-    rows.flush()
-    return panels

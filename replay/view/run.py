@@ -87,7 +87,7 @@ class RunView:
     ) -> None:
         self._rows, by_progress = rows, header.by_progress
         self._lanes = Lanes(rows, streams, by_progress=by_progress, piece=piece)
-        self.modules = ModulesView(rows, modules)
+        self.modules = ModulesView(rows, modules, by_progress=by_progress)
         self.world, notes = world_of_run(rows, header, folder, streams, every)
         curves, weights = Curves(rows, header, streams), Weights(rows, by_progress=by_progress)
         self._writers: list[Writer] = [curves, Inputs(rows), self._lanes, weights, self.modules]
