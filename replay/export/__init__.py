@@ -1,1 +1,1 @@
-"""Runs and recordings for other programs: tables, images, videos, datasets."""
+"""Export of runs and recordings for other programs: tables, images, videos, datasets."""

@@ -131,19 +131,19 @@ def _batch(
     """Return outputs as rows of a table; a slowness or novelty that is not finite is null."""
     import pyarrow as pa
 
-    columns, outputs = list(columns_of(modules)), sum(len(module.phi) for module in modules)
+    count = sum(len(module.phi) for module in modules)
     blocks = [applied.block for applied in waiting]
     lengths = [len(block) for block in blocks]
     numbers = (np.arange(block.t, block.t + len(block)) for block in blocks)
     t = np.concatenate([np.empty(0, np.int64), *numbers])
-    y = np.concatenate([np.empty((0, outputs)), *(applied.y for applied in waiting)])
+    y = np.concatenate([np.empty((0, count)), *(applied.y for applied in waiting)])
 
     def repeated(name: str, width: int, dtype: type) -> NDArray[Any]:
         values: Any = np.array([getattr(applied, name) for applied in waiting], dtype)
         rows = np.repeat(values.reshape(len(waiting), width), lengths, axis=0)
         return np.where(np.isfinite(rows), rows, np.nan) if dtype is float else rows
 
-    slowness = repeated("slowness", outputs, float)
+    slowness = repeated("slowness", count, float)
     alive = repeated("alive", len(modules), bool)
     novelty = repeated("novelty", len(modules), float)
     streams = np.repeat(np.array([block.stream for block in blocks], int), lengths)
@@ -151,10 +151,10 @@ def _batch(
     table["log_time"] = pa.array(times_of(t, spec.fps, spec.start_ns))
     table["t"] = pa.array(t)
     table["stream"] = pa.array(np.array(spec.streams, object)[streams], pa.string())
-    for i, (module, own) in enumerate(columns):
+    for i, (module, outputs) in enumerate(columns_of(modules)):
         name = f"module{module.index}"
         for kind, values in (("y", y), ("slowness", slowness)):
-            for j, column in enumerate(values[:, own].T):
+            for j, column in enumerate(values[:, outputs].T):
                 table[f"{name}_{kind}{j}"] = pa.array(column, from_pandas=kind == "slowness")
         table[f"{name}_alive"] = pa.array(alive[:, i])
         table[f"{name}_novelty"] = pa.array(novelty[:, i], from_pandas=True)
@@ -194,8 +194,8 @@ def _log_sink(
             (views[s], at, encoders[s](at, frame), at, 0)
             for at, frame in zip(times, block.frames, strict=True)
         ]
-        for i, (_, own) in enumerate(columns_of(modules)):
-            rows = zip(times, _encoded(applied, i, own), strict=True)
+        for i, (_, outputs) in enumerate(columns_of(modules)):
+            rows = zip(times, _encoded(applied, i, outputs), strict=True)
             messages += [(topics[s][i], at, row, at, 0) for at, row in rows]
         log.write_all(messages)
 
@@ -207,16 +207,16 @@ def _log_sink(
     log.finish()
 
 
-def _encoded(applied: Applied, module: int, own: slice) -> list[bytes]:
+def _encoded(applied: Applied, module: int, outputs: slice) -> list[bytes]:
     """Return the message `cdmisfa.ModuleOutput` of a module for each frame of a block."""
     values = {
-        "y": applied.y[:, own],
-        "slowness": applied.slowness[own],
+        "y": applied.y[:, outputs],
+        "slowness": applied.slowness[outputs],
         "alive": applied.alive[module],
         "novelty": applied.novelty[module],
         "frame": applied.block.t + np.arange(len(applied.block)),
     }
-    return _layout(own.stop - own.start).write(len(applied.block), values)
+    return _layout(outputs.stop - outputs.start).write(len(applied.block), values)
 
 
 @cache
@@ -249,12 +249,12 @@ def line(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> str:
         "modules": [
             {
                 "module": module.index,
-                "y": applied.y[:, own].tolist(),
-                "slowness": numbers(applied.slowness[own].tolist()),
+                "y": applied.y[:, outputs].tolist(),
+                "slowness": numbers(applied.slowness[outputs].tolist()),
                 "alive": bool(applied.alive[i]),
                 "novelty": numbers([float(applied.novelty[i])])[0],
             }
-            for i, (module, own) in enumerate(columns_of(modules))
+            for i, (module, outputs) in enumerate(columns_of(modules))
         ],
     }
     return json.dumps(document, allow_nan=False)

@@ -1,1 +1,1 @@
-"""A report: one HTML page that says what a run learned, and needs nothing but a browser."""
+"""Reports: one HTML page about a run, or about several, that needs nothing but a browser."""

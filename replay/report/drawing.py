@@ -52,11 +52,11 @@ class Axis:
         if self.log:
             powers = range(math.floor(math.log10(self.start)), math.ceil(math.log10(self.stop)) + 1)
             for factors in ((1, 2, 5), (1, 3), (1,)):
-                found = [factor * 10.0**power for power in powers for factor in factors]
-                found = [value for value in found if self.start <= value <= self.stop]
-                if len(found) <= most:
-                    return found
-            return found[:: -(-len(found) // most)]
+                values = [factor * 10.0**power for power in powers for factor in factors]
+                values = [value for value in values if self.start <= value <= self.stop]
+                if len(values) <= most:
+                    return values
+            return values[:: -(-len(values) // most)]
         if not (span := self.stop - self.start) > 0:
             return [self.start]
         step = 10.0 ** math.floor(math.log10(span / most))
@@ -153,8 +153,8 @@ class Plot:
         place = np.minimum((x * (PLACES / WIDE)).astype(np.int64), PLACES - 1)
         order = np.lexsort((y, place, part))
         first = np.diff(place[order], prepend=-1) | np.diff(part[order], prepend=-1) != 0
-        kept = np.unique(np.concatenate([order[first], order[np.roll(first, -1)]]))
-        x, y, part = x[kept], np.clip(y[kept], 0, self.y.size), part[kept]
+        rows = np.unique(np.concatenate([order[first], order[np.roll(first, -1)]]))
+        x, y, part = x[rows], np.clip(y[rows], 0, self.y.size), part[rows]
         points = [f"{number(a)} {number(b)}" for a, b in zip(x.tolist(), y.tolist(), strict=True)]
         begins = np.diff(part, prepend=-1) != 0
         alone = begins & np.roll(begins, -1)  # a point between two gaps is a dot

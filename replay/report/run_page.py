@@ -124,8 +124,8 @@ def _watched_texts(run: RunData, rules: Sequence[Measurement], t: Any) -> list[s
     for frame, row in zip(t.tolist(), blocks.places(t).tolist(), strict=True):
         text = f"frame {frame:,}, iteration {blocks.iterations[row]:,}: "
         text += run.spec.streams[blocks.streams[row]]
-        for word, kept in (("held", True), ("not", False)):
-            if names := [name for name, holds in deciding if holds[row] == kept]:
+        for word, truth in (("held", True), ("not", False)):
+            if names := [name for name, holds in deciding if holds[row] == truth]:
                 text += f"; {word}: {', '.join(names)}"
         texts.append(text)
     return texts
@@ -183,7 +183,7 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
     save = next((save for save in outline.saved if save.module == frozen.index), None)
     saved = outline.end if save is None else save.t + outline.tau
     fits = module.fits()
-    found: dict[str, Any] = {
+    section: dict[str, Any] = {
         "frozen": frozen,
         "colour": colour_class(frozen.stream_index),
         "saved": saved,
@@ -205,11 +205,11 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
         "extremes": [],
     }
     if not module.outputs.columns:
-        return found
+        return section
     t, _, _ = module.outputs.columns
-    found["after"] = min(int((t >= saved).sum()) * module.outputs.step, module.stream.count)
+    section["after"] = min(int((t >= saved).sum()) * module.outputs.step, module.stream.count)
     key = f"module{frozen.index}"
-    found["plot"] = plot = output_plot(run, module, saved, key)
+    section["plot"] = plot = output_plot(run, module, saved, key)
     if frozen.index <= SECTIONS:
         t, values, y = module.frames.columns
         texts = [f"frame {k:,}: output {v:+.2f}" for k, v in zip(t.tolist(), y, strict=True)]
@@ -220,14 +220,14 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
     ):  # fmt: skip
         if picks:
             small = [reduced(pick.frame, FRAME) for pick in picks] if images else []
-            found["extremes"].append(
+            section["extremes"].append(
                 {
                     "title": title,
                     "image": data_uri(sheet(small, len(small), 2)) if images else "",
                     "picks": [(p.y, p.t, "" if images else numbers(p.frame)) for p in picks],
                 }
             )
-    return found
+    return section
 
 
 def _overfitting(run: RunData, iteration: int) -> float | None:
