@@ -202,8 +202,9 @@ def test_several_runs_and_a_folder_of_them(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     for seed, folder in enumerate(runs):
         library.learn("oscillatory", folder, seed=seed, max_iterations=12)
     twin = shutil.copytree(runs[0], tmp_path / "twin")
-    page = Page(write_report([*runs, twin], tmp_path / "all.html"))
-    assert "3 runs; identical to the first, bit for bit: 1 of 2" in page.text
+    write_run(tmp_path / "run.mcap", VECTOR, 0)  # interrupted before its first iteration
+    page = Page(write_report([*runs, twin, tmp_path], tmp_path / "all.html"))
+    assert "4 runs; identical to the first, bit for bit: 1 of 3" in page.text
     done = cdmisfa("report", tmp_path / "runs", "-o", tmp_path / "folder.html", "--json")
     assert done.json["bytes"] == (tmp_path / "folder.html").stat().st_size
 

@@ -209,7 +209,9 @@ def curves(name: str, outlines: Sequence[Outline], about: str, *, log: bool) -> 
     """Draw a signal of several runs over their iterations; None if it does not vary in any."""
     lines = []
     for k, outline in enumerate(outlines):
-        values = outline.lines[name].reshape(max(outline.iterations, 1), -1)[:, 0]
+        if not outline.iterations:
+            continue
+        values = outline.lines[name].reshape(outline.iterations, -1)[:, 0]
         values = np.abs(values) if name == "eta_dot" else values
         if name == "learning_error":  # without a test it only holds its last value
             values = np.where(np.isfinite(outline.lines["tested"]), values, np.nan)
