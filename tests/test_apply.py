@@ -158,17 +158,6 @@ def test_what_cannot_be_applied_is_refused_in_a_line(
     assert not list(tmp_path.glob("v.*"))
 
 
-def test_a_part_and_a_loop_are_applied(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    log = camera(tmp_path / "a.mcap", 100)
-    part = cdmisfa("apply", run, log, "--start", 0.2, "--end", 1, "--json").json
-    assert part["logs"][0]["frames"] == 40
-    out = tmp_path / "o.csv"
-    done = cdmisfa("apply", run, log, "--loop", "--frames", 250, "--to", "csv", "-o", out, "--json")
-    assert json.loads(done.out)["logs"][0]["frames"] == 250
-    y = outputs(pacsv.read_csv(out), 1)
-    np.testing.assert_array_equal(y[:100], y[100:200])
-
-
 LIVE = "av:lavfi:testsrc=size=160x120:rate=30"
 
 

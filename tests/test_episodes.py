@@ -113,16 +113,6 @@ def test_streams_of_the_same_name_are_one_and_a_missing_one_is_a_gap(tmp_path: P
         np.testing.assert_array_equal(both[2].frames, one[:10])
 
 
-def test_films_and_tables_are_one_stream_whatever_their_files_are_called(tmp_path: Path) -> None:
-    values = np.random.default_rng(0).normal(size=(40, 2))
-    for name in ("a", "b"):
-        columns = {"t": np.arange(40) / 20, "x": values[:, 0], "y": values[:, 1]}
-        write_table(tmp_path / f"{name}.csv", columns)
-    found = package.Recording(*sorted(tmp_path.iterdir()), episodes=True, time="t")
-    assert (found.spec.streams, found.spec.length) == (("stream",), 80 + PAUSE)
-    np.testing.assert_array_equal(found.frames("stream", 60), values)
-
-
 def test_of_episodes_one_log_is_open_at_a_time(tmp_path: Path) -> None:
     paths = [write_log(tmp_path / f"{i}.mcap", x, i * 100) for i, x in enumerate(scenes(30, 12))]
     with opened(*paths) as source:

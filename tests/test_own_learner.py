@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import Cdmisfa
 from contracts.learners import LearnerContract
@@ -83,11 +82,3 @@ def test_what_is_no_learner_is_one_line(cdmisfa: Cdmisfa, name: str, words: str)
     refused = cdmisfa("learn", "oscillatory", "--algorithm", name)
     assert (refused.code, refused.err.count("\n")) == (2, 1)
     assert words in refused.err
-
-
-def test_it_learns_from_python(tmp_path: Path) -> None:
-    import cdmisfa
-
-    frames = np.random.default_rng(0).random((300, 2))
-    run = cdmisfa.learn(frames, tmp_path / "run", algorithm=OWN, max_iterations=3)
-    assert run.result["iterations"] == 3

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -242,16 +240,3 @@ def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
     rows = judged(icub.Icub(), trials).tables[0]["rows"]
     assert [row[1:3] for row in rows[1:]] == [["1 of 1", "**0 of 1**"]] * 2
     assert len(icub.Icub().draw(trials, tmp_path)) == 3
-
-
-@pytest.mark.parametrize("name", ["costs", "difficulty"])
-def test_studies_print_tables_and_write_rows(name: str, tmp_path: Path) -> None:
-    words = ["--trials", "2", "--no-icub", "-o", str(tmp_path)]
-    command = [sys.executable, "-m", f"benchmarks.paper.{name}", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout.startswith("| ")
-    trials = json.loads((tmp_path / f"{name}.json").read_text())["trials"]
-    assert len(trials) == 6
-    if name == "difficulty":
-        frames = [row["frames"] for _, row in trials]
-        assert max(frames[:2]) < min(frames[4:])

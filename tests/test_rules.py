@@ -75,29 +75,10 @@ def test_epsilon_decays_slowly_to_the_knee_and_fast_below() -> None:
     assert decay(0.8, 0.999, 0.8, 0.95) == 0.8 * 0.95
 
 
-@given(st.floats(1, 1.2), unit, unit, st.integers(0, 1))
-def test_epsilon_of_one_and_more_is_certainty(
-    epsilon: float, coin: float, draw: float, greedy: int
-) -> None:
-    action, explored = choose(epsilon, greedy, coin, draw)
-    assert explored
-    assert action == (draw >= 0.5)
-
-
 def test_the_coin_is_compared_with_epsilon() -> None:
     assert choose(0.3, 0, 0.29, 0.9) == (1, True)
     assert choose(0.3, 0, 0.3, 0.9) == (0, False)
     assert choose(0.0, 1, 0.0, 0.2) == (1, False)
-
-
-@given(st.integers(2, 10_000), st.data())
-def test_a_switch_never_stays(n: int, data: st.DataObject) -> None:
-    stream = data.draw(st.integers(0, n - 1))
-    following = other_stream(stream, n, data.draw(unit))
-    assert 0 <= following < n
-    assert following != stream
-    assert other_stream(2, 3, np.nextafter(1.0, 0.0)) == 1
-    assert other_stream(0, 1, 0.7) == 0
 
 
 @pytest.mark.parametrize("n", [2, 3, 7])

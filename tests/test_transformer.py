@@ -8,7 +8,6 @@ from run_data import read_signals, rows_of
 from waiting import python
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments import session
 from cdmisfa.modules import Module
 from recorder.world.oscillatory import OscillatorySource
@@ -49,11 +48,6 @@ def test_pixels_count_one_255th(tmp_path):
     np.testing.assert_allclose(features.transform(images), expected, atol=1e-12)
     np.testing.assert_allclose(features.transform(images / 255.0), expected, atol=1e-12)
     assert features.transform(images[:0]).shape == (0, 2)
-
-
-def test_it_cannot_be_fitted():
-    with pytest.raises(UsageError, match="cdmisfa learn"):
-        SlowFeatures(image_module()).fit(np.zeros((3, 12)))
 
 
 def test_it_is_a_step_of_a_pipeline():

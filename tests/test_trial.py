@@ -74,15 +74,6 @@ def test_trial_is_the_learner_across_a_swap() -> None:
     assert_equal(trial, *learner)
 
 
-def test_curves_change_nothing() -> None:
-    one, other = (
-        run_trial(QUICK, seed=2, max_iterations=700, curves=kept) for kept in (True, False)
-    )
-    assert other.curves is None
-    assert [m.iteration for m in one.modules] == [m.iteration for m in other.modules]
-    assert one.epsilon == other.epsilon
-
-
 def test_trial_ends_for_the_reason_it_gives() -> None:
     assert run_trial(QUICK, seed=0, max_iterations=10).ended == "max_iterations"
     assert run_trial(QUICK, seed=0, max_iterations=0).iterations == 0
@@ -90,10 +81,3 @@ def test_trial_ends_for_the_reason_it_gives() -> None:
     assert (one.ended, len(one.modules)) == ("max_modules", 1)
     never = dataclasses.replace(QUICK, delta=1e-12, patience=5)
     assert run_trial(never, seed=0).ended == "nothing_left"
-
-
-def test_the_paper_s_trial_finds_the_optimal_order_and_policies() -> None:
-    for seed in (0, 1, 2):
-        trial = run_trial(LearnerConfig(), seed=seed)
-        assert [m.stream_index for m in trial.modules] == [0, 1, 2]
-        assert [m.policy.tolist() for m in trial.modules] == [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
