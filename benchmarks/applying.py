@@ -23,10 +23,9 @@ from cdmisfa.experiments.session import run
 from cdmisfa.modules import Module
 from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
-from replay.arrays import ArrayLog
 from replay.export.applied import written
 from replay.export.frames import write_video
-from replay.inputs import open_log
+from replay.inputs import open_arrays, open_log
 from replay.runs.modules import save_modules
 from replay.stored import StoredSource
 from replay.view.applied import written_view
@@ -106,7 +105,7 @@ def throughput(folder: Path, rounds: int) -> tuple[Rows, Rows]:
         clock, and the shares of them that are left.
     """
     film = folder / "film.mp4"
-    shown = ArrayLog({"cam": np.stack(pictures(FILMED, *VGA))}, InputOptions(size=VGA))
+    shown = open_arrays({"cam": np.stack(pictures(FILMED, *VGA))}, InputOptions(size=VGA))
     write_video(shown, 0, film, lossless=False)
     cpu: Rows = []
     wall: Rows = []

@@ -15,9 +15,10 @@ from PIL import Image
 from benchmarks import foreign
 from benchmarks.report import interleaved, middle, save
 from benchmarks.report import ratio as times_ratio
+from recorder.images.options import InputOptions
 from recorder.recording import record
 from recorder.world.scenes import BLOCK
-from replay.camera_logs.source import ForeignSource
+from replay.inputs import open_external
 
 RATE = 30.0
 
@@ -45,7 +46,7 @@ def write_video(path: Path, n: int) -> Path:
 
 def decoding(path: Path) -> int:
     """Open a log and take all of its frames as converting does; how many."""
-    with contextlib.closing(ForeignSource(path, rate=RATE)) as source:
+    with contextlib.closing(open_external(path, InputOptions(rate=RATE))) as source:
         left = source.frames
         while left:
             left -= len(source.take(0, min(left, BLOCK)))
@@ -58,7 +59,7 @@ def converting(path: Path, folder: Path) -> Callable[[], int]:
 
     def call() -> int:
         out = folder / str(next(numbers))
-        with contextlib.closing(ForeignSource(path, rate=RATE)) as source:
+        with contextlib.closing(open_external(path, InputOptions(rate=RATE))) as source:
             count = sum(file.frames for file in record(source, out))
         shutil.rmtree(out)
         return count

@@ -28,7 +28,7 @@ from recorder.images.framing import default_size, fitted, size_of
 from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import IMAGES
 from recorder.mcap.reader import LogReader
-from replay.camera_logs.source import ForeignSource
+from replay.inputs import open_external
 
 TAU = 40
 STEP_NS = 33_333_333
@@ -156,7 +156,7 @@ def write(path: Path, case: Case, n: int) -> Path:
 
 def frames(path: Path) -> int:
     """Open a log and take all of it in blocks; how many frames."""
-    with contextlib.closing(ForeignSource(path)) as source:
+    with contextlib.closing(open_external(path)) as source:
         blocks = source.frames // TAU
         for _ in range(blocks):
             source.take(0, TAU)

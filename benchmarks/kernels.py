@@ -18,7 +18,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import IncSFAState, new_state
 from recorder.world.oscillatory import one_period
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 from tests.reference.incsfa import PlainIncSFA
 
 PIXELS = 6144
@@ -138,7 +138,7 @@ def measure_images(rounds: int) -> list[dict[str, Any]]:
 
 def measure_still(rounds: int) -> list[list[Any]]:
     """Rows of the Gram kernel: the sample log, and its frames with noise in every pixel."""
-    source = RecordedSource(SAMPLE, loop=True)
+    source = open_recording(SAMPLE, loop=True)
     views = range(len(source.spec.streams))
     shown = [source.take(stream, 40).frames.reshape(40, PIXELS) for stream in (*views, *views)]
     rng = np.random.default_rng(3)

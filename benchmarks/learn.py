@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks.report import SAMPLE, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig, load_preset
 from cdmisfa.experiments.session import run
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 CONFIGS = {
     "preset icub": LearnerConfig(**load_preset("icub")["learner"]),
@@ -27,7 +27,7 @@ Times = dict[tuple[str, str], list[float]]
 
 def learning(config: LearnerConfig, out: Path | None, *, rerun: bool) -> Callable[[int], None]:
     """A call that learns from the sample log for some iterations."""
-    source = RecordedSource(SAMPLE, loop=True)
+    source = open_recording(SAMPLE, loop=True)
 
     def call(iterations: int) -> None:
         source.seek(0)

@@ -46,17 +46,17 @@ def write_long(folder: Path, size: int) -> Path:
 
 def first_frames(path: Path) -> None:
     """Open a recording and take its first block."""
-    from replay.recordings.source import RecordedSource
+    from replay.inputs import open_recording
 
-    with contextlib.closing(RecordedSource(path)) as source:
+    with contextlib.closing(open_recording(path)) as source:
         source.take(0, TAU)
 
 
 def play(path: Path) -> None:
     """Take every block of a recording."""
-    from replay.recordings.source import RecordedSource
+    from replay.inputs import open_recording
 
-    with contextlib.closing(RecordedSource(path)) as source:
+    with contextlib.closing(open_recording(path)) as source:
         for _ in range(source.frames // TAU):
             source.take(0, TAU)
 

@@ -15,14 +15,15 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.signals import BlockSignals, canonical_bytes
 from cdmisfa.features.outputs import project
 from cdmisfa.modules import Module
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
+from replay.logs.source import LoggedSource
 
 MODULES = (0, 1, 10, 100)
 CONFIG = LearnerConfig(components=32, outputs=5, nu=0.005, tau=40, expansion="none")
 BLOCKS = 8
 
 
-def learner_of(count: int, source: RecordedSource) -> CuriousLearner:
+def learner_of(count: int, source: LoggedSource) -> CuriousLearner:
     """A learner with so many modules, that know nothing."""
     learner = CuriousLearner(CONFIG, source.spec, 0)
     rng = np.random.default_rng(5)
@@ -46,7 +47,7 @@ def learner_of(count: int, source: RecordedSource) -> CuriousLearner:
     return learner
 
 
-def stepping(learner: CuriousLearner, source: RecordedSource) -> Callable[[], int]:
+def stepping(learner: CuriousLearner, source: LoggedSource) -> Callable[[], int]:
     """A call of some iterations, reading included."""
 
     def call() -> int:
@@ -92,7 +93,7 @@ def matrix_product(
 
 def main(*, quick: bool = False) -> None:
     """Measure, and write results/modules.json."""
-    source = RecordedSource(SAMPLE, loop=True)
+    source = open_recording(SAMPLE, loop=True)
     counts = MODULES[:3] if quick else MODULES
     work: dict[str, Callable[[], int]] = {}
     for count in counts:

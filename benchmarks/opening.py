@@ -20,7 +20,7 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import open_source
-from replay.camera_logs.source import ForeignSource
+from replay.inputs import open_external
 
 
 def write(path: Path, size: int) -> Path:
@@ -44,7 +44,7 @@ def write(path: Path, size: int) -> Path:
 
 def first_picture(path: Path) -> None:
     """Open a log and take its first frame."""
-    with contextlib.closing(ForeignSource(path)) as source:
+    with contextlib.closing(open_external(path)) as source:
         source.take(0, 1)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks import long_recordings
 from benchmarks.report import SAMPLE, interleaved, middle, ratio, save
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 TAU = 40
 
@@ -35,7 +35,7 @@ def noisy_pictures(n: int) -> NDArray[np.uint8]:
 
 def ours(path: Path) -> Callable[[], int]:
     """A call that plays a file in blocks of 40 frames, with its ground truth and all CRCs."""
-    source = RecordedSource(path)
+    source = open_recording(path)
 
     def call() -> int:
         source.seek(source.first_frame)
@@ -105,7 +105,7 @@ def main(*, quick: bool = False) -> None:
         }
         rows = []
         for name, path in cases.items():
-            frames = RecordedSource(path).frames
+            frames = open_recording(path).frames
             work = {
                 "cdmisfa": ours(path),
                 "mcap": mcap_reader(path, frames, arrays=False),

@@ -22,8 +22,8 @@ from benchmarks.foreign import VGA, pictures
 from benchmarks.report import middle, save
 from cdmisfa.experiments.apply_logs import apply_to_logs
 from recorder.images.options import InputOptions
-from replay.arrays import ArrayLog
 from replay.export.frames import write_video
+from replay.inputs import open_arrays
 
 LOGS, FRAMES = 16, 500
 
@@ -68,7 +68,7 @@ def main(*, quick: bool = False) -> None:
     with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as stack:
         run, logs = make_run(Path(place) / "run", OUTPUTS[-1]), Path(place) / "logs"
         logs.mkdir()
-        shown = ArrayLog({"cam": np.stack(pictures(FRAMES, *VGA))}, InputOptions(size=VGA))
+        shown = open_arrays({"cam": np.stack(pictures(FRAMES, *VGA))}, InputOptions(size=VGA))
         write_video(shown, 0, logs / "0.mp4", lossless=False)
         for number in range(1, LOGS):
             shutil.copyfile(logs / "0.mp4", logs / f"{number}.mp4")

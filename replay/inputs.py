@@ -1,39 +1,34 @@
-"""Logs that words of a command line name: found, and opened as sources of frames."""
+"""Logs that words of a command line name, opened as sources of frames."""
 
 from __future__ import annotations
 
 import contextlib
 import glob
 import shlex
-from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import InputOptions
 from recorder.mcap.records import no_log
-from replay.arrays import ENDINGS, ArrayLog, are_arrays, open_arrays
-from replay.camera_logs.opening import (
-    ALL,
-    channels_of,
-    image_logs,
-    image_topics,
-    only_foreign,
-)
-from replay.camera_logs.pictures import by_number
-from replay.camera_logs.source import ForeignSource, UnequalError
-from replay.recordings.source import RecordedSource, SeveralRecordingsError
-from replay.recordings.view_file import NoRecordingError
+from replay.logs.aligning import UnequalError
+from replay.logs.combining import join_parts
+from replay.logs.formats import views
+from replay.logs.formats.arrays import array_streams
+from replay.logs.formats.recording import NoRecordingError, ViewFile
+from replay.logs.formats.views import SeveralRecordingsError
+from replay.logs.hue import CHOSEN, shows_hue
+from replay.logs.opening import ALL, OpenLogs, image_logs, only_external
+from replay.logs.source import LoggedSource
 from replay.runs.folders import RUN_FILE, is_run
 from replay.storage.location import is_url, location
-from replay.storage.opening import no_such, starts_as_log
+from replay.storage.opening import by_number, log_files, no_such, starts_as_log
 
-Logged = RecordedSource | ForeignSource | ArrayLog
-"""Frames from logs, or from files of arrays."""
-
-About = Callable[[Logged], None]
-"""Given logs that were opened to be looked at, to say what they are."""
+About = Callable[[LoggedSource], None]
+"""Called with logs that were opened to be shown, to print what they are."""
 
 
 def open_log(
@@ -43,67 +38,55 @@ def open_log(
     loop: bool = False,
     salvage: bool = False,
     goal: tuple[str, str] = ("learn", "RUN"),
-) -> Logged:
-    """Open one of our recordings, camera logs of others, or files of NumPy's arrays.
+) -> LoggedSource:
+    """Open one of our recordings, or external logs.
 
     Args:
-        paths: the folder of a recording or its views' files, or logs of others.
-        inputs: how images of others become frames; given, the paths are taken as such logs.
-        loop: start again at the end.
-        salvage: pass over what is damaged.
-        goal: the command and the folder of its result that a refusal names in what would work.
+        paths: the folder of a recording or its views' files, or external logs.
+        inputs: how images of external logs become frames; with it paths are taken as such.
+        loop: begin again at the end.
+        salvage: leave out what is damaged.
+        goal: the command and the folder of its result for the remedy in an error.
 
     Raises:
-        UsageError: no such log, a run, or as for `ForeignSource`.
+        UsageError: no such log, a run, or as for `open_external`.
         LogDamagedError: a log is damaged.
     """
     inputs = inputs or InputOptions()
     for path in paths:
         refuse_what_is_no_log(path)
-    if are_arrays(paths):
-        return open_arrays(paths, inputs, loop=loop)
-    left_out: list[str] = []
-    if salvage:
-        paths, inputs, left_out = _readable(paths, inputs)
-    if not inputs.external and not any(map(only_foreign, paths)):
+    if not inputs.external and not any(map(only_external, paths)):
         with contextlib.suppress(NoRecordingError):
-            return _without(left_out, RecordedSource(paths, loop=loop, salvage=salvage))
-    return _without(left_out, _open(paths, inputs, loop=loop, salvage=salvage, goal=goal))
+            return open_recording(paths, loop=loop, salvage=salvage)
+    return open_external(paths, inputs, loop=loop, salvage=salvage, goal=goal)
 
 
 def open_to_look(
     paths: Sequence[Path], inputs: InputOptions | None = None, *, salvage: bool = False
-) -> Logged:
-    """Open logs to view, export or play: every topic of images, aligned by time if need be.
+) -> LoggedSource:
+    """Open logs to view or export them: every topic of images, aligned by time if need be.
 
-    Of files of arrays all are shown.
-
-    What `cameras` choose is opened as they say. Of up to `AT_ONCE` bytes all are checked, of more
-    what is read.
+    Of up to `AT_ONCE` bytes all are checked, of more what is read.
 
     Raises:
         UsageError: as for `open_log`.
         LogDamagedError: a log is damaged.
     """
+    inputs = inputs or InputOptions()
     for path in paths:
         refuse_what_is_no_log(path)
-    inputs = inputs or InputOptions()
     chosen = bool(inputs.topics or inputs.fields)
-    if not (chosen or are_arrays(paths) or any(map(only_foreign, paths))):
+    source = None
+    if not (chosen or any(map(only_external, paths))):
         with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
-            return _checked(RecordedSource(paths, salvage=salvage))
-    goal = ("convert", "REC")
-    if not chosen:
-        inputs = replace(inputs, topics=ALL)
-    try:
-        return _checked(open_cameras(paths, inputs, salvage=salvage, goal=goal))
-    except UnequalError:
-        inputs = replace(inputs, align="time")
-        return _checked(open_cameras(paths, inputs, salvage=salvage, goal=goal))
-
-
-def _checked(source: Logged) -> Logged:
-    """Logs, with the checksum over all their data checked where that takes no time."""
+            source = open_recording(paths, salvage=salvage)
+    if source is None:
+        inputs = inputs if chosen else replace(inputs, topics=ALL)
+        how: Any = {"salvage": salvage, "goal": ("convert", "REC")}
+        try:
+            source = open_external(paths, inputs, **how)
+        except UnequalError:
+            source = open_external(paths, replace(inputs, align="time"), **how)
     try:
         source.describe_at_once()
     except BaseException:
@@ -112,91 +95,136 @@ def _checked(source: Logged) -> Logged:
     return source
 
 
-def open_cameras(
-    paths: Sequence[str | Path],
-    inputs: InputOptions,
+def open_recording(
+    paths: str | Path | Sequence[str | Path], *, loop: bool = False, salvage: bool = False
+) -> LoggedSource:
+    """Open the views of a recording.
+
+    Args:
+        paths: a recording's folder, or the files of its views, finished or `.partial`; or URLs.
+        loop: begin again at the end.
+        salvage: leave out, in every view, what is damaged in one of them, and of several files
+            one that cannot be read.
+
+    Raises:
+        NoRecordingError: a file is no view of a recording.
+        UsageError: no such recording, or several.
+        LogDamagedError: a file is damaged, or the files of a folder contradict each other.
+    """
+    named = [paths] if isinstance(paths, str | Path) else paths
+    files: list[ViewFile] = []
+    broken: list[LogDamagedError] = []
+    with ExitStack() as failed:
+        for path in log_files(named):
+            if views.only_begun(path):
+                continue
+            try:
+                files.append(ViewFile(path, salvage=salvage))
+                failed.callback(files[-1].close)
+            except NoRecordingError:
+                raise
+            except LogDamagedError as error:
+                if not salvage or len(named) == 1:
+                    raise
+                broken.append(error)
+        if not files:
+            raise (
+                broken[0] if broken else NoRecordingError(f"{named[0]}: no frame was recorded yet")
+            )
+        streams = views.streams(files, salvage=salvage)
+        source = LoggedSource(streams, loop=loop, opened=failed.pop_all())
+    return _without(source, [f"{error}: this log is left out" for error in broken])
+
+
+def open_external(
+    paths: str | Path | Sequence[str | Path],
+    inputs: InputOptions | None = None,
     *,
     loop: bool = False,
     salvage: bool = False,
     goal: tuple[str, str] = ("learn", "RUN"),
-) -> ForeignSource | ArrayLog:
-    """Open the camera logs of others, or files of arrays, as streams on one clock.
+) -> LoggedSource:
+    """Open external logs as streams on one clock: images of cameras, or numbers.
 
-    See `ForeignSource` and `open_arrays`. With `salvage` a log of several that cannot be read is
-    left out: `left_out` of the source says so, as its warnings do.
-    """
-    places = list(map(location, paths))
-    if are_arrays(places):
-        return open_arrays(places, inputs, loop=loop)
-    left_out: list[str] = []
-    if salvage:
-        paths, inputs, left_out = _readable(image_logs(paths), inputs)
-    return _without(left_out, _open(paths, inputs, loop=loop, salvage=salvage, goal=goal))
-
-
-def _open(paths: Sequence[str | Path], inputs: InputOptions, **how: Any) -> ForeignSource:
-    chosen: dict[str, Any] = {each.name: getattr(inputs, each.name) for each in fields(inputs)}
-    return ForeignSource(paths, **chosen, **how)
-
-
-def _readable(
-    paths: Sequence[Path], inputs: InputOptions
-) -> tuple[list[Path], InputOptions, list[str]]:
-    """The logs of several that can be read, with their topics, and why the others cannot.
+    Args:
+        paths: one log, or one log, video, table or folder of images a stream. Logs that follow one
+            another in time are parts of one stream, unless they are aligned by index.
+        inputs: how images become frames.
+        loop: begin again at the end.
+        salvage: leave out what is damaged, and broken images; of several logs also one that
+            cannot be read: `left_out` of the source says so, as its warnings do.
+        goal: the command and the folder of its result for the remedy in an error.
 
     Raises:
-        LogDamagedError: none can be read.
+        UsageError: no such log or topic, images smaller than a frame, or streams that need `align`.
+        LogDamagedError: a log is damaged.
     """
-    broken: dict[Path, LogDamagedError] = {}
-    for path in paths if len(paths) > 1 else ():
-        try:
-            if only_foreign(path):
-                channels_of(path)
-            elif path.is_file():
-                image_topics(path)
-        except LogDamagedError as error:
-            broken[path] = error
-    if len(broken) == len(paths):
-        raise broken[paths[0]]
-    if len(inputs.topics) == len(paths):  # one of each
-        pairs = zip(paths, inputs.topics, strict=True)
-        inputs = replace(inputs, topics=tuple(t for path, t in pairs if path not in broken))
-    said = [f"{error}: this log is left out" for error in broken.values()]
-    return [path for path in paths if path not in broken], inputs, said
+    inputs = inputs or InputOptions()
+    how: Any = {"loop": loop, "salvage": salvage, "goal": goal}
+    if inputs.color == "auto":
+        return _with_color(lambda options: open_external(paths, options, **how), inputs)
+    files = image_logs([paths] if isinstance(paths, str | Path) else paths)
+    with ExitStack() as failed:
+        logs = OpenLogs(files, inputs, failed, salvage=salvage)
+        streams = logs.streams if inputs.align == "index" else join_parts(logs.streams)
+        source = LoggedSource(streams, inputs, **how, logs=logs.logs, opened=failed.pop_all())
+    return _without(source, logs.left_out)
 
 
-Opened = TypeVar("Opened", RecordedSource, ForeignSource)
+def open_arrays(
+    arrays: Mapping[str, Any], inputs: InputOptions | None = None, *, loop: bool = False
+) -> LoggedSource:
+    """Open arrays of the caller as streams, the i-th rows together; see `array_streams`.
+
+    Raises:
+        UsageError: an array holds no frames, or they show frames of different shapes.
+    """
+    inputs = inputs or InputOptions()
+    if inputs.color == "auto":
+        return _with_color(lambda options: open_arrays(arrays, options, loop=loop), inputs)
+    return LoggedSource(array_streams(arrays, inputs), inputs, loop=loop)
 
 
-def _without(left_out: Sequence[str], source: Opened) -> Opened:
-    """A source that says which logs were left out of it."""
+def _with_color(
+    opened: Callable[[InputOptions], LoggedSource], inputs: InputOptions
+) -> LoggedSource:
+    """Open a source in colours if its frames show in them what they do not show in grey."""
+    with opened(replace(inputs, color=True)) as shown:
+        color = shows_hue(shown)
+    source = opened(replace(inputs, color=color))
+    source.notes = (CHOSEN[color],)
+    return source
+
+
+def _without(source: LoggedSource, left_out: Sequence[str]) -> LoggedSource:
+    """A source with a warning for each log that was left out."""
     source.left_out = tuple(left_out)
     source.warnings = (*left_out, *source.warnings)
     return source
 
 
 def holds_run(path: Path) -> bool:
-    """Whether a folder or a file is a run, and no camera log.
+    """Whether a folder or a file is a run, and no external log.
 
     Raises:
         UsageError: it does not exist.
         LogDamagedError: it is no log, or a damaged one.
     """
-    return not only_foreign(path) and not are_arrays([path]) and is_run(path)
+    return not only_external(path) and is_run(path)
 
 
 def is_recording(words: Sequence[str]) -> bool:
-    """Whether what words name is one of our recordings.
+    """Whether words name one of our recordings.
 
     Raises:
         UsageError: there is no such log.
         LogDamagedError: a log is damaged.
     """
     places = locations(words)
-    if are_arrays(places) or any(map(only_foreign, places)):
+    if any(map(only_external, places)):
         return False
     try:
-        RecordedSource(places).close()
+        open_recording(places).close()
     except NoRecordingError:
         return False
     return True
@@ -208,25 +236,21 @@ def refuse_what_is_no_log(path: Path) -> None:
     Raises:
         UsageError: it is one of them.
     """
+    if not path.exists():
+        raise no_such(path)
     if path.is_dir():
         run = is_run(path)
-    elif not path.exists():
-        raise no_such(path)
     elif starts_as_log(path):
         run = path.name.startswith(RUN_FILE) and is_run(path)
-    elif only_foreign(path) or ".mcap" in path.suffixes or path.suffix.lower() in ENDINGS:
+    elif only_external(path) or ".mcap" in path.suffixes:
         run = False
     else:
         raise no_log(path)
     if run:
-        raise _a_run(path)
-
-
-def _a_run(path: Path) -> UsageError:
-    return UsageError(
-        f"{path} is a run, not a recording: look at it with cdmisfa view {shlex.quote(str(path))}, "
-        "or learn from what it learned from"
-    )
+        raise UsageError(
+            f"{path} is a run, not a recording: look at it with cdmisfa view "
+            f"{shlex.quote(str(path))}, or learn from what it learned from"
+        )
 
 
 def locations(words: Sequence[str | Path]) -> list[Path]:
@@ -239,16 +263,12 @@ def locations(words: Sequence[str | Path]) -> list[Path]:
     found: list[Path] = []
     for word in words:
         pattern = isinstance(word, str) and not is_url(word) and any(c in word for c in "*?[")
-        if pattern and not Path(word).exists():
-            found += _matches(str(word))
-        else:
+        if not pattern or Path(word).exists():
             found.append(location(word))
+            continue
+        matched = map(Path, glob.glob(str(word), recursive=True))
+        logs = sorted((p for p in matched if p.suffix not in (".rrd", ".json")), key=by_number)
+        if not logs:
+            raise UsageError(f"{word}: no file or folder matches")
+        found += logs
     return found
-
-
-def _matches(word: str) -> list[Path]:
-    matched = [Path(name) for name in glob.glob(word, recursive=True)]
-    matched = [path for path in matched if path.suffix not in (".rrd", ".json")]
-    if not matched:
-        raise UsageError(f"{word}: no file or folder matches")
-    return sorted(matched, key=by_number)

@@ -1,12 +1,12 @@
-"""Frames that are kept, in a recording or in logs of others: so many, with gaps or without."""
+"""Stored frames, of recordings and external logs: a known number, with gaps or without."""
 
 from __future__ import annotations
 
 import bisect
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, get_args
+from typing import Any, Final, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,39 +15,58 @@ from cdmisfa.core.arrays import centred, mean_of
 from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, check_request, freeze
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.images.options import Centre
+from replay.storage.identity import Identity
 
 Span = tuple[int, int]
 """The frames [start, stop)."""
 
-PIECE = 64
-"""Frames of an episode that are held at once while its mean is taken."""
+PIECE: Final = 64
+"""Frames of an episode that are read at once for its mean."""
+
+AT_ONCE: Final = 64 * 1024 * 1024
+"""Logs with up to this many bytes are hashed before anything else is done; longer ones later."""
+
+Progress = Callable[[int, int], None]
+"""Called with the number of bytes that were hashed, and of all bytes."""
 
 
 class StoredSource(ClockedSource):
-    """A source of frames that are kept: all of them once, or looped, lap after lap.
+    """A source of stored frames: all of them once, or looped, lap after lap.
 
-    A class that derives from it sets `_spec`, `gaps` and, with gaps, `_held`, and has `describe`.
+    A derived class sets `_spec`, `_loop`, `_count`, `gaps` and, with gaps, `_held`.
 
     Attributes:
-        centre: what every frame is shown without: "episode", the mean of its episode; see
-            `episode`.
-        held_out: frames at the end that `take` does not give; see `hold_out`.
-        more: what else than to begin again can be done where there are too few frames, in words.
+        centre: "episode": frames are shown without the mean of their episode; see `episode`.
+        held_out: frames at the end that `take` does not return; see `hold_out`.
+        more: a remedy, beside looping, for too few frames.
+        to_judge: whether the last frames are held out by default; see `hold_out`.
+        recorded: whether it is a recording of ours.
+        left_out: a line for each log that could not be read and was left out.
+        copies: a line for each stream that shows the same as a stream of another log.
+        notes: a line for each choice that was made by default.
+        warnings: a line for each thing that the user should know.
     """
 
     centre: Centre = "run"
     held_out: int = 0
-    more: ClassVar[str] = ""
+    more: str = ""
+    to_judge: bool = False
+    recorded: bool = False
+    left_out: tuple[str, ...] = ()
+    copies: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     _loop: bool
     _first: int = 0
     _count: int
     _held: Sequence[Sequence[Span]]
-    """The frames that each stream has of the first lap."""
+    """The frames of the first lap that each stream has."""
     _means: dict[int, tuple[Span, NDArray[Any]]] | None = None
+    _identities: Sequence[Identity] | None = None
 
     @property
     def frames(self) -> int:
-        """How many there are of every stream, those of gaps included."""
+        """Number of frames of every stream, those of gaps included."""
         return self._count
 
     @property
@@ -57,7 +76,7 @@ class StoredSource(ClockedSource):
 
     @property
     def end(self) -> int:
-        """The frame after the last that `take` gives, of the first lap."""
+        """The frame after the last that `take` returns, of the first lap."""
         return self._first + self._count - self.held_out
 
     def centre_by(self, centre: Centre) -> None:
@@ -71,10 +90,10 @@ class StoredSource(ClockedSource):
         self.centre = centre
 
     def hold_out(self, count: int) -> None:
-        """Keep the last frames from `take`: what is learned is judged on them, see `pieces`.
+        """Keep the last frames from `take`: modules are judged on them, see `pieces`.
 
         Raises:
-            UsageError: it loops, or no frame would be left.
+            UsageError: the source loops, or no frame would be left.
         """
         if self._loop or not 0 <= count < self._count:
             raise UsageError(f"{self._name()}: no {count} frames of {self._count} can be held out")
@@ -82,25 +101,25 @@ class StoredSource(ClockedSource):
         self._spec = replace(self._spec, length=self._count - count)
 
     def pieces(self, stream: int, start: int, stop: int, n: int) -> Iterator[Block]:
-        """What a stream shows of the frames [start, stop), in blocks of n or fewer.
+        """Yield the frames [start, stop) of a stream in blocks of n or fewer; the clock stays.
 
-        Those held out are among them; the clock stays.
+        Held-out frames are among them.
 
         Raises:
-            LogDamagedError: what is kept is damaged.
+            LogDamagedError: the log is damaged.
         """
         for low, high in self.spans(stream, start, stop):
             for t in range(low, high, n):
                 yield self._centred(stream, t, min(n, high - t))
 
     def take(self, stream: int, n: int) -> Block:
-        """The n frames that a stream shows at t .. t+n-1; moves t by n.
+        """Return the frames of a stream at t .. t+n-1, and move t by n.
 
-        With gaps the next n that follow one another; moves t behind them.
+        With gaps the next n frames that follow one another; moves t behind them.
 
         Raises:
             LogExhaustedError: fewer than n frames are left; t stays.
-            LogDamagedError: what is kept is damaged; t stays.
+            LogDamagedError: the log is damaged; t stays.
             ValueError: no such stream, or n < 1.
         """
         check_request(self._spec, stream, n)
@@ -109,11 +128,11 @@ class StoredSource(ClockedSource):
         return block
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """What every stream shows in the next n frames, a block for each unbroken stretch.
+        """Return the next n frames of every stream, a block for each unbroken stretch.
 
         Raises:
             LogExhaustedError: fewer than n frames are left; t stays.
-            LogDamagedError: what is kept is damaged; t stays.
+            LogDamagedError: the log is damaged; t stays.
             ValueError: n < 1.
         """
         check_request(self._spec, 0, n)
@@ -129,7 +148,7 @@ class StoredSource(ClockedSource):
         return blocks
 
     def spans(self, stream: int, start: int, stop: int) -> list[Span]:
-        """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
+        """The unbroken stretches [low, high) that a stream has of the frames [start, stop)."""
         return [*self._spans(stream, start, stop)]
 
     def _spans(self, stream: int, start: int, stop: int) -> Iterable[Span]:
@@ -139,13 +158,13 @@ class StoredSource(ClockedSource):
         return in_laps(self._held[stream], self._first, self._count, start, stop)
 
     def episode(self, stream: int, t: int) -> Span:
-        """The episode [start, stop) that a frame is of, of the first lap.
+        """The episode [start, stop) of a frame, in the first lap.
 
-        Of what has no episodes of its own that is the stretch between two gaps.
+        In a log without episodes of its own it is the stretch between two gaps.
 
         Args:
-            stream: whose gaps count.
-            t: a frame that it has, of any lap.
+            stream: the stream whose gaps count.
+            t: a frame that the stream has, of any lap.
         """
         if not self.gaps:
             return self._first, self._first + self._count
@@ -156,26 +175,94 @@ class StoredSource(ClockedSource):
         """Move the clock to frame t.
 
         Raises:
-            LogExhaustedError: the frames end before it.
-            ValueError: t lies before the first frame.
+            LogExhaustedError: the source ends before frame t.
+            ValueError: t is before the first frame.
         """
         if t < self._first:
             raise ValueError(f"frame {t} lies before the first, {self._first}")
-        end = self.end
-        if not self._loop and t > end:
+        if not self._loop and t > self.end:
             raise LogExhaustedError(
-                f"{self._name()}: it ends at frame {end}, before frame {t}; begin again at its end "
-                "with --loop"
+                f"{self._name()}: it ends at frame {self.end}, before frame {t}; begin again at "
+                "its end with --loop"
             )
         self._t = t
 
+    def pixels(self, stream: int) -> str:
+        """The format of pixels that a stream's messages state, "" if they state none."""
+        return ""
+
+    def scene(self) -> Mapping[str, str]:
+        """The recorded scene, its seed and configuration, if the logs state them."""
+        return {}
+
+    def origin(self) -> Mapping[str, Any]:
+        """The description of the source that was recorded; empty of scenes and external logs."""
+        return {}
+
+    def salvaged(self) -> list[str]:
+        """A line for each stream of which damaged parts were replaced or left out so far."""
+        return []
+
+    def describe(self, told: Progress = lambda done, size: None) -> Mapping[str, Any]:
+        """The logs with the SHA-256 of all their bytes, and how they became frames.
+
+        Args:
+            told: called with the bytes that were hashed and all bytes, if there are many.
+
+        Raises:
+            LogDamagedError: a log is damaged, or was changed since it was opened.
+        """
+        logs = self.identities()
+        size, done = sum(log.size for log in logs), 0
+
+        def counted(count: int) -> None:
+            nonlocal done
+            done += count
+            if size > AT_ONCE:
+                told(done, size)
+
+        return self._with_centre([log.whole(counted) for log in logs])
+
+    def describe_at_once(self) -> Mapping[str, Any]:
+        """See `cdmisfa.core.blocks.LongSource`."""
+        logs = self.identities()
+        if sum(log.size for log in logs) <= AT_ONCE:
+            return self.describe()
+        return self._with_centre([log.sample() for log in logs])
+
+    def identities(self) -> Sequence[Identity]:
+        """The identity of each log that the source is read from."""
+        if self._identities is None:
+            self._identities = self._logs()
+        return self._identities
+
+    def _with_centre(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+        described = self.described(logs)
+        return described if self.centre == "run" else {**described, "centre": self.centre}
+
+    @abstractmethod
+    def _logs(self) -> Sequence[Identity]:
+        """The identity of each log that the source is read from, made now."""
+
+    @abstractmethod
+    def described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+        """The description of the source, with the hash of each log."""
+
+    @abstractmethod
+    def _block(self, stream: int, t: int, n: int) -> Block:
+        """Read the frames [t, t + n) of a stream, none of a gap; t may be of a later lap."""
+
+    @abstractmethod
+    def _name(self) -> str:
+        """The name of the source in errors."""
+
     def _centred(self, stream: int, t: int, n: int) -> Block:
-        """See `_block`; without the mean of its episode, where it is centred so."""
+        """Read frames as `_block`; without the mean of their episode if they are centred so."""
         block = self._block(stream, t, n)
         if self.centre == "run":
             return block
         shown, at = [], 0
-        while at < n:  # where one lap ends an episode does
+        while at < n:  # an episode ends where a lap does
             place = (t + at - self._first) % self._count
             count = min(n - at, self._count - place)
             mean = self._mean(stream, self._first + place)
@@ -198,16 +285,8 @@ class StoredSource(ClockedSource):
             self._means[stream] = known = span, mean_of(pieces)
         return known[1]
 
-    @abstractmethod
-    def _block(self, stream: int, t: int, n: int) -> Block:
-        """The frames [t, t + n) of a stream, none of a gap; their numbers may be of a later lap."""
-
-    @abstractmethod
-    def _name(self) -> str:
-        """How an error names what is read."""
-
     def _unbroken(self, stream: int, n: int) -> int:
-        """Where the next n frames of a stream begin that follow one another."""
+        """The first of the next n frames of a stream that follow one another."""
         # Looping, a stretch that holds them is in the rest of this lap or in the next two.
         end = self._t + 3 * self._count + n if self._loop else self.end
         for low, high in self._spans(stream, self._t, end):
@@ -226,10 +305,10 @@ class StoredSource(ClockedSource):
 
 
 def centre_as(centre: Centre, source: FrameSource, name: str) -> FrameSource:
-    """A source that shows frames as modules learned from them; see `StoredSource.centre_by`.
+    """Return a source with frames as modules learned from them; see `StoredSource.centre_by`.
 
     Raises:
-        UsageError: its episodes are not over, and so have no mean; the source is closed.
+        UsageError: the source is live, so that its episodes have no mean yet; it is closed.
     """
     if isinstance(source, StoredSource):
         source.centre_by(centre)
@@ -242,20 +321,9 @@ def centre_as(centre: Centre, source: FrameSource, name: str) -> FrameSource:
     return source
 
 
-def merged(spans: Iterable[Span]) -> list[Span]:
-    """Ranges in their order, with those that touch merged."""
-    found: list[Span] = []
-    for start, stop in spans:
-        if found and found[-1][1] == start:
-            found[-1] = (found[-1][0], stop)
-        else:
-            found.append((start, stop))
-    return found
-
-
-def outside(gaps: Iterable[Span], count: int) -> list[Span]:
-    """The spans of the frames [0, count) that lie between gaps, which are in their order."""
-    ends = [0, *(end for gap in gaps for end in gap), count]
+def outside(gaps: Iterable[Span], first: int, stop: int) -> list[Span]:
+    """The spans of the frames [first, stop) between gaps, which are in their order."""
+    ends = [first, *(end for gap in gaps for end in gap), stop]
     return [(low, high) for low, high in zip(ends[::2], ends[1::2], strict=True) if low < high]
 
 
@@ -263,16 +331,17 @@ def in_laps(held: Sequence[Span], first: int, count: int, start: int, stop: int)
     """The unbroken ranges of the frames [start, stop), where every lap has the same gaps.
 
     Args:
-        held: the frames that are there of the first lap.
+        held: the frames of the first lap that exist.
         first: the first frame.
         count: frames of a lap.
-        start: the first frame that is wanted.
+        start: the first frame of the result.
         stop: the frame after the last.
     """
-    laps = range((start - first) // count, (stop - 1 - first) // count + 1)
-    there = (
-        (max(low + lap * count, start), min(high + lap * count, stop))
-        for lap in laps
-        for low, high in held
-    )
-    return merged((low, high) for low, high in there if low < high)
+    merged: list[Span] = []
+    for lap in range((start - first) // count, (stop - 1 - first) // count + 1):
+        for low, high in held:
+            low, high = max(low + lap * count, start), min(high + lap * count, stop)
+            if low < high:
+                touches = merged and merged[-1][1] == low
+                merged.append((merged.pop()[0], high) if touches else (low, high))
+    return merged

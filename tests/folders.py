@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from replay.recordings.source import RecordedSource
+from recorder.images.options import InputOptions
+from replay.inputs import open_external, open_recording
+from replay.logs.source import LoggedSource
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -15,7 +19,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def coverage(recording: Path) -> dict[str, list[tuple[int, int]]]:
     """The stretches of frames that each view has."""
-    with RecordedSource(recording) as source:
+    with open_recording(recording) as source:
         return source.coverage()
 
 
@@ -24,3 +28,17 @@ def flip(path: Path, at: int | None = None) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2 if at is None else at] ^= 1
     path.write_bytes(data)
+
+
+def external(
+    paths: str | Path | Sequence[str | Path],
+    topics: Sequence[str] = (),
+    *,
+    loop: bool = False,
+    salvage: bool = False,
+    goal: tuple[str, str] = ("learn", "RUN"),
+    **chosen: Any,
+) -> LoggedSource:
+    """External logs, opened with some options."""
+    options = InputOptions(topics=tuple(topics), **chosen)
+    return open_external(paths, options, loop=loop, salvage=salvage, goal=goal)

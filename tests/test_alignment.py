@@ -1,34 +1,28 @@
-"""Streams on one clock: which image each frame shows, by times alone."""
+"""The clock of a log: which row of each stream every frame shows, by times alone."""
 
 from __future__ import annotations
 
 from itertools import accumulate
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.camera_logs.alignment import (
-    Times,
-    by_time,
-    counts,
-    of_other_rate,
-    overlap,
-    step_of,
-    unlike,
-)
-from replay.camera_logs.stream import LAST_NS, sorted_times
+from replay.logs.clock import by_time, counts, of_other_rate, overlap, step_of, unlike
+from replay.logs.stream import LAST_NS, LogStream
 
 START = 1_700_000_000 * NANOSECONDS
 
 GAPS = st.lists(st.integers(0, 10**9), min_size=1, max_size=30)
 
 
-def times(*gaps: int) -> Times:
-    return np.array(list(accumulate(gaps, initial=START)), np.uint64)
+def times(*gaps: int) -> IntArray:
+    return np.array(list(accumulate(gaps, initial=START)), np.int64)
 
 
 @given(GAPS, GAPS, st.floats(0.5, 100))
@@ -37,15 +31,15 @@ def test_every_frame_shows_the_last_image_at_or_before_it(
 ) -> None:
     streams = [times(*left), times(*right)]
     start, stop = overlap(streams)
-    for stream, rows in zip(streams, by_time(streams, start, stop, fps), strict=True):
+    for stream, rows in zip(streams, by_time(streams, fps).rows, strict=True):
         clock = [time_of(t, fps, start) for t in range(len(rows))]
         assert clock[0] == start
         assert -1 <= stop - clock[-1] < NANOSECONDS / fps + 1
-        for at, row in zip(clock, rows.tolist(), strict=True):
+        for at, row in zip(clock, rows, strict=True):
             assert stream[row] <= at
             assert row + 1 == len(stream) or stream[row + 1] > at
-        shown = len(set(rows.tolist()))
-        found = counts(stream, rows)
+        shown = len(set(rows))
+        found = counts(len(stream), rows)
         assert (found["repeated"], found["dropped"]) == (len(clock) - shown, len(stream) - shown)
 
 
@@ -55,18 +49,19 @@ def test_a_rate_is_another_from_a_hundredth_on_and_times_from_half_a_step_on() -
     for images, fps, other in ((first, 50.4, 0), (first, 51, 1), (first[:1], 51, 0)):
         assert of_other_rate(images, fps) == other
     assert not of_other_rate(times(0, 0, 0), 51)  # they tell no rate
-    assert unlike(first, first + np.uint64(10_000_000)) == ""
-    assert unlike(first, first + np.uint64(10_000_001)) == "images at different times"
+    assert unlike(first, first + 10_000_000) == ""
+    assert unlike(first, first + 10_000_001) == "images at different times"
     assert unlike(first, first[1:]) == "10 and 9 images"
 
 
 def test_no_rate_makes_frames_without_end() -> None:
     with pytest.raises(UsageError, match="choose a lower one"):
-        by_time([times(10**18)], START, START + 10**18, 1e6)
+        by_time([times(10**18)], 1e6)
 
 
-@pytest.mark.parametrize("wrong", [[-1, 5], [5, LAST_NS], [0, 2**64]])
+@pytest.mark.parametrize("wrong", [[-1, 5], [5, LAST_NS], [0, -(2**62)]])
 def test_times_beyond_any_clock_are_damage(wrong: list[int]) -> None:
-    with pytest.raises(LogDamagedError, match=r"left\.db3 has times beyond any clock"):
-        sorted_times("left.db3", wrong)
-    assert sorted_times("left.db3", [0, LAST_NS - 1]).tolist() == [0, LAST_NS - 1]
+    about = {"path": Path("left.db3"), "topic": "it", "count": 2}
+    with pytest.raises(LogDamagedError, match=r"left\.db3: it has times beyond any clock"):
+        LogStream(**about, times=np.array(wrong))
+    assert LogStream(**about, times=np.array([0, LAST_NS - 1])).count == 2

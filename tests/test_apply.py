@@ -14,6 +14,7 @@ import pytest
 from applied_data import SIZE, TAU, camera, learned, make_run
 from camera_files import pictures, write_images
 from conftest import Cdmisfa
+from folders import external
 from mcap.reader import make_reader
 from view_data import View, scalars
 from waiting import started
@@ -22,7 +23,6 @@ from cdmisfa import Run
 from cdmisfa.experiments.apply import Application, Totals
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
-from replay.camera_logs.source import ForeignSource
 from replay.export.applied import Applied
 from replay.runs.modules import save_modules
 
@@ -66,8 +66,8 @@ def test_an_mcap_has_a_topic_a_module_beside_the_frames(
     from recorder.images.options import InputOptions
     from replay.inputs import open_log
 
-    frames = ForeignSource(log, size=SIZE).take(0, 50).frames
-    again = ForeignSource(out, ["/view/cam"]).take(0, 50).frames
+    frames = external(log, size=SIZE).take(0, 50).frames
+    again = external(out, ["/view/cam"]).take(0, 50).frames
     np.testing.assert_array_equal(again, frames)
     for module in Run(run).modules:
         options = InputOptions(topics=(f"/module{module.index}/cam",), fields=("y",))
@@ -116,7 +116,7 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
     sources = [
         ArraySource({"cam": iter(shown)}),
         application.open([str(tmp_path / "rec")]),
-        ForeignSource(tmp_path / "rec" / "cam.mcap", ["/view/cam"]),
+        external(tmp_path / "rec" / "cam.mcap", ["/view/cam"]),
     ]
     found = [list(application.to(source)) for source in sources]
     assert [len(one.block) for one in found[0]] == [TAU] * 7 + [10]
@@ -169,7 +169,7 @@ def test_lines_come_block_by_block_and_are_those_of_what_was_recorded(
     assert done.code == 0, done.err
     lines = [json.loads(line) for line in done.out.splitlines()]
     assert [(line["t"], line["frames"]) for line in lines] == [(0, 20), (20, 20), (40, 10)]
-    source = ForeignSource(out, ["/view/lavfi_testsrc"])
+    source = external(out, ["/view/lavfi_testsrc"])
     assert source.spec.frame_shape == SIZE
     recorded = list(Application(run).to(source))
     for line, applied in zip(lines, recorded, strict=True):

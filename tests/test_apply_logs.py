@@ -30,7 +30,7 @@ from cdmisfa.experiments import apply_logs as applying
 from cdmisfa.experiments import store
 from cdmisfa.experiments.apply_logs import STORE, AppliedLogs, apply_to_logs
 from recorder.recording import record
-from replay.arrays import ArrayLog
+from replay.inputs import open_arrays
 
 ROOT = Path(__file__).parents[1]
 NAMES = ["a.mcap", "night/b.mcap", "night/c.mcap", "night/copy.mcap"]
@@ -70,7 +70,7 @@ def test_a_folder_of_logs_becomes_one_table(
     run: Path, logs: Path, cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
     shown = np.stack(list(pictures(50)))
-    record(ArrayLog({"cam": shown, "other": shown[::-1].copy()}), logs / "rec")
+    record(open_arrays({"cam": shown, "other": shown[::-1].copy()}), logs / "rec")
     shutil.copytree(run, logs / "learned")
     (logs / "broken.mcap").write_bytes(b"nothing")
     (logs / "unlike.csv").write_text("x\n1\n2\n")

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures
 from conftest import Cdmisfa
+from folders import external
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
-from replay.camera_logs.opening import open_images
-from replay.camera_logs.source import ForeignSource
+from replay.logs.opening import open_stream
 
 pytest.importorskip("rosbags")
 from rosbags import rosbag1, rosbag2
@@ -81,7 +81,7 @@ BAGS = [ros1_bag, ros2_bag, ros2_database, ros2_mcap]
 
 @pytest.mark.parametrize("make", BAGS)
 def test_every_image_is_there_in_its_place(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    source = ForeignSource(make(tmp_path), TOPICS, size=(HEIGHT, WIDTH))
+    source = external(make(tmp_path), TOPICS, size=(HEIGHT, WIDTH))
     assert source.spec.streams == ("cam_left", "cam_right")
     assert (source.spec.fps, source.spec.start_ns) == (50.0, 10**18)
     expected = np.stack(list(pictures(COUNT, 1)))
@@ -98,7 +98,7 @@ def test_a_torn_bag_is_one_line(make: Callable[[Path], Path], tmp_path: Path) ->
     raw = path.read_bytes()
     path.write_bytes(raw[: len(raw) // 2])
     with pytest.raises(LogDamagedError, match=r"cameras\.(bag|db3): rosbags cannot read it"):
-        ForeignSource(path, TOPICS).take(0, COUNT)
+        external(path, TOPICS).take(0, COUNT)
 
 
 @pytest.mark.parametrize("value", [5, "text"])
@@ -107,7 +107,7 @@ def test_a_message_that_is_no_bytes_is_damage(tmp_path: Path, value: object) -> 
     with contextlib.closing(sqlite3.connect(path)) as database, database:
         database.execute("UPDATE messages SET data = ?", (value,))
     with (
-        contextlib.closing(open_images(path, "/cam_left")) as images,
+        open_stream(path, "/cam_left") as images,
         pytest.raises(LogDamagedError, match=re.escape(f"{path}: /cam_left at ") + ".* no bytes"),
     ):
         images.image(0)
@@ -119,7 +119,7 @@ def test_without_rosbags_the_extra_is_named(
     path = ros1_bag(tmp_path)
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
     with pytest.raises(CdmisfaError, match=r"pip install rosbags \(the extra \[ros\]\)"):
-        ForeignSource(path, TOPICS)
+        external(path, TOPICS)
 
 
 @pytest.mark.parametrize("make", [ros1_bag, ros2_database, ros2_bag])
@@ -133,8 +133,9 @@ def test_a_bag_is_described_without_its_messages(
         unread.setattr(reader, "messages", lambda *_: pytest.fail("it was read"))
         channels = {c["topic"]: c for c in cdmisfa("info", path, "--json").json["channels"]}
         if make is not ros1_bag:
-            with contextlib.closing(open_images(path, "/cam_right")) as opened:
-                assert (len(opened.times), opened.times[-1]) == (COUNT, last)
+            with open_stream(path, "/cam_right") as opened:
+                assert opened.times is not None
+                assert (opened.count, opened.times[-1]) == (COUNT, last)
     assert {c["messages"] for c in channels.values()} == {COUNT}
     assert {(c["start_ns"], c["end_ns"]) for c in channels.values()} == {(10**18, last)}
 
@@ -152,9 +153,9 @@ def test_a_packed_bag_is_the_same(tmp_path: Path, kind: str) -> None:
     with writer:
         fill(writer, store, store.serialize_ros1 if ros1 else store.serialize_cdr, ros1)
     with (
-        contextlib.closing(open_images(packed, TOPICS[0])) as images,
-        contextlib.closing(open_images(whole, TOPICS[0])) as expected,
+        open_stream(packed, TOPICS[0]) as images,
+        open_stream(whole, TOPICS[0]) as expected,
     ):
-        np.testing.assert_array_equal(images.times, expected.times)
+        np.testing.assert_array_equal(images.times, expected.times)  # type: ignore[arg-type]
         for row in (*range(COUNT), 1, 3):
             np.testing.assert_array_equal(images.image(row), expected.image(row))

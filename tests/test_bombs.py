@@ -22,7 +22,7 @@ from recorder.log.files import RECORDING
 from recorder.log.logfile import LogFile
 from recorder.log.manifest import read_start
 from recorder.mcap.records import MalformedRecord
-from replay.camera_logs.opening import open_images
+from replay.logs.opening import open_stream
 from replay.runs.folders import REQUEST, RUN_JSON, RUN_METADATA, read_run_json
 from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.log import read_header
@@ -47,12 +47,9 @@ def growth(work: Callable[[], object]) -> float:
 
 
 def first_image(path: Path) -> None:
-    images = open_images(path, None)
-    try:
-        for row in range(min(images.count, 2)):
-            images.image(row)
-    finally:
-        images.close()
+    with open_stream(path) as stream:
+        for row in range(min(stream.count, 2)):
+            stream.image(row)
 
 
 @pytest.fixture(scope="module")

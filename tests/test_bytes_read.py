@@ -18,8 +18,8 @@ from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from recorder.world.oscillatory import OscillatorySource
+from replay.inputs import open_recording
 from replay.integrity.verify import check_log
-from replay.recordings.source import RecordedSource
 
 FRAMES = 2000
 
@@ -43,7 +43,7 @@ def share_read(path: Path, work: str) -> float:
         "from pathlib import Path\n"
         "from replay.integrity.info import describe\n"
         "from replay.integrity.verify import check_log\n"
-        "from replay.recordings.source import RecordedSource\n"
+        "from replay.inputs import open_recording\n"
         "from recorder.mcap.reader import LogReader\n"
         f"def work(path): {work}\n"
         "def read(): return int(Path('/proc/self/io').read_text().split()[1])\n"
@@ -65,8 +65,8 @@ def share_read(path: Path, work: str) -> float:
     ("work", "most"),
     [
         ("LogReader(path).close()", 0.01),
-        ("RecordedSource(path).close()", 0.05),  # looks at one chunk's layout
-        ("RecordedSource(path).describe()", 1.05),
+        ("open_recording(path).close()", 0.05),  # looks at one chunk's layout
+        ("open_recording(path).describe()", 1.05),
         ("describe(path)", 1.05),
         ("check_log(path)", 1.05),
     ],
@@ -110,7 +110,7 @@ def test_a_run_is_verified_in_one_pass(tmp_path: Path) -> None:
 def test_a_changed_fact_is_found_by_who_reads_all(noise: Path, tmp_path: Path) -> None:
     path = tmp_path / "left.mcap"
     path.write_bytes(noise.read_bytes().replace(b"plain", b"plane", 1))
-    assert RecordedSource(path).scene()["scene"] == "plane"
+    assert open_recording(path).scene()["scene"] == "plane"
     with pytest.raises(LogDamagedError, match="data section"):
-        RecordedSource(path).describe()
+        open_recording(path).describe()
     assert not check_log(path).ok

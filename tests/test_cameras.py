@@ -34,7 +34,7 @@ REFUSED = {
     "learn oscillatory --topic /left": "is a scene: --topic is for logs and cameras",
     "learn pictures": "--rate",
     "learn a.mcap --topic /cam_* --rate 25": "50 images a second, not 25",
-    "learn a.mcap --topic /cam_* --start 12 --end 5": "--start 12 is no earlier than --end 5",
+    "learn a.mcap --topic /cam_* --start 12 --end 5": "has no images there",
     "learn uneven.mcap --topic /cam_* --set input.gaps=hold --start 0.2 --end 1": (
         "--start 0.2 --end 1 --set input.gaps=hold --align time --rate 50"
     ),
@@ -82,10 +82,10 @@ def test_the_refusal_prints_a_command_that_works(cdmisfa: Cdmisfa, logs: Path) -
 
 
 def test_pictures_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    from replay.camera_logs.source import ForeignSource
+    from folders import external
 
     values = write_pictures(tmp_path / "left", 12)
-    frames = ForeignSource(tmp_path / "left", size=(12, 16), rate=10).take(0, 12).frames
+    frames = external(tmp_path / "left", size=(12, 16), rate=10).take(0, 12).frames
     np.testing.assert_array_equal(frames[:, 0, 0], values)
 
 

@@ -24,7 +24,7 @@ from recorder.mcap.chunks import decompressed
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
 from recorder.recording import record_scene
-from replay.recordings.view_file import ViewFile
+from replay.logs.formats.recording import ViewFile
 from tools.fuzz.oracle import tabled_rows
 
 pytestmark = pytest.mark.usefixtures("both_modules")

@@ -13,12 +13,11 @@ import psutil
 import pytest
 from camera_files import write_cameras
 from conftest import Cdmisfa
-from folders import contents
+from folders import contents, external
 from waiting import started, wait_for
 
 from recorder.recording import RecordingStoppedError, record, record_scene
 from recorder.world.oscillatory import OscillatoryConfig
-from replay.camera_logs.source import ForeignSource
 
 
 @pytest.mark.parametrize(
@@ -108,7 +107,7 @@ def test_a_conversion_is_resumed_by_convert(cdmisfa: Cdmisfa, tmp_path: Path) ->
     log, folder = tmp_path / "a.mcap", tmp_path / "rec"
     write_cameras(log, {"/left": (200, 20)})
     with pytest.raises(RecordingStoppedError):
-        record(ForeignSource([log], size=(12, 16)), folder, stop=lambda: True)
+        record(external([log], size=(12, 16)), folder, stop=lambda: True)
     for scene in ((), ("oscillatory",)):
         refused = cdmisfa("record", *scene, "--resume", "-o", folder)
         remedy = f"resume it with cdmisfa convert SOURCE -o {folder} --resume"

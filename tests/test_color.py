@@ -18,8 +18,8 @@ from recorder.images.framing import Framing
 from recorder.images.messages import decoder_of
 from recorder.images.options import InputOptions
 from recorder.images.videos import frame_colors
-from replay.camera_logs.hue import hue_varies
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
+from replay.logs.hue import hue_varies
 
 HEIGHT, WIDTH, COUNT = 12, 16, 60
 
@@ -87,7 +87,7 @@ def test_colours_are_learned_from_recorded_and_replayed_alike(
     assert run["source"]["recipe"].startswith("red, green and blue")
     gray = learned_alike(cdmisfa, tmp_path / "gray", log)
     assert gray["signals_sha256"] != run["signals_sha256"]
-    with RecordedSource(tmp_path / "rec") as source:
+    with open_recording(tmp_path / "rec") as source:
         assert (source.take(0, COUNT).frames == beside(colors())).all()
 
 

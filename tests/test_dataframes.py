@@ -11,7 +11,7 @@ import pytest
 import cdmisfa
 from cdmisfa import Run
 from cdmisfa.core.errors import UsageError
-from replay.arrays import ArrayLog
+from replay.inputs import open_arrays
 
 ROWS = 60
 COLUMNS = {
@@ -43,7 +43,7 @@ def test_tables_of_each_library_are_the_same_frames(kind: str) -> None:
     expected = np.column_stack(list(COLUMNS.values()))
     given = table(kind)
     for _ in range(2):  # a result of DuckDB is not used up
-        frames = ArrayLog({"car": given}).take(0, ROWS).frames
+        frames = open_arrays({"car": given}).take(0, ROWS).frames
         np.testing.assert_array_equal(frames, expected)
     recording = cdmisfa.Recording({"car": given, "again": table("pandas")})
     assert recording.spec.streams == ("car", "again")
@@ -73,16 +73,16 @@ def test_a_module_takes_tables_of_each_library(kind: str, module: Any) -> None:
     ("columns", "said"),
     [
         ({"speed": [1.0, 2.0], "name": ["a", "b"]}, "x: the column name is of type .*, no numbers"),
-        ({"speed": [1.0, None]}, "x: row 1, counted from 0, holds what is no finite number"),
+        ({"speed": [1.0, None]}, "x: row 1, counted from 0, holds NaN or infinity"),
         (
             {"on": [True, None]},
-            "x: row 1, counted from 0, holds what is no finite number|column on",
+            "x: row 1, counted from 0, holds NaN or infinity|column on",
         ),
     ],
 )
 def test_columns_of_no_numbers_are_one_line(kind: str, columns: Any, said: str) -> None:
     with pytest.raises(UsageError, match=said):
-        ArrayLog({"x": table(kind, columns)})
+        open_arrays({"x": table(kind, columns)})
 
 
 @pytest.fixture(scope="module")

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_files import encoded, pictures
+from folders import external
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from message_files import every, write_mcap
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.images import compressed
 from recorder.images.messages import MessageKind
-from replay.camera_logs import ahead, stream
-from replay.camera_logs.source import ForeignSource
+from replay.logs import images as ahead
 
 COUNT = 90
 BROKEN = (0, 17, 18, 21, 60)
@@ -51,7 +51,7 @@ def folder(path: Path, *broken: int) -> Path:
 def shown(path: Path, *, salvage: bool = False) -> tuple[list[np.ndarray], list[str], str]:
     """The frames in blocks of 7, what is said of broken ones, and the error that ends it."""
     frames: list[np.ndarray] = []
-    with contextlib.closing(ForeignSource(path, salvage=salvage, rate=25)) as source:
+    with contextlib.closing(external(path, salvage=salvage, rate=25)) as source:
         try:
             for left in range(source.frames, 0, -7):
                 frames.append(source.take(0, min(left, 7)).frames)
@@ -99,7 +99,7 @@ def test_few_pictures_are_held_and_each_is_decoded_once(
     assert (sum(map(len, frames)), len(waiting)) == (COUNT, COUNT - 1)
     assert max(waiting) <= 2 * 3
     waiting.clear()
-    with contextlib.closing(ForeignSource(tmp_path / "log.mcap", align="time", rate=60)) as source:
+    with contextlib.closing(external(tmp_path / "log.mcap", align="time", rate=60)) as source:
         while source.t < source.frames - 7:
             source.take_all(7)
     assert len(waiting) < COUNT
@@ -117,7 +117,7 @@ def anyhow(path: Path) -> list[np.ndarray | str]:
     """What is asked for without a plan: either stream, both at once, other places."""
     found: list[np.ndarray | str] = []
     order = np.random.default_rng(0)
-    with contextlib.closing(ForeignSource(path, ["/a", "/b"], loop=True, rate=25)) as source:
+    with contextlib.closing(external(path, ["/a", "/b"], loop=True, rate=25)) as source:
         for what in order.integers(0, 6, 60).tolist():
             n = int(order.integers(1, 20))
             try:
@@ -158,7 +158,7 @@ def test_whatever_is_asked_for_next_frames_and_errors_are_the_same(
 def test_an_interrupt_leaves_no_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ahead, "CORES", 2)
     before, log = threading.active_count(), write(tmp_path / "log.mcap")
-    with contextlib.closing(ForeignSource(log, rate=25)) as source:
+    with contextlib.closing(external(log, rate=25)) as source:
         source.take(0, 7)
         monkeypatch.setattr(Future, "exception", interrupted)
         with pytest.raises(KeyboardInterrupt):
@@ -180,6 +180,6 @@ def test_large_pictures_are_left_to_one_thread(
     monkeypatch.setattr(compressed, "budget", lambda: limits.append(1) or budget())
     frames = shown(log)[0]
     assert len(limits) < 10
-    monkeypatch.setattr(stream, "AT_ONCE", 20)
+    monkeypatch.setattr(ahead, "AT_ONCE", 20)
     assert all(map(np.array_equal, shown(log)[0], frames))
     assert len(limits) > COUNT

@@ -19,9 +19,9 @@ from waiting import running, wait_for
 
 import cdmisfa as package
 from cdmisfa.core.arrays import GRAY, centred, mean_of
-from replay.camera_logs.lerobot import PAUSE
 from replay.corpus.episodes import EpisodeSource
 from replay.inputs import locations
+from replay.logs.formats.lerobot import PAUSE
 from replay.runs.keyframes import read_keyframe
 
 STEP_MS = 50

@@ -21,7 +21,7 @@ from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.export import frames
 from replay.export.forms import export
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 ROOT = Path(__file__).parents[1]
 FRAMES = 53
@@ -228,7 +228,7 @@ def test_tasks_become_states_actions_and_episodes(cdmisfa, tmp_path):
     words = ("record", "gym:CartPole-v1", "--frames", 80, "--size", "40x30")
     assert cdmisfa(*words, "-o", tmp_path / "r").code == 0
     assert export(tmp_path / "r", tmp_path / "robot", "lerobot") == 80
-    with RecordedSource(tmp_path / "r") as source:
+    with open_recording(tmp_path / "r") as source:
         truth = source.take(0, 80).truth.astype(np.float32)
     data = pq.read_table(tmp_path / "robot/data/chunk-000/file-000.parquet")
     np.testing.assert_array_equal(data["observation.state"].to_pylist(), truth[:, :4])

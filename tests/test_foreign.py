@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_files import encoded, raw
+from folders import external
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
@@ -26,7 +27,6 @@ from recorder.images.compressed import compressed_image
 from recorder.images.messages import MessageKind, decoder_of, stated_format
 from recorder.images.options import InputOptions
 from recorder.images.pixels import DISTANCES, ENCODINGS, MalformedImage, raw_image, shrink
-from replay.camera_logs.source import ForeignSource
 
 RAW_IMAGES = MessageKind("foxglove.RawImage", "protobuf")
 RANDOM = np.random.default_rng(5)
@@ -233,15 +233,15 @@ def test_streams_that_differ_are_refused_with_what_would_work(tmp_path: Path) ->
     write(tmp_path / "a.mcap", {"/left": (30, 20), "/right": (15, 40)})
     topics = ["/left", "/right"]
     with pytest.raises(UsageError, match=r"--topic /right --size 4x3 --align time --rate 50 "):
-        ForeignSource(tmp_path / "a.mcap", topics, size=(3, 4))
-    source = ForeignSource(tmp_path / "a.mcap", topics, size=(3, 4), align="time", rate=50)
+        external(tmp_path / "a.mcap", topics, size=(3, 4))
+    source = external(tmp_path / "a.mcap", topics, size=(3, 4), align="time", rate=50)
     right = source.take(1, 29).frames[:, 0, 0].tolist()
     assert right == [i // 2 for i in range(29)]
     assert source.alignment["right"] == {"messages": 15, "repeated": 14, "dropped": 0}
     assert source.alignment["left"] == {"messages": 30, "repeated": 0, "dropped": 1}
-    slow = ForeignSource(tmp_path / "a.mcap", topics, size=(3, 4), align="time", rate=25)
+    slow = external(tmp_path / "a.mcap", topics, size=(3, 4), align="time", rate=25)
     assert slow.take(0, 15).frames[:, 0, 0].tolist() == list(range(0, 30, 2))
-    index = ForeignSource(tmp_path / "a.mcap", topics, size=(3, 4), align="index")
+    index = external(tmp_path / "a.mcap", topics, size=(3, 4), align="index")
     assert index.spec.length == 15
     assert index.alignment["left"]["dropped"] == 15
 
@@ -250,7 +250,7 @@ def test_one_log_a_stream(tmp_path: Path) -> None:
     for name in ("one", "two"):
         write(tmp_path / f"{name}.mcap", {"/image": (10, 20)})
     files = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
-    source = ForeignSource(files, size=(3, 4), loop=True)
+    source = external(files, size=(3, 4), loop=True)
     assert source.spec.streams == ("one_image", "two_image")
     source.seek(8)
     assert source.take(1, 4).frames[:, 0, 0].tolist() == [8, 9, 0, 1]
@@ -260,24 +260,24 @@ def test_topics_are_named_where_they_are_wrong(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, {"/left": (3, 20), "/right": (3, 20)})
     with pytest.raises(UsageError, match="/left, /right"):
-        ForeignSource(path, size=(3, 4))
+        external(path, size=(3, 4))
     with pytest.raises(UsageError, match="no topic /lefd"):
-        ForeignSource(path, ["/lefd"], size=(3, 4))
+        external(path, ["/lefd"], size=(3, 4))
     write_mcap(path, MessageKind("foxglove.Imu", "protobuf"), {"/imu": [(1, b"")]})
     with pytest.raises(UsageError, match=r"foxglove\.Imu in protobuf"):
-        ForeignSource(path, ["/imu"], size=(3, 4))
+        external(path, ["/imu"], size=(3, 4))
 
 
 def test_a_message_that_is_no_image_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, {"/left": (3, 20)})
     with pytest.raises(UsageError, match=r"a\.mcap: .* 8x6 is smaller than 80x60: .* images$"):
-        ForeignSource(path, size=(60, 80))
+        external(path, size=(60, 80))
     write(path, {"/left": (3, 20)}, broken_from=0)
     with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1000000000 ns"):
-        ForeignSource(path, size=(3, 4))
+        external(path, size=(3, 4))
     write(path, {"/left": (3, 20)}, broken_from=1)
-    source = ForeignSource(path, size=(3, 4))
+    source = external(path, size=(3, 4))
     with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1020000000 ns"):
         source.take(0, 2)
     assert source.t == 0

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_cameras, write_images
 from conftest import Cdmisfa
-from folders import contents
+from folders import contents, external
 from waiting import started, wait_for
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.camera_logs.source import ForeignSource
 
 SIZE = (HEIGHT, WIDTH)
 BOTH = ("--topic", "/left", "--topic", "/right", "--size", f"{WIDTH}x{HEIGHT}")
@@ -42,7 +41,7 @@ def parts(tmp_path: Path) -> list[Path]:
 
 
 def test_the_parts_of_a_bag_are_one_stream(parts: list[Path]) -> None:
-    source = ForeignSource(parts[0].parent, ["/right", "/left"], size=SIZE)
+    source = external(parts[0].parent, ["/right", "/left"], size=SIZE)
     assert (source.spec.length, source.spec.fps) == (120, 50.0)
     np.testing.assert_array_equal(source.take(1, 120).frames, list(pictures(120, 0)))
     source.seek(35)
@@ -54,10 +53,10 @@ def test_the_parts_of_a_bag_are_one_stream(parts: list[Path]) -> None:
 
 def test_files_that_follow_one_another_are_parts_of_one_topic(parts: list[Path]) -> None:
     named = [parts[i] for i in (2, 0, 1)]
-    source = ForeignSource(named, ["/left"], size=SIZE)
+    source = external(named, ["/left"], size=SIZE)
     assert source.spec.streams == ("left",)
     np.testing.assert_array_equal(source.take(0, 30).frames, list(pictures(30, 0)))
-    apart = ForeignSource(named, ["/left"], size=SIZE, align="index")
+    apart = external(named, ["/left"], size=SIZE, align="index")
     assert len(apart.spec.streams) == 3
 
 
@@ -65,8 +64,8 @@ def test_files_at_the_same_time_stay_streams(parts: list[Path]) -> None:
     write_part(parts[0].parent / "other.mcap", range(5, 15))
     both = [parts[0], parts[0].parent / "other.mcap"]
     with pytest.raises(UsageError, match="--align"):
-        ForeignSource(both, ["/left"], size=SIZE)
-    assert len(ForeignSource(both, ["/left"], size=SIZE, align="time").spec.streams) == 2
+        external(both, ["/left"], size=SIZE)
+    assert len(external(both, ["/left"], size=SIZE, align="time").spec.streams) == 2
 
 
 def test_a_part_that_was_cut_before_its_first_message_is_left_out_and_said(
@@ -74,14 +73,14 @@ def test_a_part_that_was_cut_before_its_first_message_is_left_out_and_said(
 ) -> None:
     os.truncate(parts[3], 42)
     options: dict[str, Any] = {"size": SIZE, "align": "time", "rate": 50}
-    with ForeignSource(parts[0].parent, ["/r*"], **options) as source:
+    with external(parts[0].parent, ["/r*"], **options) as source:
         assert source.alignment["right"]["messages"] == 110
         assert f"{parts[3]}: " in source.warnings[1]
         assert source.warnings[1].endswith("there is no message before: left out")
     for part in parts:
         os.truncate(part, 42)
     with pytest.raises(LogDamagedError, match="there is no message before"):
-        ForeignSource(parts[0].parent, ["/right"], size=SIZE)
+        external(parts[0].parent, ["/right"], size=SIZE)
 
 
 def test_a_killed_conversion_is_resumed(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

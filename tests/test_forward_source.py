@@ -16,7 +16,7 @@ from live_cameras import SHAPE, bar
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from recorder.recording import RecordingStoppedError, record
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 FRAMES = 700
 
@@ -79,7 +79,7 @@ def test_what_was_recorded_is_what_the_cameras_showed(cdmisfa: Cdmisfa, recordin
     assert not isinstance(Webcams(), SeekableSource)
     assert sorted(contents(recording)) == ["left.mcap", "right.mcap"]
     assert cdmisfa("verify", recording).code == 0
-    source = RecordedSource(recording)
+    source = open_recording(recording)
     assert source.spec == Webcams(length=FRAMES).spec
     for one, two in zip(source.take_all(FRAMES), Webcams().take_all(FRAMES), strict=True):
         same(one, two)
@@ -116,7 +116,7 @@ def test_a_camera_that_is_unplugged_leaves_readable_partials(tmp_path: Path) -> 
 
     with pytest.raises(LogExhaustedError, match="unplugged"):
         record(Unplugged(), tmp_path / "rec")
-    assert len(RecordedSource(tmp_path / "rec").take(0, 90)) == 90
+    assert len(open_recording(tmp_path / "rec").take(0, 90)) == 90
 
 
 def test_a_source_that_ends_is_recorded_to_its_end(tmp_path: Path) -> None:

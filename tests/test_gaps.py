@@ -14,16 +14,16 @@ import pytest
 from camera_files import write_images
 from conftest import Cdmisfa
 from contracts.sources import SourceContract
-from folders import contents, coverage
+from folders import contents, coverage, external
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError
 from recorder.images.framing import FRAME_PIXELS, default_size, fitted
 from recorder.images.options import Align, Fit
 from recorder.recording import RecordingStoppedError, record, recorded
-from replay.camera_logs.source import ForeignSource
-from replay.recordings.source import RecordedSource
-from replay.recordings.view_file import intersection
+from replay.inputs import open_recording
+from replay.logs.clock import intersection
+from replay.logs.source import LoggedSource
 
 STEP_MS = 20
 PAUSED = (*range(0, 2000, STEP_MS), *range(5000, 9000, STEP_MS))
@@ -49,17 +49,17 @@ class TestWithoutGaps(SourceContract):
         self.path = write_log(tmp_path / "log.mcap", PAUSED)
 
     def open(self) -> FrameSource:
-        return ForeignSource(self.path, gaps="hold")
+        return external(self.path, gaps="hold")
 
 
-def values(source: ForeignSource, n: int) -> tuple[int, list[int]]:
+def values(source: LoggedSource, n: int) -> tuple[int, list[int]]:
     block = source.take(0, n)
     return block.t, block.frames[:, 0, 0].tolist()
 
 
 @pytest.mark.parametrize("align", [None, "time"])
 def test_no_block_reaches_across_a_gap(tmp_path: Path, align: Align | None) -> None:
-    source = ForeignSource(write_log(tmp_path / "log.mcap", PAUSED), align=align)
+    source = external(write_log(tmp_path / "log.mcap", PAUSED), align=align)
     assert (source.frames, source.pauses) == (450, {"cam": [(100, 250)]})
     assert values(source, 90) == (0, list(range(90)))
     assert values(source, 90) == (250, [i % 256 for i in range(100, 190)])
@@ -90,7 +90,7 @@ def test_images_at_other_times_than_their_frames_are_said(
     times: Sequence[int], said: str, tmp_path: Path
 ) -> None:
     path = write_log(tmp_path / "log.mcap", times)
-    warnings = ForeignSource(path).warnings
+    warnings = external(path).warnings
     if not said:
         assert not [line for line in warnings if "by number" in line]
         return
@@ -98,21 +98,21 @@ def test_images_at_other_times_than_their_frames_are_said(
     assert line.startswith(f"{path}: /cam is taken by number, its rate uneven ")
     assert said in line
     remedy = line.split("--align time --rate ")[1].split()[0]
-    kept = ForeignSource(path, align="time", rate=float(remedy))
+    kept = external(path, align="time", rate=float(remedy))
     assert not kept.warnings
     assert kept.frames / kept.spec.fps == pytest.approx((times[-1] - times[0]) / 1000, abs=0.05)
-    assert not ForeignSource(path, align="index").warnings
+    assert not external(path, align="index").warnings
 
 
 def test_a_gap_comes_again_with_every_turn(tmp_path: Path) -> None:
-    source = ForeignSource(write_log(tmp_path / "log.mcap", PAUSED), loop=True)
+    source = external(write_log(tmp_path / "log.mcap", PAUSED), loop=True)
     assert [values(source, 150)[0] for _ in range(4)] == [250, 400, 700, 850]
     with pytest.raises(LogExhaustedError, match="without a gap"):
         source.take(0, 500)
 
 
 def test_held_gaps_show_the_last_image(tmp_path: Path) -> None:
-    source = ForeignSource(write_log(tmp_path / "log.mcap", PAUSED), gaps="hold")
+    source = external(write_log(tmp_path / "log.mcap", PAUSED), gaps="hold")
     source.seek(90)
     assert values(source, 170) == (90, [*range(90, 100), *[99] * 150, *range(100, 110)])
     assert "the last image is shown" in source.warnings[0]
@@ -120,7 +120,7 @@ def test_held_gaps_show_the_last_image(tmp_path: Path) -> None:
 
 def test_a_part_of_a_log_is_taken(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.mcap", range(0, 4000, STEP_MS))
-    source = ForeignSource(log, start=1.0, end=2.0)
+    source = external(log, start=1.0, end=2.0)
     assert (source.frames, source.spec.start_ns) == (50, 10**9)
     assert values(source, 50) == (0, list(range(50, 100)))
 
@@ -189,7 +189,7 @@ def test_a_conversion_with_gaps_is_resumed(tmp_path: Path, split: float | None) 
     def converted(name: str, after: int, *, resume: bool = False) -> Path:
         told: list[float] = []
         how = {"stop": lambda: len(told) > after, "progress": told.append}
-        source = ForeignSource([left, right], align="time", rate=50, start=0.4)
+        source = external([left, right], align="time", rate=50, start=0.4)
         with contextlib.closing(source), contextlib.suppress(RecordingStoppedError):
             record(source, tmp_path / name, split=split, resume=resume, **how)
         return tmp_path / name
@@ -216,7 +216,7 @@ def test_a_dataset_has_an_episode_between_gaps(cdmisfa: Cdmisfa, tmp_path: Path)
     assert cdmisfa("convert", left, right, "--align", "time", "-o", rec).code == 0
     done = cdmisfa("export", rec, "--to", "lerobot", "--lossless", "-o", out)
     assert done.code == 0, done.err
-    with RecordedSource(rec) as source:
+    with open_recording(rec) as source:
         one, two = source.coverage().values()
         shared = intersection(one, two)
         assert len(shared) == 2
@@ -233,7 +233,7 @@ def test_a_dataset_has_an_episode_between_gaps(cdmisfa: Cdmisfa, tmp_path: Path)
         assert starts == [0, lengths[0] / 50]
         for row, frames in zip(episodes, own, strict=True):
             assert row[f"stats/{key}/mean"][0][0][0] == pytest.approx(frames.mean() / 255)
-        with ForeignSource(out, [key]) as source:
+        with external(out, [key]) as source:
             read = [_frames(source, 0, *span) for span in source.spans(0, 0, source.frames)]
         for frames, again in zip(own, read, strict=True):
             assert np.abs(frames.astype(int) - again).max() <= 1

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import external
 from message_files import write_table
 from numpy.typing import NDArray
 from PIL import Image
@@ -21,7 +22,6 @@ from cdmisfa.experiments.holdout import judged
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.features.sfa import batch_sfa, slowness
 from cdmisfa.modules import Module
-from replay.camera_logs.source import ForeignSource
 from replay.runs.modules import load_modules
 
 FRAMES = 6000
@@ -174,7 +174,7 @@ def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -
     none, policy = np.zeros(1), np.zeros(0, np.int64)
     learned = Module(1, "log", 0, 0, np.eye(6)[:1], np.zeros(6), none, none, none, policy)
     for salvage in (False, True):
-        with ForeignSource(tmp_path, rate=5, salvage=salvage) as source:
+        with external(tmp_path, rate=5, salvage=salvage) as source:
             source.hold_out(20)
             source.take(0, 100)
             with pytest.raises(LogExhaustedError, match="before 20 held out"):

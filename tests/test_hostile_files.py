@@ -26,9 +26,8 @@ from recorder.log.logfile import LogFile
 from recorder.log.resume import frames_held
 from recorder.mcap.records import KINDS
 from recorder.recording import record_scene
-from replay.camera_logs import pictures
-from replay.camera_logs.opening import open_images
 from replay.integrity.info import describe
+from replay.logs.formats.images import MAX_IMAGE, image_files
 from replay.runs.folders import REQUEST, RUN_METADATA, read_run_json
 from replay.runs.log import read_header
 from replay.runs.modules import load_modules, save_modules
@@ -38,9 +37,9 @@ from replay.storage.arrays import stored_arrays
 def test_a_huge_picture_is_refused_unread(tmp_path: Path) -> None:
     write_pictures(tmp_path / "pictures", 3)
     with (tmp_path / "pictures" / "2.png").open("r+b") as file:
-        file.truncate(pictures.MAX_PICTURE + 1)
+        file.truncate(MAX_IMAGE + 1)
     with pytest.raises(CdmisfaError, match=r"2\.png: \d+ bytes.*limit"):
-        open_images(tmp_path / "pictures", None)
+        image_files(tmp_path / "pictures")
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])

@@ -15,7 +15,7 @@ from cdmisfa.core.learning import Learner
 from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.studies.paper import icub
 from cdmisfa.studies.paper.experiment import paper_config
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 
@@ -28,7 +28,7 @@ def config(components: int) -> LearnerConfig:
 
 @pytest.mark.parametrize("components", COMPONENTS)
 def test_object_1_then_object_3(components: int) -> None:
-    with RecordedSource(SAMPLE, loop=True) as source:
+    with open_recording(SAMPLE, loop=True) as source:
         learner = open_learner(config(components), source.spec, 2)
         learn_blocks(source, learner, max_iterations=icub.ITERATIONS, max_modules=2)
     found = [(m.stream_index, "".join(map(str, m.policy))) for m in learner.modules]
@@ -46,7 +46,7 @@ def test_live_and_recorded_are_the_same(tmp_path: Path) -> None:
 
     scene = IcubConfig(seed=4)
     record_scene("icub", tmp_path, scene, frames=400)
-    live, recorded = open_scene("icub", scene), RecordedSource(tmp_path)
+    live, recorded = open_scene("icub", scene), open_recording(tmp_path)
     assert after_ten(live) == after_ten(recorded)
 
 

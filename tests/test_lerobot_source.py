@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 from camera_files import encoded, pictures, write_cameras
 from conftest import Cdmisfa
+from folders import external
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.camera_logs.lerobot import PAUSE
-from replay.camera_logs.source import ForeignSource
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
+from replay.logs.formats.lerobot import PAUSE
 
 pytest.importorskip("av")
 
@@ -57,7 +57,7 @@ def as_pictures(dataset: Path) -> None:
 def test_episodes_follow_one_another_after_a_pause(dataset: Path, kept: str) -> None:
     if kept == "pictures":
         as_pictures(dataset)
-    source = ForeignSource(dataset)
+    source = external(dataset)
     assert source.pauses["cam"] == [(FIRST, FIRST + PAUSE)]
     expected = np.stack(list(pictures(COUNT)))
     blocks = source.take_all(COUNT + PAUSE)
@@ -81,35 +81,35 @@ def test_numbers_come_back_as_they_were_exported(cdmisfa: Cdmisfa, tmp_path: Pat
     assert tasks == [{"task_index": 0, "__index_level_0__": "oscillate"}]
     expected = []
     for name, count in frames.items():
-        with RecordedSource(tmp_path / name) as one:
+        with open_recording(tmp_path / name) as one:
             views = one.spec.streams
             expected.append(np.hstack([block.frames for block in one.take_all(count)]))
     fields = [f"observation.{view}" for view in views]
-    with ForeignSource(out, fields=fields) as source:
+    with external(out, fields=fields) as source:
         assert source.pauses == {"data": [(60, 60 + PAUSE)]}
         found = [block.frames for block in source.take_all(101 + PAUSE)]
     for block, numbers in zip(found, expected, strict=True):
         np.testing.assert_array_equal(block, numbers.astype(np.float32))
     with pytest.raises(UsageError, match="no numbers state; it has observation"):
-        ForeignSource(out, fields=["state"])
+        external(out, fields=["state"])
     table = out / "data/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(table).slice(0, 50), table)
     with pytest.raises(LogDamagedError, match="LeRobot's layout"):
-        ForeignSource(out, fields=fields)
+        external(out, fields=fields)
 
 
 def test_what_is_no_such_dataset_is_one_line(dataset: Path) -> None:
     with pytest.raises(UsageError, match=f"no topic cam; it has images on: {KEY}"):
-        ForeignSource(dataset, ["cam"])
+        external(dataset, ["cam"])
     info = dataset / "meta/info.json"
     text = info.read_text()
     info.write_text(text.replace("v3.0", "v2.1"))
     with pytest.raises(UsageError, match=r"LeRobot dataset v2\.1"):
-        ForeignSource(dataset)
+        external(dataset)
     info.write_text(text[:50])
     with pytest.raises(LogDamagedError, match="describes no LeRobot dataset"):
-        ForeignSource(dataset)
+        external(dataset)
     info.write_text(text)
     next(dataset.glob("videos/*/*/*.mp4")).unlink()
     with pytest.raises(LogDamagedError, match="no such file"):
-        ForeignSource(dataset)
+        external(dataset)

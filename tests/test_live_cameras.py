@@ -25,9 +25,9 @@ from cdmisfa.experiments.session import run
 from recorder.cameras.live import LiveSource, Steady
 from recorder.cameras.readers import CameraFrames, Readers
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
+from replay.inputs import open_recording
 from replay.integrity.info import describe
 from replay.integrity.verify import check_log
-from replay.recordings.source import RecordedSource
 
 FPS = 30.0
 
@@ -193,7 +193,7 @@ def test_what_is_learned_live_is_learned_again_from_the_recording(
     counts = live.alignment
     for name in ("repeated", "dropped", "missing", "late", "disordered"):
         assert sum(count[name] for count in counts.values()) > 0, name
-    with RecordedSource(tmp_path / "rec") as source:
+    with open_recording(tmp_path / "rec") as source:
         again = learned(source, config)
     assert again.signals_sha256 == first.signals_sha256
     assert again.iterations == first.iterations > 20
@@ -356,7 +356,7 @@ def test_a_recording_with_gaps_is_shown_with_its_gaps(tmp_path: Path) -> None:
     source = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
     record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
     assert check_log(tmp_path / "rec").ok
-    with RecordedSource(tmp_path / "rec", loop=True) as looped:
+    with open_recording(tmp_path / "rec", loop=True) as looped:
         looped.seek(85)
         block = looped.take(0, 10)
         # it goes on at its beginning without a cut, as a programme that starts again

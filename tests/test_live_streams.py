@@ -32,7 +32,7 @@ from cdmisfa.core.errors import UsageError
 from recorder.cameras.video import VideoCamera
 from recorder.cameras.words import is_live, live_names, open_live
 from recorder.images.options import InputOptions
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 TEST = "av:lavfi:testsrc=size=160x120:rate=30"
 
@@ -132,7 +132,7 @@ def learned_twice(cdmisfa: Cdmisfa, place: Path, *words: str) -> dict[str, Any]:
     again = cdmisfa("learn", place / "rec", *options).json
     assert again["signals_sha256"] == live.json["signals_sha256"]
     stated = json.loads((place / "run" / "run.json").read_text())["config"]["record"]
-    with RecordedSource(place / "rec") as source:
+    with open_recording(place / "rec") as source:
         assert (stated["fps"], stated["start_ns"]) == (source.spec.fps, source.spec.start_ns)
     return {**live.json, "said": live.err}
 
@@ -166,7 +166,7 @@ def test_a_video_is_recorded_until_it_ends(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     clip = write_clip(tmp_path / "clip.mkv")
     done = cdmisfa("record", f"av:{clip}", "-o", str(tmp_path / "rec"), "--size", "64x48")
     assert re.search(r"ended at frame \d+: clip ended$", done.err, re.MULTILINE)
-    with RecordedSource(tmp_path / "rec") as source:
+    with open_recording(tmp_path / "rec") as source:
         assert source.spec.fps == 25
         (held,) = source.coverage().values()
         shown = [block.frames[:, 0, 0].tolist() for block in source.take_all(source.frames)]
@@ -271,14 +271,14 @@ def test_images_and_numbers_of_a_running_robot_are_recorded_and_learned_from(
     words = [f"{robot.address}/cam/left", f"{robot.address}/cam/right", "--size", "64x48"]
     run = learned_twice(cdmisfa, tmp_path / "images", *words)
     assert run["source"]["rate"] == pytest.approx(50, rel=0.3)
-    with RecordedSource(tmp_path / "images" / "rec") as source:
+    with open_recording(tmp_path / "images" / "rec") as source:
         assert source.spec.streams == ("cam_left", "cam_right")
         shown = source.take(0, 20).frames
         assert (shown == shown[:, :1, :1]).all()
         assert (np.diff(shown[:, 0, 0].astype(int)) % 256 <= 3).all()
     run = learned_twice(cdmisfa, tmp_path / "k", f"{robot.address}/words", "--field", "k")
     assert run["source"]["fields"] == ["k"]
-    with RecordedSource(tmp_path / "k" / "rec") as source:
+    with open_recording(tmp_path / "k" / "rec") as source:
         assert (np.diff(source.take(0, 20).frames[:, 0]) <= 3).all()
     with pytest.raises(UsageError, match="there is no z, it has k"):
         open_live([f"{robot.address}/words"], InputOptions(fields=("z",)))
@@ -352,7 +352,7 @@ def ended(rec: Path, number: int, least: int) -> tuple[int, str]:
 def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
     code, said = ended(tmp_path / "rec", signal.SIGINT, 0)
     assert code == 0, said
-    with RecordedSource(tmp_path / "rec") as source:
+    with open_recording(tmp_path / "rec") as source:
         assert source.frames > 3
     assert (tmp_path / "rec" / "lavfi_testsrc.mcap").exists()
 
@@ -366,7 +366,7 @@ def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
     assert refused.code == 2
     assert "is of live streams, which cannot go back" in refused.err
     cdmisfa("recover", str(tmp_path / "rec"), "-o", str(tmp_path / "saved"))
-    with RecordedSource(tmp_path / "saved") as source:
+    with open_recording(tmp_path / "saved") as source:
         assert source.frames > 0
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from folders import flip
+from folders import external, flip
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SeekableSource, description
@@ -23,11 +23,10 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
-from replay.camera_logs.source import ForeignSource
-from replay.recordings.source import RecordedSource
+from replay import stored
+from replay.inputs import open_recording
 from replay.runs.compare import different_settings
 from replay.runs.log import read_header
-from replay.storage import identity
 
 CONFIG = LearnerConfig(tau=20)
 ITERATIONS = 12
@@ -36,7 +35,7 @@ ITERATIONS = 12
 @pytest.fixture(autouse=True)
 def long(monkeypatch: pytest.MonkeyPatch) -> None:
     """All logs count as long."""
-    monkeypatch.setattr(identity, "AT_ONCE", 0)
+    monkeypatch.setattr(stored, "AT_ONCE", 0)
 
 
 @pytest.fixture
@@ -65,7 +64,7 @@ def killed() -> None:
 
 def learn(path: Path, out: Path, *sinks: Sink, **how: Any) -> RunResult:
     with_end = {"max_iterations": ITERATIONS, "rerun": False, **how}
-    source = RecordedSource(path)
+    source = open_recording(path)
     try:
         return run(source, CONFIG, out, sinks=sinks, **with_end)
     finally:
@@ -86,7 +85,7 @@ def test_a_run_begins_with_a_sample_and_ends_with_the_sha256(
         seen.extend(read_header(tmp_path / "run").manifest["source"]["views"])
 
     result = learn(recording, tmp_path / "run", Then(look))
-    monkeypatch.setattr(identity, "AT_ONCE", 2**40)
+    monkeypatch.setattr(stored, "AT_ONCE", 2**40)
     before = learn(recording, tmp_path / "before")
     keys = {"name", "frames", "file", "bytes", "sample_sha256"}
     assert [view.keys() for view in seen] == [keys] * 3
@@ -117,9 +116,9 @@ def table(path: Path, value: int) -> Path:
 def source_of(kind: str, recording: Path, folder: Path, value: int) -> SeekableSource:
     folder.mkdir()
     if kind == "recording":
-        return RecordedSource(recording)
+        return open_recording(recording)
     make = {"pictures": pictures, "table": table}[kind]
-    return ForeignSource(make(folder / "log.csv", value), rate=10)
+    return external(make(folder / "log.csv", value), rate=10)
 
 
 @pytest.mark.parametrize("kind", ["recording", "pictures", "table"])
@@ -141,7 +140,7 @@ def test_every_kind_of_log_is_known_by_a_sample_and_in_the_end_by_all_of_it(
         other = source_of(kind, oscillatory_recording, tmp_path / "b", 2)
         assert description(other, at_once=True)["files"][0]["bytes"] == known["bytes"]
         assert description(other, at_once=True)["files"][0] != known
-    monkeypatch.setattr(identity, "AT_ONCE", 2**40)
+    monkeypatch.setattr(stored, "AT_ONCE", 2**40)
     assert description(source, at_once=True) == description(source)
     source.close()
 

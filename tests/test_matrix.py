@@ -22,6 +22,7 @@ from camera_files import (
 )
 from conftest import Cdmisfa
 from contracts.sources import SourceContract
+from folders import external
 from message_files import STEP, every, learned_alike, write_mcap, write_table
 from PIL import Image
 from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
@@ -31,7 +32,6 @@ from web_server import serving
 
 from cdmisfa.core.blocks import FrameSource
 from recorder.images.messages import MessageKind
-from replay.camera_logs.source import ForeignSource
 from replay.corpus.index import read_index
 
 COUNT = 60
@@ -136,7 +136,7 @@ class TestSources(SourceContract):
     def open(self) -> FrameSource:
         topics = ["/cam_*"] if self.kind in BAGS else []
         rate = 50.0 if self.kind in (*PICTURES, "table") else None
-        return ForeignSource(self.paths, topics, rate=rate)
+        return external(self.paths, topics, rate=rate)
 
 
 def write_numbers(table: Path, log: Path) -> None:

@@ -24,9 +24,9 @@ from recorder.mcap import store
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import OnePass, Store
 from recorder.recording import RecordingStoppedError, record, record_scene, recorded
+from replay.inputs import open_recording
 from replay.integrity.recover import RepairedStore
 from replay.integrity.verify import check_log
-from replay.recordings.source import RecordedSource
 
 HERE = Path(__file__).parent
 LIMIT = 64
@@ -53,9 +53,9 @@ def test_more_parts_than_files_may_be_open_are_read(parts: Path) -> None:
         f"import sys; sys.path.append({str(Path(__file__).parent)!r})\n"
         "from contracts.sources import same\n"
         "from recorder.world.oscillatory import OscillatorySource\n"
-        "from replay.recordings.source import RecordedSource\n"
+        "from replay.inputs import open_recording\n"
         "from replay.integrity.verify import check_log\n"
-        "live, source = OscillatorySource(), RecordedSource(sys.argv[1])\n"
+        "live, source = OscillatorySource(), open_recording(sys.argv[1])\n"
         "for _ in range(2):\n"
         "    source.seek(0), live.seek(0)\n"
         f"    for i in range({FRAMES // 50}): same(source.take(i % 3, 50), live.take(i % 3, 50))\n"
@@ -186,7 +186,7 @@ def test_each_of_many_views_names_only_its_own(tmp_path: Path) -> None:
     one, other = (folder / "v0007.mcap" for folder in (many, more))
     assert one.stat().st_size == other.stat().st_size < (few / "v0007.mcap").stat().st_size
     for folder in (few, many, more):
-        with RecordedSource(folder) as source:
+        with open_recording(folder) as source:
             assert source.spec.streams == ManyViews(len(list(folder.iterdir()))).spec.streams
             (config,) = LogReader(folder / "v0000.mcap").attachments
             assert config.name == "config.json"

@@ -15,8 +15,8 @@ from cdmisfa.core.errors import UsageError
 from recorder.config import parse_split
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
+from replay.inputs import open_recording
 from replay.integrity.verify import check_log
-from replay.recordings.source import RecordedSource
 
 FRAMES = 700
 SPLIT = 3.0
@@ -38,13 +38,13 @@ class TestParts(SourceContract):
         self.folder = parts
 
     def open(self) -> FrameSource:
-        return RecordedSource(self.folder)
+        return open_recording(self.folder)
 
 
 def test_parts_read_as_one(parts: Path) -> None:
     assert len(list(parts.glob("x1-*.mcap"))) == 5
     assert check_log(parts).ok
-    live, recorded = OscillatorySource(), RecordedSource(parts)
+    live, recorded = OscillatorySource(), open_recording(parts)
     assert recorded.spec.length == FRAMES
     for i in range(FRAMES // 35):
         same(live.take(i % 3, 35), recorded.take(i % 3, 35))
@@ -74,7 +74,7 @@ def test_kill_9_at_any_moment_leaves_parts_that_play_and_go_on(parts: Path, tmp_
         folder = tmp_path / str(count)
         with running("-c", program, folder) as process:
             wait_for(lambda f=folder, n=count: len(list(f.glob("x3-*"))) >= n, 60, process)
-        with RecordedSource(folder) as source:
+        with open_recording(folder) as source:
             length = source.frames
             same(source.take(1, length), OscillatorySource().take(1, length))
         record_scene("oscillatory", folder, frames=FRAMES, split=SPLIT, resume=True)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, encoded, pictures, write_cameras
+from folders import external
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
 
 from recorder.mcap.reader import LogReader
 from recorder.recording import record
-from replay.camera_logs.source import ForeignSource
 
 COUNT = 200
 SIZE = (HEIGHT, WIDTH)
@@ -45,7 +45,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One view of images, as the recorder writes it."""
     folder = tmp_path_factory.mktemp("peers")
     write_cameras(folder / "a.mcap", {"/cam": (COUNT, 20)})
-    source = ForeignSource(folder / "a.mcap", size=SIZE)
+    source = external(folder / "a.mcap", size=SIZE)
     (written,) = record(source, folder / "rec")
     source.close()
     return written.file
@@ -131,7 +131,7 @@ def test_logs_of_mcap_ros2_are_streams(tmp_path: Path, kind: str) -> None:
 
 
 def _check(path: Path) -> None:
-    source = ForeignSource(path, ["/cam"], size=SIZE)
+    source = external(path, ["/cam"], size=SIZE)
     assert (source.spec.fps, source.spec.length, source.spec.start_ns) == (50.0, COUNT, stamp(0))
     np.testing.assert_array_equal(source.take(0, COUNT).frames, EXPECTED)
     source.close()

@@ -39,7 +39,7 @@ from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure
 from recorder.recording import record
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 CONFIG = ProgressConfig(components=8)
 NO_TRUTH = np.zeros((40, 0))
@@ -116,7 +116,7 @@ def test_live_recorded_and_resumed_are_the_same_bit_for_bit(tmp_path: Path) -> N
     names = ("noise", "swing", "constant", "stroll")
     live = run(MovingPictures(*names), CONFIG, tmp_path / "live", rerun=False)
     record(MovingPictures(*names), tmp_path / "log", frames=live.frames)
-    recorded = run(RecordedSource([tmp_path / "log"]), CONFIG, tmp_path / "recorded", rerun=False)
+    recorded = run(open_recording([tmp_path / "log"]), CONFIG, tmp_path / "recorded", rerun=False)
     assert recorded.signals_sha256 == live.signals_sha256
     stopped = run(MovingPictures(*names), CONFIG, tmp_path / "run", max_iterations=37, keyframes=10)
     assert stopped.iterations == 37

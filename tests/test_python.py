@@ -22,7 +22,8 @@ from cdmisfa import Recording, Run, learn
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.resume import check_run
 from recorder.images.options import InputOptions
-from replay.arrays import ArrayLog
+from replay.inputs import open_arrays
+from replay.logs.source import LoggedSource
 
 ROOT = Path(__file__).parents[1]
 FEW: dict[str, Any] = {"max_iterations": 12, "tau": 20}
@@ -47,16 +48,16 @@ class Table:
 class TestArrays(SourceContract):
     ends = True
 
-    def open(self) -> ArrayLog:
+    def open(self) -> LoggedSource:
         rows = pictures(8, 12, 3)[:100]
-        return ArrayLog({"left": rows, "right": 255 - rows}, InputOptions(size=(4, 6), rate=10))
+        return open_arrays({"left": rows, "right": 255 - rows}, InputOptions(size=(4, 6), rate=10))
 
 
 class TestNumbers(SourceContract):
     ends = True
 
-    def open(self) -> ArrayLog:
-        return ArrayLog({"all": numbers(60)})
+    def open(self) -> LoggedSource:
+        return open_arrays({"all": numbers(60)})
 
 
 @pytest.mark.parametrize(
@@ -102,12 +103,12 @@ def test_pictures_of_any_type_are_the_same_frames() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ([[1.0, 2.0], [3.0, np.nan]], "stream: row 1, counted from 0, holds what is no finite"),
-        ({"cam": np.zeros((9, 3, 20, 30))}, r"cam: .*move its colours last, np.moveaxis"),
+        ([[1.0, 2.0], [3.0, np.nan]], "stream: row 1, counted from 0, holds NaN"),
+        ({"cam": np.zeros((9, 3, 20, 30))}, r"cam: .* np.moveaxis\(x, 1, -1\) moves colours last"),
         (1000 * numbers().reshape(-1, 4, 5), "scale them to 0 to 1"),
-        (["one", 2], "no numbers"),
-        (np.zeros((0, 3)), "it is empty"),
-        ({"a": numbers(), "b": pictures(4, 5)}, "a rows of 3 and b pictures"),
+        (["one", 2], "an array .* of <U21: give"),
+        (np.zeros((0, 3)), "an array .0, 3. of float64: give"),
+        ({"a": numbers(), "b": pictures(4, 5)}, "these show 3 numbers and images"),
         ("nowhere.npz", "no such file"),
         (numbers()[:10], "10 frames are left at frame 0, 40 are needed"),
     ],

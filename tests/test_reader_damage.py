@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, IndexType
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.reader import LogReader
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 MESSAGES = 40
 
@@ -206,7 +206,7 @@ def test_a_recording_cut_off_while_it_is_read_is_damage(
     tmp_path: Path, oscillatory_recording: Path, share: float
 ) -> None:
     copy = Path(shutil.copytree(oscillatory_recording, tmp_path / "copy"))
-    with RecordedSource(sorted(copy.glob("*.mcap"))) as source:
+    with open_recording(sorted(copy.glob("*.mcap"))) as source:
         source.take(0, 40)
         os.truncate(copy / "x1.mcap", int(share * (copy / "x1.mcap").stat().st_size))
         with contextlib.suppress(LogDamagedError):

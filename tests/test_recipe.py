@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from camera_files import RAW, raw
 from conftest import Cdmisfa
+from folders import external
 from message_files import write_mcap
 
 from cdmisfa import Module, Recipe, Run, make_frame
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import Depth, Fit
-from replay.camera_logs.source import ForeignSource
 from replay.runs.modules import load_modules, save_modules
 
 RNG = np.random.default_rng(5)
@@ -61,7 +61,7 @@ def test_a_raw_picture_becomes_the_frame_that_the_log_shows(
     dtype, shape, color, depth = KINDS[encoding]
     pictures = of_type(dtype, *shape)
     log = logged(tmp_path / "a.mcap", pictures, encoding)
-    source = ForeignSource(log, size=(8, 16), fit=fit, color=color, range=depth)
+    source = external(log, size=(8, 16), fit=fit, color=color, range=depth)
     frames = source.take(0, len(pictures)).frames
     recipe = Recipe.of(source.describe(), frames.shape[1:])
     assert (recipe.fit, recipe.color, recipe.range) == (fit, color, depth)
@@ -101,7 +101,7 @@ def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) 
     ] * len(stated)
     module = Run(out).modules[0]
     assert module.recipe == load_modules(out)[0].recipe == Recipe((8, 8), "stretch", raw=(12, 16))
-    frames = ForeignSource(log, size=(8, 8), fit="stretch").take(0, 50).frames
+    frames = external(log, size=(8, 8), fit="stretch").take(0, 50).frames
     y = module.transform(pictures[:50, :, :, ::-1])  # red first
     np.testing.assert_array_equal(y, module.transform(frames))
     larger = pictures[:5].repeat(2, 1).repeat(2, 2)

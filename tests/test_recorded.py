@@ -19,10 +19,10 @@ from recorder.log.viewlog import ViewLog
 from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
+from replay.inputs import open_recording
 from replay.integrity.info import describe
 from replay.integrity.recover import recover_log
 from replay.integrity.verify import check_log
-from replay.recordings.source import RecordedSource
 
 FRAMES = 330
 IMAGES = SourceSpec(("left", "right"), (12, 16), "uint8", ("x", "y"), 50.0, 10**18)
@@ -77,7 +77,7 @@ class TestRecorded(SourceContract):
         self.folder = request.getfixturevalue(request.param)
 
     def open(self) -> FrameSource:
-        return RecordedSource(self.folder, loop=self.loop)
+        return open_recording(self.folder, loop=self.loop)
 
 
 class TestLooped(TestRecorded):
@@ -85,7 +85,7 @@ class TestLooped(TestRecorded):
 
 
 def test_recorded_equals_live_to_the_bit(vectors: Path) -> None:
-    live, recorded = OscillatorySource(), RecordedSource(vectors)
+    live, recorded = OscillatorySource(), open_recording(vectors)
     for i in range(FRAMES // 30):
         same(live.take(i % 3, 30), recorded.take(i % 3, 30))
     assert recorded.spec.streams == live.spec.streams
@@ -95,14 +95,14 @@ def test_recorded_equals_live_to_the_bit(vectors: Path) -> None:
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
 def test_pixels_and_truth_come_back(tmp_path: Path, compression: str) -> None:
     blocks = write_pictures(tmp_path, compression=compression)
-    source = RecordedSource(tmp_path)
+    source = open_recording(tmp_path)
     for block in blocks:
         source.seek(0)
         same(source.take(block.stream, FRAMES), block)
 
 
 def test_a_loop_begins_again(pictures: Path) -> None:
-    looped, once = RecordedSource(pictures, loop=True), RecordedSource(pictures)
+    looped, once = open_recording(pictures, loop=True), open_recording(pictures)
     looped.seek(FRAMES * 5 - 10)
     block = looped.take(1, 25)
     assert block.t == FRAMES * 5 - 10
@@ -114,7 +114,7 @@ def test_a_loop_begins_again(pictures: Path) -> None:
 
 
 def test_the_end_names_the_remedy(vectors: Path) -> None:
-    source = RecordedSource(vectors)
+    source = open_recording(vectors)
     with pytest.raises(LogExhaustedError, match="--loop"):
         source.take(0, FRAMES + 1)
 
@@ -123,7 +123,7 @@ def test_the_shortest_view_is_the_length(copy: Path) -> None:
     raw = (copy / "x2.mcap").read_bytes()
     (copy / "x2.mcap").unlink()
     (copy / "x2.mcap.partial").write_bytes(raw[: len(raw) // 2])
-    source = RecordedSource(copy)
+    source = open_recording(copy)
     assert source.spec.length is not None
     assert 0 < source.spec.length < FRAMES
     assert any("x2.mcap.partial" in w for w in source.warnings)
@@ -133,18 +133,18 @@ def test_the_shortest_view_is_the_length(copy: Path) -> None:
 
 
 def test_files_may_be_named_in_any_order(vectors: Path) -> None:
-    source = RecordedSource([vectors / "x3.mcap", vectors / "x1.mcap"])
+    source = open_recording([vectors / "x3.mcap", vectors / "x1.mcap"])
     assert source.spec.streams == ("x1", "x3")
     np.testing.assert_array_equal(source.take(1, 9).frames, OscillatorySource().take(2, 9).frames)
 
 
 def test_what_does_not_belong_together_is_refused(vectors: Path, pictures: Path) -> None:
     with pytest.raises(UsageError, match="are recordings of their own: name one"):
-        RecordedSource([vectors, pictures])
-    with pytest.raises(UsageError, match=r"x1\.mcap is named twice"):
-        RecordedSource([vectors / "x1.mcap", vectors / "x1.mcap"])
+        open_recording([vectors, pictures])
+    with pytest.raises(UsageError, match=r"x1\.mcap is a copy of .*x1\.mcap: leave one out"):
+        open_recording([vectors / "x1.mcap", vectors / "x1.mcap"])
     with pytest.raises(UsageError, match="no such"):
-        RecordedSource(vectors / "nothing")
+        open_recording(vectors / "nothing")
 
 
 def damage(path: Path) -> tuple[int, int]:
@@ -158,8 +158,8 @@ def damage(path: Path) -> tuple[int, int]:
 def test_damage_stops_and_is_named(copy: Path) -> None:
     start, end = damage(copy / "x1.mcap")
     with pytest.raises(LogDamagedError, match=rf"x1\.mcap.*{start} to {end}"):
-        RecordedSource(copy).describe()
-    source = RecordedSource(copy)
+        open_recording(copy).describe()
+    source = open_recording(copy)
     assert len(source.take(0, 100)) == 100
     with pytest.raises(LogDamagedError, match=rf"x1\.mcap.*{start} to {end}"):
         source.take(0, 1)
@@ -168,7 +168,7 @@ def test_damage_stops_and_is_named(copy: Path) -> None:
 
 def test_salvage_leaves_the_damage_out_of_every_view(copy: Path) -> None:
     damage(copy / "x1.mcap")
-    source = RecordedSource(copy, salvage=True)
+    source = open_recording(copy, salvage=True)
     assert source.frames == FRAMES - 50
     assert any("50 frames" in w for w in source.warnings)
     live = OscillatorySource()
@@ -238,7 +238,7 @@ def test_a_recovered_folder_plays(copy: Path, tmp_path: Path) -> None:
     assert not report.complete
     assert any(c.lost is None for c in report.channels)
     assert (tmp_path / "saved" / "x2.mcap").exists()
-    same(RecordedSource(tmp_path / "saved").take(1, 90), OscillatorySource().take(1, 90))
+    same(open_recording(tmp_path / "saved").take(1, 90), OscillatorySource().take(1, 90))
 
 
 def test_recovering_a_whole_log_keeps_everything(vectors: Path, tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_recovering_a_whole_log_keeps_everything(vectors: Path, tmp_path: Path) 
 
 
 def test_memory_does_not_grow_with_the_length(pictures: Path) -> None:
-    source, peaks = RecordedSource(pictures, loop=True), []
+    source, peaks = open_recording(pictures, loop=True), []
     for blocks in (10, 60):
         tracemalloc.start()
         for _ in range(blocks):

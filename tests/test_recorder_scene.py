@@ -17,7 +17,7 @@ from recorder.log.scenery import scenery_of, times, turned
 from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.icub.config import IcubConfig
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "icub"
 FRAMES = 120
@@ -45,7 +45,7 @@ def test_frames_and_truth_are_the_bytes_that_they_were_before_there_was_a_world(
 
 
 def test_objects_are_where_the_truth_says(recorded):
-    with RecordedSource(recorded) as source:
+    with open_recording(recorded) as source:
         truth = source.take(0, FRAMES).truth
     scenery = scenery_of(section_table(IcubConfig()))
     told = messages(recorded / "right.mcap", "/scene")

@@ -18,7 +18,7 @@ from recorder.log.scenery import scenery_of, turned, turns_of
 from recorder.recording import record_scene
 from recorder.world.icub.config import EyesConfig, IcubConfig
 from recorder.world.icub.head import FRAMES_OF_A_LOOK, Roaming, turn, turn_frames, turns
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 from replay.runs.run import read_outline
 
 YAW = (45.0, 0.0, -45.0)
@@ -99,7 +99,7 @@ def test_a_switch_costs_the_same_frames_live_and_from_the_log(scene, tmp_path):
     record_scene("icub", recording, SMALL, frames=500)
     scene.seek(0)
     live = run(scene, LEARNER, tmp_path / "live", max_iterations=25, rerun=False)
-    with contextlib.closing(RecordedSource(recording)) as source:
+    with contextlib.closing(open_recording(recording)) as source:
         logged = run(source, LEARNER, tmp_path / "log", max_iterations=25, rerun=False)
     assert live.signals_sha256 == logged.signals_sha256
     blocks = read_outline(tmp_path / "log" / "run.mcap").blocks
@@ -107,7 +107,7 @@ def test_a_switch_costs_the_same_frames_live_and_from_the_log(scene, tmp_path):
     switched = np.diff(blocks.streams) != 0
     assert 3 < switched.sum() < 21
     np.testing.assert_array_equal(lost, COST * switched)
-    with contextlib.closing(RecordedSource(recording)) as source:
+    with contextlib.closing(open_recording(recording)) as source:
         assert check_run(tmp_path / "log", (str(recording),), start=11).holds
         for stop in (7, 25):  # stopped, and resumed
             again = run(

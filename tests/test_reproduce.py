@@ -22,7 +22,7 @@ from cdmisfa.studies.paper.experiment import Experiment, Findings, Trial, groups
 from cdmisfa.studies.paper.oscillatory import Oscillatory
 from cdmisfa.studies.paper.reproduce import reproduce
 from recorder.world.oscillatory import OscillatorySource
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_logs" / "icub"
@@ -179,7 +179,7 @@ def test_intervals_of_epsilon_d_are_by_seeds() -> None:
 @pytest.mark.skipif(not SAMPLE.exists(), reason="the sample recording is not there")
 def test_the_icub_trial_keeps_what_its_figures_show(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(icub, "HELD_OUT", 400)
-    with RecordedSource(SAMPLE) as source:
+    with open_recording(SAMPLE) as source:
         row, arrays = icub.learn_curves(source, paper_config("icub"), seed=0)
         frames = source.frames - 400
     assert row["iterations"] == frames // 40

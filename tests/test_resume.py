@@ -29,7 +29,7 @@ from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 from replay.runs.compare import first_difference
 from replay.runs.folders import run_log
 from replay.runs.keyframes import KEYFRAME_TOPIC, read_keyframe
@@ -98,7 +98,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole: Path, tmp_path: Path, stopped:
 
 def test_a_recording_that_ended_goes_on_to_the_same_end(tmp_path: Path) -> None:
     record_scene("oscillatory", tmp_path / "log", frames=30 * CONFIG.tau)
-    source = RecordedSource(tmp_path / "log")
+    source = open_recording(tmp_path / "log")
     for resume in (False, True):
         result = go(source, tmp_path / "run", LENGTH, resume=resume)
         assert (result.ended, result.iterations) == ("log_exhausted", 30)

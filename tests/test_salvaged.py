@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, PACKED, RAW, WIDTH, packed, pictures, raw
 from conftest import Cdmisfa
-from folders import flip
+from folders import external, flip
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from message_files import START, STEP, every, learned_alike, write_mcap
 from video_packets import COUNT, FOXGLOVE, GROUP, foxglove, video
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.camera_logs.source import ForeignSource
 
 SIZE = (HEIGHT, WIDTH)
 
@@ -39,7 +38,7 @@ def write_video_messages(path: Path, packets: Sequence[bytes]) -> Path:
 
 def shown(path: Path, rows: Sequence[int]) -> list[np.ndarray[Any, Any]]:
     """The frames of a salvaged log, asked for in some order."""
-    with ForeignSource(path, size=SIZE, salvage=True, loop=True) as source:
+    with external(path, size=SIZE, salvage=True, loop=True) as source:
         frames = []
         for row in rows:
             source.seek(row)
@@ -50,16 +49,16 @@ def shown(path: Path, rows: Sequence[int]) -> list[np.ndarray[Any, Any]]:
 def test_a_broken_image_is_refused_with_the_remedy_and_passed_over_with_it(tmp_path: Path) -> None:
     path, images = write(tmp_path / "a.mcap", [0, 7, 8, 39]), list(pictures(40))
     with pytest.raises(LogDamagedError, match=f"/cam at {START} ns.*broken.*with --salvage"):
-        ForeignSource(path)
+        external(path)
     stands_for = {0: 1, 7: 6, 8: 6, 39: 38}
     order = [*range(45), 8, 7, 39, 0, 1, 7]
     for row, frame in zip(order, shown(path, order), strict=True):
         np.testing.assert_array_equal(frame, images[stands_for.get(row % 40, row % 40)])
-    with ForeignSource(path, salvage=True) as source:
+    with external(path, salvage=True) as source:
         assert source.take(0, 8).frames.shape[0] == 8
         assert "2 broken of 40 images" in source.salvaged()[0]
     with pytest.raises(LogDamagedError, match=r"/cam.*its PNG is cut short$"):
-        ForeignSource(write(tmp_path / "b.mcap", range(3), 3), salvage=True)
+        external(write(tmp_path / "b.mcap", range(3), 3), salvage=True)
 
 
 def test_salvaged_images_are_learned_from_and_converted_alike(
@@ -81,7 +80,7 @@ def test_a_video_is_shown_again_from_the_next_whole_picture(tmp_path: Path) -> N
     order = [*range(COUNT), *random.Random(0).sample(range(COUNT), COUNT)]
     for row, frame in zip(order, shown(path, order), strict=True):
         np.testing.assert_array_equal(frame, expected[last.get(row, row)], err_msg=str(row))
-    with ForeignSource(path, size=SIZE) as source:
+    with external(path, size=SIZE) as source:
         source.seek(30)
         with pytest.raises(LogDamagedError, match="its message is empty, without an image"):
             source.take(0, 1)
@@ -123,9 +122,9 @@ def test_what_is_not_read_is_no_damage(tmp_path: Path) -> None:
     images = write_mcap(tmp_path / "b.mcap", RAW, {"/cam": every(STEP, messages)})
     for salvage in (False, True):
         with pytest.raises(UsageError, match=r"/cam at .* waits for later ones \(B-frames\)"):
-            ForeignSource(videos, salvage=salvage)
+            external(videos, salvage=salvage)
         with pytest.raises(UsageError, match="its pixel format 'weird8' is not read"):
-            ForeignSource(images, salvage=salvage)
+            external(images, salvage=salvage)
 
 
 def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Path) -> None:
@@ -133,7 +132,7 @@ def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Pa
     time = (START + 3 * STEP).to_bytes(8, "little")
     flip(path, path.read_bytes().rfind(time))  # in the chunk's message index
     with (
-        ForeignSource(path) as source,
+        external(path) as source,
         pytest.raises(LogDamagedError, match=r"other messages than the summary names.*--salvage"),
     ):
         source.take(0, 8)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures
+from folders import external
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from message_files import START, STEP, every, write_mcap
 from test_foreign import raw_json
@@ -17,7 +18,6 @@ from test_numbers import joint_state
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError
 from recorder.images.messages import MessageKind, stamp_of
-from replay.camera_logs.source import ForeignSource
 
 COUNT = 40
 MADE = 5 * NANOSECONDS + 7
@@ -56,10 +56,10 @@ def test_images_are_shown_at_the_times_of_their_headers(kind: str, tmp_path: Pat
     what, messages = LOGS[kind]
     path = write_mcap(tmp_path / "a.mcap", what, {"/cam": every(STEP, messages())})
     images = list(pictures(COUNT))
-    with ForeignSource(path) as logged:
+    with external(path) as logged:
         assert (logged.spec.fps, logged.spec.start_ns) == (50, START)
         assert (logged.take(0, 3).frames == images[:3]).all()
-    with ForeignSource(path, stamp="header") as source:
+    with external(path, stamp="header") as source:
         assert (source.spec.fps, source.spec.start_ns) == (25, MADE)
         shown = source.take(0, COUNT).frames
         assert (shown == [images[i] for i in (0, 2, 1, *range(3, COUNT))]).all()

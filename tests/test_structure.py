@@ -46,13 +46,13 @@ FORBIDDEN = {
     "recorder.world": ("recorder.log.logfile", "replay.palette", "cdmisfa.features.sfa", "mcap"),
     "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),
     "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),
-    "replay.camera_logs": ("replay.recordings.source", "replay.view.build", "rerun"),
     "replay.corpus": ("replay.viewer", "cdmisfa.experiments.session", "rerun"),
     "replay.export": ("replay.view.build", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer", "rerun"),
-    "replay.recordings": ("replay.camera_logs.source", "replay.view.build", "recorder.recording"),
+    "replay.logs": ("replay.inputs", "replay.view.build", "recorder.recording", "rerun"),
+    "replay.logs.formats": ("replay.logs.source", "replay.runs.log", "recorder.recording"),
     "replay.report": ("replay.view.build", "replay.export.frames", "rerun"),
-    "replay.runs": ("replay.recordings.source", "replay.view.build", "cdmisfa.agents.learner"),
+    "replay.runs": ("replay.logs.source", "replay.view.build", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
     "replay.view": ("replay.viewer", "replay.export.frames", "pybullet"),
 }
@@ -128,7 +128,7 @@ def test_learning_from_a_scene_without_a_view_imports_no_viewer(tmp_path: Path) 
     words = ["learn", "oscillatory", "-o", str(tmp_path / "run"), "--max-iterations", "1"]
     code = (
         f"import sys; from cdmisfa.cli import run; assert run({[*words, '--no-rerun']}) == 0\n"
-        "heavy = {'rerun', 'matplotlib', 'pybullet', 'replay.camera_logs.source'}\n"
+        "heavy = {'rerun', 'matplotlib', 'pybullet', 'replay.logs.source'}\n"
         "print(heavy & sys.modules.keys(), file=sys.stderr)"
     )
     assert python("-c", code, check=True).stderr.splitlines()[-1] == "set()"

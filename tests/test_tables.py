@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import external
 from message_files import write_table
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.camera_logs.source import ForeignSource
 
 ROWS = 12
 
@@ -29,7 +29,7 @@ def written(folder: Path, rows: Mapping[int, str], *, names: str = "t,a,b") -> P
 
 def taken(path: Path, **options: Any) -> tuple[list[list[float]], tuple[str, ...]]:
     """All frames of a table, and what is said of it but of its times: see test_gaps."""
-    with ForeignSource(path, **{"time": "t", **options}) as source:
+    with external(path, **{"time": "t", **options}) as source:
         said = tuple(line for line in source.warnings if "is taken by number" not in line)
         return source.take(0, source.frames).frames.tolist(), said
 
@@ -89,26 +89,18 @@ def test_semicolons_and_tabs_separate_cells(tmp_path: Path, separator: str) -> N
     ("text", "options", "error", "why"),
     [
         ("", {}, LogDamagedError, "Empty CSV file"),
-        ("t,a\n", {}, UsageError, "it has names of columns, and no rows"),
-        ("t,a\n", {"time": None, "rate": 5}, UsageError, "names of columns, and no rows"),
-        ("t;a\n0,5;1\n", {}, UsageError, "t holds string, neither numbers nor dates such as 2"),
+        ("t,a\n", {"time": None, "rate": 5}, UsageError, "no column of numbers with rows, but t"),
+        ("t;a\n0,5;1\n", {}, UsageError, "t, of string, holds no times since 1970, dates or"),
         ("t,a\xb5\n0,1\n", {}, LogDamagedError, "PyArrow cannot read it .UnicodeDecodeError"),
-        ("t,a\n1.2.24 10:00,1\n", {}, UsageError, "t holds string, neither numbers nor dates"),
         ("t,a\nx,y\n", {"time": None, "rate": 5}, UsageError, "but t of string, a of string"),
-        ("0.0,1\n0.1,2\n", {}, UsageError, "its first line holds numbers: write a line with"),
-        ("t,a,a\n0,1,2\n", {}, UsageError, "two columns have the same name"),
+        ("0.0,1\n0.1,2\n", {}, UsageError, "its first line must have the names"),
+        ("t,a,a\n0,1,2\n", {}, UsageError, "its first line must have the names"),
         ("t,a\n0,1\n1,2,3", {}, LogDamagedError, "Row #3: Expected 2 columns, got 3: 1,2,3"),
         ("t,a\n0,1\n1", {}, LogDamagedError, "Row #3: Expected 2 columns, got 1: 1"),
         ("t,a\n0,1\n\xff,2,3\n", {}, LogDamagedError, "Row #3: Expected 2 columns, got 3"),
         ("# a log\nt,a\n0,1\n", {}, LogDamagedError, "Row #2: Expected 1 columns, got 2: t,a"),
         ("t,a\n0,\n1,\n", {"fields": ["a"]}, UsageError, "a holds no numbers"),
-        (
-            "t,a\n0,1\n1,2\n2,3\n",
-            {"time": "t:ns"},
-            UsageError,
-            "1e.09 rows a second.*time=COL",
-        ),
-        ("t,a\n0,1\n.1,2\n.2,3\n", {"time": "t:ns"}, UsageError, "say what its times count, as"),
+        ("t,a\n0,1\n1,2\n2,3\n", {"time": "t:ns"}, UsageError, "tells no rate: .*what they count"),
     ],
 )
 def test_what_is_wrong_with_a_table_is_said(
@@ -127,7 +119,7 @@ def test_an_empty_column_and_rows_out_of_order_are_said(tmp_path: Path) -> None:
     assert [b for (b,) in frames] == [i for i in range(ROWS) if i != 9]
     assert [line.partition("t.csv: ")[2] for line in said[:2]] == [
         "1 of 12 rows lack a finite number or their time and are left out, the first is line 11",
-        "3 rows stand after later ones: taken in the order of t",
+        "3 rows are after later ones: taken in the order of t",
     ]
 
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_video
 from conftest import Cdmisfa
+from folders import external
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.pixels import shrink
-from replay.camera_logs.pictures import VideoImages
-from replay.camera_logs.source import ForeignSource
+from replay.logs.formats.video import VideoFile
 
 pytest.importorskip("av")
 
@@ -23,7 +23,7 @@ SIZE = (HEIGHT, WIDTH)
 
 def test_a_lossless_video_gives_its_very_pixels(tmp_path: Path) -> None:
     images = write_video(tmp_path / "a.mkv", pictures(40))
-    source = ForeignSource(tmp_path / "a.mkv", size=SIZE)
+    source = external(tmp_path / "a.mkv", size=SIZE)
     assert (source.spec.fps, source.spec.length, source.spec.streams) == (25.0, 40, ("a",))
     np.testing.assert_array_equal(source.take(0, 40).frames, images)
     for t in (39, 3, 4, 0, 25):
@@ -46,11 +46,11 @@ def test_other_codecs_come_close_in_any_order(
 ) -> None:
     path = tmp_path / f"a.{ending}"
     images = np.array(write_video(path, pictures(60), codec=codec, pixels=pixels), float)
-    with contextlib.closing(VideoImages(path, None)) as video:
+    with contextlib.closing(VideoFile(path)) as video:
         once = [video.image(row) for row in range(60)]
     small = np.array([shrink(image, *SIZE) for image in once], float)
     assert abs(small - images).mean() < 8
-    with contextlib.closing(VideoImages(path, None)) as video:
+    with contextlib.closing(VideoFile(path)) as video:
         for row in (59, 0, 31, 30, 7, 8, *range(60)):
             np.testing.assert_array_equal(video.image(row), once[row])
 
@@ -58,7 +58,7 @@ def test_other_codecs_come_close_in_any_order(
 def test_limited_luma_becomes_the_full_range(tmp_path: Path) -> None:
     flat = [np.full(SIZE, value, np.uint8) for value in (0, 64, 128, 200, 255)]
     write_video(tmp_path / "a.mkv", flat, pixels="yuv420p")
-    frames = ForeignSource(tmp_path / "a.mkv", size=SIZE).take(0, 5).frames
+    frames = external(tmp_path / "a.mkv", size=SIZE).take(0, 5).frames
     assert abs(frames[:, 0, 0].astype(int) - [0, 64, 128, 200, 255]).max() <= 1
 
 
@@ -81,10 +81,10 @@ def test_a_video_of_a_telephone_stands_upright(tmp_path: Path, how: str) -> None
     images = write_video(path, pictures(3), codec="libx264", pixels="yuv420p")
     state_display_matrix(path, *matrix)
     upright = turned(images[0])
-    with contextlib.closing(VideoImages(path, None)) as video:
+    with contextlib.closing(VideoFile(path)) as video:
         small = shrink(video.image(0), *upright.shape)
         assert abs(small.astype(float) - upright).mean() < 8
-    with contextlib.closing(VideoImages(path, None, color=True)) as video:
+    with contextlib.closing(VideoFile(path, color=True)) as video:
         assert video.image(0).shape == (4 * upright.shape[0], 4 * upright.shape[1], 3)
 
 
@@ -102,8 +102,8 @@ def test_times_are_those_of_the_video(tmp_path: Path) -> None:
     write_video(tmp_path / "b.mkv", pictures(50), first=5)
     both = [tmp_path / "a.mkv", tmp_path / "b.mkv"]
     with pytest.raises(UsageError, match="--align time"):
-        ForeignSource(both, size=SIZE)
-    source = ForeignSource(both, size=SIZE, align="time")
+        external(both, size=SIZE)
+    source = external(both, size=SIZE, align="time")
     assert (source.spec.length, source.spec.start_ns) == (45, 200_000_000)
     assert source.alignment["a"] == {"messages": 48, "repeated": 2, "dropped": 5}
     a, expected = source.take(0, 45).frames, list(pictures(50))
@@ -133,14 +133,14 @@ def test_damage_within_a_video_is_found_where_ffmpeg_sees_it(tmp_path: Path) -> 
         data[at] ^= 255
     path.write_bytes(bytes(data))
     with pytest.raises(LogDamagedError, match=r"a\.mp4: (at|FFmpeg)"):
-        ForeignSource(path, size=SIZE).take(0, 60)
+        external(path, size=SIZE).take(0, 60)
 
 
 def test_a_video_that_lost_its_end_says_so(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mkv", pictures(100))
     data = (tmp_path / "a.mkv").read_bytes()
     (tmp_path / "a.mkv").write_bytes(data[: len(data) // 3])
-    source = ForeignSource(tmp_path / "a.mkv", size=SIZE)
+    source = external(tmp_path / "a.mkv", size=SIZE)
     assert source.spec.length is not None
     assert source.spec.length < 50
     assert any("it states 4 s, its last frame is at" in said for said in source.warnings)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH
+from folders import external
 from foxglove.channels import CompressedVideoChannel
 from foxglove.messages import CompressedVideo
 from live_cameras import Robot
@@ -21,9 +23,8 @@ from recorder.cameras.words import open_live
 from recorder.images.messages import MessageKind
 from recorder.images.options import InputOptions
 from recorder.images.videos import frame_gray
-from replay.camera_logs.opening import open_images
-from replay.camera_logs.source import ForeignSource
-from replay.camera_logs.stream import ImageStream
+from replay.logs.opening import open_stream
+from replay.logs.stream import LogStream
 
 av = pytest.importorskip("av")
 
@@ -46,8 +47,8 @@ def write(
     return write_mcap(path, kind, {"/cam": every(STEP, messages)})
 
 
-def opened(path: Path) -> contextlib.closing[ImageStream]:
-    return contextlib.closing(open_images(path, None))
+def opened(path: Path) -> AbstractContextManager[LogStream]:
+    return open_stream(path)
 
 
 @pytest.mark.parametrize("codec", ENCODERS)
@@ -73,10 +74,10 @@ def test_a_video_is_taken_from_its_first_whole_picture(tmp_path: Path) -> None:
         np.testing.assert_array_equal(images.image(0), decoded("h264")[GROUP])
     path = write(tmp_path / "b.mcap", video("h264")[1:GROUP])
     with pytest.raises(UsageError, match="/cam: each picture of its video needs earlier ones"):
-        open_images(path, None)
+        opened(path).__enter__()
     path = write(tmp_path / "c.mcap", video("h264"), "theora")
     with pytest.raises(UsageError, match="a video in 'theora' is not read: h264, h265, vp9 and"):
-        open_images(path, None)
+        opened(path).__enter__()
 
 
 def test_what_follows_a_broken_picture_is_not_made_up(tmp_path: Path) -> None:
@@ -87,7 +88,7 @@ def test_what_follows_a_broken_picture_is_not_made_up(tmp_path: Path) -> None:
         for row in (14, 24, 59):
             np.testing.assert_array_equal(images.image(row), expected[row])
     with (
-        ForeignSource(path, size=(HEIGHT, WIDTH)) as source,
+        external(path, size=(HEIGHT, WIDTH)) as source,
         pytest.raises(LogDamagedError, match="its video is broken there"),
     ):
         source.take(0, COUNT)

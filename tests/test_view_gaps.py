@@ -12,7 +12,7 @@ from view_data import View
 from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 from replay.runs.modules import load_modules, save_modules
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view
@@ -39,7 +39,7 @@ def shown(tmp_path_factory):
         for k in range(ITERATIONS):
             log.write(block_of(IMAGE, s, after_the_gap(k * TAU), TAU, rng))
         log.finish()
-    with RecordedSource(recording, loop=True) as source:
+    with open_recording(recording, loop=True) as source:
         described = source.describe()
     learner = {"tau": TAU, "delta": 0.001}
     manifest = {"config": {"learner": learner}, "seed": 0, "source": described}

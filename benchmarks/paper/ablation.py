@@ -18,7 +18,7 @@ from cdmisfa.studies.paper.experiment import (
     of_all,
     paper_config,
 )
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 Keys = dict[str, float]
 
@@ -74,7 +74,7 @@ def run(settings: Settings) -> dict[str, Any]:
     if scene == "oscillatory":
         most = oscillatory.MAX_ITERATIONS
         return module_row(run_trial(config, seed=seed, max_iterations=most).modules)
-    with contextlib.closing(RecordedSource(settings["recording"])) as source:
+    with contextlib.closing(open_recording(settings["recording"])) as source:
         return icub.learn_and_judge(source, config, seed, source.frames - icub.HELD_OUT)
 
 

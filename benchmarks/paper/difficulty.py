@@ -19,7 +19,7 @@ from cdmisfa.features.sfa import slowness
 from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_of, paper_config
 from cdmisfa.studies.paper.oscillatory import STREAMS
 from recorder.world.oscillatory import one_period
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
 
 THRESHOLD = 0.95
 """Direction cosine with batch SFA above which a stream counts as learned.
@@ -54,7 +54,7 @@ def run(settings: Settings) -> dict[str, Any]:
         # The stream repeats: other frames would hold nothing new.
         training = held_out = frames[: 4 * len(period)]
     else:
-        with contextlib.closing(RecordedSource(settings["recording"])) as source:
+        with contextlib.closing(open_recording(settings["recording"])) as source:
             seen = source.take(settings["stream"], FRAMES[scene]).frames
         frames = seen.reshape(len(seen), -1) / 255.0
         training, held_out = frames[:TRAINING], frames[TRAINING : 2 * TRAINING]

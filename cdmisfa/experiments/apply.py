@@ -30,13 +30,12 @@ from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.words import is_live, open_live, refuse_stored
 from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
-from replay.arrays import TAKES, ArrayLog, are_arrays
-from replay.camera_logs.opening import ALL, only_foreign
-from replay.camera_logs.source import UnequalError
 from replay.export.applied import Applied, AppliedSink
-from replay.inputs import locations
-from replay.recordings.source import RecordedSource, SeveralRecordingsError
-from replay.recordings.view_file import NoRecordingError
+from replay.inputs import locations, open_recording
+from replay.logs.aligning import UnequalError
+from replay.logs.formats.recording import NoRecordingError
+from replay.logs.formats.views import SeveralRecordingsError
+from replay.logs.opening import ALL, only_external
 from replay.runs.folders import MODULES_FILE
 from replay.runs.run import Run
 from replay.storage.identity import file_sha256
@@ -140,11 +139,9 @@ class Application:
 
     def _open_log(self, words: Sequence[str], inputs: InputOptions, **how: Any) -> FrameSource:
         places = locations(words)
-        if are_arrays(places):
-            return self._open_arrays(words, inputs, **how)
-        if not inputs.external and not any(map(only_foreign, places)):
+        if not inputs.external and not any(map(only_external, places)):
             with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
-                recorded = RecordedSource(places, **how)
+                recorded = open_recording(places, **how)
                 if recorded.spec.frame_shape == self.recipe.shape or not recorded.spec.images:
                     return recorded
                 recorded.close()
@@ -155,15 +152,6 @@ class Application:
             return open_logs(words, inputs=inputs, **how)
         except UnequalError:
             return open_logs(words, inputs=replace(inputs, align="time"), **how)
-
-    def _open_arrays(self, words: Sequence[str], inputs: InputOptions, **how: Any) -> FrameSource:
-        source = open_logs(words, inputs=inputs, **how)
-        if not isinstance(source, ArrayLog) or not source.spec.images or not self.recipe.size:
-            return source
-        source.close()
-        made = self._with_recipe(inputs)
-        taken: Any = {name: getattr(made, name) for name in TAKES}
-        return open_logs(words, inputs=replace(inputs, **taken), **how)
 
     def to(
         self,

@@ -15,7 +15,6 @@ from cdmisfa.core.expansion import expand
 from cdmisfa.experiments.sources import OF_CAMERAS, Configuration
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.modules import Module
-from replay.storage.identity import LoggedSource
 from replay.stored import StoredSource
 
 PIECE = 256
@@ -47,7 +46,7 @@ def hold_out(source: FrameSource, configuration: Configuration) -> None:
     if share == 0.0:
         return
     by_progress = configuration.learner.algorithm == OF_CAMERAS
-    logged = isinstance(source, LoggedSource) and source.to_judge
+    logged = isinstance(source, StoredSource) and source.to_judge
     if not by_progress or not logged or source.spec.length is None:
         if share is not None:
             raise UsageError(
@@ -55,7 +54,7 @@ def hold_out(source: FrameSource, configuration: Configuration) -> None:
                 "leave it out, or leave out --loop and --algorithm"
             )
         return
-    assert isinstance(source, LoggedSource)
+    assert isinstance(source, StoredSource)
     count = int(source.frames * (HOLDOUT if share is None else share))
     if count >= FEWEST:
         source.hold_out(count)

@@ -34,13 +34,12 @@ from recorder.log.files import (
     relative_path,
 )
 from recorder.world.scenes import SCENES, open_scene
-from replay.recordings.source import RecordedSource
 from replay.runs.folders import MODULES_FILE, REPORT_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.log import read_header
 from replay.runs.modules import save_modules
 from replay.runs.provenance import final_record
 from replay.runs.writer import RunWriter
-from replay.storage.identity import LoggedSource
+from replay.stored import StoredSource
 
 COMMAND = "command"
 """Key of a manifest: the command that started the run, which may differ when it is resumed."""
@@ -224,7 +223,7 @@ def with_recipes(
         source: what they were learned from; of a recording, the recipe is that of its source.
         described: the description of the source.
     """
-    if isinstance(source, RecordedSource):
+    if isinstance(source, StoredSource) and source.recorded:
         described = source.origin()
 
     def recipe(stream: int) -> Recipe:
@@ -233,7 +232,7 @@ def with_recipes(
         framings = getattr(source, "framings", [None] * len(source.spec.streams))
         made = replace(made, raw=getattr(framings[stream], "first", frames) or ())
         made = replace(made, centre=getattr(source, "centre", "run"))
-        stated = source.pixels(stream) if isinstance(source, LoggedSource) else ""
+        stated = source.pixels(stream) if isinstance(source, StoredSource) else ""
         return replace(made, pixels=stated) if stated.startswith("bayer_") else made
 
     return tuple(replace(module, recipe=recipe(module.stream_index)) for module in modules)

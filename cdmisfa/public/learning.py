@@ -24,7 +24,7 @@ from cdmisfa.experiments.sources import (
 from cdmisfa.public.recording import Given, Recording, as_words
 from cdmisfa.public.run import Run
 from recorder.images.options import OPTIONS, Centre, InputOptions
-from replay.arrays import ArrayLog
+from replay.logs.source import LoggedSource
 from replay.stored import centre_as
 
 
@@ -107,7 +107,7 @@ def learn(
             **limits,
         )
         run = Run(folder)
-        if command is None and isinstance(frames, ArrayLog):
+        if command is None and isinstance(frames, LoggedSource) and frames.in_memory:
             run._learned_from = Recording.of(source)  # the folder has only hashes of arrays
         if out is None:
             weakref.finalize(run, shutil.rmtree, folder.parent, ignore_errors=True)

@@ -16,7 +16,7 @@ from cdmisfa.core.shown import Shown
 from cdmisfa.experiments.sources import open_logs
 from cdmisfa.public.shown import view
 from recorder.images.options import InputOptions
-from replay.arrays import ArrayLog
+from replay.inputs import open_arrays
 
 Given: TypeAlias = Any
 """What `learn` takes: arrays, tables, mappings of these by streams' names, paths and URLs of logs,
@@ -93,7 +93,7 @@ class Recording(Shown):
             return open_logs(self.words, inputs=self.inputs, episodes=self.episodes, **how)
         given = self._given
         streams = given if isinstance(given, Mapping) else {"stream": given}
-        source = ArrayLog(streams, self.inputs, loop=loop)
+        source = open_arrays(streams, self.inputs, loop=loop)
         source.centre_by(self.inputs.centre)
         return source
 

@@ -12,8 +12,6 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import counted
 from recorder.images.options import InputOptions
-from replay.camera_logs.alignment import UNEVEN
-from replay.camera_logs.lerobot import PAUSE
 from replay.corpus.logs import (
     Episode,
     Found,
@@ -24,9 +22,12 @@ from replay.corpus.logs import (
     logs_of_corpus,
     sampled,
 )
-from replay.inputs import Logged, open_log
-from replay.storage.identity import Identity, LoggedSource
-from replay.stored import Span
+from replay.inputs import open_log
+from replay.logs.clock import UNEVEN
+from replay.logs.formats.lerobot import PAUSE
+from replay.logs.source import LoggedSource
+from replay.storage.identity import Identity
+from replay.stored import Span, StoredSource
 
 SAID: Final = 5
 """Lines of a kind, as of logs that are left out, that are said."""
@@ -63,7 +64,7 @@ def open_episodes(
     return None if logs is None else EpisodeSource(logs, inputs, **how)
 
 
-class EpisodeSource(LoggedSource):
+class EpisodeSource(StoredSource):
     """Logs one after the other, by when each begins and then by their paths.
 
     Streams of the same name are one. What lies between two logs is a gap, `PAUSE` frames of the
@@ -108,7 +109,7 @@ class EpisodeSource(LoggedSource):
                 f"{len(logs):,} logs are more episodes than one run lists, {MOST:,}: index fewer"
             )
         self._inputs, self._loop, self._salvage = inputs, loop, salvage
-        self._open_now: tuple[int, Logged] | None = None
+        self._open_now: tuple[int, LoggedSource] | None = None
         self._reading = 0, 0
         self._lost: list[str] = []
         self.changes: dict[str, str] = {}
@@ -236,7 +237,7 @@ class EpisodeSource(LoggedSource):
         block = source.take(one.spec.streams.index(self._spec.streams[stream]), n)
         return replace(block, stream=stream, t=t)
 
-    def _log(self, number: int) -> Logged:
+    def _log(self, number: int) -> LoggedSource:
         """A log, open, and no other one.
 
         Raises:
@@ -255,7 +256,7 @@ class EpisodeSource(LoggedSource):
             self._open_now = number, source
         return self._open_now[1]
 
-    def _opened(self, log: Log) -> Logged:
+    def _opened(self, log: Log) -> LoggedSource:
         return open_log(log, self._inputs, salvage=self._salvage)
 
     def _leave_out(self, error: LogDamagedError) -> None:
@@ -275,7 +276,7 @@ class EpisodeSource(LoggedSource):
         one = self._kind.scenes
         return {"scene": next(iter(one))} if len(one) == 1 and one != {""} else {}
 
-    def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    def described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """The logs in their order with the frames [start, stop) of each."""
         files = [
             {

@@ -12,17 +12,16 @@ from typing import Final, NamedTuple
 
 from cdmisfa.core.errors import CdmisfaError
 from recorder.mcap.store import PARTIAL
-from replay.arrays import ENDINGS
-from replay.camera_logs.opening import WHOLE_FILES, log_format
-from replay.camera_logs.pictures import PICTURES
 from replay.inputs import locations
+from replay.logs.formats.images import ENDINGS as IMAGE_ENDINGS
+from replay.logs.opening import ENDINGS, log_format
 from replay.runs.folders import RUN_FILE
 from replay.storage.location import is_url
 
 INDEX: Final = "corpus.parquet"
 """Name of the index of a folder, in it."""
 
-_LOGS: Final = frozenset((".mcap", *ENDINGS, *(WHOLE_FILES - {*PICTURES})))
+_LOGS: Final = frozenset((".mcap", *ENDINGS))
 _RUN: Final = frozenset((RUN_FILE, RUN_FILE + PARTIAL))
 
 
@@ -121,7 +120,7 @@ def _below(root: str, seen: set[tuple[int, int]]) -> Iterator[Found]:
 
 def _kind_of(folder: str, names: set[str]) -> str:
     """The format of the log that a folder is; "mcap" or "split" where its files are logs."""
-    hints = any(os.path.splitext(name)[1].lower() in PICTURES for name in names)
+    hints = any(os.path.splitext(name)[1].lower() in IMAGE_ENDINGS for name in names)
     if not (hints or names & {"metadata.yaml", "meta"}) or names & _RUN:
         return "mcap"
     try:

@@ -13,15 +13,13 @@ from typing import Any, Final, NamedTuple
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.arrays import are_arrays
-from replay.camera_logs.opening import log_format
-from replay.camera_logs.pictures import by_number
 from replay.corpus.finding import INDEX, may_be_corpus
 from replay.corpus.index import indexed_logs, is_index
-from replay.inputs import Logged
-from replay.recordings.source import RecordedSource
-from replay.storage.identity import Identity, LoggedSource
+from replay.logs.opening import log_format
+from replay.logs.source import LoggedSource
+from replay.storage.identity import Identity
 from replay.storage.location import location
+from replay.storage.opening import by_number
 from replay.stored import Span
 
 STREAM: Final = "stream"
@@ -130,7 +128,7 @@ class LogIdentity(Identity):
     """
 
     def __init__(self, source: LoggedSource, opened: Callable[[], LoggedSource]) -> None:
-        logs = source._known_logs()
+        logs = source.identities()
         self.path, self.size = logs[0].path, sum(log.size for log in logs)
         self._opened, self._sha256 = opened, ""
         self.sampled = sampled(source)
@@ -141,17 +139,17 @@ class LogIdentity(Identity):
         """See `Identity`."""
         return {"sha256": self._sha256} if self._sha256 else {"sample_sha256": self.sampled}
 
-    def whole(self, counted: Callable[[int], None]) -> dict[str, Any]:
+    def whole(self, counted: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
         """See `Identity`."""
         if not self._sha256:
             with contextlib.closing(self._opened()) as source:
-                self._sha256 = _digest([log.whole(counted) for log in source._known_logs()])
+                self._sha256 = _digest([log.whole(counted) for log in source.identities()])
         return {"sha256": self._sha256}
 
 
 def sampled(source: LoggedSource) -> str:
     """The checksum of a sample of a log's bytes."""
-    return _digest([log.sample() for log in source._known_logs()])
+    return _digest([log.sample() for log in source.identities()])
 
 
 def _digest(logs: Sequence[Mapping[str, Any]]) -> str:
@@ -182,7 +180,7 @@ class Found(NamedTuple):
     warnings: list[str]
 
 
-def find_episodes(logs: Sequence[Log], opened: Callable[[Log], Logged], told: Told) -> Found:
+def find_episodes(logs: Sequence[Log], opened: Callable[[Log], LoggedSource], told: Told) -> Found:
     """Open each log once, and close it.
 
     Raises:
@@ -213,14 +211,14 @@ def find_episodes(logs: Sequence[Log], opened: Callable[[Log], Logged], told: To
 def _episode(
     log: Log,
     name: str,
-    source: Logged,
-    opened: Callable[[Log], Logged],
+    source: LoggedSource,
+    opened: Callable[[Log], LoggedSource],
     kinds: dict[Any, Kind],
 ) -> Episode:
     spec = source.spec
     if len(spec.streams) == 1 and _named_by_file(log):
         spec = replace(spec, streams=(STREAM,))
-    stated = source.origin() if isinstance(source, RecordedSource) else source._described([])
+    stated = source.origin() if source.recorded else source.described([])
     kind = kinds.setdefault(kind_of(spec), Kind(stated, getattr(source, "turns", ())))
     kind.scenes.add(source.scene().get("scene", ""))
     fields = stated.get("fields") or []
@@ -259,4 +257,4 @@ def _by_numbers(name: str) -> list[Any]:
 
 def _named_by_file(log: Log) -> bool:
     """Whether the stream of a log is named by its file, and so has another name in each."""
-    return log_format(log[0]) in ("video", "table", "pictures") or are_arrays(log)
+    return log_format(log[0]) in ("video", "table", "pictures", "arrays")

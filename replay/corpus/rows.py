@@ -16,12 +16,11 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.log.messages import view_topic
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord
-from replay.arrays import are_arrays
-from replay.camera_logs.alignment import missing
-from replay.camera_logs.opening import identity_of, image_topics, only_foreign, open_images
 from replay.corpus.finding import Found, state_of_log
 from replay.integrity.info import describe_log, describe_reader
 from replay.integrity.report import ChannelInfo, LogReport, failed_state
+from replay.logs.clock import missing
+from replay.logs.opening import identity_of, image_topics, only_external, open_stream
 from replay.storage.identity import Identity, LogIdentity
 from replay.storage.location import is_url, location
 
@@ -173,9 +172,9 @@ def _stream(channel: ChannelInfo, view: Mapping[str, str]) -> dict[str, Any]:
 
 def _described(place: Path, deep: bool) -> tuple[LogReport, str, list[dict[str, Any]]]:
     """Return what a log is, its identity, and what the images of each channel show."""
-    if only_foreign(place) or are_arrays([place]):
-        info, sha256 = describe_log(place, decode=deep), _hash_of(identity_of(place, ()))
-        topics = [c.topic for c in info.channels] if deep else []
+    if only_external(place):
+        info, sha256 = describe_log(place, decode=deep), _hash_of(identity_of(place))
+        topics = [c.topic for c in info.channels if deep and c.encoding != "numpy"]
     else:
         with LogReader(place, salvage=True, check="chunks") as reader:
             sha256 = _hash_of(LogIdentity(reader))
@@ -190,11 +189,9 @@ def _described(place: Path, deep: bool) -> tuple[LogReport, str, list[dict[str, 
 def _shown(place: Path, topic: str) -> dict[str, Any]:
     """Shape of the first image of a topic, and how many are missing; nothing where it has none."""
     try:
-        with contextlib.closing(open_images(place, topic)) as images:
-            if not images.count:
-                return {}
-            shape = "x".join(map(str, images.image(0).shape))
-            return {"shape": shape, "gaps": missing(images.times)}
+        with open_stream(place, topic) as stream:
+            shape = "x".join(map(str, stream.image(0).shape))
+            return {"shape": shape, "gaps": 0 if stream.times is None else missing(stream.times)}
     except (LogDamagedError, MalformedRecord, UsageError) as error:
         said = str(error).removeprefix(f"{place}: ")
         return {"problem": said} if isinstance(error, LogDamagedError) else {}

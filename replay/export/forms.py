@@ -13,7 +13,8 @@ from recorder.log.files import atomic_write, refuse_existing, refuse_taken
 from replay.export.frames import write_images, write_video, write_videos
 from replay.export.lerobot import write_dataset
 from replay.export.tables import TABLES
-from replay.inputs import About, Logged, holds_run, is_recording, open_to_look
+from replay.inputs import About, holds_run, is_recording, open_to_look
+from replay.logs.source import LoggedSource
 
 FORMS: Final = (*TABLES, "images", "mp4", "lerobot")
 """Forms of the signals of a run, and forms of frames."""
@@ -90,7 +91,7 @@ def export(
 
 def _opened(
     paths: list[Path], form: str, inputs: InputOptions | None, about: About, *, single: bool
-) -> Generator[Logged]:
+) -> Generator[LoggedSource]:
     """Yield each log, open until the next one.
 
     Raises:

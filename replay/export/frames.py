@@ -21,8 +21,8 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.names import stream_names
 from recorder.images.videos import pyav
-from replay.inputs import Logged
-from replay.recordings.view_file import intersection
+from replay.logs.clock import intersection
+from replay.logs.source import LoggedSource
 from replay.stored import Span
 
 PIECE, PIECE_BYTES = 1000, 64 * 2**20
@@ -41,7 +41,9 @@ FULL_RANGE = 2
 """FFmpeg's AVCOL_RANGE_JPEG: luma from 0 to 255."""
 
 
-def pieces(source: Logged, stream: int, spans: Sequence[Span] | None = None) -> Iterator[Block]:
+def pieces(
+    source: LoggedSource, stream: int, spans: Sequence[Span] | None = None
+) -> Iterator[Block]:
     """Yield the frames of one stream in order: all that it has, or those of some spans.
 
     This moves the clock of the source.
@@ -54,7 +56,7 @@ def pieces(source: Logged, stream: int, spans: Sequence[Span] | None = None) -> 
             yield source.take(stream, min(size, high - t))
 
 
-def shared_spans(source: Logged) -> list[Span]:
+def shared_spans(source: LoggedSource) -> list[Span]:
     """Return the spans of frames without gaps in any stream.
 
     Raises:
@@ -67,12 +69,12 @@ def shared_spans(source: Logged) -> list[Span]:
     return shared
 
 
-def _spans(source: Logged, stream: int) -> list[Span]:
+def _spans(source: LoggedSource, stream: int) -> list[Span]:
     first = source.first_frame
     return source.spans(stream, first, first + source.frames)
 
 
-def write_images(source: Logged, folder: Path) -> int:
+def write_images(source: LoggedSource, folder: Path) -> int:
     """Write every frame of every stream as STREAM/FRAME.png, and return their number."""
     count = 0
     for stream, name in enumerate(stream_names(source.spec.streams)):
@@ -84,7 +86,7 @@ def write_images(source: Logged, folder: Path) -> int:
     return count
 
 
-def write_videos(source: Logged, folder: Path, *, lossless: bool) -> int:
+def write_videos(source: LoggedSource, folder: Path, *, lossless: bool) -> int:
     """Write each stream as STREAM.mp4, and return the number of frames; see `write_video`."""
     folder.mkdir()
     names = stream_names(source.spec.streams)
@@ -95,7 +97,7 @@ def write_videos(source: Logged, folder: Path, *, lossless: bool) -> int:
 
 
 def write_video(
-    source: Logged,
+    source: LoggedSource,
     stream: int,
     file: Path,
     *,
@@ -150,7 +152,7 @@ def write_video(
 
 
 def _video_frames(
-    av: Any, source: Logged, stream: int, spans: Sequence[Span] | None
+    av: Any, source: LoggedSource, stream: int, spans: Sequence[Span] | None
 ) -> Iterator[tuple[int, Any]]:
     """Yield the frames of a stream with their numbers, as PyAV's, in one buffer."""
     height, width = source.spec.frame_shape

@@ -23,8 +23,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import ACTION, BEGINS, JOINT, stream_names
 from replay.export.frames import pieces, pixel_format, shared_spans, write_video
-from replay.inputs import Logged
-from replay.recordings.source import RecordedSource
+from replay.logs.source import LoggedSource
 from replay.stored import Span
 
 VERSION = "v3.0"
@@ -47,7 +46,7 @@ Stats = dict[str, NDArray[Any]]
 
 
 def write_dataset(
-    logs: Iterable[Logged], folder: Path, *, lossless: bool, task: str | None = None
+    logs: Iterable[LoggedSource], folder: Path, *, lossless: bool, task: str | None = None
 ) -> int:
     """Write recordings as a LeRobot dataset, and return its number of frames.
 
@@ -122,15 +121,15 @@ def _whole_rate(spec: SourceSpec) -> int:
     return round(spec.fps)
 
 
-def _task(source: Logged) -> str:
+def _task(source: LoggedSource) -> str:
     """Return the tasks that were recorded, in words, or else the scene."""
-    tasks = source.origin().get("tasks") if isinstance(source, RecordedSource) else None
+    tasks = source.origin().get("tasks")
     if isinstance(tasks, list) and tasks:
         return " and ".join(map(str, tasks))
     return f"what {source.scene().get('scene', 'a recording')} shows"
 
 
-def _episodes(source: Logged) -> list[Span]:
+def _episodes(source: LoggedSource) -> list[Span]:
     """Return the spans of frames that every stream has, cut where a recorded task begins again."""
     begins = [i for i, name in enumerate(source.spec.truth) if name.startswith(BEGINS)]
     spans: list[Span] = []
@@ -142,7 +141,7 @@ def _episodes(source: Logged) -> list[Span]:
     return spans
 
 
-def _numbers(source: Logged, spans: Sequence[Span]) -> Columns:
+def _numbers(source: LoggedSource, spans: Sequence[Span]) -> Columns:
     """Return ground truth and frames that are no images, as float32."""
     spec, columns = source.spec, Columns()
     if spec.truth:
@@ -287,7 +286,7 @@ def number_stats(values: NDArray[Any]) -> Stats:
     }
 
 
-def image_stats(source: Logged, stream: int, span: Span) -> Stats:
+def image_stats(source: LoggedSource, stream: int, span: Span) -> Stats:
     """Return LeRobot's statistics of pixels from 0 to 1, (3, 1, 1) each, from a histogram."""
     counts = np.zeros(256, dtype=np.int64)
     for block in pieces(source, stream, [span]):

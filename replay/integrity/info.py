@@ -20,9 +20,6 @@ from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
-from replay.arrays import are_arrays
-from replay.camera_logs.opening import channels_of, log_format, only_foreign
-from replay.camera_logs.pictures import FolderImages
 from replay.inputs import locations
 from replay.integrity.learned import run_facts
 from replay.integrity.report import (
@@ -35,8 +32,9 @@ from replay.integrity.report import (
     combined,
     failed,
 )
+from replay.logs.formats.images import broken_images, image_files
+from replay.logs.opening import channels_of, log_format, only_external
 from replay.runs.folders import RUN_METADATA
-from replay.storage.arrays import load_numbers
 from replay.storage.opening import log_files
 
 CHECK_BYTES: Final = 1024 * 1024 * 1024
@@ -97,8 +95,7 @@ def report_all(
 
 def _describe_place(place: Path, alone: bool) -> Iterator[LogReport]:
     """Describe the logs in a place, the only one or not."""
-    external = only_foreign(place) or are_arrays([place])
-    logs = [place] if external else log_files(place)
+    logs = [place] if only_external(place) else log_files(place)
     for log in logs:
         try:
             yield describe_log(log)
@@ -115,10 +112,8 @@ def describe_log(log: Path, *, decode: bool | None = None) -> LogReport:
         log: the file or the folder.
         decode: decode the content, or read its summary only; by default as its size allows.
     """
-    if only_foreign(log):
+    if only_external(log):
         return _describe_external(log, 0 if decode is False else CHECK_BYTES)
-    if are_arrays([log]):
-        return _describe_arrays(log)
     if decode or (decode is None and log.stat().st_size <= CHECK_BYTES):
         return read_once(log, lambda reader: describe_reader(reader, decode=decode))
     with LogReader(log, salvage=True, check="chunks") as reader:
@@ -148,12 +143,13 @@ def _describe_external(place: Path, most: int) -> LogReport:
     """Describe a log in another format than MCAP; check up to `most` bytes of its images."""
     channels = channels_of(place)
     missing = tuple(Problem(str(place), c.missing) for c in channels if c.missing)
-    broken = None
-    if most and log_format(place) == "pictures":
-        with contextlib.closing(FolderImages(place, None)) as images:
-            broken = images.broken(most)
+    kind, broken = log_format(place), None
+    if most and kind == "pictures":
+        broken = broken_images(image_files(place), most)
     crc: Crc = "absent" if broken is None else "bad" if broken else "ok"
     state: State = "damaged" if broken else "unchecked" if broken is None else "whole"
+    if kind == "arrays":  # whole if they can be loaded
+        state = "whole"
     return LogReport(
         path=str(place),
         channels=tuple(
@@ -167,17 +163,6 @@ def _describe_external(place: Path, most: int) -> LogReport:
         size=_size_of(place),
         notes=tuple(dict.fromkeys(line for c in channels for line in c.remarks)),
     )
-
-
-def _describe_arrays(place: Path) -> LogReport:
-    """Describe a file of NumPy's arrays; it is whole if it can be loaded."""
-    channels = []
-    for name, array in load_numbers(place).items():
-        shape = "x".join(map(str, array.shape[1:]))
-        rows = len(array) if array.ndim else 1
-        kind = f"{array.dtype} {shape}".rstrip()
-        channels.append(ChannelInfo(name, "numpy", kind, rows, None, None, place.name))
-    return LogReport(str(place), channels=tuple(channels), size=_size_of(place))
 
 
 def _size_of(place: Path) -> SizeInfo:

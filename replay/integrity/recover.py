@@ -23,9 +23,9 @@ from recorder.mcap.chunks import UNUSED, MessageTable, check_size, decompressed,
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segment, crc32
 from recorder.mcap.store import PARTIAL, Store
-from replay.camera_logs.opening import only_foreign
 from replay.integrity.info import ChannelCount, problems_of
 from replay.integrity.report import SCHEMA
+from replay.logs.opening import only_external
 from replay.storage.location import location
 from replay.storage.opening import log_files
 
@@ -93,7 +93,7 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
         LogWriteError: the disk does not take it.
     """
     src, dst = location(src), Path(dst)
-    if src.exists() and only_foreign(src):
+    if src.exists() and only_external(src):
         raise UsageError(
             f"{src} is no MCAP file, and others are not recovered: learn and convert pass over "
             "broken images of them with --salvage"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import itertools
 import json
@@ -17,24 +16,17 @@ import numpy as np
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.core.untrusted import read_regular
-from recorder.images.messages import Decoder
-from recorder.images.options import IMAGES
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import Problem, Segment
-from replay.camera_logs.mcap_log import channels_on, topics_in
-from replay.camera_logs.opening import (
-    channels_of,
-    image_topics,
-    log_format,
-    only_foreign,
-    open_images,
-)
-from replay.camera_logs.stream import explained, sorted_times
-from replay.camera_logs.table import table_notes
 from replay.integrity.info import count_decoded, kind_of, read_once, report_all, report_on
 from replay.integrity.report import LogReport, State, as_problem, combined, failed
-from replay.recordings.source import RecordedSource
-from replay.recordings.view_file import ViewFile
+from replay.logs.formats import table
+from replay.logs.formats import views as recorded
+from replay.logs.formats.mcap_log import decoders_in
+from replay.logs.formats.recording import ViewFile
+from replay.logs.opening import channels_of, image_topics, log_format, only_external, open_stream
+from replay.logs.source import LoggedSource
+from replay.logs.stream import check_times, limited
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
 from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, header_in
 from replay.runs.modules import load_modules
@@ -61,7 +53,7 @@ def check_log(path: str | Path) -> LogReport:
         CdmisfaError: a package that reads it is missing.
     """
     place = location(path)
-    if only_foreign(place):
+    if only_external(place):
         return combined(str(place), [_check_external(place)])
     reports: list[LogReport] = []
     views: list[_ViewContent] = []
@@ -157,18 +149,15 @@ class _ImageContent(_Content):
 
     def __init__(self, path: Path, reader: LogReader) -> None:
         super().__init__(path, reader)
-        self._decoders: dict[int, Decoder] = {}
-        for topic in topics_in(reader, IMAGES):
-            channels, decode = channels_on(reader, topic, IMAGES)
-            self._decoders |= dict.fromkeys((channel.id for channel in channels), decode)
+        self._decoders = decoders_in(reader)
 
     def add(self, segment: Segment) -> None:
         table = self.reader.table(segment)
         assert table is not None
         rows = np.flatnonzero(np.isin(table.channel, list(self._decoders)))
         if len(rows):
-            sorted_times(str(self.path), np.sort(table.log_time[rows]))
-        with explained(self.path, "its decoder", held=table.data.nbytes):
+            check_times(self.path, np.sort(table.log_time[rows]).astype(np.int64))
+        with limited(self.path, "its decoder", held=table.data.nbytes):
             for row in rows.tolist():
                 self._decoders[int(table.channel[row])](table.view(row))
 
@@ -309,19 +298,15 @@ def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Probl
     if any(content.error is not None for content in contents):
         return
     try:
-        source = RecordedSource([view.path for view in views], salvage=True, opened=views)
+        source = LoggedSource(recorded.streams(views, salvage=True))
     except LogDamagedError as error:
         yield replace(as_problem(views[0].path, error), where=folder)
         return
-    with contextlib.closing(source):
-        if source.gaps:
-            return
-        ends = {name: ranges[-1][1] for name, ranges in source.coverage().items()}
-        shortest = min(ends.values())
-        for name, end in ends.items():
-            if end > shortest:
-                what = f"the view {name!r} ends before frame {end}, another before {shortest}"
-                yield Problem(folder, what)
+    ends = {name: ranges[-1][1] for name, ranges in source.coverage().items() if not source.gaps}
+    for name, end in ends.items():
+        if end > min(ends.values()):
+            what = f"the view {name!r} ends before frame {end}, another before "
+            yield Problem(folder, f"{what}{min(ends.values())}")
 
 
 def _missing_views(folder: str, views: list[ViewFile]) -> Iterator[Problem]:
@@ -343,7 +328,7 @@ def _check_external(path: Path) -> LogReport:
     """Decode every image of a camera log without checksums."""
     try:
         kind = log_format(path)
-        notes = table_notes(path) if kind == "table" else []
+        notes = table.notes(path) if kind == "table" else []
         if kind == "bag":
             notes = [f"{path}: a ROS bag has no checksums, changed bytes may go unnoticed"]
         channels = channels_of(path, whole=True)
@@ -362,14 +347,14 @@ def _check_topics(path: Path, topics: Iterable[str]) -> LogReport:
     notes: dict[str, None] = {}
     for topic in topics:
         try:
-            with contextlib.closing(open_images(path, topic)) as images:
-                for row in range(images.count):
+            with open_stream(path, topic) as stream:
+                for row in range(stream.count):
                     try:
-                        images.image(row)
+                        stream.image(row)
                     except LogDamagedError as error:
-                        problems.append(Problem(images.where(row), str(error)))
-                missing |= dict.fromkeys([images.missing] if images.missing else [])
-                notes |= dict.fromkeys((*images.remarks, *images.warnings))
+                        problems.append(Problem(stream.name_of(row), str(error)))
+                missing |= dict.fromkeys([stream.missing] if stream.missing else [])
+                notes |= dict.fromkeys((*stream.remarks, *stream.warnings))
         except LogDamagedError as error:
             problems.append(as_problem(path, error))
         except UsageError as error:  # it needs an option, or a package that is not installed

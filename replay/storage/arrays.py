@@ -16,19 +16,20 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_line
-from cdmisfa.core.untrusted import BUDGET, check_regular, open_regular
+from cdmisfa.core.errors import one_line
+from cdmisfa.core.untrusted import open_regular
 
 MAX_BYTES: Final = 192 * 1024 * 1024
 """Largest file of arrays that is read."""
 
 _END = struct.Struct("<4s4H2LH")
 _PLAIN = re.compile(r"[<|][bifuU]\d{1,6}")
-_IMPOSSIBLE = (MemoryError, OverflowError, RecursionError, SyntaxError, TokenError)
-_DAMAGED = (
-    *(OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error),
-)  # together what numpy and zipfile raise for damaged files
+NOT_ARRAYS: Final = (
+    *(MemoryError, OverflowError, RecursionError, SyntaxError, TokenError, zlib.error),
+    *(OSError, EOFError, LookupError, TypeError, ValueError, AttributeError, RuntimeError),
+    zipfile.BadZipFile,
+)
+"""The errors of numpy and zipfile for files that are damaged, or hold something else."""
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -51,39 +52,10 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 if len(members) != _stated_members(stored.zip):
                     raise ValueError("its directory is cut")
                 arrays = {name: stored[name] for name in stored.files}
-        except (*_IMPOSSIBLE, *_DAMAGED) as error:
+        except NOT_ARRAYS as error:
             raise ValueError(one_line(error)) from error
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise ValueError("not all of it are arrays")
-    return arrays
-
-
-def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a user's file, by name: of .npy the one, mapped and called as the file.
-
-    Raises:
-        UsageError: there is no such file, or it is too large.
-        LogDamagedError: it holds something else.
-    """
-    check_regular(path)
-    try:
-        if path.suffix.lower() == ".npy":
-            return {path.stem: np.lib.format.open_memmap(path, mode="r")}
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as found:
-            if sum(member.file_size for member in found.zip.infolist()) > BUDGET:
-                raise UsageError(
-                    f"{path}: its arrays have more than {BUDGET >> 20} MiB: save each as .npy, "
-                    "which is not read whole"
-                )
-            arrays = {name: found[name] for name in found.files}
-    except CdmisfaError:
-        raise
-    except (*_IMPOSSIBLE, *_DAMAGED) as error:
-        pickled = "pickle" in str(error)
-        why = "it holds Python objects, or something else" if pickled else one_line(error)
-        raise LogDamagedError(f"{path} is no file of NumPy's arrays ({why})") from error
-    if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
-        raise LogDamagedError(f"{path} is no file of NumPy's arrays: it holds none")
     return arrays
 
 
@@ -112,8 +84,8 @@ def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
                 raise ValueError(f"{str(name)[:40]!r} is no array of it")
             arrays[str(name)] = np.ndarray(shape, dtype, data, at).copy()
             at += size
-    except (*_IMPOSSIBLE, TypeError, LookupError) as error:
-        raise ValueError("an impossible array") from error
+    except NOT_ARRAYS as error:
+        raise ValueError(f"an impossible array: {one_line(error)}") from error
     if at != len(data):
         raise ValueError(f"its arrays have {at} bytes, and it has {len(data)}")
     return arrays

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -70,3 +71,9 @@ def starts_as_log(path: Path) -> bool:
     """
     with opened_regular(path) as file:
         return file.read(len(MAGIC)) == MAGIC
+
+
+def by_number(path: Path) -> list[tuple[int, str]]:
+    """Return a sort key that puts 9.png before 10.png."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(p) if p.isdecimal() else -1, p) for p in parts]

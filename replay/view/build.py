@@ -21,8 +21,8 @@ from cdmisfa.core.errors import CdmisfaError, UsageError, are_for
 from cdmisfa.core.untrusted import opened_regular
 from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
-from replay.inputs import About, Logged, holds_run, open_to_look
-from replay.recordings.source import RecordedSource
+from replay.inputs import About, holds_run, open_to_look
+from replay.logs.source import LoggedSource
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_batches, read_header
 from replay.runs.modules import load_modules
@@ -186,7 +186,7 @@ def _write_recording(
     with contextlib.closing(open_to_look(paths, inputs)) as source:
         about(source)
         first, count, spec = source.t, source.frames, source.spec
-        ours = isinstance(source, RecordedSource)
+        ours = source.recorded
         scenery = scenery_of_recording(paths[0]) if ours else None
         rows = Rows(recording, spec)
         world = None if scenery is None else SceneView(rows, scenery, every)
@@ -199,7 +199,7 @@ def _write_recording(
     recording.send_blueprint(layout)
 
 
-def _write_frames(rows: Rows, source: Logged, every: int, world: SceneView | None) -> None:
+def _write_frames(rows: Rows, source: LoggedSource, every: int, world: SceneView | None) -> None:
     """Write all frames of a recording, from its first on."""
     spec, end, entities = rows.spec, source.t + source.frames, view_entities(rows.spec)
     step = every if spec.images else 1

@@ -26,8 +26,8 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.log.scenery import KIND, ROAMING, Eye, Gaze, Scenery, Thing, scenery_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
+from replay.logs.formats.views import first_pose
 from replay.palette import Rgb, colour, packed_all
-from replay.recordings.source import first_pose
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, RunHeader
 from replay.storage.opening import log_files

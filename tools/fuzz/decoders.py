@@ -34,7 +34,7 @@ from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import IMAGES
 from recorder.images.videos import VideoPackets
 from recorder.mcap.records import MalformedRecord
-from replay.camera_logs.opening import open_images
+from replay.logs.opening import open_stream
 from replay.runs.codec import decode_matrices, decode_signals, encode_matrix, encode_signals
 from replay.runs.folders import RUN_JSON, read_run_json
 from replay.runs.keyframes import decode_keyframe, encode_keyframe
@@ -176,12 +176,9 @@ def _write_video(folder: Path) -> None:
 def _cameras(path: Path) -> None:
     """Decode the first image of each topic, and the last."""
     for topic in ("/cam_left", "/cam_right") if path.suffix in (".bag", ".db3") else (None,):
-        images = open_images(path, topic)
-        try:
-            for row in (0, images.count - 1):
-                images.image(row)
-        finally:
-            images.close()
+        with open_stream(path, topic) as stream:
+            for row in (0, stream.count - 1):
+                stream.image(row)
 
 
 def _presets() -> Iterator[bytes]:
@@ -223,7 +220,7 @@ DECODERS: Mapping[str, Decoder] = {
         )
         for kind in video_packets.KINDS
     },
-    "picture": Decoder(lambda p: open_images(p.parent, None).image(0), _packed, "0.png"),
+    "picture": Decoder(lambda path: _cameras(path.parent), _packed, "0.png"),
     "bag": Decoder(_cameras, _written(".bag", ros1_bag), "a.bag"),
     "db3": Decoder(_cameras, _written(".db3", ros2_database), "a.db3"),
     "mkv": Decoder(_cameras, _written(".mkv", _write_video), "a.mkv"),

@@ -18,11 +18,11 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MAX_CHUNK
+from replay.inputs import open_recording
 from replay.integrity.info import describe
 from replay.integrity.recover import recover_log
 from replay.integrity.verify import check_log
-from replay.recordings.source import RecordedSource
-from replay.recordings.view_file import ViewFile
+from replay.logs.formats.recording import ViewFile
 
 from .mutations import Case, bases
 
@@ -103,7 +103,7 @@ def _read(case: Case, path: Path, *, salvage: bool) -> None:
 
 
 def _play(case: Case, path: Path, *, salvage: bool) -> None:
-    with RecordedSource([path], salvage=salvage) as source:
+    with open_recording([path], salvage=salvage) as source:
         if source.frames > 1000:
             raise BrokenPromise(f"{source.frames} frames in {len(case.raw)} bytes")
         blocks: list[Block] = []
@@ -142,9 +142,10 @@ def tabled_rows(view: ViewFile, start: int, frames: np.ndarray, truth: np.ndarra
     for rows, out in zip(view._channels, outs, strict=False):
         at = 0
         for number, low, n in rows.pieces(start, len(out)):
-            own, layout = rows._own(number), rows.layout
+            table = rows._table(number)
+            own = table.select(table.channel == rows._channel.id)
             ends = (own.at + own.size)[low : low + n, None, None]
-            places = ends - layout.distances[:, None] + np.arange(layout.width)
+            places = ends - np.array(rows.places)[:, None] + np.arange(rows.width)
             out[at : at + n] = own.data[places].reshape(n, -1)
             at += n
 

@@ -265,7 +265,7 @@ def convert_command(
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
     from recorder.recording import record
-    from replay.inputs import locations, open_cameras, refuse_what_is_no_log
+    from replay.inputs import locations, open_external, refuse_what_is_no_log
 
     if live := next(filter(is_live, source), None):
         raise UsageError(f"{live} is a live stream: cdmisfa record {shlex.join(source)} -o REC")
@@ -274,7 +274,7 @@ def convert_command(
         refuse_what_is_no_log(place)
     if not resume:
         refuse_existing(out, force=force)
-    opened = open_cameras(named, inputs, salvage=salvage, goal=("convert", str(out)))
+    opened = open_external(named, inputs, salvage=salvage, goal=("convert", str(out)))
     with contextlib.closing(opened) as frames:
         say_about(frames)
         with recording(ctx, out, resume=resume) as (report, stop):

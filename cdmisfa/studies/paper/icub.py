@@ -38,7 +38,8 @@ from cdmisfa.studies.paper.experiment import (
 )
 from cdmisfa.studies.paper.oscillatory import GAIN, gains, stay_rewards
 from recorder.world.icub.config import IcubConfig
-from replay.recordings.source import RecordedSource
+from replay.inputs import open_recording
+from replay.logs.source import LoggedSource
 
 OPTIMAL = ((0, "011"), (2, "110"))
 """Stream and policy of both modules, as the paper gives them."""
@@ -74,14 +75,14 @@ class Icub(Experiment):
 
     def conditions(self, quick: bool, recording: Path | None) -> list[Settings]:
         """Each learner, on one recording."""
-        with contextlib.closing(RecordedSource(str(recording))) as source:
+        with contextlib.closing(open_recording(str(recording))) as source:
             about = {"recording": str(recording), "identity": plain(source.describe())}
         return [{**about, "algorithm": a, "roc_error": error} for a, error in LEARNERS]
 
     def run(self, settings: Settings) -> Output:
         """Learn for 1400 iterations, or as many as the recording has."""
         keys = {key: settings[key] for key in ("algorithm", "roc_error")}
-        with contextlib.closing(RecordedSource(settings["recording"])) as source:
+        with contextlib.closing(open_recording(settings["recording"])) as source:
             return learn_curves(source, paper_config("icub", **keys), settings["seed"])
 
     def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
@@ -211,7 +212,7 @@ class Curves(Sink):
         self.arrays |= {name: np.stack(values) for name, values in self._curves.items()}
 
 
-def learn_curves(source: RecordedSource, config: LearnerConfig, seed: int) -> Output:
+def learn_curves(source: LoggedSource, config: LearnerConfig, seed: int) -> Output:
     """Learn from a recording; return a trial's row, curves, and each module's last outputs."""
     curves = Curves(config.tau, source.spec.truth)
     row = learn_and_judge(source, config, seed, source.frames - HELD_OUT, curves)

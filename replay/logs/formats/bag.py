@@ -1,4 +1,4 @@
-"""ROS bags: the images, or numbers, of a rosbag2 (.db3) or of a ROS 1 .bag, through rosbags."""
+"""ROS bags, a rosbag2 (.db3) or a ROS 1 .bag, through rosbags."""
 
 from __future__ import annotations
 
@@ -7,42 +7,36 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path, PurePath
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import zstandard
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.arrays import IntArray
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
 from recorder.images.messages import MessageKind, decoder_of
-from recorder.images.options import IMAGES, NUMBERS_RECIPE, InputOptions
+from recorder.images.options import InputOptions
 from recorder.mcap.records import MAX_CHUNK
-from replay.camera_logs.stream import (
-    ChannelFacts,
-    MessageImages,
-    choose_images,
-    explained,
-    sorted_times,
-)
+from replay.logs.formats.messages import choose_topics, message_stream
+from replay.logs.stream import ChannelFacts, LogStream, limited
 
-Found = TypeVar("Found")
-
-BAGS: Final = (".bag", ".db3")
+ENDINGS: Final = (".bag", ".db3")
 
 METADATA: Final = "metadata.yaml"
 MAX_METADATA: Final = 1024 * 1024
 """Largest metadata.yaml that is read, in bytes."""
 MOST_TIMES: Final = 100
-"""How many times the size of a packed file what is in it may have, where it is more than a chunk's.
-
-Images of anything but one colour are packed to more than that.
-"""
+"""Largest ratio of a packed file's contents to its size, beyond the size of a chunk. Only images
+of one colour are packed to less."""
 
 
-class _Bag(NamedTuple):
-    """An opened bag: readers of rosbags for its parts, one after the other, and its format."""
+class Bag(NamedTuple):
+    """An open bag: readers of rosbags for its parts, one after the other, and its format."""
 
+    path: Path
     readers: Sequence[Any]
     ros1: bool
 
@@ -81,59 +75,57 @@ class _Bag(NamedTuple):
             for storage in getattr(reader.storage, "storages", [reader.storage]):
                 yield from storage.dbconn.execute(query, tuple(topics))
 
+    def fetcher(self, topic: str, times: IntArray) -> Callable[[int], bytes]:
+        """Return a function that reads the messages on a topic, quickly in their order."""
+        coming: Iterator[tuple[str, int, Any]] = iter(())
+        following = -1
 
-class BagImages(MessageImages):
-    """The images, or the numbers, on a topic of a .bag, .db3 or rosbag2's folder, by stamps.
+        def fetch(row: int) -> bytes:
+            nonlocal coming, following
+            if row != following:
+                coming = self.messages([topic], int(times[row]))
+                following = int(np.searchsorted(times, times[row]))
+            while following <= row:
+                _, _, data = next(coming, ("", 0, b""))
+                following += 1
+            if not isinstance(data, bytes):  # SQLite keeps anything in any column
+                at = f"{self.path}: {topic} at {times[row]} ns"
+                raise LogDamagedError(f"{at}: the message has no bytes")
+            return data
+
+        return fetch
+
+
+def streams(
+    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+) -> list[LogStream]:
+    """Open the topics of a .bag, .db3 or rosbag2's folder.
 
     Raises:
         CdmisfaError: the package rosbags is missing.
-        UsageError: no such topic, or no images on it.
+        UsageError: no such topic, or not what is asked for on it.
         LogDamagedError: rosbags cannot read it.
     """
-
-    def __init__(self, path: Path, topic: str | None, *, reading: InputOptions = IMAGES) -> None:
-        self.path, self.color = path, (reading.color is True)
-        if reading.fields:
-            self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
-        self._messages: Iterator[tuple[str, int, Any]] = iter(())
-        self._next = -1
-        with contextlib.ExitStack() as opened:
-            self._bag = bag = opened.enter_context(_opened(path))
-            kinds = bag.kinds()
-            channels = [(name, kind, name) for name, kind in kinds.items()]
-            (self.topic, *_), self.decode = choose_images(path, topic, channels, reading)
-            self.kind = kinds[self.topic]
-            with explained(path, "rosbags"):
-                stamps = [stamp for _, stamp in bag.stamps([self.topic])]
-            if stamps != sorted(stamps):
-                raise LogDamagedError(
-                    f"{path}: its messages are not in the order of time; convert it to MCAP"
-                )
-            if not stamps:
-                raise UsageError(f"{path}: there is no message on {self.topic}")
-            self.times = sorted_times(f"{path}: {self.topic}", stamps)
-            self._opened = opened.pop_all()
-        self.remarks = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
-
-    def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
-        with explained(self.path, "rosbags"):
-            if row != self._next:
-                self._messages = self._bag.messages([self.topic], int(self.times[row]))
-                self._next = int(np.searchsorted(self.times, self.times[row]))
-            while self._next <= row:
-                _, _, data = next(self._messages, ("", 0, b""))
-                self._next += 1
-        if not isinstance(data, bytes):  # SQLite keeps anything in any column
-            raise LogDamagedError(f"{self.where(row)}: the message has no bytes")
-        return take(data)
-
-    def close(self) -> None:
-        self._messages = iter(())
-        self._opened.close()
+    with open_bag(path) as bag:
+        kinds = [(topic, kind, topic) for topic, kind in bag.kinds().items()]
+    found = []
+    for topic, kind, _ in choose_topics(path, kinds, options):
+        bag = opened.enter_context(open_bag(path))  # readers hold one chunk: of one topic
+        with limited(path, "rosbags"):
+            times = np.array([stamp for _, stamp in bag.stamps([topic])], np.int64)
+        if (times[1:] < times[:-1]).any():
+            raise LogDamagedError(
+                f"{path}: its messages are not in the order of time; convert it to MCAP"
+            )
+        fetch = bag.fetcher(topic, times)
+        remark = f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"
+        about = {"program": "rosbags", "remarks": [remark]}
+        found.append(message_stream(path, topic, kind, options, times, fetch, **about))
+    return found
 
 
-def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
-    """What is on each topic of a bag, by the index of a .bag or the columns of a database.
+def channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
+    """Return the topics of a bag, by the index of a .bag or the columns of a database.
 
     Args:
         path: the bag.
@@ -143,10 +135,10 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
         CdmisfaError: the package rosbags is missing.
         LogDamagedError: rosbags cannot read it.
     """
-    with _opened(path) as bag:
+    with open_bag(path) as bag:
         kinds = bag.kinds()
         stamps: dict[str, list[int]] = {name: [] for name in kinds}
-        with explained(path, "rosbags"):
+        with limited(path, "rosbags"):
             if bag.ros1 and not whole:
                 for reader in bag.readers:
                     for connection in reader.connections:
@@ -160,20 +152,14 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
     for name, kind in kinds.items():
         own = stamps[name]
         ends = min(own, default=None), max(own, default=None)
-        images = decoder_of(kind, IMAGES) is not None
+        images = decoder_of(kind, InputOptions()) is not None
         found.append(ChannelFacts(name, kind.encoding, kind.schema, len(own), *ends, images))
     return found
 
 
-def bag_topics(path: Path, reading: InputOptions = IMAGES) -> list[str]:
-    """The topics of a bag with what is wanted; raises as `bag_channels` does."""
-    with _opened(path) as bag:
-        kinds = bag.kinds()
-    return [name for name, kind in kinds.items() if decoder_of(kind, reading) is not None]
-
-
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[_Bag]:
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag; raises as `channels` does."""
     try:
         from rosbags.rosbag1 import Reader as Rosbag1
         from rosbags.rosbag2 import Reader as Rosbag2
@@ -182,23 +168,20 @@ def _opened(path: Path) -> Iterator[_Bag]:
             f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
         ) from None
     ros1 = path.suffix == ".bag" and path.is_file()
-    with _parts(path) as parts, contextlib.ExitStack() as opened:
-        with explained(path, "rosbags"):
+    with _parts(path) as parts, ExitStack() as opened:
+        with limited(path, "rosbags"):
             readers: list[Any] = [Rosbag1(part) if ros1 else Rosbag2(part) for part in parts]
             for reader in readers:
                 reader.open()
                 opened.callback(reader.close)
-        yield _Bag(readers, ros1)
+        yield Bag(path, readers, ros1)
 
 
 @contextlib.contextmanager
 def _parts(path: Path) -> Iterator[Sequence[Path]]:
-    """Yield what rosbags opens: the bag, or its packed files, unpacked into a temporary folder.
+    """Yield the paths for rosbags: the bag, or its packed files, unpacked to a temporary folder.
 
     rosbags unpacks files without a limit; chunks and messages take memory alone, of the budget.
-
-    Args:
-        path: a file, or the folder of a rosbag2.
 
     Raises:
         UsageError: a file of it is no regular one.
@@ -210,14 +193,14 @@ def _parts(path: Path) -> Iterator[Sequence[Path]]:
         return
     from ruamel.yaml import YAML
 
-    with explained(path / METADATA, "YAML"):
+    with limited(path / METADATA, "YAML"):
         text = read_regular(path / METADATA, MAX_METADATA).decode("utf-8")
-        said = YAML(typ="safe").load(text)["rosbag2_bagfile_information"]
-        files = [path / PurePath(str(name)).name for name in said["relative_file_paths"]]
-        packed, kept_as = said.get("compression_mode"), str(said["storage_identifier"])
-    if kept_as != "sqlite3":
+        info = YAML(typ="safe").load(text)["rosbag2_bagfile_information"]
+        files = [path / PurePath(str(name)).name for name in info["relative_file_paths"]]
+        packed, storage = info.get("compression_mode"), str(info["storage_identifier"])
+    if storage != "sqlite3":
         raise LogDamagedError(
-            f"{path}: files of {kept_as[:40]} are read if they are MCAP and called .mcap: "
+            f"{path}: files of {storage[:40]} are read if they are MCAP and called .mcap: "
             "unpack them with zstd -d"
         )
     for file in files:
@@ -236,7 +219,7 @@ def _unpacked(packed: Path, folder: Path) -> Path:
         LogDamagedError: it would, or it is not packed by zstd.
     """
     target = folder / packed.stem
-    with explained(packed, "zstd"), opened_regular(packed) as source, target.open("xb") as out:
+    with limited(packed, "zstd"), opened_regular(packed) as source, target.open("xb") as out:
         most = max(os.fstat(source.fileno()).st_size * MOST_TIMES, MAX_CHUNK)
         most = min(most, shutil.disk_usage(folder).free // 2)
         unpacking = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2)

@@ -1,1 +1,0 @@
-"""Other people's logs of cameras as sources of frames."""

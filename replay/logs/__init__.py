@@ -1,0 +1,1 @@
+"""Recordings and external logs as sources of frames."""

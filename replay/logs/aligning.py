@@ -1,0 +1,160 @@
+"""Streams of external logs on one clock, as options say, or a refusal with the options to give."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from cdmisfa.core.arrays import IntArray
+from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
+from cdmisfa.core.errors import UsageError
+from recorder.images.options import Align, InputOptions
+from replay.logs import clock as clocks
+from replay.logs.clock import Clock
+from replay.logs.combining import copies
+from replay.logs.formats.arrays import FPS
+from replay.logs.stream import LogStream
+
+
+class UnequalError(UsageError):
+    """Streams that are on no common clock unless they are aligned."""
+
+
+class Aligned(NamedTuple):
+    """Streams that have times, cut to the part that is asked for, and their clock."""
+
+    streams: list[LogStream]
+    fps: float
+    clock: Clock
+
+
+def align(
+    streams: Sequence[LogStream], options: InputOptions, goal: tuple[str, str] = ("learn", "RUN")
+) -> Aligned:
+    """Put streams on one clock; arrays always by index.
+
+    Args:
+        streams: the streams, one at least.
+        options: the rate, the part of the logs, and how streams that differ are aligned.
+        goal: the command and the folder of its result for the remedy in an error.
+
+    Raises:
+        UnequalError: the streams differ, and no option says how to align them.
+        UsageError: no rate is known, or a stream has nothing in the part that is asked for.
+    """
+    arrays = all(stream.encoding == "numpy" for stream in streams)
+    fps = options.rate or (FPS if arrays else _rate(streams))
+    streams = [stream.at_rate(fps) for stream in streams]
+    if options.start or options.end is not None:
+        zero = min(int(_times(stream)[0]) for stream in streams)
+        streams = [_excerpt(stream, options, zero) for stream in streams]
+    times = list(map(_times, streams))
+    by_index = arrays or (options.align == "index" and len(times) > 1)
+    try:
+        if options.align == "time":
+            _refuse_apart(streams)
+            clock = clocks.by_time(times, fps)
+        else:
+            if not by_index:
+                _refuse_unequal(streams, options, fps, goal)
+            clock = clocks.by_index(times, fps, gaps=not by_index)
+    except UsageError as error:
+        # Streams that do not fit may be copies of one another, of which one was cut.
+        line = next(copies(streams), None)
+        raise error if line is None else type(error)(f"{line}: leave one out") from None
+    return Aligned(streams, fps, clock)
+
+
+def _times(stream: LogStream) -> IntArray:
+    assert stream.times is not None
+    return stream.times
+
+
+def _rate(streams: Sequence[LogStream]) -> float:
+    """Rows a second of the first stream that has times.
+
+    Raises:
+        UsageError: no stream has times, or they tell no rate that is taken.
+    """
+    timed = next((stream for stream in streams if stream.times is not None), streams[0])
+    step = float("nan") if timed.times is None else clocks.step_of(timed.times)
+    if not (step > 0 and (timed.read is None or 1 / step <= RECORDED_FPS[1])):
+        remedy = "set one with --rate"
+        if timed.read is not None:
+            remedy += (
+                ", or name the column of its times, and what they count (s, ms, us, ns), with "
+                "--set input.time=COLUMN:s"
+            )
+        raise UsageError(f"{timed.path} tells no rate: {remedy}")
+    return float(f"{1 / step:.6g}")
+
+
+def _excerpt(stream: LogStream, options: InputOptions, zero: int) -> LogStream:
+    """A stream between --start and --end, in seconds after the first row of all streams."""
+    times = _times(stream)
+    low, high = (
+        len(times) if at is None else int(np.searchsorted(times, zero + round(at * NANOSECONDS)))
+        for at in (options.start, options.end)
+    )
+    if low >= high:
+        lasts = (int(times[-1]) - zero) / NANOSECONDS
+        raise UsageError(
+            f"{stream.path}: {stream.topic} has no images there, its last is at {lasts:g} s: "
+            "choose another --start or --end"
+        )
+    return stream.part(np.arange(low, high), times[low:high])
+
+
+def _refuse_apart(streams: Sequence[LogStream]) -> None:
+    """Refuse streams to be aligned by time that have no time in common."""
+    ends = min(streams, key=lambda stream: int(_times(stream)[-1]))
+    begins = max(streams, key=lambda stream: int(_times(stream)[0]))
+    if _times(ends)[-1] < _times(begins)[0]:
+        raise UsageError(
+            f"{ends.path}: {ends.topic} ends before {begins.topic} begins, they have no time in "
+            "common: take each by itself, with --topic"
+        )
+
+
+def _refuse_unequal(
+    streams: Sequence[LogStream], options: InputOptions, fps: float, goal: tuple[str, str]
+) -> None:
+    """Refuse streams that are not on one clock, or not of the rate asked for."""
+
+    def command(align: Align) -> str:
+        words = ["cdmisfa", goal[0], *dict.fromkeys(str(stream.path) for stream in streams)]
+        for stream in streams:
+            words += ["--topic", stream.topic]
+        words += replace(options, topics=(), align=None, rate=None).words()
+        return shlex.join([*words, "--align", align, "--rate", f"{fps:g}", "-o", goal[1]])
+
+    times = list(map(_times, streams))
+    begins, ends = clocks.overlap(times)
+    for stream, own in zip(streams[1:], times[1:], strict=True):
+        if not (reason := clocks.unlike(times[0], own)):
+            continue
+        two = f"{streams[0].topic} and {stream.topic}"
+        if begins < ends:
+            raise UnequalError(
+                f"{two} have {reason}: put them on one clock, as with: {command('time')}"
+            )
+        if any(len(clocks.pauses(each)) for each in times):
+            raise UnequalError(
+                f"{two} have no time in common, and gaps, across which --align index takes images "
+                "for neighbours: take each by itself, with --topic, or a part without with "
+                "--start and --end"
+            )
+        raise UnequalError(
+            f"{two} have no time in common: take the i-th image of each together, as with: "
+            f"{command('index')}"
+        )
+    for stream, own in zip(streams, times, strict=True):
+        if clocks.of_other_rate(own, fps):
+            raise UnequalError(
+                f"{stream.topic} has {1 / clocks.step_of(own):g} images a second, not {fps:g}: "
+                f"choose images by their times, as with: {command('time')}"
+            )

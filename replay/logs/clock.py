@@ -1,0 +1,244 @@
+"""The clock of a log: which row of each stream every frame shows, by the times of the rows.
+
+All functions are pure; times are int64 nanoseconds, not decreasing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from cdmisfa.core.arrays import IntArray
+from cdmisfa.core.clock import NANOSECONDS, times_of
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.stored import Span, outside
+
+MAX_FRAMES: Final = 2**31
+"""Most frames that streams are aligned to."""
+GAP_STEPS: Final = 10
+"""A pause between two rows of more than this many median steps is a gap."""
+UNEVEN: Final = 0.01
+"""Rates that differ by less than this share are the same."""
+JITTER: Final = 0.75
+"""Share of a frame by which the time of a row may differ from that of its frame."""
+
+Rows = range | IntArray
+"""The row that each frame shows, (frames,), none after a later one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Frames of all streams on one clock.
+
+    Attributes:
+        start_ns: time of frame 0, nanoseconds.
+        rows: the rows of each stream, from frame `first` on.
+        gaps: the frames in which each stream has nothing new to show.
+        first: number of the first frame.
+    """
+
+    start_ns: int
+    rows: Sequence[Rows]
+    gaps: Sequence[Sequence[Span]]
+    first: int = 0
+
+
+def by_time(streams: Sequence[IntArray], fps: float) -> Clock:
+    """Show in each frame the last row at or before its time, while every stream has rows.
+
+    Raises:
+        UsageError: the rate makes more frames than anybody can want.
+    """
+    start, stop = overlap(streams)
+    ticks = (stop - start) * fps / NANOSECONDS + 1
+    if ticks > MAX_FRAMES:
+        raise UsageError(
+            f"--rate {fps:g} makes {ticks:.0f} frames: choose a lower one, or a part of the log "
+            "with --start and --end"
+        )
+    clock = times_of(np.arange(int(ticks)), fps, start)
+    rows = [np.searchsorted(times, clock, side="right") - 1 for times in streams]
+    gaps: list[list[Span]] = []
+    for times in streams:
+        step, found = step_of(times) * NANOSECONDS, list[Span]()
+        for i in pauses(times):
+            begins = int(np.searchsorted(clock, int(times[i - 1]) + int(step / 2), side="right"))
+            ends = int(np.searchsorted(clock, times[i], side="left"))
+            if begins < ends:
+                found.append((begins, ends))
+        gaps.append(found)
+    return Clock(start, rows, gaps)
+
+
+def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> Clock:
+    """Show the i-th row of every stream together, up to the end of the shortest.
+
+    Args:
+        streams: the times of each.
+        fps: frames a second.
+        gaps: show the last row longer where the first stream, and so all, pause.
+
+    Raises:
+        UsageError: the pauses make more frames than anybody can want.
+    """
+    first, count = streams[0], min(map(len, streams))
+    begins = [int(i) for i in pauses(first) if i < count] if gaps else []
+    if not begins:
+        return Clock(int(first[0]), [range(count)] * len(streams), [[]] * len(streams))
+    ticks = np.ones(count, np.int64)
+    for i in begins:
+        ticks[i] = max(round(int(first[i] - first[i - 1]) * fps / NANOSECONDS), 2)
+    frame = np.cumsum(ticks) - ticks[0]
+    found = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
+    if frame[-1] > MAX_FRAMES:
+        said = f"it has {gaps_in_words(found, fps)}, {frame[-1] + 1} frames in all"
+        raise UsageError(f"{said}: choose a part without, with --start or --end")
+    rows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
+    return Clock(int(first[0]), [rows] * len(streams), [found] * len(streams))
+
+
+def by_number(streams: Sequence[Sequence[Span]], start_ns: int, first: int, *, gaps: bool) -> Clock:
+    """Show each frame of a recording at its number; rows are numbers of frames.
+
+    Args:
+        streams: the frames that each stream has.
+        start_ns: time of frame 0, nanoseconds.
+        first: the first frame of the recording.
+        gaps: frames that a stream lacks are gaps; else they are left out of all streams.
+
+    Raises:
+        LogDamagedError: no frame is in every stream.
+    """
+    streams = [merged(held) for held in streams]
+    common = streams[0]
+    if gaps:
+        common = [(first, max((high for held in streams for _, high in held), default=first))]
+    else:
+        for held in streams[1:]:
+            common = intersection(common, held)
+    common = merged(span for span in common if span[0] < span[1])
+    if not common:
+        raise LogDamagedError("no frame is there, whole, in every view")
+    begins, end = common[0][0], common[-1][1]
+    parts = [np.arange(low, high) for low, high in common] if len(common) > 1 else []
+    rows: Rows = np.concatenate(parts) if parts else range(begins, end)
+    absent = [outside(held, begins, end) if gaps else [] for held in streams]
+    return Clock(start_ns, [rows] * len(streams), absent, begins)
+
+
+def merged(spans: Iterable[Span]) -> list[Span]:
+    """Ranges in their order, with those that touch merged."""
+    found: list[Span] = []
+    for start, stop in spans:
+        touches = found and found[-1][1] == start
+        found.append((found.pop()[0], stop) if touches else (start, stop))
+    return found
+
+
+def intersection(one: Sequence[Span], two: Sequence[Span]) -> list[Span]:
+    """The frames in both of two sorted lists of ranges [start, stop)."""
+    found: list[Span] = []
+    i = j = 0
+    while i < len(one) and j < len(two):
+        low, high = max(one[i][0], two[j][0]), min(one[i][1], two[j][1])
+        if low < high:
+            found.append((low, high))
+        if one[i][1] < two[j][1]:
+            i += 1
+        else:
+            j += 1
+    return found
+
+
+def overlap(streams: Sequence[IntArray]) -> tuple[int, int]:
+    """The first and the last time at which every stream has rows; the first may be the later."""
+    return max(int(times[0]) for times in streams), min(int(times[-1]) for times in streams)
+
+
+def step_of(times: IntArray) -> float:
+    """The median time between rows, in seconds; NaN of fewer than two."""
+    return float(np.median(np.diff(times)) / NANOSECONDS) if len(times) > 1 else float("nan")
+
+
+def of_other_rate(times: IntArray, fps: float) -> bool:
+    """Whether a stream has a rate that differs from another by more than a hundredth."""
+    step = step_of(times)
+    return step > 0 and abs(step * fps - 1) > UNEVEN
+
+
+def unlike(first: IntArray, times: IntArray) -> str:
+    """The reason why the i-th rows of two streams do not belong together; "" if they do.
+
+    They may be apart by half a step of the first stream.
+    """
+    if len(times) != len(first):
+        return f"{len(first)} and {len(times)} images"
+    apart = np.abs(times - first).max()
+    return "images at different times" if apart > NANOSECONDS * step_of(first) / 2 else ""
+
+
+def pauses(times: IntArray) -> IntArray:
+    """The rows before which a stream paused for more than `GAP_STEPS` of its steps."""
+    step = step_of(times) * NANOSECONDS
+    return np.flatnonzero(np.diff(times) > GAP_STEPS * step) + 1 if step > 0 else np.empty(0, int)
+
+
+def missing(times: IntArray) -> int:
+    """How many rows a stream lacks between its first and last that its rate would have had."""
+    return int(_lacks(times).sum())
+
+
+def _lacks(times: IntArray) -> IntArray:
+    """How many rows are missing before each row but the first, (n - 1,)."""
+    step = step_of(times) * NANOSECONDS
+    if not step > 0:
+        return np.zeros(max(len(times) - 1, 0), int)
+    return np.maximum(np.round(np.diff(times) / step) - 1, 0).astype(int)
+
+
+def retimed(times: IntArray, rows: Rows, fps: float) -> str:
+    """A warning if frames by number are not at the times of their rows; else "".
+
+    Jitter is allowed, and, where no row is missing, a rate that is known to a hundredth.
+
+    Args:
+        times: of the rows, nanoseconds.
+        rows: which of them each frame shows, each at least once.
+        fps: frames a second.
+    """
+    shown = np.asarray(rows)
+    frame = np.concatenate([[0], np.flatnonzero(shown[1:] != shown[:-1]) + 1])
+    since = (times - times[0]) / NANOSECONDS
+    lacks = _lacks(times)
+    lacks[pauses(times) - 1] = 0
+    lost = int(lacks.sum())
+    allowed = JITTER / fps + (0 if lost else UNEVEN) * since
+    if (np.abs(since - frame / fps) <= allowed).all():
+        return ""
+    lasts, become = since[-1] + 1 / fps, len(rows) / fps
+    return f"its rate uneven ({lost} missing): {lasts:.6g} s of it become {become:.6g} s of frames"
+
+
+def counts(count: int, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
+    """Counts of a stream's rows, of frames that repeat one, and of rows in no frame.
+
+    Args:
+        count: of the rows.
+        rows: which of them each frame shows.
+        gaps: frames that are not counted.
+    """
+    shown = len(rows)
+    if not isinstance(rows, range):
+        shown = int(np.count_nonzero(rows[1:] != rows[:-1])) + 1
+    held = sum(stop - start for start, stop in gaps)
+    return {"messages": count, "repeated": len(rows) - held - shown, "dropped": count - shown}
+
+
+def gaps_in_words(gaps: Sequence[Span], fps: float) -> str:
+    """How many gaps there are, how long the longest is, and when it begins."""
+    start, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
+    many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
+    return f"{many} of {(stop - start) / fps:.3g} s after {(start - 1) / fps:.6g} s"

@@ -1,0 +1,189 @@
+"""Arrays of numbers or of images, of the caller or in files of NumPy, at any even rate."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray, as_array
+from cdmisfa.core.clock import START_NS
+from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
+from cdmisfa.core.untrusted import BUDGET, check_regular
+from recorder.images.framing import pixels_of
+from recorder.images.options import InputOptions
+from recorder.images.pixels import raw_image
+from replay.logs.formats.messages import NoTopicError, fits_topic
+from replay.logs.stream import ChannelFacts, LogStream, Rows, picked
+from replay.storage.arrays import NOT_ARRAYS
+
+ENDINGS: Final = (".npy", ".npz")
+
+FPS: Final = 50.0
+"""Frames a second by default, as arrays have no times."""
+
+RECIPE: Final = (
+    "pictures: truth as 0 and 255, 16 bit by its high byte, floats of 0 to 1 as round(255 x); "
+    "numbers as they are, float64"
+)
+"""How arrays of other types than uint8 become frames, for the record."""
+
+_FORMS: Final = (
+    "give (n,) or (n, values) numbers, or pictures as (n, height, width), or (n, height, width, 3) "
+    "in colours"
+)
+
+
+def streams(
+    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+) -> list[LogStream]:
+    """Open a file of NumPy, of which an .npz has a stream for each array.
+
+    Raises:
+        UsageError: no such array, or one that holds no frames.
+        LogDamagedError: the file holds something else.
+    """
+    held = load_numbers(path)
+    chosen = [name for name in held if not options.topics or fits_topic(name, options.topics)]
+    if not chosen:
+        raise NoTopicError(f"{path}: it has the arrays {', '.join(held)}: name of these")
+    try:
+        return array_streams({name: held[name] for name in chosen}, options, path)
+    except UsageError as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def array_streams(
+    arrays: Mapping[str, Any], options: InputOptions, path: Path | None = None
+) -> list[LogStream]:
+    """Return arrays as streams.
+
+    Args:
+        arrays: by the stream's name numbers (n,) or (n, I) of any type, or images (n, height,
+            width), or in colours (n, height, width, 3 or 4), of uint8, uint16, bool, or floats of
+            0 to 1; arrays, lists, or tables of pandas, Polars, Arrow or DuckDB.
+        options: whether colours are shown.
+        path: of their file.
+
+    Raises:
+        UsageError: an array has another form, or holds numbers that are not finite.
+    """
+    if not arrays:
+        raise UsageError("no array given: name one at least")
+    found = []
+    for name, given in arrays.items():
+        array = _checked(str(name), given)
+        stream = LogStream(
+            path=path or Path(f"the array {name}"),
+            topic=str(name),
+            count=len(array),
+            begins=START_NS,
+            read=partial(_frames, array, options.color is True),
+            encoding="numpy",
+            recipe=RECIPE,
+            digest=None if path else partial(array_hash, str(name), array),
+        )
+        found.append(stream)
+    return found
+
+
+def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
+    """Load the arrays of a user's file, by name; the one of .npy is mapped, and called as the file.
+
+    Raises:
+        UsageError: there is no such file, or it is too large.
+        LogDamagedError: the file holds something else.
+    """
+    check_regular(path)
+    try:
+        if path.suffix.lower() == ".npy":
+            return {path.stem: np.lib.format.open_memmap(path, mode="r")}
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+            large = sum(member.file_size for member in stored.zip.infolist()) > BUDGET
+            arrays = {} if large else {name: stored[name] for name in stored.files}
+    except NOT_ARRAYS as error:
+        pickled = "pickle" in str(error)
+        why = "it holds Python objects, or something else" if pickled else one_line(error)
+        raise LogDamagedError(f"{path} is no file of NumPy's arrays ({why})") from error
+    if large:
+        raise UsageError(
+            f"{path}: its arrays have more than {BUDGET >> 20} MiB: save each as .npy, which is "
+            "not read whole"
+        )
+    if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
+        raise LogDamagedError(f"{path} is no file of NumPy's arrays: it holds none")
+    return arrays
+
+
+def channels(path: Path) -> list[ChannelFacts]:
+    """Return the arrays of a file; raises as `load_numbers`."""
+    found = []
+    for name, array in load_numbers(path).items():
+        shape = "x".join(map(str, array.shape[1:]))
+        rows = len(array) if array.ndim else 1
+        kind = f"{array.dtype} {shape}".rstrip()
+        found.append(ChannelFacts(name, "numpy", kind, rows, images=False))
+    return found
+
+
+def array_hash(name: str, array: NDArray[Any]) -> dict[str, Any]:
+    """Return what identifies an array of the caller, as JSON values."""
+    digest = hashlib.sha256()
+    for start in range(0, len(array), 1024):
+        digest.update(np.ascontiguousarray(array[start : start + 1024]).data)
+    about = {"dtype": array.dtype.str, "shape": list(array.shape)}
+    return {"stream": name, **about, "sha256": digest.hexdigest()}
+
+
+def _frames(array: NDArray[Any], color: bool, rows: Rows) -> tuple[NDArray[Any], FloatArray]:
+    """Return rows of an array as images of uint8, or numbers of float64, never a view of it."""
+    part, none = picked(array, rows), np.empty((len(rows), 0))
+    if part.ndim == 2:
+        return part.astype(np.float64), none
+    if part.dtype == np.uint16:
+        pixels = (part >> 8).astype(np.uint8)
+    else:
+        pixels = pixels_of(part).astype(np.uint8)
+    if pixels.ndim == 3 or color:
+        return pixels, none
+    height, width = pixels.shape[1:3]
+    gray = [
+        raw_image(np.ascontiguousarray(x).reshape(-1).data, height, width, "rgb8") for x in pixels
+    ]
+    return np.stack(gray), none
+
+
+def _checked(name: str, given: Any) -> NDArray[Any]:
+    """Return an array as (n, I) of numbers or (n, height, width[, 3])."""
+    array = as_array(given, name)
+    array = array[:, None] if array.ndim == 1 else array
+    if array.ndim == 4 and array.shape[3] in (1, 3, 4):
+        array = array[..., 0] if array.shape[3] == 1 else array[..., :3]
+    if array.dtype.kind not in "biuf" or array.ndim not in (2, 3, 4) or not array.size:
+        raise UsageError(f"{name}: an array {array.shape} of {array.dtype}: {_FORMS}")
+    if array.ndim == 4 and array.shape[3] != 3:
+        raise UsageError(
+            f"{name}: an array {array.shape} of {array.dtype}: {_FORMS}; np.moveaxis(x, 1, -1) "
+            "moves colours last"
+        )
+    if array.dtype.kind == "f":
+        finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
+        if not finite.all():
+            raise UsageError(
+                f"{name}: row {int(np.argmin(finite))}, counted from 0, holds NaN or infinity, as "
+                f"{int((~finite).sum())} of {len(array)} rows do: leave them out or fill them"
+            )
+    if array.ndim > 2 and array.dtype not in (np.uint8, np.uint16, np.bool_):
+        low, high, most = array.min(), array.max(), 1 if array.dtype.kind == "f" else 255
+        if low < 0 or high > most:
+            raise UsageError(
+                f"{name}: pictures of {array.dtype} hold {low:g} to {high:g}: scale them to 0 to "
+                f"{most}, or give uint8; other numbers are rows, as x.reshape(len(x), -1)"
+            )
+    return array.astype(array.dtype.newbyteorder("="), copy=False)

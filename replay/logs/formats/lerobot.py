@@ -1,0 +1,291 @@
+"""LeRobot datasets, layout v3.0: cameras, or numbers, of all episodes, in their order.
+
+The layout is read as it is published (github.com/huggingface/lerobot), with PyArrow and PyAV.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from cdmisfa.core.arrays import ByteArray, FloatArray
+from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.untrusted import BUDGET, check_regular, read_json
+from recorder.images.compressed import compressed_image
+from recorder.images.fields import EXACT, bounded
+from recorder.images.options import NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, InputOptions
+from recorder.mcap.records import MAX_CHUNK, MalformedRecord
+from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic
+from replay.logs.formats.video import VideoFile
+from replay.logs.stream import ChannelFacts, LogStream, Rows, explained, limited, picked
+
+INFO: Final = "meta/info.json"
+PAUSE: Final = 20
+"""Frames that would fit between two episodes, of which nobody knows when they were."""
+
+_IMAGES: Final = ("video", "image")
+
+
+class Dataset:
+    """The frames of a dataset: where each episode begins, and when each frame is.
+
+    Attributes:
+        info: its description.
+        rows: its table of episodes.
+        starts: the first frame of each episode, and the end of the last.
+        times: of each frame, nanoseconds.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        self.path, self.info = path, _info(path)
+        self.rows = _episodes(path, ["episode_index", "length", *columns])
+        with limited(path, "LeRobot's layout"):
+            lengths = np.array([int(row["length"]) for row in self.rows], np.int64)
+            self.starts = np.concatenate([[0], np.cumsum(lengths)])
+            ticks = np.arange(self.starts[-1]) + np.repeat(np.arange(len(lengths)) * PAUSE, lengths)
+            times = np.round(ticks * (NANOSECONDS / float(self.info["fps"])))
+        if not len(times):
+            raise UsageError(f"{path}: there is no frame in it")
+        self.times = times.astype(np.int64)
+
+    def stream(self, topic: str, what: str, **about: Any) -> LogStream:
+        """Return a stream of all frames."""
+        many = len(self.rows)
+        note = f"{self.path}: {what} is of {many} episodes, with pauses between"
+        about["warnings"] = [*about.get("warnings", ()), *([note] if many > 1 else [])]
+        return LogStream(
+            path=self.path, topic=topic, count=len(self.times), times=self.times, **about
+        )
+
+
+def streams(
+    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+) -> list[LogStream]:
+    """Open the cameras of a dataset, or the numbers that are asked for as one stream.
+
+    Raises:
+        UsageError: no such camera or numbers, another version of the layout, or PyAV is missing.
+        LogDamagedError: its tables cannot be read, or contradict each other.
+    """
+    if options.fields:
+        return [_numbers(path, options)]
+    cameras = features(path)[1]
+    chosen = [c for c in cameras if not options.topics or fits_topic(c, options.topics)]
+    if not chosen or (not options.topics and len(chosen) > 1):
+        wrong = f"no topic {', '.join(options.topics)}" if options.topics else "name one --topic"
+        raise NoTopicError(f"{path}: {wrong}; it has images on: {', '.join(cameras) or 'none'}")
+    found = []
+    for topic in chosen:
+        camera = _Camera(path, topic, color=options.color is True)
+        opened.callback(camera.close)
+        stream = camera.dataset.stream(
+            topic,
+            topic,
+            fetch=camera.fetch,
+            decode=camera.decode,
+            picture=None if camera.video else bytes,
+            held=camera.held,
+            program="LeRobot's layout",
+            recipe=VIDEO_RECIPE if camera.video else RECIPE,
+        )
+        found.append(stream)
+    return found
+
+
+class _Camera:
+    """The images of one camera, in videos or in tables."""
+
+    def __init__(self, path: Path, topic: str, *, color: bool) -> None:
+        self._topic, self._color = topic, color
+        self.video = _info(path)["features"][topic]["dtype"] == "video"
+        place = f"videos/{topic}/" if self.video else "data/"
+        keys = [f"{place}chunk_index", f"{place}file_index"]
+        start = f"{place}from_timestamp" if self.video else "dataset_from_index"
+        self.dataset = Dataset(path, [*keys, start])
+        self._fps = float(self.dataset.info["fps"])
+        scale = self._fps if self.video else 1
+        with explained(path, "LeRobot's layout"):
+            rows = self.dataset.rows
+            self._files = [(int(row[keys[0]]), int(row[keys[1]])) for row in rows]
+            self._first = [round(float(row[start]) * scale) for row in rows]
+        self._file: Path | None = None
+        self._images: Any = None
+
+    def fetch(self, row: int) -> Any:
+        """Read the JPEG or PNG of a frame, or find its place in a video; the file stays open."""
+        dataset = self.dataset
+        episode = int(np.searchsorted(dataset.starts, row, side="right")) - 1
+        place = self._first[episode] + row - int(dataset.starts[episode])
+        chunk, number = self._files[episode]
+        template = dataset.info["video_path" if self.video else "data_path"]
+        name = template.format(video_key=self._topic, chunk_index=chunk, file_index=number)
+        file = dataset.path / name
+        if self._file != file:
+            self.close()
+            if not file.is_file():
+                raise LogDamagedError(f"{file}: there is no such file, its dataset names it")
+            self._images = self._table(file) if not self.video else VideoFile(file, self._color)
+            self._file = file
+        if not self.video:
+            return self._picture(place)
+        times = self._images.times
+        if not (
+            place < len(times) and abs(int(times[place]) / NANOSECONDS * self._fps - place) < 0.5
+        ):
+            raise MalformedRecord(f"{name} has no frame at {place / self._fps:g} s")
+        return place
+
+    def decode(self, stored: Any) -> ByteArray:
+        """Decode what `fetch` returns."""
+        if not self.video:
+            return compressed_image(stored, color=self._color)
+        image: ByteArray = self._images.image(stored)
+        return image
+
+    def held(self) -> int:
+        """Bytes of the file that is open."""
+        if self._images is None:
+            return 0
+        return int(self._images.held if self.video else self._images.nbytes)
+
+    def close(self) -> None:
+        """Close the file that is open; harmless when called twice."""
+        if self.video and self._images is not None:
+            self._images.close()
+        self._file = self._images = None
+
+    def _table(self, file: Path) -> Any:
+        import pyarrow.parquet as pq
+
+        with limited(file, "PyArrow"):
+            table = pq.read_table(file, columns=["index", self._topic], use_threads=False)
+            if table.nbytes > BUDGET - MAX_CHUNK:  # PyArrow aborts where a small allocation fails
+                raise MemoryError
+        return table
+
+    def _picture(self, index: int) -> bytes:
+        table = self._images
+        row = index - int(table["index"][0].as_py())
+        value = table[self._topic][row].as_py() if 0 <= row < table.num_rows else None
+        data = value.get("bytes") if isinstance(value, Mapping) else None
+        if not isinstance(data, bytes):
+            raise MalformedRecord("its table holds no picture there")
+        return data
+
+
+def _numbers(path: Path, options: InputOptions) -> LogStream:
+    """Numbers of a dataset, as observation.state and action, those of each frame one row."""
+    topic, names, what = path.resolve().name, options.fields, ", ".join(options.fields)
+    check_topics(path, topic, options.topics)
+    known = features(path)[0]
+    if absent := [name for name in names if name not in known]:
+        raise UsageError(f"{path}: no numbers {absent[0]}; it has {', '.join(known)}")
+    dataset = Dataset(path, ["dataset_from_index"])
+    files = sorted((path / "data").rglob("*.parquet"))
+    if not files:
+        raise LogDamagedError(f"{path}: there is no table of its frames")
+    numbers = np.concatenate([_columns(file, names) for file in files])
+    with limited(path, "LeRobot's layout", held=numbers.nbytes):
+        starts = dataset.starts
+        firsts = np.array([int(row["dataset_from_index"]) for row in dataset.rows]) - starts[:-1]
+        at = np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))
+        frames = bounded(numbers[at], options.range)
+    if not (whole := np.isfinite(frames).all(axis=1)).all():
+        raise UsageError(
+            f"{path}: frame {int(np.argmin(whole))} lacks a number of {what}, or has one that is "
+            "not finite: name others with --field"
+        )
+    rounded = [f"{path}: numbers beyond 2^53 may be rounded, to float64"]
+
+    def read(rows: Rows) -> tuple[FloatArray, FloatArray]:
+        return picked(frames, rows), np.empty((len(rows), 0))
+
+    return dataset.stream(
+        topic,
+        what,
+        read=read,
+        recipe=NUMBERS_RECIPE,
+        fields=names,
+        warnings=rounded if (np.abs(frames) > EXACT).any() else [],
+    )
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder is a LeRobot dataset."""
+    return (path / INFO).is_file()
+
+
+def channels(path: Path) -> list[ChannelFacts]:
+    """Return the features of a dataset, one value a frame."""
+    info = _info(path)
+    found = []
+    for name, feature in info["features"].items():
+        kind, shape = feature.get("dtype"), "x".join(map(str, feature.get("shape", ())))
+        frames = int(info["total_frames"])
+        found.append(ChannelFacts(name, str(kind), shape, frames, images=kind in _IMAGES))
+    return found
+
+
+def features(path: Path) -> tuple[list[str], list[str]]:
+    """Return the features of a dataset that are numbers, and those that are images."""
+    kinds = {name: str(own.get("dtype")) for name, own in _info(path)["features"].items()}
+    numbers = [name for name, kind in kinds.items() if kind.startswith(("float", "int", "bool"))]
+    return numbers, [name for name, kind in kinds.items() if kind in _IMAGES]
+
+
+def _columns(file: Path, names: Sequence[str]) -> FloatArray:
+    """The numbers of each frame in a table, one after the other, (n, I)."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    check_regular(file)
+    found = []
+    with limited(file, "PyArrow", remedy="take fewer, with --field"):
+        table = pq.ParquetFile(file).read(columns=list(names), use_threads=False)
+        for name in names:
+            column = table[name].combine_chunks()
+            while pa.types.is_nested(column.type):
+                column = column.flatten()
+            flat = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+            found.append(flat.reshape(table.num_rows, -1))
+        return np.concatenate(found, axis=1)
+
+
+def _info(path: Path) -> Any:
+    try:
+        info = read_json(path / INFO, "it describes no LeRobot dataset")
+        version = str(info["codebase_version"])
+        sound = all(isinstance(f, dict) for f in info["features"].values()) and info["fps"] > 0
+        int(info["total_frames"])
+    except (LogDamagedError, ValueError, KeyError, TypeError, AttributeError):
+        sound, version = False, "v3"
+    if not version.startswith("v3"):
+        raise UsageError(
+            f"{path} is a LeRobot dataset {version}, v3.0 is read: convert it with LeRobot's "
+            "convert_dataset_v21_to_v30"
+        )
+    if not sound:
+        raise LogDamagedError(f"{path / INFO}: it describes no LeRobot dataset")
+    return info
+
+
+def _episodes(path: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
+    """The rows of the tables of episodes, in their order."""
+    import pyarrow.parquet as pq
+
+    rows: list[dict[str, Any]] = []
+    files = sorted((path / "meta" / "episodes").rglob("*.parquet"))
+    if not files:
+        raise LogDamagedError(f"{path}: there is no table of its episodes")
+    for file in files:
+        check_regular(file)
+        with limited(file, "PyArrow"):
+            table = pq.ParquetFile(file).read(columns=list(columns), use_threads=False)
+            rows += table.to_pylist()
+    with explained(path, "LeRobot's layout"):
+        return sorted(rows, key=lambda row: int(row["episode_index"]))

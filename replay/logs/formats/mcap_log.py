@@ -1,0 +1,199 @@
+"""MCAP logs: images or numbers in messages of any kind, of one file or of the parts of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import IntArray
+from recorder.images.messages import Decoder, MessageKind, decoder_of
+from recorder.images.options import InputOptions
+from recorder.mcap.chunks import MessageTable
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MalformedRecord, Segment
+from replay.logs.formats.messages import choose_topics, message_stream
+from replay.logs.stream import LogStream, NothingLoggedError
+from replay.storage.opening import by_number
+
+
+def streams(
+    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+) -> list[LogStream]:
+    """Open the topics of a file, or of a folder whose files are the parts of one log.
+
+    A part may lack a topic, and an empty part is left out.
+
+    Raises:
+        UsageError: no such topic, or not what is asked for on it.
+        LogDamagedError: the log is damaged.
+    """
+    readers: list[LogReader] = []
+    empty: list[NothingLoggedError] = []
+    for file in sorted(path.glob("*.mcap"), key=by_number) if path.is_dir() else [path]:
+        reader = opened.enter_context(LogReader(file, salvage=salvage))
+        try:
+            refuse_empty(reader)
+            readers.append(reader)
+        except NothingLoggedError as error:
+            empty.append(error)
+    if not readers:
+        raise empty[0]
+    channels = [
+        (channel.topic, kind_of(reader, channel), (reader, channel.id))
+        for reader in readers
+        for channel in reader.channels.values()
+    ]
+    expected: dict[LogReader, Sequence[Segment]] = {}
+    found = []
+    for topic, kind, own in choose_topics(path, channels, options):
+        messages, parts = Messages(own, expected), len({reader for reader, _ in own})
+        joined = [f"{path}: {topic} is joined from {parts} logs, by time"] if parts > 1 else []
+        left_out = [f"{error}: left out" for error in empty]
+        stream = message_stream(
+            path,
+            topic,
+            kind,
+            options,
+            messages.times,
+            messages.fetch,
+            held=messages.held,
+            reader=None if path.is_dir() else readers[0],
+            warnings=[*joined, *left_out, *(w for reader in readers for w in reader.warnings)],
+        )
+        found.append(stream)
+    return found
+
+
+class Messages:
+    """The messages on a topic, by log time, ties in the order of the files.
+
+    Args:
+        channels: of the topic, each with the reader of its file.
+        expected: the chunks that each reader was last told to expect, by whatever topic.
+
+    Attributes:
+        times: (n,) log times, nanoseconds.
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[tuple[LogReader, int]],
+        expected: dict[LogReader, Sequence[Segment]],
+    ) -> None:
+        self._expected = expected
+        self._channels: dict[LogReader, list[int]] = {}
+        for reader, number in channels:
+            self._channels.setdefault(reader, []).append(number)
+        self._segments: dict[LogReader, list[Segment]] = {}
+        self._chunks: list[tuple[LogReader, Segment]] = []
+        parts: list[NDArray[np.uint64]] = [np.empty(0, np.uint64)]
+        for reader, numbers in self._channels.items():
+            by_chunk = _by_index if reader.by_index else _by_pass
+            found = list(by_chunk(reader, numbers))
+            self._segments[reader] = [segment for segment, _ in found]
+            self._chunks += [(reader, segment) for segment, _ in found]
+            parts += [own for _, own in found]
+        times, counts = np.concatenate(parts), [len(own) for own in parts[1:]]
+        order = np.argsort(times, kind="stable")
+        self.times = times[order].astype(np.int64)
+        self._chunk_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)[order]
+        self._row_in = np.concatenate([np.arange(n) for n in counts] or [order])[order]
+        self._now: tuple[int, IntArray] = -1, np.empty(0, int)
+        self._bytes = 0
+        for reader in self._channels:
+            self._expect(reader)
+
+    def fetch(self, row: int) -> memoryview:
+        """Read a message; a `MalformedRecord` if its chunk is damaged."""
+        number = int(self._chunk_of[row])
+        reader, segment = self._chunks[number]
+        if number != self._now[0]:
+            self._expect(reader)
+        table = reader.table(segment)
+        if table is None:
+            raise MalformedRecord("it is damaged")
+        if number != self._now[0]:
+            self._now, self._bytes = (
+                (number, _rows_of(table, self._channels[reader])),
+                table.data.nbytes,
+            )
+        own, place = self._now[1], int(self._row_in[row])
+        if place >= len(own) or int(table.log_time[own[place]]) != int(self.times[row]):
+            raise MalformedRecord("its chunk holds other messages than the summary names")
+        return table.view(int(own[place]))
+
+    def held(self) -> int:
+        """Bytes of the chunk that was read last."""
+        return self._bytes
+
+    def _expect(self, reader: LogReader) -> None:
+        """Announce the chunks of the topic, if the last topic that was read has others."""
+        if self._expected.get(reader) != self._segments[reader]:
+            self._expected[reader] = self._segments[reader]
+            reader.expect(self._segments[reader])
+
+
+def _rows_of(table: MessageTable, channels: Sequence[int]) -> IntArray:
+    return np.flatnonzero(np.isin(table.channel, channels))
+
+
+def _by_pass(
+    reader: LogReader, channels: Sequence[int]
+) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
+    """Yield the chunks with messages of channels, and their log times, read and checked."""
+    for segment, table in reader.tables():
+        own = _rows_of(table, channels)
+        if len(own):
+            yield segment, table.log_time[own]
+
+
+def _by_index(
+    reader: LogReader, channels: Sequence[int]
+) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
+    """As `_by_pass`, by the message indexes: a chunk is checked when its messages are read."""
+    numbers = set(channels)
+    segments = [s for s in reader.segments if not numbers.isdisjoint(s.channel_counts() or ())]
+    reader.expect(segments, indexes=True)
+    for segment in segments:
+        own = [pairs for _, pairs in reader.index(segment, numbers)]
+        pairs = own[0] if len(own) == 1 else np.concatenate(own)
+        yield segment, pairs[pairs[:, 1].argsort(kind="stable"), 0]
+
+
+def refuse_empty(reader: LogReader) -> None:
+    """Refuse a log that was cut before its first message."""
+    there = reader.channels and any(segment.size for segment in reader.segments)
+    if not reader.complete and not there:
+        raise NothingLoggedError(f"{reader.path}: {reader.missing}: there is no message before")
+
+
+def topics_in(reader: LogReader) -> list[str]:
+    """Return the topics of a log with images."""
+    channels = reader.channels.values()
+    found = (c.topic for c in channels if decoder_of(kind_of(reader, c), InputOptions()))
+    return list(dict.fromkeys(found))
+
+
+def decoders_in(reader: LogReader) -> dict[int, Decoder]:
+    """Return the decoder of each channel of images."""
+    channels = [(c.topic, kind_of(reader, c), c.id) for c in reader.channels.values()]
+    topics, found = topics_in(reader), dict[int, Decoder]()
+    options = InputOptions(topics=tuple(topics))
+    for _, kind, numbers in choose_topics(reader.path, channels, options) if topics else ():
+        decode = decoder_of(kind, options)
+        assert decode is not None
+        found |= dict.fromkeys(numbers, decode)
+    return found
+
+
+def kind_of(reader: LogReader, channel: Channel) -> MessageKind:
+    """Return the kind of a channel's messages."""
+    schema = reader.schemas.get(channel.schema_id)
+    if schema is None:
+        return MessageKind("no schema", channel.message_encoding)
+    return MessageKind(schema.name, channel.message_encoding, schema.data, schema.encoding)

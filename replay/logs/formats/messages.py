@@ -1,0 +1,243 @@
+"""Topics of messages, of MCAP logs and ROS bags alike, as streams of images or numbers."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from cdmisfa.core.arrays import IntArray
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.messages import (
+    PACKED,
+    SCHEMAS,
+    MessageKind,
+    decoder_of,
+    packed_picture,
+    stamp_of,
+    stated_format,
+)
+from recorder.images.options import NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, InputOptions
+from recorder.images.pixels import MalformedImage, Shown
+from recorder.images.videos import VideoPackets
+from recorder.mcap.records import MalformedRecord
+from replay.logs.stream import LogStream
+
+Channel = TypeVar("Channel")
+
+
+class NoTopicError(UsageError):
+    """A log that has none of the topics that are asked for."""
+
+
+def fits_topic(name: str, topics: Sequence[str]) -> bool:
+    """Whether a name is one of some topics, or matches a pattern among them."""
+    return any(name == topic or fnmatch.fnmatchcase(name, topic) for topic in topics)
+
+
+def check_topics(path: Path, name: str, topics: Sequence[str]) -> None:
+    """Refuse topics of a log that has none, unless one is its name; a `NoTopicError`."""
+    if topics and not fits_topic(name, topics):
+        raise NoTopicError(f"{path}: it has no topics, leave {', '.join(topics)} out")
+
+
+def choose_topics(
+    path: Path, channels: Iterable[tuple[str, MessageKind, Channel]], options: InputOptions
+) -> list[tuple[str, MessageKind, list[Channel]]]:
+    """Choose the topics that are asked for, of images or of fields, in their order in the log.
+
+    A topic may have several channels of one kind, as where its publisher began again.
+
+    Args:
+        path: the log.
+        channels: the topic, the kind of the messages, and the channel itself.
+        options: `topics`, which may be left out if there is one, and what is taken of them.
+
+    Returns:
+        Topic, kind and channels of each.
+
+    Raises:
+        NoTopicError: there is none, or several and none is named.
+        UsageError: its messages are of several kinds.
+    """
+    readable: dict[str, dict[MessageKind, tuple[MessageKind, list[Channel]]]] = {}
+    others: dict[str, str] = {}
+    for topic, kind, channel in channels:
+        if decoder_of(kind, options) is None:
+            others[topic] = f"{kind.schema} in {kind.encoding or 'no encoding'}"
+        else:
+            alike = kind if options.fields else MessageKind(kind.schema, kind.encoding)
+            kinds = readable.setdefault(topic, {})
+            kinds.setdefault(alike, (kind, []))[1].append(channel)
+    topics = options.topics
+    chosen = [topic for topic in readable if not topics or fits_topic(topic, topics)]
+    if not chosen or (not topics and len(chosen) > 1):
+        raise NoTopicError(f"{path}: {_why_none(readable, others, options)}")
+    for topic in chosen:
+        if len(readable[topic]) > 1:
+            listed = ", ".join(f"{kind.schema} in {kind.encoding}" for kind in readable[topic])
+            raise UsageError(
+                f"{path}: {topic} holds messages of several kinds, which are no one stream: "
+                f"{listed}"
+            )
+    return [(topic, *next(iter(readable[topic].values()))) for topic in chosen]
+
+
+def _why_none(readable: Iterable[str], others: Mapping[str, str], options: InputOptions) -> str:
+    """Say why no topic is chosen, given those that can be read and the kinds of the others."""
+    what = "messages with fields" if options.fields else "images"
+    if not readable and not any(topic in others for topic in options.topics):
+        if options.fields:
+            return "it holds no messages whose fields are known"
+        return "it holds no images; numbers are taken with --field"
+    wrong = "name one --topic or more"
+    if topics := ", ".join(options.topics):
+        kind = next((others[topic] for topic in options.topics if topic in others), "")
+        images = f"{topics} holds {kind}, which is no image that is read ({', '.join(SCHEMAS)})"
+        wrong = images if kind and not options.fields else f"no topic {topics}"
+    return f"{wrong}; it has {what} on: {', '.join(sorted(readable)) or 'none'}"
+
+
+def message_stream(
+    path: Path,
+    topic: str,
+    kind: MessageKind,
+    options: InputOptions,
+    times: IntArray,
+    fetch: Callable[[int], Any],
+    **about: Any,
+) -> LogStream:
+    """Make a stream of the messages on a topic.
+
+    Args:
+        path: the log.
+        topic: the topic.
+        kind: of its messages.
+        options: what is taken of them.
+        times: when each was logged, nanoseconds, in order.
+        fetch: reads a message.
+        about: further attributes of the stream.
+
+    Raises:
+        UsageError: there is no message.
+        LogDamagedError: a message cannot be read.
+    """
+    if not len(times):
+        raise UsageError(f"{path}: there is no message on {topic}")
+    decode = decoder_of(kind, options)
+    assert decode is not None
+    names = kind.schema, kind.encoding
+    stream = LogStream(
+        path=path,
+        topic=topic,
+        count=len(times),
+        times=times,
+        fetch=fetch,
+        decode=decode,
+        picture=partial(packed_picture, *names) if names in PACKED and not options.fields else None,
+        stamp=stamp_of(kind) if options.stamp == "header" else None,
+        pixel_format=partial(stated_format, *names),
+        recipe=NUMBERS_RECIPE if options.fields else RECIPE,
+        fields=options.fields,
+        **about,
+    )
+    if isinstance(decode, VideoPackets):
+        stream = _Video(stream, decode).stream()
+    return by_stamps(stream) if options.stamp == "header" else stream
+
+
+def by_stamps(stream: LogStream) -> LogStream:
+    """Return a stream in the order and at the times that its messages state; all are read.
+
+    Raises:
+        UsageError: the messages state no times.
+        LogDamagedError: a message cannot be read.
+    """
+    if stream.stamp is None:
+        raise UsageError(
+            f"{stream.path}: {stream.topic} has no messages with a header: leave out "
+            "input.stamp=header"
+        )
+    stamps = np.empty(stream.count, np.int64)
+    for row in range(stream.count):
+        try:
+            stamps[row] = stream.taken(row, stream.stamp)
+        except (MalformedRecord, MalformedImage) as error:
+            raise LogDamagedError(f"{stream.name_of(row)}: {error}") from None
+    if len(stamps) > 1 and stamps.min() == stamps.max():
+        raise UsageError(
+            f"{stream.path}: the headers on {stream.topic} all say {stamps[0]} ns: leave out "
+            "--set input.stamp=header"
+        )
+    order = np.argsort(stamps, kind="stable")
+    return stream.part(order, stamps[order])
+
+
+class _Video:
+    """Images of a video in messages, in any order, from the first on that needs none before it.
+
+    Args:
+        messages: the messages.
+        packets: their decoder.
+    """
+
+    def __init__(self, messages: LogStream, packets: VideoPackets) -> None:
+        self._messages, self._packets = messages, packets
+        self._next = -1  # the message that the decoder expects
+        self._broken: dict[int, MalformedImage | MalformedRecord] = {}
+
+    def stream(self) -> LogStream:
+        """Return the images as a stream; a UsageError if none can be decoded."""
+        messages = self._messages
+        rows = range(messages.count)
+        first = next((row for row in rows if self._begins(row)), messages.count)
+        if first == messages.count:
+            why = "each picture of its video needs earlier ones"
+            try:
+                messages.taken(0, self._packets.begins)
+            except (MalformedImage, MalformedRecord) as error:
+                why = str(error)
+            raise UsageError(f"{messages.path}: {messages.topic}: {why}")
+        self._first = first
+        stamp = messages.stamp
+        lost = f"{messages.path}: {first} pictures that need earlier ones are left out"
+        video = replace(
+            messages,
+            fetch=int,
+            decode=self._decode,
+            pixel_format=None,
+            stamp=stamp and (lambda row: messages.taken(row, stamp)),
+            recipe=VIDEO_RECIPE,
+            warnings=[*messages.warnings, *([lost] if first else [])],
+        )
+        assert messages.times is not None
+        return video.part(np.arange(first, messages.count), messages.times[first:])
+
+    def _decode(self, row: int) -> Shown:
+        start = row
+        while start not in (self._first, self._next) and not self._begins(start):
+            start -= 1
+            if start in self._broken:  # the images behind it are made of it
+                raise self._broken[start]
+        if start != self._next:
+            self._packets.forget()
+        self._next = -1
+        for at in range(start, row + 1):
+            try:
+                shown = self._packets(self._messages.fetch(at))
+            except (MalformedImage, MalformedRecord) as error:
+                self._broken[at] = error
+                raise
+        self._next = row + 1
+        return shown
+
+    def _begins(self, row: int) -> bool:
+        try:
+            return self._messages.taken(row, self._packets.begins)
+        except (MalformedImage, MalformedRecord):
+            return False

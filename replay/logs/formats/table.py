@@ -1,0 +1,282 @@
+"""Tables of numbers, CSV or Parquet, through PyArrow: each row is a frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from cdmisfa.core.arrays import FloatArray, IntArray
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.untrusted import check_regular
+from recorder.images.fields import EXACT, Field, bounded, is_path
+from recorder.images.options import NUMBERS_RECIPE, InputOptions
+from replay.logs.formats.messages import check_topics
+from replay.logs.stream import LAST_NS, ChannelFacts, LogStream, Rows, limited, picked
+
+ENDINGS: Final = (".csv", ".parquet")
+
+UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
+"""Units of a column of times, in nanoseconds."""
+
+MAX_BYTES: Final = 1024**3
+"""Largest file that is read as a table, which is held in memory."""
+
+MAX_ROWS: Final = 4 * 1024**2
+"""Most rows of a file with fewer bytes than rows, as each has a place on the clock, too."""
+
+_MISSING: Final = (" ", "-", "--", "?", "<NA>", "None", "none", "na", "n.a.", "N.A.", "Null")
+"""Words for a missing value that PyArrow does not know by itself."""
+
+_NUMBER: Final = r"^[ \t]*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?[ \t]*$"
+
+
+def streams(
+    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+) -> list[LogStream]:
+    """Read the numbers of a table as one stream, in the order of time.
+
+    The columns are those that `options.fields` names, or all of numbers but the times; a column of
+    lists or of structures is a message, with the fields that `Field` names. Times are in the
+    column `options.time`: dates, or numbers of seconds, or of another unit as in `stamp:ns`.
+    Without it the rows are at an even rate.
+
+    Rows without a number or a time are left out, and those with one that is not finite where
+    numbers are kept in no range.
+
+    Raises:
+        UsageError: no such column, or no numbers in it.
+        LogDamagedError: it is no table, or has words among numbers.
+    """
+    check_topics(path, path.stem, options.topics)
+    table = _read(path)
+    if path.suffix.lower() == ".csv":
+        _refuse_words(path, table, options.fields or table.column_names)
+    times, time_column = _times(path, table, options.time)
+    fields = options.fields or tuple(
+        name for name in table.column_names if name != time_column and _is_numeric(table[name])
+    )
+    if not fields or not table.num_rows:
+        kinds = ", ".join(f"{name} of {table[name].type}" for name in table.column_names[:20])
+        raise UsageError(f"{path}: it has no column of numbers with rows, but {kinds}")
+    with limited(path, "PyArrow", remedy="take fewer columns, with --field"):
+        columns = [_column(path, table, name) for name in fields]
+    numbers = np.concatenate(columns, axis=1)
+    # A missing number is not out of bounds: input.range keeps no row without one.
+    whole = ~np.any([np.isnan(column).all(axis=1) for column in columns], axis=0)
+    whole &= np.isfinite(numbers).all(axis=1) | (options.range is not None)
+    if times is not None:
+        whole &= times >= 0
+    first_left_out = _row_name(path, int(np.argmin(whole)))
+    if times is None and not whole.all():
+        raise UsageError(
+            f"{path}: {first_left_out} lacks a finite number: name the column of its times with "
+            "--set input.time=COLUMN, so that it can be left out"
+        )
+    if not whole.any():
+        raise UsageError(f"{path}: there is no row with all of {', '.join(fields)}")
+    rows, warnings = np.flatnonzero(whole), []
+    if left_out := int((~whole).sum()):
+        warnings.append(
+            f"{left_out} of {len(whole)} rows lack a finite number or their time and are left "
+            f"out, the first is {first_left_out}"
+        )
+    if times is not None:
+        times = times[whole]
+        if late := int((times < np.maximum.accumulate(times)).sum()):
+            warnings.append(
+                f"{late} rows are after later ones: taken in the order of {time_column}"
+            )
+        order = np.argsort(times, kind="stable")
+        rows, times = rows[order], times[order]
+    frames = bounded(numbers, options.range)[rows]
+    if (np.abs(frames) > EXACT).any():
+        warnings.append("numbers beyond 2^53 may be rounded, to float64")
+
+    def read(wanted: Rows) -> tuple[FloatArray, FloatArray]:
+        return picked(frames, wanted), np.empty((len(wanted), 0))
+
+    stream = LogStream(
+        path=path,
+        topic=path.stem,
+        count=len(frames),
+        times=times,
+        read=read,
+        where=lambda row: f"{path}: {_row_name(path, int(rows[row]))}",
+        encoding=path.suffix[1:],
+        recipe=NUMBERS_RECIPE,
+        fields=fields,
+        warnings=[f"{path}: {line}" for line in warnings],
+    )
+    return [stream]
+
+
+def channels(path: Path) -> list[ChannelFacts]:
+    """Return the columns of a table; raises as `streams`."""
+    table, kind = _read(path), path.suffix[1:]
+    return [
+        ChannelFacts(name, kind, str(own.type), len(own) - own.null_count, images=False)
+        for name, own in zip(table.column_names, table.columns, strict=True)
+    ]
+
+
+def notes(path: Path) -> list[str]:
+    """Return the lines that `verify` prints of a table; raises as `streams`."""
+    table = _read(path)
+    return [
+        f"{path}: {table.num_rows} rows of {table.num_columns} columns can be read; a table has "
+        "no checksums, changed numbers would go unnoticed"
+    ]
+
+
+def _read(path: Path) -> Any:
+    """Read a table, PyArrow's own.
+
+    Raises:
+        UsageError: its columns have no names, or the same.
+        LogDamagedError: PyArrow cannot read it.
+    """
+    check_regular(path, MAX_BYTES)
+    with limited(path, "PyArrow", remedy="write fewer columns or rows into a file"):
+        if path.suffix.lower() == ".csv":
+            table = _read_csv(path)
+        else:
+            from pyarrow import parquet
+
+            table = parquet.ParquetFile(path).read()
+        names = table.column_names  # not UTF-8 in some files
+    if table.num_rows > max(MAX_ROWS, path.stat().st_size):
+        raise LogDamagedError(f"{path}: {table.num_rows} rows are too many for its few bytes")
+    if len(set(names)) < len(names) or all(re.match(_NUMBER, name) for name in names):
+        raise UsageError(
+            f"{path}: its first line must have the names of the columns, each another, not numbers"
+        )
+    return table
+
+
+def _read_csv(path: Path, numbers: Sequence[str] = ()) -> Any:
+    """Read a CSV file, with commas, semicolons or tabs between the cells, as its first line has.
+
+    Args:
+        path: the file.
+        numbers: names of columns that must be of numbers.
+    """
+    import pyarrow
+    from pyarrow import csv
+
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        names = re.sub(r'"[^"]*"', "", file.readline(64 * 1024))
+    separator = next((s for s in (",", ";", "\t") if s in names), ",")
+    return csv.read_csv(
+        path,
+        csv.ReadOptions(use_threads=False),  # in several threads errors lack the line
+        csv.ParseOptions(delimiter=separator),
+        csv.ConvertOptions(
+            null_values=[*csv.ConvertOptions().null_values, *_MISSING],
+            column_types=dict.fromkeys(numbers, pyarrow.float64()),
+        ),
+    )
+
+
+def _refuse_words(path: Path, table: Any, names: Sequence[str]) -> None:
+    """Refuse words in those columns of a CSV file that hold a number; PyArrow names the line."""
+    import pyarrow.compute as compute
+
+    mixed = [
+        name
+        for name in names
+        if name in table.column_names
+        and str(table[name].type) in ("string", "binary")
+        and compute.any(compute.match_substring_regex(table[name], _NUMBER)).as_py()
+    ]
+    if mixed:
+        with limited(path, "PyArrow", remedy="choose columns of numbers with --field"):
+            _read_csv(path, mixed)
+
+
+def _row_name(path: Path, row: int) -> str:
+    """Name a row: the line of a CSV file, from 1; of Parquet the row, from 0."""
+    return f"line {row + 2}" if path.suffix.lower() == ".csv" else f"row {row}"
+
+
+def _is_numeric(column: Any) -> bool:
+    import pyarrow.types as kinds
+
+    kind = column.type
+    numbers = kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind)
+    return bool(numbers) and column.null_count < len(column)
+
+
+def _column(path: Path, table: Any, name: str) -> FloatArray:
+    """Return the numbers of a field in each row, (n, I) float64; NaN where there is none.
+
+    Raises:
+        UsageError: the table has none such, or no number in it.
+    """
+    field = Field(name, plain=name in table.column_names or not is_path(name))
+    first = field.first
+    if first not in table.column_names:
+        raise _no_column(path, table, name)
+    if first == name and _is_numeric(table[name]):
+        return _floats(table[name])[:, None]
+    try:
+        values = table[first].to_pylist()
+        found = [None if value is None else field.numbers({first: value}) for value in values]
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+    sizes = {len(own) for own in found if own is not None}
+    if len(sizes) != 1:
+        counts = " or ".join(map(str, sorted(sizes))) or "no"
+        raise UsageError(f"{path}: {name} holds {counts} numbers in a row: choose a part of it")
+    (size,) = sizes
+    return np.array([[np.nan] * size if own is None else own for own in found], np.float64)
+
+
+def _floats(column: Any) -> FloatArray:
+    import pyarrow
+
+    numbers: FloatArray = column.cast(pyarrow.float64(), safe=False).to_numpy()
+    return numbers
+
+
+def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, str]:
+    """Return the time of each row, nanoseconds, -1 where it is missing; and the column's name."""
+    if named is None:
+        return None, ""
+    name, unit = named, "s"
+    if name not in table.column_names:
+        name, _, unit = named.rpartition(":")
+    if name not in table.column_names or unit not in UNITS:
+        raise _no_column(path, table, named)
+    import pyarrow
+    import pyarrow.types as kinds
+
+    column, scale = table[name], UNITS[unit]
+    if kinds.is_timestamp(column.type):
+        with limited(path, "PyArrow"):
+            column = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast(pyarrow.int64())
+        scale = 1
+    rough = _floats(column) * scale if _is_numeric(column) else np.full(len(column), np.nan)
+    known = np.isfinite(rough)
+    if not known.any() or (rough[known] < 0).any() or (rough[known] >= LAST_NS).any():
+        raise UsageError(
+            f"{path}: {name}, of {table[name].type}, holds no times since 1970, dates or numbers "
+            f"counted in {unit}: say what they count ({', '.join(UNITS)}), as --set "
+            f"input.time={name}:ns"
+        )
+    if kinds.is_floating(column.type):
+        exact = np.round(np.where(known, rough, -1.0)).astype(np.int64)
+    else:
+        exact = column.cast(pyarrow.int64(), safe=False).fill_null(-1).to_numpy() * np.int64(scale)
+    return np.where(known, exact, -1), name
+
+
+def _no_column(path: Path, table: Any, name: str) -> UsageError:
+    return UsageError(
+        f"{path}: there is no column {name}; it has {', '.join(table.column_names[:20])}; times "
+        f"may have a unit ({', '.join(UNITS)}), as --set input.time=COLUMN:ns"
+    )

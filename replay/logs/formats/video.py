@@ -1,0 +1,197 @@
+"""Videos, decoded through PyAV (FFmpeg) on one thread."""
+
+from __future__ import annotations
+
+import contextlib
+from array import array
+from collections.abc import Iterator
+from contextlib import ExitStack
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.untrusted import data_bytes
+from recorder.images.options import VIDEO_RECIPE, InputOptions
+from recorder.images.pixels import MAX_PIXELS
+from recorder.images.videos import frame_colors, frame_gray, pyav
+from recorder.mcap.records import MalformedRecord
+from replay.logs.formats.containers import extent_of
+from replay.logs.formats.messages import check_topics
+from replay.logs.stream import LogStream, UnreadableError, limited
+
+ENDINGS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
+_UNTIMED: Final = ("avi", "asf")
+_UNSURE: Final = ("mpeg", "mpegts")
+"""Containers without an index, in which FFmpeg may find a place behind the one that is sought."""
+
+_BEGIN: Final = -(2**40)
+_NOWHERE: Final = 2**62
+_FORWARD: Final = 256
+"""Frames that are decoded and passed over rather than sought."""
+
+
+def streams(
+    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+) -> list[LogStream]:
+    """Open the frames of a video's first stream, at its presentation times.
+
+    Raises:
+        UsageError: PyAV is missing, or its frames have no times.
+        LogDamagedError: it is no video, or a broken one.
+    """
+    check_topics(path, path.stem, options.topics)
+    video = VideoFile(path, options.color is True)
+    opened.callback(video.close)
+    stream = LogStream(
+        path=path,
+        topic=path.stem,
+        count=len(video.times),
+        times=video.times,
+        decode=video.image,
+        held=lambda: video.held,
+        program="FFmpeg",
+        where=lambda row: f"{path}: at {float(int(video.stamps[row]) * video.tick):g} s",
+        encoding=video.encoding,
+        recipe=VIDEO_RECIPE,
+        warnings=[f"{path}: {line}" for line in video.warnings],
+        remarks=[f"{path}: {line}" for line in video.remarks],
+        missing=video.missing,
+    )
+    return [stream]
+
+
+class VideoFile:
+    """The frames of a video by their number.
+
+    Attributes:
+        times: (n,) presentation times, nanoseconds.
+        stamps: (n,) the same, in ticks.
+        tick: length of a tick, in seconds.
+        held: bytes of memory that the open file takes.
+        encoding: name of the codec.
+        missing: what a file that was cut lacks; "" of others.
+        warnings: a line for each thing that it lacks.
+        remarks: a line for each thing that nothing proves.
+    """
+
+    def __init__(self, path: Path, color: bool = False) -> None:
+        self.path = path
+        self._shown = frame_colors if color else frame_gray
+        self._av = pyav(f"{path} is a video, which")
+        self._next = _NOWHERE
+        self._cut = _NOWHERE  # time of the last frame of a file that was cut, which may be a part
+        self._frames: Iterator[Any] = iter(())
+        self._container: Any = None
+        extent = extent_of(path)
+        self.missing = extent.missing
+        before = data_bytes()
+        try:
+            with limited(path, "FFmpeg"):
+                self._container = self._av.open(str(path))
+                self._open()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, UnreadableError) and self.missing:
+                raise LogDamagedError(f"{path}: cut short: {self.missing}") from None
+            raise
+        self.held = data_bytes() - before
+        self.warnings = [self.missing] if self.missing else []
+        self.remarks = ["a video has no checksums, damaged pixels may go unnoticed"]
+        if not self.missing and not extent.stated:
+            self.remarks.append("it does not state where it ends, a missing end would go unnoticed")
+        last = int(self.times[-1]) / NANOSECONDS
+        stated = (self._container.duration or 0) / self._av.time_base
+        if stated > last + 1:
+            self.warnings.append(f"it states {stated:g} s, its last frame is at {last:g} s")
+
+    def _open(self) -> None:
+        """Find the times of all frames, without decoding one."""
+        found = self._container.streams.video
+        if not found or found[0].codec_context is None:
+            raise LogDamagedError(f"{self.path}: there is no video in it")
+        self._stream = stream = found[0]
+        stream.thread_type = "NONE"
+        context = stream.codec_context
+        context.thread_count = 1
+        context.options = {"err_detect": "explode"}  # rather than made up pixels
+        if not 0 < context.width * context.height <= MAX_PIXELS:
+            size = f"{context.width}x{context.height}"
+            raise LogDamagedError(f"{self.path}: images of {size} are not read")
+        self.encoding = str(context.name)
+        container = self._container.format.name
+        self._unsure = container in _UNSURE
+        self.tick = Fraction(stream.time_base)
+        stamps = array("q")
+        timed = True
+        for packet in self._container.demux(stream):
+            if packet.size and not packet.is_discard:
+                timed &= packet.pts is not None
+                stamps.append(packet.pts or 0)
+        # A container without times may hold images that wait for later ones (B-frames).
+        waits = container in _UNTIMED and context.name in ("h264", "hevc") and context.has_b_frames
+        if not timed or (waits and (np.diff(stamps) >= 0).all()):
+            raise UsageError(
+                f"{self.path}: its frames have no times; copy it into an .mp4 file with some "
+                "(ffmpeg -fflags +genpts -i ... -c copy)"
+            )
+        if self.missing and stamps:
+            self._cut = stamps.pop()
+        if not stamps:
+            why = f", cut short: {self.missing}" if self.missing else ""
+            raise LogDamagedError(f"{self.path}: there is no frame in it{why}")
+        self.stamps = np.sort(np.array(stamps, np.int64))
+        if (np.diff(self.stamps) == 0).any():
+            raise LogDamagedError(f"{self.path}: two of its frames have the same time")
+        # From the video's beginning, or its first frame if that is before.
+        first = min(int(self.stamps[0]), 0)
+        exact = (round((int(stamp) - first) * self.tick * NANOSECONDS) for stamp in self.stamps)
+        self.times = np.fromiter(exact, np.int64, len(self.stamps))
+        self._container.seek(0, stream=stream, backward=True)
+
+    def image(self, row: int) -> ByteArray:
+        """Decode a frame; a `MalformedRecord` if it is broken, and FFmpeg's own errors."""
+        stamp = int(self.stamps[row])
+        found, at, self._next = None, self._next, _NOWHERE
+        if at <= row < at + _FORWARD:
+            with contextlib.suppress(self._av.FFmpegError):  # of a frame that this does not need
+                found = self._forward(stamp)
+        if found is None:
+            try:
+                found = self._from(stamp, stamp)
+            except self._av.FFmpegError:
+                if not self._unsure:
+                    raise
+        if found is None and self._unsure:
+            found = self._from(_BEGIN, stamp)
+        if found is None:
+            raise MalformedRecord("the video is broken, no frame can be decoded")
+        self._next = row + 1
+        return self._shown(found)
+
+    def _decoded(self) -> Iterator[Any]:
+        for packet in self._container.demux(self._stream):
+            if packet.pts != self._cut:
+                yield from packet.decode()
+
+    def _from(self, place: int, stamp: int) -> Any:
+        """Decode a frame from the whole image before a place on; see `_forward`."""
+        self._container.seek(place, stream=self._stream, backward=True)
+        self._frames = self._decoded()
+        return self._forward(stamp)
+
+    def _forward(self, stamp: int) -> Any:
+        """Decode on to a frame; None if it is broken or not there."""
+        found = next((f for f in self._frames if f.pts is None or f.pts >= stamp), None)
+        return None if found is None or found.pts != stamp or found.is_corrupt else found
+
+    def close(self) -> None:
+        """Close the file; harmless when called twice."""
+        container, self._container = self._container, None
+        self._frames = iter(())
+        if container is not None:
+            container.close()

@@ -1,0 +1,160 @@
+"""The files of a recording as its views: which belong together, and in which order."""
+
+from __future__ import annotations
+
+import bisect
+import filecmp
+import itertools
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from foxglove_schemas_protobuf import PoseInFrame_pb2
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.blocks import HeadPose
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.log.messages import POSE_TOPIC
+from recorder.mcap.reader import LogReader
+from recorder.mcap.store import PARTIAL
+from replay.logs.formats.recording import ViewFile
+from replay.logs.stream import LogStream, Rows
+
+_FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
+_SMALLEST: Final = 64
+"""Fewest bytes of a log of a recording whose header is written."""
+SCENE: Final = ("scene", "seed", "config_sha256")
+"""Keys of a view's metadata that say what was recorded."""
+_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", "gaps", *SCENE)
+"""Keys that are the same in all files of a recording."""
+
+
+class SeveralRecordingsError(UsageError):
+    """Recordings of images that were named together; they can be taken as external logs."""
+
+
+def streams(views: Sequence[ViewFile], *, salvage: bool = False) -> list[LogStream]:
+    """Return the views of a recording as streams, whose rows are the numbers of frames.
+
+    Args:
+        views: the files, open.
+        salvage: frames may be missing between two parts.
+
+    Raises:
+        UsageError: the files are of several recordings.
+        LogDamagedError: the files contradict each other.
+    """
+    return [_stream(parts) for parts in arrange(views, salvage=salvage)]
+
+
+def _stream(parts: Sequence[ViewFile]) -> LogStream:
+    facts = parts[0].facts
+    placed = sorted((*span, view) for view in parts for span in view.ranges)
+    starts = [low for low, _, _ in placed]
+
+    def read(rows: Rows) -> tuple[NDArray[Any], FloatArray]:
+        frames = np.empty((len(rows), *facts.frame_shape), facts.dtype)
+        truth = np.empty((len(rows), len(facts.truth)))
+        at = 0
+        while at < len(rows):
+            first = int(rows[at])
+            _, stop, view = placed[bisect.bisect_right(starts, first) - 1]
+            end = min(at + stop - first, len(rows))
+            if not isinstance(rows, range):  # frames may be left out
+                own = rows[at:end]
+                end = at + int(np.count_nonzero(own - np.arange(len(own)) == first))
+            view.take(first, frames[at:end], truth[at:end])
+            at = end
+        return frames, truth
+
+    return LogStream(
+        path=parts[0].path,
+        topic=facts.view,
+        count=sum(view.count for view in parts),
+        read=read,
+        warnings=[text for view in parts for text in view.reader.warnings],
+        views=parts,
+    )
+
+
+def arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
+    """Return views by stream index, each as its parts by first frame; raises as `streams`."""
+    by_view: dict[tuple[int, str], list[ViewFile]] = {}
+    for view in views:
+        by_view.setdefault((view.facts.stream_index, view.facts.view), []).append(view)
+    indexes, names = zip(*by_view, strict=True)
+    if len(set(indexes)) < len(indexes) or len(set(names)) < len(names):
+        wrong = f"{views[0].path}: its files are not of one recording: two claim the same stream"
+        raise _several(views) or LogDamagedError(wrong)
+    first = views[0]
+    for view in views[1:]:
+        differ = [k for k in _SAME if getattr(first.facts, k) != getattr(view.facts, k)]
+        if differ:
+            wrong = (
+                f"{view.path}: not of the same recording as {first.path.name}: {differ[0]} differs"
+            )
+            raise _several(views) or LogDamagedError(wrong)
+    arranged = []
+    for stream in sorted(by_view):
+        parts = sorted(by_view[stream], key=lambda view: view.facts.first_frame)
+        for one, two in itertools.pairwise(parts):
+            end = one.ranges[-1][1] if one.ranges else one.facts.first_frame
+            begins = two.facts.first_frame
+            if end > begins or (end < begins and not salvage):
+                wrong = (
+                    f"{two.path}: begins at frame {begins}, {one.path.name} ends before {end}: a "
+                    "part is missing or doubled"
+                )
+                raise _several(views) or LogDamagedError(wrong)
+        arranged.append(parts)
+    return arranged
+
+
+def _several(views: Sequence[ViewFile]) -> UsageError | None:
+    """The refusal of files that do not belong together; None of different ones in one folder."""
+    copied = ""
+    for one, two in itertools.combinations([view.path for view in views], 2):
+        if one == two or filecmp.cmp(one, two, shallow=False):
+            copied = f"{two} is a copy of {one}: leave one out"
+            break
+    folders = list(dict.fromkeys(str(view.path.parent) for view in views))
+    if len(folders) < 2:
+        return UsageError(copied) if copied else None
+    refused = copied or f"{folders[0]} and {folders[1]} are recordings of their own"
+    if not views[0].facts.spec.images:
+        return UsageError(f"{refused}: name one of them")
+    return SeveralRecordingsError(
+        f"{refused}: name one of them, or put their streams on one clock with --align index"
+    )
+
+
+def only_begun(path: Path) -> bool:
+    """Whether a file is a further part of which its recorder had written no frame yet."""
+    if not _FURTHER_PART.fullmatch(path.name):
+        return False
+    try:
+        with LogReader(path) as reader:
+            return not reader.segments
+    except LogDamagedError:
+        return path.stat().st_size < _SMALLEST
+
+
+def first_pose(reader: LogReader) -> HeadPose | None:
+    """Return where the head is in a view's log, None if the log does not state it.
+
+    Raises:
+        LogDamagedError: it cannot be read.
+    """
+    entry = next(reader.messages({POSE_TOPIC}), None)
+    if entry is None:
+        return None
+    try:
+        pose = PoseInFrame_pb2.PoseInFrame.FromString(entry.data).pose
+    except DecodeError as error:
+        raise LogDamagedError(f"{reader.path} {POSE_TOPIC}: not a foxglove.PoseInFrame") from error
+    place, turn = pose.position, pose.orientation
+    return HeadPose((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))

@@ -1,0 +1,153 @@
+"""Images of streams: decoded ahead, and replaced if they are broken."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Final
+
+from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.processes import thread_count
+from recorder.images.compressed import AT_ONCE, compressed_image
+from recorder.images.pixels import Shown, UnknownPixels
+from replay.logs.stream import BROKEN, LogStream
+
+SALVAGE: Final = "learn and convert pass over what is broken with --salvage"
+
+CORES: Final = thread_count()
+"""Images that are decoded at once."""
+
+Place = tuple[int, int]
+"""The number of a stream, and a row of it."""
+
+
+class DecodingAhead:
+    """Images of streams that threads decode; with one thread there are none.
+
+    No more than two a thread are held, those of which nothing is known until they are asked for
+    among them.
+
+    Args:
+        streams: the streams.
+        color: whether images are decoded in their colours.
+    """
+
+    def __init__(self, streams: Sequence[LogStream], *, color: bool) -> None:
+        self._streams, self._color = streams, color
+        self._threads = ThreadPoolExecutor(CORES)
+        self._begun: dict[Place, Future[ByteArray] | None] = {}
+        self._coming: Iterator[Place] = iter(())
+
+    def expect(self, places: Iterable[Place]) -> None:
+        """Announce the rows that are asked for next, in this order; others are forgotten."""
+        wanted = dict.fromkeys(places if CORES > 1 else ())
+        for place in self._begun.keys() - wanted:
+            self._forget(place)
+        self._coming = iter([place for place in wanted if place not in self._begun])
+        self._begin()
+
+    def pop(self, place: Place) -> ByteArray | None:
+        """Return an image; None if no thread has decoded it, or the caller shall see the error."""
+        coming = self._begun.pop(place, None)
+        self._begin()
+        return None if coming is None or coming.exception() is not None else coming.result()
+
+    def close(self) -> None:
+        """Decode no more, and wait for what is being decoded; harmless when called twice."""
+        for place in [*self._begun]:
+            self._forget(place)
+        self._threads.shutdown()
+
+    def _begin(self) -> None:
+        for place in itertools.islice(self._coming, max(2 * CORES - len(self._begun), 0)):
+            self._begun[place] = self._decode(*place)
+
+    def _decode(self, number: int, row: int) -> Future[ByteArray] | None:
+        """Fetch a row in this thread, and let another decode it; None of what is no JPEG or PNG."""
+        stream = self._streams[number]
+        if stream.picture is None:
+            return None
+        try:
+            data = stream.taken(row, stream.picture)
+        except CdmisfaError:  # the caller shall see it
+            return None
+        if data is None:
+            return None
+        return self._threads.submit(compressed_image, data, color=self._color, most=AT_ONCE)
+
+    def _forget(self, place: Place) -> None:
+        if (coming := self._begun.pop(place)) is not None:
+            coming.cancel()
+
+
+class Images:
+    """The images of streams, one by one; every error of a row is raised here, with its name.
+
+    Args:
+        streams: the streams.
+        color: whether images are decoded in their colours.
+        salvage: show for a broken image the last whole one before it, else the first of all.
+    """
+
+    def __init__(self, streams: Sequence[LogStream], *, color: bool, salvage: bool) -> None:
+        self._streams, self._salvage = streams, salvage
+        self._ahead = DecodingAhead(streams, color=color)
+        self._whole: dict[int, tuple[int, Shown]] = {}
+        self._broken: dict[int, dict[int, LogDamagedError]] = {}
+        self.expect, self.close = self._ahead.expect, self._ahead.close
+
+    def image(self, stream: int, row: int) -> Shown:
+        """Read an image of a stream.
+
+        Raises:
+            UsageError: the image has no pixels, or the message no fields, that are read.
+            LogDamagedError: the image is broken, or with `salvage` all are.
+        """
+        name = self._streams[stream].name_of
+        try:
+            return self._whole_image(stream, row) if self._salvage else self._decoded(stream, row)
+        except UnknownPixels as error:
+            raise UsageError(f"{name(row)}: {error}") from None
+        except BROKEN as error:
+            remedy = "" if self._salvage else f": {SALVAGE}"
+            raise LogDamagedError(f"{name(row)}: {error}{remedy}") from None
+        except UsageError as error:
+            raise UsageError(f"{name(row)}: {error}") from None
+
+    def _decoded(self, stream: int, row: int) -> Shown:
+        image = self._ahead.pop((stream, row))
+        return self._streams[stream].image(row) if image is None else image
+
+    def _whole_image(self, stream: int, row: int) -> Shown:
+        """The last whole image up to a row, else the first behind it: of the log alone."""
+        broken = self._broken.setdefault(stream, {})
+        count = self._streams[stream].count
+        for near in itertools.chain(range(row, -1, -1), range(row + 1, count)):
+            if near in broken:
+                continue
+            known = self._whole.get(stream)
+            if known is not None and known[0] == near:
+                return known[1]
+            try:
+                image = self._decoded(stream, near)
+            except BROKEN as error:
+                broken[near] = error
+                continue
+            self._whole[stream] = near, image
+            return image
+        raise broken[row]
+
+    def broken_lines(self) -> list[str]:
+        """Return a line for each stream of which broken images were replaced so far."""
+        lines = []
+        for stream, broken in sorted(self._broken.items()):
+            if broken:
+                log, first = self._streams[stream], min(broken)
+                what = "messages" if log.fields else "images"
+                lines.append(
+                    f"{log.name_of(first)}: {broken[first]}: {len(broken)} broken of {log.count} "
+                    f"{what}: the last whole one is taken instead"
+                )
+        return lines

@@ -1,0 +1,225 @@
+"""The format of a log, by its path, and its streams."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, Literal, Protocol
+
+from cdmisfa.core.errors import LogDamagedError
+from recorder.images.options import InputOptions
+from recorder.mcap.reader import LogReader
+from replay.logs.formats import arrays, bag, images, lerobot, mcap_log, table, video
+from replay.logs.formats.messages import NoTopicError, fits_topic
+from replay.logs.stream import ChannelFacts, LogStream
+from replay.storage.identity import Identity, LogIdentity
+from replay.storage.location import location
+from replay.storage.opening import log_files
+
+Format = Literal["mcap", "split", "bag", "dataset", "pictures", "video", "table", "arrays"]
+
+
+class Streams(Protocol):
+    """Opens the streams of a log; what it opens is closed with `opened`."""
+
+    def __call__(
+        self, path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+    ) -> list[LogStream]: ...
+
+
+FORMATS: Final[Mapping[Format, Streams]] = {
+    "mcap": mcap_log.streams,
+    "split": mcap_log.streams,
+    "bag": bag.streams,
+    "dataset": lerobot.streams,
+    "pictures": images.streams,
+    "video": video.streams,
+    "table": table.streams,
+    "arrays": arrays.streams,
+}
+
+_BY_ENDING: Final[Mapping[str, Format]] = {
+    **dict.fromkeys(video.ENDINGS, "video"),
+    **dict.fromkeys(bag.ENDINGS, "bag"),
+    **dict.fromkeys(table.ENDINGS, "table"),
+    **dict.fromkeys(arrays.ENDINGS, "arrays"),
+}
+"""Formats of files that are known by their endings; other files are MCAP."""
+
+ENDINGS: Final = tuple(_BY_ENDING)
+"""Endings of logs in one file, but MCAP's."""
+
+ALL: Final = ("*",)
+"""Topics that mean every one with images."""
+
+
+def log_format(path: Path) -> Format:
+    """Return the format of a log; a folder of MCAP files that are parts of one log is "split"."""
+    if path.is_dir():
+        if lerobot.is_dataset(path):
+            return "dataset"
+        parts, metadata = any(path.glob("*.mcap")), path / bag.METADATA
+        if metadata.exists() and not parts:
+            return "bag"
+        if metadata.is_file():
+            return "split"
+        pictures = any(file.suffix.lower() in images.ENDINGS for file in path.iterdir())
+        return "pictures" if pictures and not any(path.glob("*.mcap*")) else "mcap"
+    known = _BY_ENDING.get(path.suffix.lower(), "mcap")
+    return known if known == "bag" or path.is_file() else "mcap"
+
+
+def only_external(path: Path) -> bool:
+    """Whether a path cannot be one of our recordings, by its format."""
+    return log_format(path) not in ("mcap", "split")
+
+
+def image_logs(paths: Sequence[str | Path]) -> list[Path]:
+    """Return the logs that paths mean: a folder of MCAP files is each, a rosbag2 is one log."""
+    found: list[Path] = []
+    for path in map(location, paths):
+        found += log_files(path) if log_format(path) == "mcap" else [path]
+    return found
+
+
+class OpenLogs:
+    """The streams of several logs, while they are opened.
+
+    Attributes:
+        streams: the streams, in the order of their topics, and of the logs.
+        logs: the logs that were opened, MCAP files with their readers.
+        left_out: a line for each log that could not be read.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        options: InputOptions,
+        opened: ExitStack,
+        *,
+        salvage: bool = False,
+    ) -> None:
+        """Open the topics that are asked for.
+
+        Without topics each log has one stream. As many topics as logs are one of each log in turn;
+        otherwise a topic, or every one that a pattern fits, is looked for in every log.
+
+        Args:
+            files: the logs.
+            options: the topics, and what is taken of them.
+            opened: closes the logs.
+            salvage: leave out what is damaged, of several logs also one that cannot be read.
+
+        Raises:
+            UsageError: no log has a topic.
+            LogDamagedError: a log is damaged; with `salvage` all are.
+        """
+        topics, self.streams = options.topics, list[LogStream]()
+        self.logs: list[tuple[Path, LogReader | None]] = []
+        patterns = any(letter in topic for topic in topics for letter in "*?[")
+        in_turn = len(topics) == len(files) > 1 and not patterns
+        broken: dict[Path, LogDamagedError] = {}
+        refused: list[NoTopicError] = []
+        for i, file in enumerate(files):
+            own = replace(options, topics=topics[i : i + 1]) if in_turn else options
+            try:
+                found = FORMATS[log_format(file)](file, own, opened, salvage=salvage)
+            except NoTopicError as error:
+                if in_turn or len(files) == 1 or not topics:
+                    raise
+                refused.append(error)
+                continue
+            except LogDamagedError as error:
+                if not salvage or len(files) == 1:
+                    raise
+                broken[file] = error
+                continue
+            self.streams += found
+            self.logs.append((file, found[0].reader))
+        self.left_out = [f"{error}: this log is left out" for error in broken.values()]
+        if not self.streams:
+            raise refused[0] if refused else next(iter(broken.values()))
+        if topics and not in_turn:
+            for topic in topics:
+                if not any(fits_topic(stream.topic, [topic]) for stream in self.streams):
+                    alone = replace(options, topics=(topic,))  # whose error names those there are
+                    FORMATS[log_format(files[0])](files[0], alone, opened, salvage=salvage)
+            self.streams.sort(
+                key=lambda s: next(i for i, t in enumerate(topics) if fits_topic(s.topic, [t]))
+            )
+
+
+@contextlib.contextmanager
+def open_stream(
+    path: Path, topic: str | None = None, options: InputOptions | None = None
+) -> Iterator[LogStream]:
+    """Open one stream of a log; raises as `OpenLogs`."""
+    options = options or InputOptions()
+    if topic is not None:
+        options = replace(options, topics=(topic,))
+    with ExitStack() as opened:
+        yield FORMATS[log_format(path)](path, options, opened)[0]
+
+
+def identity_of(path: Path, reader: LogReader | None = None) -> Identity:
+    """Return the identity of a log: its bytes; of a folder, names and contents count.
+
+    Args:
+        path: the log.
+        reader: of an MCAP file.
+    """
+    if reader is not None:
+        return LogIdentity(reader)
+    if not path.is_dir():
+        return Identity(path)
+    found = path.rglob("*") if lerobot.is_dataset(path) else path.iterdir()
+    return Identity(path, (file for file in found if file.is_file()))
+
+
+def image_topics(path: Path) -> list[str]:
+    """Return the topics of an MCAP file with images.
+
+    Raises:
+        LogDamagedError: it is no MCAP file, or has nothing in it.
+    """
+    with LogReader(path, salvage=True) as reader:
+        mcap_log.refuse_empty(reader)
+        return mcap_log.topics_in(reader)
+
+
+def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
+    """Return the contents of each topic of a log that is not in MCAP files.
+
+    Args:
+        path: the log.
+        whole: read all of a bag, of which otherwise an index may do.
+
+    Raises:
+        LogDamagedError: it cannot be read.
+        CdmisfaError: a package that reads it is missing.
+    """
+    kind = log_format(path)
+    if kind == "dataset":
+        return lerobot.channels(path)
+    if kind == "bag":
+        return bag.channels(path, whole=whole)
+    if kind == "table":
+        return table.channels(path)
+    if kind == "arrays":
+        return arrays.channels(path)
+    with open_stream(path) as stream:
+        first, last = (None, None) if stream.times is None else map(int, stream.times[[0, -1]])
+        facts = ChannelFacts(
+            stream.topic,
+            stream.encoding,
+            "picture" if kind == "pictures" else "video",
+            stream.count,
+            first,
+            last,
+            missing=stream.missing,
+            remarks=tuple(stream.remarks),
+        )
+        return [facts]

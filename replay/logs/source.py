@@ -1,0 +1,386 @@
+"""Recordings and external logs as sources of frames: streams on one clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.blocks import Block, SourceSpec, freeze
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.untrusted import parse_json
+from recorder.images.fields import rounded
+from recorder.images.framing import Framing, Vector, framings
+from recorder.images.options import COLOR_RECIPE, InputOptions
+from recorder.images.pixels import Shown
+from recorder.log.scenery import turns_of
+from recorder.log.viewlog import CONFIG_NAME
+from recorder.mcap.reader import LogReader
+from replay.logs import clock as clocks
+from replay.logs.aligning import align
+from replay.logs.clock import Clock
+from replay.logs.combining import copies, names_of
+from replay.logs.formats.views import SCENE
+from replay.logs.images import Images
+from replay.logs.opening import identity_of
+from replay.logs.stream import BROKEN, LogStream, Rows
+from replay.storage.identity import Identity, LogIdentity
+from replay.stored import Span, StoredSource, outside
+
+LIKELY: Final = 32
+"""Frames behind a block that are decoded ahead, at least: some show the same image."""
+
+COLORS: Final = "red, green and blue beside one another"
+
+
+class LoggedSource(StoredSource):
+    """Streams of one recording, or of external logs, on one clock.
+
+    Args:
+        streams: the streams, one at least; all views of a recording, or none.
+        options: how images become frames, and streams are aligned.
+        loop: begin again at the end.
+        salvage: show for a broken image the last whole one before it, else the first of all.
+        goal: the command and the folder of its result for the remedy in an error.
+        logs: the external logs, MCAP files with their readers.
+        opened: the files, which are closed with the source, or if it cannot be made.
+
+    Attributes:
+        streams: the streams.
+        recorded: whether they are the views of a recording.
+        framings: for each stream how an image becomes a frame; None for recordings.
+        color: whether frames show colours.
+        in_memory: whether they are arrays of the caller.
+        alignment: for each stream the counts of its rows, of repeated frames and of dropped rows.
+        pauses: for each stream the frames [start, stop) of its gaps.
+        changes: for each stream whose images change their size, or whose numbers are rounded, a
+            line that says so; as soon as one was shown.
+
+    Raises:
+        UsageError: images are smaller than a frame, or the streams need `align`.
+        LogDamagedError: a log is damaged.
+    """
+
+    def __init__(
+        self,
+        streams: Sequence[LogStream],
+        options: InputOptions | None = None,
+        *,
+        loop: bool = False,
+        salvage: bool = False,
+        goal: tuple[str, str] = ("learn", "RUN"),
+        logs: Sequence[tuple[Path, LogReader | None]] = (),
+        opened: ExitStack | None = None,
+    ) -> None:
+        self.streams, self._options = list(streams), options or InputOptions()
+        self._loop, self._salvage, self._goal = loop, salvage, goal
+        self._paths = list(dict.fromkeys(stream.path for stream in streams))
+        self._log_list, self._opened = logs, opened or ExitStack()
+        self.recorded, self.color = bool(streams[0].views), self._options.color is True
+        self.in_memory = any(stream.digest for stream in streams)
+        self._arrays = all(stream.encoding == "numpy" for stream in streams)
+        self.to_judge = not (self.recorded or self._arrays)
+        if self.recorded:
+            self.more = "record more frames, or "
+        self.changes: dict[int, str] = {}
+        self._shown: dict[int, tuple[int, Shown]] = {}
+        self._together = False
+        self._images: Images | None = None
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+        self.warnings = tuple(dict.fromkeys(self._warnings()))
+
+    def _open(self) -> None:
+        """Put the streams on one clock, and find out how an image becomes a frame."""
+        if self.recorded:
+            self._clock = clock = self._recorded_clock()
+        else:
+            aligned = align(self.streams, self._options, self._goal)
+            self.streams, self._fps, self._clock = aligned
+            clock = aligned.clock
+        self._first = self._t = clock.first
+        self._count = len(clock.rows[0])
+        length = None if self._loop else self._count
+        self.framings: Sequence[Framing | Vector | None] = [None] * len(self.streams)
+        if self.recorded:
+            names = tuple(stream.topic for stream in self.streams)
+            spec = self.streams[0].views[0].facts.spec
+            self._spec = replace(spec, streams=names, length=length)
+        else:
+            names = names_of(self.streams)
+            self._images = images = Images(self.streams, color=self.color, salvage=self._salvage)
+            firsts = [images.image(i, int(rows[0])) for i, rows in enumerate(clock.rows)]
+            how = self._options
+            self.framings = made = framings(firsts, how.size, how.fit, color=self.color)
+            self._spec = SourceSpec(
+                names, made[0].shape, str(firsts[0].dtype), (), self._fps, clock.start_ns, length
+            )
+            for i, rows in enumerate(clock.rows):  # refused before anything is written
+                self._frame(i, int(rows[0]), firsts[i])
+        self.gaps = any(clock.gaps) and self._options.gaps == "skip"
+        if self.recorded:
+            self.gaps = self.streams[0].views[0].facts.gaps
+        end = self._first + self._count
+        self._held = [outside(own, self._first, end) for own in clock.gaps]
+        self.pauses = dict(zip(names, clock.gaps, strict=True))
+        self.alignment: dict[str, dict[str, int]] = {}
+        if self.to_judge:
+            left_out = clock.gaps if self.gaps else [[] for _ in names]
+            each = zip(names, self.streams, clock.rows, left_out, strict=True)
+            for name, stream, rows, gaps in each:
+                self.alignment[name] = clocks.counts(stream.count, rows, gaps)
+            self.copies = tuple(copies(self.streams))
+
+    def _recorded_clock(self) -> Clock:
+        facts = self.streams[0].views[0].facts
+        held = list(self.coverage().values())
+        try:
+            return clocks.by_number(held, facts.start_ns, facts.first_frame, gaps=facts.gaps)
+        except LogDamagedError as error:
+            raise LogDamagedError(f"{self._name()}: {error}") from None
+
+    # Frames
+
+    def take_all(self, n: int) -> tuple[Block, ...]:
+        """See `StoredSource`."""
+        self._together = True
+        try:
+            return super().take_all(n)
+        finally:
+            self._together = False
+
+    def _block(self, stream: int, t: int, n: int) -> Block:
+        rows, parts = self._clock.rows[stream], []
+        at = t
+        while at < t + n:
+            place = (at - self._first) % self._count
+            stop = min(place + t + n - at, self._count)
+            parts.append(self._frames(stream, at, rows[place:stop]))
+            at += stop - place
+        frames, truth = parts[0]
+        if len(parts) > 1:
+            frames, truth = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return Block(stream, t, freeze(frames), freeze(truth))
+
+    def _frames(self, stream: int, t: int, rows: Rows) -> tuple[NDArray[Any], FloatArray]:
+        """The frames of rows, of which the first is shown at t, and their ground truth."""
+        log, framing = self.streams[stream], self.framings[stream]
+        if log.read is not None:
+            images, truth = log.read(rows)
+            if framing is None or images.shape[1:] == framing.shape:
+                return images, truth
+            return np.stack([framing.frame(image) for image in images]), truth
+        if log.picture is not None:
+            self._expect(stream, t, rows)
+        frames = np.empty((len(rows), *self._spec.frame_shape), self._spec.dtype)
+        for i, row in enumerate(rows if isinstance(rows, range) else rows.tolist()):
+            frames[i] = self._frame(stream, row)
+        return frames, np.empty((len(rows), 0))
+
+    def _expect(self, stream: int, t: int, rows: Rows) -> None:
+        """Decode rows from frame t on ahead, and those that are likely asked for behind them.
+
+        These are of the next stream at the same frames, if all are taken, else what follows.
+        """
+        assert self._images is not None
+        after, start = stream, t + len(rows)
+        if self._together:
+            after, start = stream + 1, t
+            if after == len(self.streams):
+                after, start = 0, t + len(rows)
+        stop = start + max(len(rows), LIKELY)
+        ahead = np.arange(start, stop if self._loop else min(stop, self.end))
+        next_rows = np.asarray(self._clock.rows[after])[(ahead - self._first) % self._count]
+        places = [(stream, int(row)) for row in rows]
+        places += [(after, row) for row in next_rows.tolist()]
+        shown = {(number, row) for number, (row, _) in self._shown.items()}
+        self._images.expect(place for place in places if place not in shown)
+
+    def _frame(self, stream: int, row: int, image: Shown | None = None) -> Shown:
+        """A stream's image as a frame; decoded once if it is repeated."""
+        shown = self._shown.get(stream)
+        if shown is not None and shown[0] == row:
+            return shown[1]
+        framing, log = self.framings[stream], self.streams[stream]
+        assert framing is not None
+        assert self._images is not None
+        image = self._images.image(stream, row) if image is None else image
+        if stream not in self.changes:
+            change = framing.change(image.shape)
+            if image.ndim == 1 and log.read is None:
+                change = rounded(log.fields, image)
+            if change:
+                self.changes[stream] = f"{log.name_of(row)}: {change}"
+        try:
+            frame = framing.frame(image)
+        except UsageError as error:
+            raise type(error)(f"{log.path}: {error}") from None
+        self._shown[stream] = (row, frame)
+        return frame
+
+    def close(self) -> None:
+        """Close the logs; harmless when called twice."""
+        if self._images is not None:
+            self._images.close()
+        self._opened.close()
+
+    # What the source states
+
+    def _warnings(self) -> Iterator[str]:
+        for stream in self.streams:
+            yield from stream.warnings
+        yield from self.copies
+        clock = self._clock
+        if self.recorded:
+            ends = {
+                view.ranges[-1][1] for view in (s.views[-1] for s in self.streams) if view.ranges
+            }
+            end = int(clock.rows[0][-1]) + 1
+            if not self.gaps and len(ends) > 1:
+                yield (
+                    f"{self._name()}: its views end at different frames; it ends with the "
+                    f"shortest, before frame {end}"
+                )
+            if left_out := end - self._first - self._count:
+                yield (
+                    f"{self._name()}: {left_out} frames are missing in a view and left out in all"
+                )
+            return
+        held = "no block reaches across" if self.gaps else "the last image is shown"
+        for stream, gaps in zip(self.streams, clock.gaps, strict=True):
+            if gaps:
+                line = clocks.gaps_in_words(gaps, self._fps)
+                yield f"{stream.path}: {stream.topic} has {line}: {held}"
+        one = self.streams[0]
+        assert one.times is not None
+        by_number = self._options.align is None and not self._arrays
+        if by_number and (line := clocks.retimed(one.times, clock.rows[0], self._fps)):
+            yield (
+                f"{one.path}: {one.topic} is taken by number, {line}; convert or learn it with "
+                f"--align time --rate {self._fps:g} to keep its times"
+            )
+
+    def salvaged(self) -> list[str]:
+        """See `StoredSource`."""
+        return self._images.broken_lines() if self._images else []
+
+    def pixels(self, stream: int) -> str:
+        """See `StoredSource`."""
+        log = self.streams[stream]
+        try:
+            return log.taken(0, log.pixel_format) if log.pixel_format else ""
+        except BROKEN:
+            if not self._salvage:
+                raise
+            return ""
+
+    def coverage(self) -> dict[str, list[Span]]:
+        """The frames that are there of each view of a recording, as ranges [start, stop)."""
+        return {s.topic: [span for view in s.views for span in view.ranges] for s in self.streams}
+
+    def scene(self) -> Mapping[str, str]:
+        """See `StoredSource`."""
+        if not self.recorded:
+            return {}
+        facts = self.streams[0].views[0].facts
+        return {name: getattr(facts, name) for name in SCENE if name in facts.values}
+
+    def origin(self) -> Mapping[str, Any]:
+        """See `StoredSource`."""
+        return self._configured("source")
+
+    @cached_property
+    def turns(self) -> tuple[tuple[int, ...], ...]:
+        """Frames that are lost between each two views, as in the scene; see `turn_to`."""
+        indexes = [stream.views[0].facts.stream_index for stream in self.streams if self.recorded]
+        return turns_of(self._configured("scene"), indexes)
+
+    def _configured(self, section: str) -> Mapping[str, Any]:
+        """A section of the recording's configuration; empty if it has none."""
+        if not self.recorded:
+            return {}
+        reader = self.streams[0].views[0].reader
+        own = next((one for one in reader.attachments if one.name == CONFIG_NAME), None)
+        try:
+            stated = parse_json(bytes(reader.attachment_data(own)))[section] if own else {}
+        except (ValueError, LookupError, TypeError):
+            return {}
+        return stated if isinstance(stated, dict) else {}
+
+    def _name(self) -> str:
+        if not self.recorded:
+            return str(self._paths[0])
+        files = [view.path for stream in self.streams for view in stream.views]
+        return str(files[0]) if len(files) == 1 else min(str(path.parent) for path in files)
+
+    def _logs(self) -> Sequence[Identity]:
+        if not self.recorded:
+            return [identity_of(*log) for log in self._log_list]
+        return [LogIdentity(view.reader) for stream in self.streams for view in stream.views]
+
+    def described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+        """See `StoredSource`."""
+        shared: dict[str, Any] = {"frames": self._count, "loop": self._loop}
+        if self.recorded:
+            views = [view for stream in self.streams for view in stream.views]
+            named = [{"name": view.facts.view, "frames": view.count} for view in views]
+            return {
+                "kind": "recording",
+                **self.scene(),
+                "first_frame": self._first,
+                "views": [{**one, **log} for one, log in zip(named, logs, strict=True)],
+                **shared,
+            }
+        options, size = self._options, list(self._spec.frame_shape)
+        recipes = dict.fromkeys(stream.recipe for stream in self.streams)
+        shared |= {"files": list(logs), "size": size, "rate": self._spec.fps}
+        if self._arrays:
+            return {
+                "kind": "arrays",
+                "streams": [s.digest() if s.digest else s.topic for s in self.streams],
+                "fit": options.fit,
+                **({"color": COLORS} if self.color else {}),
+                "recipe": "; ".join(recipes),
+                **shared,
+            }
+        return {
+            "kind": "foreign",
+            "topics": [stream.topic for stream in self.streams],
+            "recipe": COLOR_RECIPE if self.color else "; ".join(recipes),
+            "align": options.align,
+            **self._chosen(),
+            "alignment": self.alignment,
+            **({"held_out": self.held_out} if self.held_out else {}),
+            **shared,
+        }
+
+    def _chosen(self) -> dict[str, Any]:
+        """The options that changed the frames, as JSON values."""
+        options = self._options
+        chosen: dict[str, Any] = {}
+        if any(self.pauses.values()):
+            chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
+            chosen["gaps_are"] = "left out" if self.gaps else "the last image"
+        if options.fit != "crop" or any(framing.lossy for framing in self.framings if framing):
+            chosen["fit"] = options.fit
+        if options.range is not None:
+            chosen["range_metres" if self._spec.images else "range"] = list(options.range)
+        if not self._spec.images:
+            chosen["fields"] = [list(stream.fields) for stream in self.streams]
+        if options.time is not None:
+            chosen["time"] = options.time
+        if options.stamp != "log":
+            chosen["stamp"] = options.stamp
+        if self.color:
+            chosen["color"] = COLORS
+        return chosen

@@ -1,0 +1,269 @@
+"""One stream of a log: its times, and how its images or numbers are read and decoded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import FloatArray, IntArray
+from cdmisfa.core.clock import times_of
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.untrusted import BUDGET, budget
+from recorder.images.options import RECIPE
+from recorder.images.pixels import MalformedImage, Shown
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MalformedRecord
+
+LAST_NS: Final = 2**62
+"""Log times from here on are beyond any clock, in nanoseconds."""
+
+Result = TypeVar("Result")
+
+Rows = range | IntArray
+"""Rows of a stream: one a message, image or row of a table, from 0."""
+
+
+class UnreadableError(LogDamagedError):
+    """A library cannot read a file."""
+
+
+class NothingLoggedError(LogDamagedError):
+    """A log that was cut before its first message."""
+
+
+BROKEN: Final = (MalformedImage, MalformedRecord, UnreadableError)
+"""Errors of one image, behind which there may be whole ones."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogStream:
+    """One topic, video, folder of images, table, array, or view of a recording.
+
+    Its rows are read one by one, by `fetch` and `decode`, or, where none is broken by itself, many
+    at once, by `read`.
+
+    Attributes:
+        path: the log.
+        topic: the topic, or the name of what has no topics.
+        count: number of rows.
+        times: (count,) nanoseconds, not decreasing; None of rows at any even rate.
+        begins: time of the first row where `times` is None, nanoseconds.
+        fetch: reads the stored bytes of a row; not in several threads.
+        decode: turns them into an image, gray and of its own size, or numbers (I,).
+        picture: returns the JPEG or PNG in them, which threads can decode ahead; None of others.
+        read: returns the frames or images of rows, (n, ...), and their ground truth, (n, D).
+        held: returns the bytes of the memory budget that `fetch` holds.
+        program: the library that decodes, for errors.
+        where: how an error names a row.
+        stamp: returns the time that the header in them states, nanoseconds; None of others.
+        pixel_format: returns the format of pixels that they state; None of others.
+        encoding: how its images are stored, for what is not in messages.
+        recipe: how an image becomes a frame, for the record.
+        fields: the numbers that are taken instead of images, in their order.
+        warnings: a line for each thing that the user should know.
+        remarks: a line for each thing that its format cannot prove.
+        missing: what a file that was cut lacks; "" of others.
+        reader: the MCAP file, if all rows are in one.
+        digest: returns what identifies an array of the caller, as JSON values.
+        views: the files of a view of our recordings, by first frame; rows are then frame numbers.
+    """
+
+    path: Path
+    topic: str
+    count: int
+    times: IntArray | None = None
+    begins: int = 0
+    fetch: Callable[[int], Any] = int
+    decode: Callable[[Any], Shown] = np.asarray
+    picture: Callable[[Any], bytes | None] | None = None
+    read: Callable[[Rows], tuple[NDArray[Any], FloatArray]] | None = None
+    held: Callable[[], int] = int
+    program: str = "its decoder"
+    where: Callable[[int], str] | None = None
+    stamp: Callable[[Any], int] | None = None
+    pixel_format: Callable[[Any], str] | None = None
+    encoding: str = ""
+    recipe: str = RECIPE
+    fields: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+    remarks: Sequence[str] = ()
+    missing: str = ""
+    reader: LogReader | None = None
+    digest: Callable[[], Mapping[str, Any]] | None = None
+    views: Sequence[Any] = ()
+
+    def __post_init__(self) -> None:
+        """Check the times, which must lie between 1970 and the end of any clock.
+
+        Raises:
+            LogDamagedError: a time lies elsewhere.
+        """
+        if self.times is not None:
+            check_times(f"{self.path}: {self.topic}", self.times)
+
+    def image(self, row: int) -> Shown:
+        """Decode a row.
+
+        Raises:
+            MalformedRecord: the row is damaged.
+            LogDamagedError: the log is damaged there.
+        """
+        if self.read is not None:
+            image: Shown = self.read(range(row, row + 1))[0][0]
+            return image
+        return self.taken(row, self.decode)
+
+    def taken(self, row: int, function: Callable[[Any], Result]) -> Result:
+        """Apply a function to the stored bytes of a row; raises as `image`."""
+        with limited(self.path, self.program, held=self.held()):
+            return function(self.fetch(row))
+
+    def name_of(self, row: int) -> str:
+        """How an error names a row."""
+        if self.where is not None:
+            return self.where(row)
+        at = f" at {self.times[row]} ns" if self.times is not None else ""
+        return f"{self.path}: {self.topic}{at}"
+
+    def at_rate(self, fps: float) -> LogStream:
+        """The stream, with times at an even rate if it has none."""
+        if self.times is not None:
+            return self
+        return replace(self, times=times_of(np.arange(self.count), fps, self.begins))
+
+    def part(self, rows: IntArray, times: IntArray | None) -> LogStream:
+        """Some rows of the stream, at the times given."""
+
+        def at(function: Callable[[int], Any]) -> Callable[[int], Any]:
+            return lambda row: function(int(rows[row]))
+
+        changes: dict[str, Any] = {"fetch": at(self.fetch), "where": at(self.name_of)}
+        if (read := self.read) is not None:
+            changes["read"] = lambda own: read(picked(rows, own))
+        return replace(self, count=len(rows), times=times, **changes)
+
+
+def check_times(where: object, times: IntArray) -> None:
+    """Refuse sorted times before 1970 or beyond any clock, as damage of `where`."""
+    if not 0 <= times[0] <= times[-1] < LAST_NS:
+        raise LogDamagedError(f"{where} has times beyond any clock")
+
+
+def joined(parts: Sequence[LogStream]) -> LogStream:
+    """Streams with times as one, by time, ties in the order of the streams."""
+    times = np.concatenate([part.times for part in parts if part.times is not None])
+    order = np.argsort(times, kind="stable")
+    of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
+    rows = np.concatenate([np.arange(part.count) for part in parts])[order]
+
+    def place(row: int) -> tuple[LogStream, int]:
+        return parts[int(of[row])], int(rows[row])
+
+    def fetch(row: int) -> tuple[LogStream, Any]:
+        part, own = place(row)
+        return part, part.image(own) if part.read else part.fetch(own)
+
+    def decode(stored: tuple[LogStream, Any]) -> Shown:
+        part, data = stored
+        return data if part.read else part.decode(data)
+
+    def picture(stored: tuple[LogStream, Any]) -> bytes | None:
+        part, data = stored
+        return part.picture(data) if part.picture else None
+
+    def where(row: int) -> str:
+        part, own = place(row)
+        return part.name_of(own)
+
+    def pixel_format(stored: tuple[LogStream, Any]) -> str:
+        part, data = stored
+        return part.pixel_format(data) if part.pixel_format else ""
+
+    first = parts[0]
+    note = f"{first.path}: {first.topic} is joined from {len(parts)} logs, by time"
+    return replace(
+        first,
+        count=len(times),
+        times=times[order],
+        fetch=fetch,
+        decode=decode,
+        picture=picture,
+        read=None,
+        held=lambda: max(part.held() for part in parts),
+        where=where,
+        pixel_format=pixel_format,
+        warnings=[note, *(warning for part in parts for warning in part.warnings)],
+    )
+
+
+def picked(array: NDArray[Any], rows: Rows) -> NDArray[Any]:
+    """Some rows of an array; of rows that follow one another without a copy."""
+    return array[rows.start : rows.stop] if isinstance(rows, range) else array[rows]
+
+
+@contextmanager
+def explained(path: object, program: str, remedy: str = "") -> Iterator[None]:
+    """Turn any error of a library that reads a file into one line.
+
+    Raises:
+        UnreadableError: the library raised an error, or would take more memory than its budget.
+    """
+    try:
+        yield
+    except CdmisfaError:
+        raise
+    except MemoryError:
+        limit = f"{BUDGET >> 20} MiB of memory for it, the limit"
+        line = f"{path}: {program} takes more than {limit}"
+        raise UnreadableError(f"{line}: {remedy}" if remedy else line) from None
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise UnreadableError(f"{path}: {program} cannot read it ({reason})") from None
+
+
+@contextmanager
+def limited(path: object, program: str, *, held: int = 0, remedy: str = "") -> Iterator[None]:
+    """As `explained`, within the memory budget of what others may have written.
+
+    The memory that PyArrow takes is then the system's, as its own pool reserves some that no
+    budget counts.
+    """
+    if program == "PyArrow":
+        import pyarrow
+
+        pyarrow.set_memory_pool(pyarrow.system_memory_pool())
+    with explained(path, program, remedy), budget(max(BUDGET - held, 0)):
+        yield
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelFacts:
+    """The contents of one topic of a log, as `info` prints them.
+
+    Attributes:
+        topic: its name, or what stands for it.
+        encoding: of its messages: "cdr", "ros1", the codec of a video, "png".
+        schema: type of its messages.
+        messages: how many there are.
+        start_ns: time of the first, nanoseconds; None if it is not known.
+        end_ns: time of the last.
+        images: whether they are images that are read.
+        missing: what a file that was cut lacks; "" of others.
+        remarks: a line for each thing that the format cannot prove.
+    """
+
+    topic: str
+    encoding: str
+    schema: str
+    messages: int
+    start_ns: int | None = None
+    end_ns: int | None = None
+    images: bool = True
+    missing: str = ""
+    remarks: tuple[str, ...] = ()

@@ -1,1 +1,0 @@
-"""Our recordings as sources of frames."""
