@@ -51,12 +51,8 @@ def zero(theta: FloatArray) -> FloatArray:
     return np.zeros((len(theta), 2))
 
 
-STREAMS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
-    "x1": x1,
-    "x2": x2,
-    "x3": x3,
-    "zero": zero,
-}
+_Signal = Callable[[FloatArray], FloatArray]
+STREAMS: Mapping[str, _Signal] = {"x1": x1, "x2": x2, "x3": x3, "zero": zero}
 
 
 def one_period(name: str) -> FloatArray:

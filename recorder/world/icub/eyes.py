@@ -25,7 +25,7 @@ Matrix = tuple[float, ...]
 
 
 def eye_matrix(eyes: EyesConfig, neck: FloatArray, yaw: float, side: int) -> Matrix:
-    """View matrix of an eye, column by column as OpenGL has it.
+    """Return the view matrix of an eye, column by column as OpenGL has it.
 
     Args:
         eyes: the head's measures.
@@ -44,7 +44,7 @@ def eye_matrix(eyes: EyesConfig, neck: FloatArray, yaw: float, side: int) -> Mat
 
 
 def look(place: FloatArray, target: FloatArray) -> Matrix:
-    """View matrix of an upright camera at `place` that looks at `target`."""
+    """Return the view matrix of an upright camera at `place` that looks at `target`."""
     gaze = (target - place) / np.linalg.norm(target - place)
     right = np.cross(gaze, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -56,7 +56,7 @@ def look(place: FloatArray, target: FloatArray) -> Matrix:
 
 
 def perspective(vertical_fov: float, aspect: float, near: float, far: float) -> Matrix:
-    """Projection matrix of a camera, column by column; degrees and metres."""
+    """Return the projection matrix of a camera, column by column; degrees and metres."""
     scale = 1.0 / math.tan(math.radians(vertical_fov) / 2)
     depth = near - far
     columns = (
@@ -69,14 +69,14 @@ def perspective(vertical_fov: float, aspect: float, near: float, far: float) -> 
 
 
 def grey(colours: ByteArray) -> ByteArray:
-    """Colours, (..., 3 or 4), as grey, (...): BT.601, rounded."""
+    """Convert colours, (..., 3 or 4), to grey, (...): BT.601, rounded."""
     red, green, blue = (colours[..., i].astype(np.uint32) for i in range(3))
     mixed = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
     return ((mixed + 500) // 1000).astype(np.uint8)
 
 
 def from_afar(half: float) -> Matrix:
-    """Projection matrix of a camera `AFAR` metres away that sees so many metres to each side.
+    """Return the projection matrix of a camera `AFAR` metres away that sees `half` to each side.
 
     The renderer knows no camera without perspective.
     """
@@ -95,7 +95,7 @@ AFAR = 100.0
 
 
 def seen_from(view: Matrix, places: FloatArray) -> FloatArray:
-    """(3, ...) places, root frame, in a camera's frame: to its right, up, and behind it.
+    """Transform (3, ...) places, root frame, to a camera's frame: to its right, up, behind it.
 
     Element by element, so that the sums are the same on every processor.
     """
@@ -108,10 +108,9 @@ def seen_from(view: Matrix, places: FloatArray) -> FloatArray:
 def rays(
     view: Matrix, projection: Matrix, height: int, width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """The place of a camera, (3, 1, 1), and what its pixels look at, root frame.
+    """Return the place of a camera, (3, 1, 1), and the rays of its pixels, root frame.
 
-    Returns:
-        That place, and for each pixel, (3, height, width), what is to be added for a metre's depth.
+    A ray, of (3, height, width), is the step for a metre of depth.
     """
     across = ((np.arange(width) + 0.5) / width * 2 - 1) / projection[0]
     up = (1 - (np.arange(height) + 0.5) / height * 2) / projection[5]
@@ -123,14 +122,14 @@ def rays(
 
 
 def metres(depth: NDArray[Any], projection: Matrix) -> FloatArray:
-    """Depth of a picture, 0 to 1, as metres in front of a camera."""
+    """Convert the depth of an image, 0 to 1, to metres in front of a camera."""
     return projection[14] / (2 * np.asarray(depth, np.float64) - 1 + projection[10])
 
 
 class Eyes:
     """Renders the images of both eyes in each view, side by side.
 
-    Hides the world's table for good, since it is already in every eye's background.
+    Hides the world's table, since it is already in every eye's background.
 
     Args:
         eyes: the head's measures.

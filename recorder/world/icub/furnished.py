@@ -1,7 +1,7 @@
-"""What the robot's eyes see of a furnished room.
+"""Render the images of the robot's eyes in a furnished room.
 
-All that stands still (room, table, arms, their shadows) is a plate, drawn finely once for each
-eye of a view. A frame draws the objects and their shadows on the table into it, where they are.
+All that never moves (room, table, arms, their shadows) is a plate, drawn finely once for each eye
+of a view. A frame draws only the objects and their shadows on the table into it.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from recorder.world.icub.shadows import LAMP, TEXEL, ObjectShadow, RoomShadows
 from recorder.world.icub.world import World
 
 FINE = 2
-"""Rays of a plate along each side of one of a frame."""
+"""Rays of a plate for each ray of a frame, along each side."""
 
 LIGHTING = {"lightAmbientCoeff": 0.62, "lightDiffuseCoeff": 0.68, "lightSpecularCoeff": 0.1}
-"""How much of the light comes from everywhere, how much from the lamp, and what is mirrored."""
+"""Shares of the ambient light, of the lamp's light, and of mirrored light."""
 
 _POOL, _WIDE, _UNDER = 0.25, 0.8, (-0.55, -0.1)
-"""The share of light lost far from the lamp, how far that is, and where it is nearest, metres."""
+"""The share of light lost far from the lamp, that distance, and the brightest place, metres."""
 
 Part = tuple[slice, slice]
 """Rows and columns of a picture."""
 
 _FLAT = 0.003
-"""Metres from the table's height within which a pixel shows the table."""
+"""Metres from the table's height within which a pixel counts as the table."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plate:
-    """What stands still in an eye's image.
+    """The image of an eye without objects.
 
     Attributes:
-        view: of the eye.
-        light: (height, width, channels) its picture.
-        depth: (height, width) of it.
-        rows: (height, width) where the ray of each pixel meets the table: y in the root frame,
-            in `TEXEL`; `columns` is x.
-        lamp: share of the light that a shadow takes there: 0 beside the table.
+        view: matrix of the eye.
+        light: (height, width, channels) the image.
+        depth: (height, width) of the image.
+        rows: (height, width) y of the point where the ray of each pixel meets the table, root
+            frame, in `TEXEL`; `columns` is x.
+        lamp: share of the light that a shadow takes at each pixel: 0 beside the table.
     """
 
     view: Matrix
@@ -60,17 +60,17 @@ class Plate:
 
 
 class FurnishedEyes:
-    """Renders what both eyes see of a room, side by side.
+    """Renders the images of both eyes in a room, side by side.
 
-    Hides all that stands still for good, since it is in the plates.
+    Hides all bodies that never move, since they are in the plates.
 
     Args:
         scene: one that is not plain.
-        world: whose plain bodies are replaced.
+        world: its plain bodies are replaced.
 
     Attributes:
-        shape: (height, width) of the joined image; of both eyes' red, green and blue beside one
-            another, where they see colours.
+        shape: (height, width) of the joined image; for colours, red, green and blue of both eyes
+            are beside one another.
     """
 
     def __init__(self, scene: IcubConfig, world: World) -> None:
@@ -87,7 +87,10 @@ class FurnishedEyes:
         world.furnish(room, arms=scene.arms)
         world.show_room((), robot=False)
         self._balls = [_ball(scene, across, height) for across, height in sizes_of(scene)]
-        self._shadows = _object_shadows(scene, world) if scene.shadow else []
+        self._shadows = []
+        for number, (across, height) in enumerate(sizes_of(scene) if scene.shadow else ()):
+            reach = across + 1.2 * math.hypot(*_fall(scene, height))
+            self._shadows.append(ObjectShadow(world, number, scene.table.top, reach))
         world.show_objects(())
         self._pieces = range(len(room.pieces))
         self._room = RoomShadows(world, room, robot=scene.arms) if scene.shadow else None
@@ -95,7 +98,7 @@ class FurnishedEyes:
         self._plates: dict[float, list[Plate]] = {}
 
     def look(self, view: int, t: int, positions: FloatArray, yaw: Sequence[float]) -> ByteArray:
-        """What a view shows from frame t on; see `Eyes.look`."""
+        """Render a view from frame t on; see `Eyes.look`."""
         height, width = self._size
         frames = np.empty((len(positions), height, 2, width, self._channels), np.uint8)
         for frame, places, turned in zip(frames, positions, yaw, strict=True):
@@ -126,7 +129,7 @@ class FurnishedEyes:
     def _shade(
         self, plate: Plate, places: FloatArray, part: Part, objects: Sequence[int]
     ) -> NDArray[np.float32]:
-        """Share of the light that the shadows of objects leave to a part of an image."""
+        """Return the share of light that the objects' shadows leave to a part of an image."""
         rows, columns, left = plate.rows[part], plate.columns[part], np.ones(1, np.float32)
         for number in objects:
             x, y = places[number, :2] / TEXEL
@@ -135,26 +138,26 @@ class FurnishedEyes:
         return np.asarray(1 - (1 - left) * plate.lamp[part])
 
     def _part(self, view: Matrix, middle: tuple[float, float, float], radius: float) -> Part | None:
-        """Rows and columns of the pixels that a ball may cover, or none."""
+        """Return the rows and columns of the pixels that a ball may cover, or None."""
         x, y, z = (
             view[i] * middle[0] + view[4 + i] * middle[1] + view[8 + i] * middle[2] + view[12 + i]
             for i in range(3)
         )
         if -z <= radius + self._scene.eyes.near:
             return None
-        found = []
+        part = []
         for at, size in ((y / z, self._size[0]), (-x / z, self._size[1])):
-            # Far from the middle a ball is seen as a longer shape.
+            # Far from the middle of an image a ball looks longer.
             reach = radius * self._focal / -z * math.sqrt(1 + at * at) * 1.1 + 1
             centre = size / 2 + self._focal * at
             low, high = max(0, int(centre - reach)), min(size, int(centre + reach) + 1)
             if low >= high:
                 return None
-            found.append(slice(low, high))
-        return found[0], found[1]
+            part.append(slice(low, high))
+        return part[0], part[1]
 
     def _draw_part(self, view: Matrix, part: Part) -> tuple[ByteArray, NDArray[np.float32]]:
-        """Colours and depth of a part of an image."""
+        """Render the colours and the depth of a part of an image."""
         (height, width), (rows, columns) = self._size, part
         down, across = rows.stop - rows.start, columns.stop - columns.start
         whole = list(self._projection)
@@ -165,11 +168,11 @@ class FurnishedEyes:
         return self._world.render(view, tuple(whole), across, down, LAMP, **LIGHTING)
 
     def _toned(self, colours: ByteArray) -> ByteArray:
-        """Colours, (..., 3 or 4), in as many channels as the eyes see."""
+        """Convert colours, (..., 3 or 4), to the channels of the eyes."""
         return colours[..., :3] if self._channels == 3 else grey(colours)[..., None]
 
     def _plates_at(self, yaw: float) -> list[Plate]:
-        """What stands still, for both eyes; drawn when the head is first turned there."""
+        """Return the plates of both eyes, drawn when the head first turns there."""
         if yaw not in self._plates:
             world, arms = self._world, self._scene.arms
             world.show_objects(())
@@ -184,7 +187,9 @@ class FurnishedEyes:
         colours, depth = self._world.render(
             view, self._projection, fine[1], fine[0], LAMP, **LIGHTING
         )
-        places, hidden = seen_at(view, self._projection, depth, room)
+        eye, ray = rays(view, self._projection, *depth.shape)
+        places = eye + metres(depth, self._projection) * ray
+        hidden = np.zeros(depth.shape) if room is None else room.hidden(places)
         light = light_at(scene, places, hidden)[..., None]
         picture = averaged(colours[..., :3] * light, FINE)
         on_table = abs(places[2] - scene.table.top) < _FLAT
@@ -201,7 +206,7 @@ class FurnishedEyes:
 
 
 def sizes_of(scene: IcubConfig) -> list[tuple[float, float]]:
-    """Of each object the radius of what it covers on the table, and its height."""
+    """Return each object's radius on the table, and its height."""
     return [
         (scene.object1.half_size * math.sqrt(2), 2 * scene.object1.half_size),
         (scene.object2.radius, scene.object2.height),
@@ -210,38 +215,20 @@ def sizes_of(scene: IcubConfig) -> list[tuple[float, float]]:
 
 
 def _fall(scene: IcubConfig, height: float) -> tuple[float, float]:
-    """How far the shadow of a point so high over the table is from it, x and y."""
+    """Return the offset, x and y, of the shadow of a point at a height over the table."""
     share = height / LAMP[2] if scene.shadow else 0.0
     return -share * LAMP[0], -share * LAMP[1]
 
 
 def _ball(scene: IcubConfig, across: float, height: float) -> tuple[tuple[float, ...], float]:
-    """A ball around an object and its shadow: its middle, from the object's place, and radius."""
+    """Return a ball around an object and its shadow: middle, from the object, and radius."""
     x, y = _fall(scene, height)
     middle = x / 2, y / 2, scene.table.top + height / 2
     return middle, math.hypot(across + math.hypot(x, y) / 2, height / 2)
 
 
-def _object_shadows(scene: IcubConfig, world: World) -> list[ObjectShadow]:
-    return [
-        ObjectShadow(
-            world, number, scene.table.top, across + 1.2 * math.hypot(*_fall(scene, height))
-        )
-        for number, (across, height) in enumerate(sizes_of(scene))
-    ]
-
-
-def seen_at(
-    view: Matrix, projection: Matrix, depth: NDArray[Any], shadows: RoomShadows | None
-) -> tuple[FloatArray, FloatArray]:
-    """Where the pixels of a picture are, (3, height, width), and what share of light they lack."""
-    eye, ray = rays(view, projection, *depth.shape)
-    places = eye + metres(depth, projection) * ray
-    return places, np.zeros(depth.shape) if shadows is None else shadows.hidden(places)
-
-
 def light_at(scene: IcubConfig, places: FloatArray, hidden: FloatArray) -> FloatArray:
-    """(...) factor of the colours at (3, ...) places: shadows, and less light far from the lamp."""
+    """Return the factor of the colours at (3, ...) places: shadows, and distance from the lamp."""
     if not scene.shadow:
         return np.ones(hidden.shape)
     x, y, _ = places
@@ -250,7 +237,7 @@ def light_at(scene: IcubConfig, places: FloatArray, hidden: FloatArray) -> Float
 
 
 def averaged(image: NDArray[Any], n: int) -> FloatArray:
-    """(n h, n w, ...) as (h, w, ...), the mean of each n x n pixels."""
+    """Average (n h, n w, ...) to (h, w, ...), the mean of each n x n pixels."""
     total = np.zeros((image.shape[0] // n, image.shape[1] // n, *image.shape[2:]))
     for i in range(n * n):
         total += image[i // n :: n, i % n :: n]

@@ -1,4 +1,4 @@
-"""The robot's joints: how its head turns to a view, where one that roams looks, how arms rest."""
+"""The robot's joints: turns of its head, the path of a roaming head, arms at rest."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import numpy as np
 from cdmisfa.core.arrays import FloatArray
 
 ROAM, YAW = "roam", "head_yaw"
-"""The view of a head that roams, and the truth's name for how far that is turned to the left."""
+"""The view of a roaming head, and the column of truth with its angle to the left."""
 
 FRAMES_OF_A_LOOK = 60
-"""Frames after which a head that roams may turn to another view."""
+"""Frames after which a roaming head may turn to another view."""
 
 ROAMS_BY = 7.5
-"""Degrees that it turns in a frame where `scene.transit` does not say so."""
+"""Degrees that a roaming head turns in a frame by default; `scene.transit` changes it."""
 
 SLOWEST_TURN = 0.1
-"""Degrees in a frame; slower, a turn would take thousands."""
+"""Degrees in a frame below which the head jumps: a turn would take thousands of frames."""
 
 ARMS = {
     "shoulder_pitch": -30.0,
@@ -41,14 +41,14 @@ Place = tuple[float, float, float]
 
 
 def bent(vector: Place, pitch: float) -> FloatArray:
-    """A vector of a level head, (3,), root frame, as the neck bends by degrees upwards."""
+    """Rotate a vector of a level head, (3,), root frame, as the neck bends upwards, degrees."""
     cos, sin = math.cos(math.radians(pitch)), math.sin(math.radians(pitch))
     x, y, z = vector
     return np.array([cos * x + sin * z, y, cos * z - sin * x])
 
 
 def neck_at(pitch: float) -> Place:
-    """Origin of the neck's yaw joint, root frame, as the neck bends by degrees upwards."""
+    """Return the origin of the neck's yaw joint, root frame, as the neck bends upwards, degrees."""
     if not pitch:
         return NECK
     (x, y, z), (a, b, c) = NECK, NECK_PITCH
@@ -57,10 +57,10 @@ def neck_at(pitch: float) -> Place:
 
 
 def quaternion(yaw: float, pitch: float) -> tuple[float, float, float, float]:
-    """How a head is turned in the root frame, (x, y, z, w); degrees to the left and upwards."""
+    """Return the rotation of a head, root frame, (x, y, z, w); degrees to the left and upwards."""
     a, b = math.radians(yaw) / 2, math.radians(pitch) / 2
     across, along = math.sin(b), math.cos(b)
-    # A zero has no sign: recordings of a level head are as they were.
+    # + 0.0 removes the sign of a zero, which recordings of a level head never had.
     return (
         across * math.sin(a) + 0.0,
         across * math.cos(a) + 0.0,
@@ -70,28 +70,28 @@ def quaternion(yaw: float, pitch: float) -> tuple[float, float, float, float]:
 
 
 def turn_frames(degrees: float, transit: float) -> int:
-    """Frames of a turn, at most so many degrees in each in the mean; 0 where the head jumps."""
+    """Return the frames of a turn by `transit` degrees a frame in the mean; 0 if the head jumps."""
     if not transit >= SLOWEST_TURN:
         return 0
-    return math.ceil(max(0.0, min(abs(degrees), 360.0)) / transit)  # also of a broken log's
+    return math.ceil(max(0.0, min(abs(degrees), 360.0)) / transit)  # logs may state any
 
 
 def turn(start: float, stop: float, frames: int) -> list[float]:
-    """Angles at the frames of a turn at least jerk; at the frame behind them it has ended."""
+    """Return the angles of a minimum-jerk turn, without the frame at which it has ended."""
     shares = [(i + 1) / (frames + 1) for i in range(frames)]
     path = (start + (stop - start) * s * s * s * (10 - 15 * s + 6 * s * s) for s in shares)
     return [round(angle, _DIGITS) for angle in path]
 
 
 def turns(yaw: Sequence[float], transit: float, *, roam: bool) -> tuple[tuple[int, ...], ...]:
-    """Frames that are lost between each two views, [from][to].
+    """Return the frames that a change between each two views loses, [from][to].
 
-    Nobody knows where a head that roams will be: to find it and to leave it takes the longest turn.
+    The place of a roaming head is unknown: changes to and from its view take the longest turn.
 
     Args:
         yaw: of the head in each view, degrees.
-        transit: degrees that it turns in a frame; 0 where it jumps.
-        roam: another view, behind the others, is of a head that roams.
+        transit: degrees that the head turns in a frame; 0 if it jumps.
+        roam: whether the last view is of a roaming head.
     """
     frames = [[turn_frames(b - a, transit) for b in yaw] for a in yaw]
     if roam:
@@ -101,24 +101,24 @@ def turns(yaw: Sequence[float], transit: float, *, roam: bool) -> tuple[tuple[in
 
 
 class Roaming:
-    """Where a head that roams looks: at one of the views, chosen anew every so many frames.
+    """The path of a roaming head, which chooses a view every `FRAMES_OF_A_LOOK`.
 
     Args:
         yaw: of the views, degrees.
-        transit: degrees that it turns in a frame; 0 for `ROAMS_BY`.
-        seed: of what it looks at.
+        transit: degrees that the head turns in a frame; 0 for `ROAMS_BY`.
+        seed: of the choices.
     """
 
     def __init__(self, yaw: Sequence[float], transit: float, seed: int) -> None:
         self._yaw, self._transit, self._seed = yaw, transit or ROAMS_BY, seed
-        self._look = lru_cache(maxsize=4)(self._look_anew)
+        self._look = lru_cache(maxsize=4)(self._path)
 
     def angles(self, start: int, n: int) -> list[float]:
-        """Degrees to the left at n frames from `start` on."""
+        """Return the degrees to the left at n frames from `start` on."""
         places = (divmod(t, FRAMES_OF_A_LOOK) for t in range(start, start + n))
         return [self._look(look)[frame] for look, frame in places]
 
-    def _look_anew(self, look: int) -> list[float]:
+    def _path(self, look: int) -> list[float]:
         before, now = (self._yaw[self._chosen(max(i, 0))] for i in (look - 1, look))
         frames = min(turn_frames(now - before, self._transit), FRAMES_OF_A_LOOK - 1)
         return [*turn(before, now, frames), *[now] * (FRAMES_OF_A_LOOK - frames)]

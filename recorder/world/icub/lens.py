@@ -1,7 +1,7 @@
-"""What light, optics and the sensor do to an image, the same at every frame t of a seed.
+"""Effects of light, optics and sensor on an image, the same at every frame t of a seed.
 
-A frame's noise has numbers of its own, so that none before has to be drawn. It is a sum of random
-bytes, which is the same on every machine.
+A frame's noise has random numbers of its own, so that earlier ones need not be drawn. It is a sum
+of random bytes, which is the same on every machine.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.world.icub.config import IcubConfig
 
 SAMPLES = 2
-"""Rays of a pixel along each side, which are averaged."""
+"""Rays along each side of a pixel, which are averaged."""
 
 _RISE = 1500
-"""Frames in which drifting light goes from its least to its most."""
+"""Frames in which drifting light changes from its minimum to its maximum."""
 
 _NOISE = 0x4015E
 _EXPOSED = np.float32(128)
@@ -29,18 +29,14 @@ _SPREAD = np.float32(1 / np.sqrt(_BYTES * (256**2 - 1) / 12))
 
 
 def light(drift: float, t: int, n: int) -> FloatArray:
-    """Factor of the light at n frames from t on, (n,): it swells and fades by a share."""
-    there = (t + np.arange(n)) % (2 * _RISE) / _RISE
-    share = 1 - np.abs(there - 1)
+    """Return the factor of the light at n frames from t on, (n,), which drifts by a share."""
+    phase = (t + np.arange(n)) % (2 * _RISE) / _RISE
+    share = 1 - np.abs(phase - 1)
     return np.asarray(1 + drift * (2 * share * share * (3 - 2 * share) - 1))
 
 
 class Lens:
-    """From images of `SAMPLES` rays a pixel each way to those that are learned.
-
-    Args:
-        scene: what is done.
-    """
+    """Turns images with `SAMPLES` rays along each side of a pixel into frames, as a scene says."""
 
     def __init__(self, scene: IcubConfig) -> None:
         self._scene, eyes = scene, scene.eyes
@@ -52,7 +48,7 @@ class Lens:
         self._gain = gain.astype(np.float32)[:, None, :, None]
 
     def through(self, rays: ByteArray, t: int, view: int) -> ByteArray:
-        """Images of a view's eyes from frame t on.
+        """Apply all effects to images of a view's eyes from frame t on.
 
         Args:
             rays: (n, SAMPLES height, eyes, SAMPLES width, channels).
@@ -84,7 +80,7 @@ class Lens:
         return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
     def _noise(self, t: int, view: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Noise of n images from frame t on."""
+        """Return the noise of images from frame t on."""
         words = -(-int(np.prod(shape[1:])) * _BYTES // 32) * 4  # Philox gives four at a time
         seed = np.array([self._scene.seed or 0, _NOISE + view], np.uint64)
         bits = np.random.Philox(key=seed)
@@ -96,13 +92,13 @@ class Lens:
 
 
 def _means(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(n,) means of images, of whole numbers, so that no order of a sum matters."""
+    """Return the means of images, (n,), from whole numbers: no order of a sum matters."""
     whole = np.rint(images).astype(np.int64).reshape(len(images), -1)
     return np.asarray(whole.sum(axis=1) / whole.shape[1], np.float32)
 
 
 def _spread(image: Any, axis: int) -> Any:
-    """(1, 2, 1) along an axis of an image whose first and last pixels go on beyond it."""
+    """Convolve with (1, 2, 1) along an axis; the border pixels repeat beyond it."""
     image = image.swapaxes(0, axis)
     wide = 2 * image
     wide[1:] += image[:-1]

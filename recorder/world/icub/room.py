@@ -35,7 +35,7 @@ _STEPS = np.array(
 
 @dataclass(slots=True)
 class Mesh:
-    """What Bullet takes of a mesh: triangles by their corners, each with normal and texture."""
+    """A mesh as Bullet takes it: triangles by their corners, each with normal and texture."""
 
     vertices: list[list[float]] = field(default_factory=list)
     normals: list[list[float]] = field(default_factory=list)
@@ -43,12 +43,12 @@ class Mesh:
     indices: list[int] = field(default_factory=list)
 
     def arguments(self) -> dict[str, Any]:
-        """For `createVisualShape`."""
+        """Return the arguments of `createVisualShape`."""
         return asdict(self)
 
 
 def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) -> Mesh:
-    """A box around the origin, fibres of its texture along an axis.
+    """Return a box around the origin, fibres of its texture along an axis.
 
     Args:
         half: of its three sides, metres.
@@ -57,8 +57,7 @@ def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) ->
     """
     mesh, fibres = Mesh(), "xyz".index(along)
     for axis in range(3):
-        others = [i for i in range(3) if i != axis]
-        u, v = sorted(others, key=lambda i: i == fibres)
+        u, v = sorted({0, 1, 2} - {axis}, key=lambda i: (i == fibres, i))
         for side in (-1, 1):
             first = len(mesh.vertices)
             for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
@@ -69,7 +68,7 @@ def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) ->
                 mesh.normals.append(normal)
                 size = (period / 2 / half[u], period / 2 / half[v]) if period else (1, 1)
                 mesh.uvs.append([(a + 1) / 2 / size[0], (b + 1) / 2 / size[1]])
-            # Seen from outside, corners go round against the clock.
+            # Seen from outside, the corners are counterclockwise.
             straight = side * (1 if (v - u) % 3 == 1 else -1) > 0
             turns = (0, 1, 2, 0, 2, 3) if straight else (0, 2, 1, 0, 3, 2)
             mesh.indices += [first + i for i in turns]
@@ -77,7 +76,7 @@ def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) ->
 
 
 def round_mesh(rings: Sequence[tuple[float, float, float, float, float]]) -> Mesh:
-    """A body of revolution about z, from the bottom up, its texture once around.
+    """Return a body of revolution about z, from the bottom up, its texture once around.
 
     Args:
         rings: radius, height, the normal's parts outward and upward, and the place in the texture.
@@ -98,29 +97,29 @@ def round_mesh(rings: Sequence[tuple[float, float, float, float, float]]) -> Mes
 
 
 def steady(normal: Sequence[float]) -> list[float]:
-    """The normal of float32 near a unit normal that stays as it is when it is normalised again.
+    """Return the float32 normal near a unit normal that normalising does not change.
 
-    Bullet's renderer does so in place each time that it draws a corner. Others go to and fro by a
-    last digit, and what is seen then depends on how often it was drawn before.
+    Bullet's renderer normalises in place each time that it draws a corner. Other normals change by
+    a last digit each time, and images then depend on how often the body was drawn before.
     """
     near = np.asarray(normal, np.float32)
     for steps in _STEPS:
-        found = near + np.spacing(near) * steps * (near != 0)
-        x, y, z = found * found
+        normal32 = near + np.spacing(near) * steps * (near != 0)
+        x, y, z = normal32 * normal32
         if x + y + z == x + z + y == y + z + x == 1:
-            return [float(part) for part in found]
+            return [float(part) for part in normal32]
     raise ValueError(f"{normal} is no unit normal")
 
 
 def can_mesh(radius: float, height: float) -> Mesh:
-    """A can: its side, and its lid; the bottom is never seen."""
+    """Return a can: its side and its lid; the bottom is never visible."""
     half = height / 2
     side = [(radius, -half, 1.0, 0.0, 0.0), (radius, half, 1.0, 0.0, 0.9)]
     return round_mesh([*side, (radius, half, 0.0, 1.0, 0.95), (0.0, half, 0.0, 1.0, 1.0)])
 
 
 def ball_mesh(radius: float) -> Mesh:
-    """A ball of eight rings."""
+    """Return a ball of eight rings."""
     turns = [math.pi * (i / 8 - 0.5) for i in range(9)]
     sides = [(round(math.cos(turn), 9), round(math.sin(turn), 9)) for turn in turns]
     return round_mesh([(radius * c, radius * s, c, s, i / 8) for i, (c, s) in enumerate(sides)])
@@ -131,15 +130,15 @@ Place = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A body to be drawn.
+    """A body of the room.
 
     Attributes:
         mesh: around its own origin.
-        centre: where that is, root frame.
-        colour: where it has no paint.
+        centre: place of that origin, root frame.
+        colour: without a texture.
         paint: its texture.
-        gloss: share of the light that is mirrored.
-        casts: it casts a shadow.
+        gloss: share of mirrored light.
+        casts: whether it casts a shadow.
     """
 
     mesh: Mesh
@@ -152,10 +151,10 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """Everything that is drawn but the robot.
+    """All bodies but the robot.
 
     Attributes:
-        pieces: what stands still, the table's top first.
+        pieces: those that never move, the table's top first.
         objects: the box, the cylinder and the ball, as `World.place` moves them.
     """
 
@@ -164,22 +163,22 @@ class Room:
 
 
 def room_of(scene: IcubConfig) -> Room:
-    """The room of a scene; where it has none, the table that fills every image."""
-    told = _document()
+    """Return the room of a scene; without one, the table that fills every image."""
+    document = _document()
     top, thickness = scene.table.top, scene.table.thickness
     if scene.room:
         low, high = (*TABLE_FROM, top - thickness), (*TABLE_TO, top)
     else:
         side = scene.table.half_size
         low, high = (-side, -side, top - thickness), (side, side, top)
-    table = {**told["table"], "from": low, "to": high}
+    table = {**document["table"], "from": low, "to": high}
     if not scene.texture:
         table["colour"] = scene.table.colour
-    pieces = [table, *(_legs(told["legs"], low, high) if scene.room else ())]
-    pieces += told["piece"] if scene.room else []
+    pieces = [table, *(_legs(document["legs"], low, high) if scene.room else ())]
+    pieces += document["piece"] if scene.room else []
     return Room(
         tuple(_box(piece, textured=scene.texture) for piece in pieces),
-        _objects(scene, told["objects"]),
+        _objects(scene, document["objects"]),
     )
 
 
@@ -190,14 +189,15 @@ def _document() -> dict[str, Any]:
 
 
 def painted(name: str) -> Place:
-    """The colour of the table or of an object, "box", "cylinder" or "ball", with its paint."""
-    told = _document()
-    place: Place = tuple((told["table"] if name == "table" else told["objects"][name])["colour"])
-    return place
+    """Return the colour of the textured "table", "box", "cylinder" or "ball"."""
+    document = _document()
+    piece = document["table"] if name == "table" else document["objects"][name]
+    red, green, blue = piece["colour"]
+    return red, green, blue
 
 
 def _legs(legs: Mapping[str, Any], low: Place, high: Place) -> list[dict[str, Any]]:
-    """The table's four legs, from the floor to its top."""
+    """Return the table's four legs, from the floor to its top."""
     half, inset = legs["half"], legs["inset"]
     floor = next(piece for piece in _document()["piece"] if piece["name"] == "floor")["to"][2]
     return [
@@ -216,7 +216,7 @@ def _box(piece: Mapping[str, Any], *, textured: bool) -> Piece:
     return Piece(mesh, (x, y, z), tuple(piece["colour"]), paint, casts=piece.get("casts", True))
 
 
-def _objects(scene: IcubConfig, told: Mapping[str, Any]) -> tuple[Piece, ...]:
+def _objects(scene: IcubConfig, looks: Mapping[str, Any]) -> tuple[Piece, ...]:
     box, cylinder, ball = scene.object1, scene.object2, scene.object3
     shapes = (
         ("box", box_mesh((box.half_size,) * 3, period=0.0), box.grey),
@@ -224,12 +224,12 @@ def _objects(scene: IcubConfig, told: Mapping[str, Any]) -> tuple[Piece, ...]:
         ("ball", ball_mesh(ball.radius), ball.grey),
     )
     if scene.physics:  # stripes that roll would hide how slowly the ball moves
-        told = {**told, "ball": {**told["ball"], "texture": "plaster", "count": 6}}
+        looks = {**looks, "ball": {**looks["ball"], "texture": "plaster", "count": 6}}
     return tuple(
         Piece(
             mesh,
             colour=(grey,) * 3,
-            paint=_paint(told[name]) if scene.texture else None,
+            paint=_paint(looks[name]) if scene.texture else None,
             gloss=0.2 if scene.texture else 0.0,
         )
         for name, mesh, grey in shapes
@@ -237,7 +237,7 @@ def _objects(scene: IcubConfig, told: Mapping[str, Any]) -> tuple[Piece, ...]:
 
 
 def _paint(piece: Mapping[str, Any]) -> ByteArray | None:
-    """A piece's texture, if it has one."""
+    """Return a piece's texture, if it has one."""
     if "texture" not in piece:
         return None
     return texture(piece["texture"], tuple(piece["colour"]), piece["count"])

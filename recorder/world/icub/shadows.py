@@ -1,6 +1,6 @@
-"""The lamp of the furnished room, and where its light does not reach.
+"""The lamp of the furnished room, and its shadows.
 
-Shadows come from pictures drawn as the lamp would see the world, with soft edges.
+Shadows come from images rendered from the lamp, with soft edges.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ _ROUND = [(i / 2, j / 2) for i in range(-2, 3) for j in range(-2, 3) if i * i + 
 """Points of a lamp of half size 1."""
 
 _SIDE, _REACH, _MIDDLE = 1024, 2.6, (-0.5, 0.0, -0.3)
-"""Pixels, half size and middle of the lamp's picture of the room, metres."""
+"""Pixels, half size and middle of the lamp's image of the room, metres."""
 
 _SLACK, _BLUR = 0.02, 0.01
-"""Metres that something must be behind what it is shaded by, and of a shadow's edge."""
+"""Metres from a body to its shadow at least, and width of a shadow's edge."""
 
 
 class RoomShadows:
-    """Shadows of all that stands still, wherever they fall.
+    """Shadows of all bodies that never move, everywhere in the room.
 
     Args:
-        world: which shows no object.
-        room: what stands in it.
-        robot: it is in the light, too.
+        world: without objects.
+        room: its bodies.
+        robot: whether the robot casts a shadow, too.
     """
 
     def __init__(self, world: World, room: Room, *, robot: bool) -> None:
@@ -50,7 +50,7 @@ class RoomShadows:
         self._depth = metres(depth, picture)
 
     def hidden(self, places: FloatArray) -> FloatArray:
-        """(...) share of the lamp's light that (3, ...) places do not get."""
+        """Return the share of the lamp's light that (3, ...) places lack."""
         x, y, z = seen_from(self._view, places)
         x, y, depth = x * (-AFAR / z), y * (-AFAR / z), -z - _SLACK
         total = np.zeros(x.shape)
@@ -64,13 +64,13 @@ class RoomShadows:
 
 
 class ObjectShadow:
-    """The shadow that an object casts on the table, wherever on it the object stands.
+    """The shadow of an object on the table, the same for all its places.
 
     Args:
-        world: which shows nothing else; the object is put over the root's origin.
+        world: without other bodies; the object is moved over the root's origin.
         number: of the object.
         height: of the table.
-        reach: how far from the object the shadow is drawn, metres.
+        reach: distance from the object up to which the shadow is drawn, metres.
     """
 
     def __init__(self, world: World, number: int, height: float, reach: float) -> None:
@@ -89,7 +89,7 @@ class ObjectShadow:
     def hidden(
         self, rows: NDArray[np.float32], columns: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Share of the lamp's light that is lost so many `TEXEL` from the object."""
+        """Return the share of the lamp's light that is lost, at `TEXEL` from the object."""
         middle, last = np.float32(self._size / 2 + 1), np.float32(self._size + 1)
         i, j = (
             np.minimum(np.maximum(at + middle, np.float32(0)), last).astype(np.int32)
@@ -102,11 +102,11 @@ TEXEL = 0.004
 """Metres of a pixel of an object's shadow."""
 
 _NOTHING = np.float32(0.9999)
-"""Depth of a pixel where nothing is."""
+"""Depth of a pixel without a body."""
 
 
 def _flattened(lamp: tuple[float, float, float], height: float) -> Matrix:
-    """View from above, `AFAR` over a plane, onto which all is moved along the light."""
+    """Return a view from `AFAR` over a plane, onto which light moves all points."""
     x, y = lamp[0] / lamp[2], lamp[1] / lamp[2]
     return (
         *(1.0, 0.0, 0.0, 0.0),

@@ -1,4 +1,4 @@
-"""The iCub scene as a `FrameSource`: only the watched view is rendered."""
+"""The iCub scene as a `FrameSource`: only the attended view is rendered."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
 """Columns of ground truth: the objects' positions in the paper's coordinates, metres."""
 
 HEIGHTS = tuple(f"object{i}_z" for i in (1, 2, 3))
-"""More of them where physics moves the objects: heights of their middles, root frame, metres."""
+"""More columns if physics moves the objects: heights of their middles, root frame, metres."""
 
 LIGHT = "light"
-"""Where the light drifts, its factor."""
+"""Column with the factor of drifting light."""
 
 
 class IcubSource(ClockedSource):
-    """What the robot's eyes see in a scene, rendered when it is asked for, on a clock.
+    """The images of the robot's eyes in a scene, rendered on demand, on a clock.
 
     Raises:
         CdmisfaError: the simulator is not installed.
@@ -47,21 +47,21 @@ class IcubSource(ClockedSource):
             Eyes(scene.eyes, self._world) if scene.plain else FurnishedEyes(scene, self._world)
         )
         self._roaming = Roaming(scene.eyes.yaw, scene.transit, self._seed) if scene.roam else None
-        told = ((HEIGHTS, scene.physics), ((LIGHT,), scene.drift), ((YAW,), scene.roam))
-        truth = TRUTH + tuple(name for names, there in told if there for name in names)
+        truth = [*TRUTH, *(HEIGHTS if scene.physics else ())]
+        truth += [LIGHT] * bool(scene.drift) + [YAW] * scene.roam
         self._spec = SourceSpec(
-            scene.views, self._eyes.shape, "uint8", truth, record.fps, record.start_ns
+            scene.views, self._eyes.shape, "uint8", tuple(truth), record.fps, record.start_ns
         )
 
     @property
     def head_poses(self) -> Sequence[HeadPose]:
-        """The head's pose in each view in which it stands still."""
+        """The head's pose in each view but a roaming one."""
         (x, y, z), eyes = self._world.neck.tolist(), self._scene.eyes
         return [HeadPose((x, y, z), quaternion(yaw, eyes.pitch)) for yaw in eyes.yaw]
 
     @property
     def turns(self) -> tuple[tuple[int, ...], ...]:
-        """Frames that are lost where another view is looked at; see `turn_to`."""
+        """Frames that a change of view loses; see `turn_to`."""
         scene = self._scene
         return turns(scene.eyes.yaw, scene.transit, roam=scene.roam)
 
@@ -83,7 +83,7 @@ class IcubSource(ClockedSource):
         return Block(stream, t, freeze(frames), freeze(np.concatenate(truth, axis=1)))
 
     def describe(self) -> Mapping[str, Any]:
-        """The scene's seed and everything it was built from."""
+        """Return the scene's seed and configuration."""
         return {"kind": "icub", "seed": self._seed, "scene": section_table(self._scene)}
 
     def close(self) -> None:

@@ -22,7 +22,7 @@ Colour = Sequence[float]
 
 
 def hashed(rows: int, columns: int, seed: int) -> Pixels:
-    """(rows, columns) values in [0, 1) that depend on their place alone."""
+    """Return (rows, columns) values in [0, 1) that depend on their place only."""
     i, j = np.indices((rows, columns), dtype=np.uint64)
     mixed = i * np.uint64(0x9E3779B97F4A7C15) + j * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(seed)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
@@ -31,7 +31,7 @@ def hashed(rows: int, columns: int, seed: int) -> Pixels:
 
 
 def cloud(rows: int, columns: int, seed: int) -> Pixels:
-    """(SIDE, SIDE) smooth noise in [0, 1) with so many bumps each way."""
+    """Return (SIDE, SIDE) smooth noise in [0, 1) with `rows` and `columns` of bumps."""
     grid = hashed(rows, columns, seed)
     (i, u), (j, v) = (_steps(n) for n in (rows, columns))
     above, below = grid[i], grid[(i + 1) % rows]
@@ -41,7 +41,7 @@ def cloud(rows: int, columns: int, seed: int) -> Pixels:
 
 
 def _steps(n: int) -> tuple[NDArray[np.int64], Pixels]:
-    """Of each pixel the bump before it, and how far it is on the way to the next one."""
+    """Return the bump before each pixel, and the share of the way to the next bump."""
     at = np.arange(SIDE, dtype=np.float32) * np.float32(n) / np.float32(SIDE)
     low = at.astype(np.int64)
     u = at - low
@@ -49,7 +49,7 @@ def _steps(n: int) -> tuple[NDArray[np.int64], Pixels]:
 
 
 def wood(base: Colour, seed: int, boards: int) -> Pixels:
-    """Boards beside one another, their fibres along the rows: tone, grain and joints."""
+    """Draw boards beside one another, their fibres along the rows: tone, grain and joints."""
     at = np.arange(SIDE) * boards // SIDE
     fibres = (
         0.5 * cloud(3, 170, seed) + 0.3 * cloud(9, 256, seed + 1) + 0.35 * cloud(2, 23, seed + 2)
@@ -61,7 +61,7 @@ def wood(base: Colour, seed: int, boards: int) -> Pixels:
 
 
 def tiles(base: Colour, seed: int, across: int) -> Pixels:
-    """Square tiles, each of its own tone, with joints."""
+    """Draw square tiles, each with a tone, with joints."""
     at = np.arange(SIDE) * across // SIDE
     value = 0.8 + 0.16 * hashed(across, across, seed)[at][:, at] + 0.1 * cloud(64, 64, seed + 1)
     joint = np.arange(SIDE) * across % SIDE < 5 * across
@@ -70,14 +70,14 @@ def tiles(base: Colour, seed: int, across: int) -> Pixels:
 
 
 def plaster(base: Colour, seed: int, bumps: int) -> Pixels:
-    """A wall, a little uneven."""
+    """Draw a wall, slightly uneven."""
     return _painted(
         base, 0.88 + 0.06 * cloud(bumps, bumps, seed) + 0.08 * cloud(120, 120, seed + 1)
     )
 
 
 def die(base: Colour, seed: int, spots: int) -> Pixels:
-    """A painted cube's side: a darker frame and so many light spots along the diagonal."""
+    """Draw a cube's side: a darker frame, and light spots along the diagonal."""
     image = _painted(base, 0.85 + 0.25 * cloud(9, 9, seed))
     i, j = np.indices((SIDE, SIDE))
     image[np.minimum(np.minimum(i, j), SIDE - 1 - np.maximum(i, j)) < SIDE // 12] *= 0.55
@@ -88,7 +88,7 @@ def die(base: Colour, seed: int, spots: int) -> Pixels:
 
 
 def label(base: Colour, seed: int, bands: int) -> Pixels:
-    """Bands around a can or a ball, every other one light."""
+    """Draw bands around a can or a ball, every other one light."""
     image = _painted(base, 0.85 + 0.25 * cloud(12, 12, seed))
     light = (np.arange(SIDE) * (2 * bands + 1) // SIDE) % 2 == 1
     image[light] = _painted((0.93, 0.91, 0.84), 0.9 + 0.1 * cloud(12, 40, seed + 1))[light]
@@ -106,11 +106,11 @@ TEXTURES: dict[str, Callable[[Colour, int, int], Pixels]] = {
     "die": die,
     "label": label,
 }
-"""By name: of a colour, a seed, and a count of what it has."""
+"""By name: functions of a colour, a seed, and a count of boards, tiles, spots ..."""
 
 
 @cache
 def texture(name: str, colour: tuple[float, ...], count: int) -> ByteArray:
-    """(SIDE, SIDE, 3) a texture of `TEXTURES` as bytes; drawn once in a process."""
+    """Return a texture of `TEXTURES`, (SIDE, SIDE, 3) bytes; drawn once in a process."""
     seed = sum(round(1000 * part) for part in colour) + count
     return np.rint(TEXTURES[name](colour, seed, count) * 255).astype(np.uint8)
