@@ -21,8 +21,8 @@ from cdmisfa.core.shown import Shown, weights
 if TYPE_CHECKING:  # the mind knows no images: who saves a module adds how they became frames
     from recorder.images.framing import Recipe
 
+# Frames that are expanded at once: as few as to stay in the processor's cache.
 CHUNK = 1024
-"""Frames that are turned into values at once."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -72,14 +72,11 @@ class Module(Shown):
     def transform(
         self, frames: Any, outputs: int | slice | Sequence[int] | None = None
     ) -> NDArray[np.float64]:
-        """Outputs on frames or raw pictures, y = phi (x - mean), the same bits on every machine.
+        """Return outputs on frames or raw images, y = phi (x - mean), the same bits everywhere.
 
         Args:
-            frames: (n, *frame_shape), or these as rows (n, I), uint8 or values, tables too; it
-                scales the former and expands both as it learned them. Where it has a recipe,
-                pictures of any size as the source gave them, too; see `make_frame`. Where that
-                centres episodes, one whole episode.
-            outputs: which of the outputs, from 0, the slowest first: a number of one, a slice, or
+            frames: see `rows`; where the recipe centres episodes, one whole episode.
+            outputs: which of the outputs, from 0, the slowest first: the number of one, a slice, or
                 a list of some; all where it is not given.
 
         Returns:
@@ -87,42 +84,80 @@ class Module(Shown):
             it recorded as y_frozen.
 
         Raises:
-            UsageError: these are no frames as it learned from, a value is no finite number, or it
-                has no such outputs.
+            UsageError: these are no frames as it learned from, or a value is no finite number.
+            IndexError: it has no such outputs.
         """
-        rows = self._inputs(self._episode(frames))
-        phi = np.ascontiguousarray(self._chosen(outputs), np.float64)
-        return _projected(rows, self.expansion, phi, kernels.mean_output(phi, self._mean))
+        chosen = self.phi
+        if outputs is not None:
+            chosen = chosen[outputs if isinstance(outputs, slice) else np.atleast_1d(outputs)]
+        phi = np.ascontiguousarray(chosen, np.float64)
+        return _projected(
+            self.rows(frames), self.expansion, phi, kernels.mean_output(phi, self._mean)
+        )
 
     @property
     def _mean(self) -> NDArray[np.float64]:
         return np.ascontiguousarray(self.mean, np.float64)
 
-    def _episode(self, given: Any) -> Any:
-        """The frames of an episode without its mean, where it learned from such."""
-        if self.recipe is None or self.recipe.centre == "run":
-            return given
-        given = without_table(given)
-        if getattr(given, "shape", ())[1:] == (prod(self.frame_shape),):
-            given = np.reshape(given, (-1, *self.frame_shape))
-        frames = self.recipe.frames(given)
-        return centred(frames, mean_of([frames])) if len(frames) else frames
+    def rows(self, frames: Any, *, centre: bool = True) -> NDArray[Any]:
+        """Return frames or raw images as rows of what the module learned from, (n, values).
 
-    def _inputs(self, frames: Any) -> NDArray[Any]:
-        """Frames or raw pictures as scaled rows; see `transform`."""
-        array = self._frames(frames)
-        if array.dtype != UINT8 and array.dtype.kind != "f":
-            raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float values")
-        rows = self._rows(array)
-        if rows.dtype != UINT8 and not np.isfinite(rows).all():
-            row, place = (int(found[0]) for found in np.nonzero(~np.isfinite(rows)))
+        Args:
+            frames: (n, *frame_shape), or these as rows, uint8 or values, or a table. A module with
+                a recipe also takes images of any size as the source gave them; see `make_frame`.
+            centre: subtract the mean of the episode, where the recipe says so.
+
+        Raises:
+            UsageError: these are no frames as it learned from, or a value is no finite number.
+        """
+        array = as_array(frames if self.recipe is None else self._by_recipe(frames, centre))
+        own, shape = self.frame_shape, array.shape[1:]
+        if own:
+            fits = shape in (own, (prod(own),))
+        else:
+            fits = expanded_size(self.expansion, prod(shape)) == self.phi.shape[1]
+        if array.ndim < 2 or not fits or (array.dtype != UINT8 and array.dtype.kind != "f"):
+            wanted = ", ".join(map(str, own)) or "values"
+            raise UsageError(
+                f"frames of {array.dtype} {array.shape} given: give uint8 pixels or float values, "
+                f"(n, {wanted})"
+            )
+        rows = array.reshape(len(array), prod(shape))
+        if rows.dtype == UINT8:
+            return rows if self.scale == PIXEL else rows.astype(np.float64)
+        if not np.isfinite(rows).all():
+            row, place = (int(indices[0]) for indices in np.nonzero(~np.isfinite(rows)))
             raise UsageError(
                 f"frame {row} holds {rows[row, place]} at place {place}, which is no finite "
                 "number: leave it out, or fill it in"
             )
-        if rows.dtype != UINT8 or self.scale != PIXEL:
-            rows = rows.astype(np.float64)
-        return rows
+        return rows.astype(np.float64)
+
+    def _by_recipe(self, given: Any, centre: bool) -> Any:
+        """Return frames from raw images; frames that the recipe made before stay as they are."""
+        recipe, own = self.recipe, self.frame_shape
+        assert recipe is not None
+        given = without_table(given)
+        shape = getattr(given, "shape", ())
+        if centre and recipe.centre != "run":
+            images = np.reshape(given, (-1, *own)) if shape[1:] == (prod(own),) else given
+            frames = recipe.frames(images)
+            return centred(frames, mean_of([frames])) if len(frames) else frames
+        try:
+            array = np.asarray(given)
+        except ValueError:  # images of several sizes
+            return recipe.frames(given)
+        images = recipe.size is not None
+        values = array.dtype == UINT8 or array.dtype.kind == "f"
+        bounded = recipe.range is not None and not images and recipe.centre == "run"
+        made = array.shape[1:] in (own, (prod(own),)) or array.shape == own
+        if not made or not values or bounded:
+            return recipe.frames(array if array.dtype.kind in "biuf" else given)
+        if images and array.dtype.kind == "f" and (array > 1).any():
+            raise UsageError(
+                f"frames of {array.dtype} hold {array.max():g}: scale them to 0 to 1, or give uint8"
+            )
+        return array
 
     def _facts(self) -> Mapping[str, Any]:
         shape = "x".join(map(str, self.frame_shape)) or f"{self.phi.shape[1]} values"
@@ -140,64 +175,6 @@ class Module(Shown):
         own = self.frame_shape
         plain = len(own) == 2 and prod(own) == self.phi.shape[1]
         return weights(self.phi[0].reshape(own if plain else (1, -1)))
-
-    def _frames(self, given: Any) -> NDArray[Any]:
-        """Frames as they were given, or made of raw pictures."""
-        if self.recipe is None:
-            return as_array(given)
-        own, given = self.frame_shape, without_table(given)
-        try:
-            array = np.asarray(given)
-        except ValueError:  # of several sizes
-            return self.recipe.frames(given)
-        shaped = array.shape[1:] in (own, (prod(own),)) or array.shape == own
-        plain = self.recipe.size is not None or self.recipe.centre == "episode"
-        bounded = self.recipe.range is not None and not plain
-        if shaped and (array.dtype == UINT8 or array.dtype.kind == "f") and not bounded:
-            if self.recipe.size and array.dtype.kind == "f" and (array > 1).any():
-                raise UsageError(
-                    f"frames of {array.dtype} hold {array.max():g}: scale them to 0 to 1, or give "
-                    "uint8"
-                )
-            return array
-        return self.recipe.frames(array if array.dtype.kind in "biuf" else given)
-
-    def _chosen(self, outputs: int | slice | Sequence[int] | None) -> NDArray[np.float64]:
-        """The weights of some outputs, see `transform`."""
-        if outputs is None:
-            return self.phi
-        try:
-            return self.phi[outputs if isinstance(outputs, slice) else np.atleast_1d(outputs)]
-        except (IndexError, TypeError) as error:
-            raise UsageError(
-                f"no outputs {outputs!r}: this module has {len(self.phi)}, counted from 0"
-            ) from error
-
-    def _rows(self, array: NDArray[Any]) -> NDArray[Any]:
-        """Frames as rows."""
-        shape, size, own = array.shape[1:], prod(array.shape[1:]), self.frame_shape
-        right = not own or shape in (own, (prod(own),))
-        if array.ndim > 1 and right and self._fits(size):
-            return array.reshape(len(array), size)
-        wanted = f"give ({', '.join(map(str, ('n', *(own or ('values',)))))})"
-        if array.shape == own or (not own and self._fits(array.size)):
-            raise UsageError(
-                f"a single frame of shape {array.shape} given: {wanted}, as frame[None]"
-            )
-        if array.ndim < 2:
-            raise UsageError(f"frames of shape {array.shape} given: {wanted}")
-        if own:
-            raise UsageError(
-                f"frames of shape {shape} given: this module learned from {own}, {wanted}"
-            )
-        raise UsageError(
-            f"frames of {size} values given: this module has {self.phi.shape[1]} weights an "
-            "output, give frames of the size that it learned from"
-        )
-
-    def _fits(self, size: int) -> bool:
-        """Whether frames of so many values expand to this module's inputs."""
-        return bool(expanded_size(self.expansion, size) == self.phi.shape[1])
 
 
 def columns_of(modules: Sequence[Module]) -> Iterator[tuple[Module, slice]]:
@@ -225,13 +202,13 @@ class Stack:
         self._offset = np.concatenate(means)
 
     def transform(self, frames: Any) -> NDArray[np.float64]:
-        """Outputs of each module, one beside the other, (n, R), to the bit those that it gives.
+        """Return the outputs of all modules side by side, (n, R), each to the bit its own.
 
         Args:
-            frames: see `Module.transform`, as for what it raises; without the mean of their
-                episode, where they learned from such.
+            frames: see `Module.rows`; without the mean of their episode, where the modules
+                learned from such.
         """
-        rows = self.modules[0]._inputs(frames)
+        rows = self.modules[0].rows(frames, centre=False)
         return _projected(rows, self.modules[0].expansion, self._phi, self._offset)
 
 
