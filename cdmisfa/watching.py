@@ -28,7 +28,7 @@ except ImportError:
 
 
 class WatchEnv(Env):
-    """What a learner does while others choose what it watches.
+    """A learner whose streams are chosen from outside.
 
     A step is an iteration: the learner learns from a block of the stream that the action names. The
     reward is the learner's own: the fall of the learning error with that block of the progress
@@ -77,19 +77,6 @@ class WatchEnv(Env):
         max_iterations: int | None = None,
         **settings: Any,
     ) -> None:
-        if not isinstance(source, FrameSource):
-            raise UsageError(
-                f"{type(source).__name__} given: WatchEnv takes an open source, as "
-                "OscillatorySource(), ArraySource({name: frames}) or Recording(path).source()"
-            )
-        if observe not in ("block", "outputs"):
-            raise UsageError(f'observe={observe!r} given: it is "block" or "outputs"')
-        if max_iterations is not None and not (
-            isinstance(max_iterations, int) and max_iterations >= 1
-        ):
-            raise UsageError(
-                f"max_iterations={max_iterations!r} given: it is a number from 1, or None"
-            )
         entry = learner_class(algorithm)
         preset = getattr(entry, "preset", None)
         base = load_preset(preset)["learner"] if preset else {}
@@ -99,23 +86,17 @@ class WatchEnv(Env):
         self._most = max_iterations
         spec = source.spec
         first = open_learner(self._config, spec, 0)
-        if not hasattr(first, "watch"):
-            raise UsageError(
-                f"the learner {algorithm} cannot be told what to watch: it has no watch"
-            )
         shape: tuple[int, ...] = (first.tau, len(first.phi))
+        pixels = False
         if observe == "block":
-            shape = (first.tau, *spec.frame_shape)
-        if observe == "block" and spec.dtype == "uint8":
-            self.observation_space = Box(0, 255, shape, np.uint8)
-        else:
-            self.observation_space = Box(-np.inf, np.inf, shape, np.float64)
-        self._nothing: NDArray[Any] = np.zeros(shape, self.observation_space.dtype)
+            shape, pixels = (first.tau, *spec.frame_shape), spec.dtype == "uint8"
+        low, high, dtype = (0, 255, np.uint8) if pixels else (-np.inf, np.inf, np.float64)
+        self.observation_space = Box(low, high, shape, dtype)
         self.action_space = Discrete(len(spec.streams))
         self.learner: Learner | None = None
-        self._watched = 0
         self.signals: BlockSignals | None = None
-        self._seen = self._nothing
+        self._seen: NDArray[Any] = np.zeros(shape, dtype)
+        self._watched = 0
         self._ended = True
 
     def reset(
@@ -135,7 +116,7 @@ class WatchEnv(Env):
         if isinstance(self._source, SeekableSource):
             self._source.seek(self._start)
         self.learner = open_learner(self._config, self._source.spec, own)
-        self.signals, self._seen, self._ended = None, self._nothing, False
+        self.signals, self._seen, self._ended = None, np.zeros_like(self._seen), False
         self._watched = self.learner.stream
         return self._seen.copy(), {"stream": self._watched}
 
@@ -150,15 +131,13 @@ class WatchEnv(Env):
             `info`.
 
         Raises:
-            UsageError: there is no such stream, or no episode.
+            UsageError: there is no episode.
+            ValueError: there is no such stream.
             LogExhaustedError: the source has not enough for a single block.
         """
         learner: Any = self.learner
         if self._ended:
             raise UsageError("there is no episode, or it is over: call reset()")
-        if not self.action_space.contains(action):
-            streams = len(self._source.spec.streams)
-            raise UsageError(f"no stream {action!r}: the actions are 0 to {streams - 1}")
         reward, terminated = 0.0, False
         turn_to(self._source, self._watched, int(action))
         self._watched = int(action)
@@ -179,9 +158,6 @@ class WatchEnv(Env):
             truncated = self._most is not None and learner.iteration >= self._most
         self._ended = terminated or truncated
         return self._seen.copy(), reward, terminated, truncated, {"stream": learner.stream}
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} of {self._source!r}>"
 
     def close(self) -> None:
         """Close the source."""

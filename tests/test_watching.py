@@ -132,10 +132,7 @@ def test_where_the_source_ends_it_is_truncated() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: WatchEnv(np.zeros((9, 2))), "ndarray given: WatchEnv takes an open source"),
         (lambda: WatchEnv(OscillatorySource(), "progres"), "progres"),
-        (lambda: WatchEnv(OscillatorySource(), observe="frame"), '"block" or "outputs"'),
-        (lambda: WatchEnv(OscillatorySource(), max_iterations=0), "max_iterations=0 given"),
         (lambda: WatchEnv(OscillatorySource(), taus=3), "unknown key learner.taus"),
         (lambda: WatchEnv(OscillatorySource()).step(0), r"call reset\(\)"),
     ],
