@@ -1,7 +1,8 @@
-"""Types of arrays, and what a user gives as one."""
+"""Types of arrays, and frames from arrays and tables of a user."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,19 +17,19 @@ ByteArray = NDArray[np.uint8]
 
 _TYPES = (np.dtype(np.float64), np.dtype(np.uint8))
 
+# Value of a pixel that is equal to the mean of its episode.
 GRAY = 128
-"""What a pixel that is as in the mean of its episode becomes."""
 
 
 def as_array(given: Any, name: str = "frames") -> NDArray[Any]:
-    """What a user gave as frames, as an array, of a table its columns side by side.
+    """Return the frames of a user as an array, the columns of a table side by side.
 
     Args:
         given: an array, nested lists, or a table of pandas, Polars, Arrow or DuckDB.
-        name: what it is, for what is refused.
+        name: of the frames, for errors.
 
     Raises:
-        UsageError: its rows differ in length, values are masked, or a column holds no numbers.
+        UsageError: rows differ in length, values are masked, or a column holds no numbers.
     """
     try:
         return np.asarray(without_table(given, name))
@@ -37,27 +38,38 @@ def as_array(given: Any, name: str = "frames") -> NDArray[Any]:
 
 
 def without_table(given: Any, name: str = "frames") -> Any:
-    """What a user gave, the values of a table, NaN where it has none; see `as_array`."""
-    if np.ma.isMaskedArray(given) and np.ma.getmaskarray(given).any():
+    """Return what a user gave, the values of a table, NaN where it has none; see `as_array`."""
+    if np.ma.is_masked(given):
         raise UsageError(f"{name}: some values are masked: fill them, or leave out the rows")
     if hasattr(given, "to_frame"):  # one column of pandas or Polars
         given = given.to_frame()
-    if hasattr(given, "iloc"):  # pandas
-        columns = [(str(key), given.iloc[:, i]) for i, key in enumerate(given.columns)]
-    elif hasattr(given, "__arrow_c_stream__") and hasattr(given, "columns"):  # Arrow, Polars
-        import pyarrow
-
-        table = pyarrow.table(given)
-        columns = list(zip(table.column_names, table.columns, strict=True))
-    else:
+    tabular = hasattr(given, "iloc") or hasattr(given, "__arrow_c_stream__")
+    if not tabular or not hasattr(given, "columns"):
         return given.to_numpy() if hasattr(given, "to_numpy") else given
-    if not columns:
-        raise UsageError(f"{name}: a table without columns given")
-    return np.column_stack([_column(name, *column) for column in columns])
+    import pyarrow
+
+    if hasattr(given, "iloc"):  # pandas
+        table = pyarrow.Table.from_pandas(given, preserve_index=False)
+    else:
+        table = pyarrow.table(given)
+    columns = []
+    for key, column in zip(table.column_names, table.columns, strict=True):
+        kinds, kind = pyarrow.types, column.type
+        if kinds.is_decimal(kind) or kinds.is_null(kind) or column.null_count:
+            with contextlib.suppress(pyarrow.ArrowException):
+                column = column.cast("float64")
+        values: NDArray[Any] = column.to_numpy()
+        if values.dtype.kind not in "biuf":
+            raise UsageError(
+                f"{name}: the column {key} is of type {kind}, no numbers: choose the columns of "
+                "numbers"
+            )
+        columns.append(values)
+    return np.column_stack(columns) if columns else np.empty((len(table), 0))
 
 
 def mean_of(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
-    """The mean of the frames of an episode, the same bits however they are cut.
+    """Return the mean of the frames of an episode, the same bits however they are cut.
 
     Args:
         pieces: (n, *frame_shape) each, one frame at least in all, uint8 pixels or float64 values.
@@ -80,7 +92,7 @@ def mean_of(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
 
 
 def centred(frames: NDArray[Any], mean: NDArray[Any]) -> NDArray[Any]:
-    """Frames of an episode without its mean.
+    """Return the frames of an episode without its mean.
 
     Of pixels that is `GRAY` and how far each is from the mean, no darker than black and no
     brighter than white. Where it was neither, centred once more they stay as they are.
@@ -95,28 +107,8 @@ def centred(frames: NDArray[Any], mean: NDArray[Any]) -> NDArray[Any]:
     return np.clip(apart, 0, 255, out=apart).astype(np.uint8)
 
 
-def _column(name: str, key: str, given: Any) -> NDArray[Any]:
-    """A column of a table as numbers, NaN where it has none."""
-    import pyarrow
-
-    try:
-        column = given if hasattr(given, "chunks") else pyarrow.array(given, from_pandas=True)
-        kinds, kind = pyarrow.types, column.type
-        if kinds.is_decimal(kind) or (kinds.is_boolean(kind) and column.null_count):
-            column = column.cast("float64")
-        numbers: NDArray[Any] = column.to_numpy(zero_copy_only=False)
-    except (pyarrow.ArrowException, NotImplementedError):  # of what Arrow has no type for
-        numbers = np.asarray(given)
-    if numbers.dtype.kind not in "biuf":
-        held = getattr(given, "dtype", getattr(given, "type", ""))
-        raise UsageError(
-            f"{name}: the column {key} is of type {held}, no numbers: choose the columns of numbers"
-        )
-    return numbers
-
-
 def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
-    """Frames as rows of uint8 pixels or float64 values, in C order and not to be written.
+    """Return frames as rows of uint8 pixels or float64 values, in C order and read-only.
 
     Args:
         frames: (n, I).
@@ -129,11 +121,13 @@ def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
         UsageError: they are of another shape or type.
     """
     array = frames if type(frames) is np.ndarray else as_array(frames)
-    if array.dtype not in _TYPES:
-        raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float64 values")
-    if array.ndim != 2 or (size is not None and array.shape[1] != size):
+    fits = array.ndim == 2 and size in (None, array.shape[1])
+    if array.dtype not in _TYPES or not fits:
         wanted = "values" if size is None else size
-        raise UsageError(f"frames of shape {array.shape} given: give (n, {wanted}), a row a frame")
+        raise UsageError(
+            f"frames of {array.dtype} {array.shape} given: give uint8 pixels or float64 values, "
+            f"(n, {wanted})"
+        )
     flags = array.flags
     if not (flags.c_contiguous and flags.aligned):
         array = array.copy(order="C")
