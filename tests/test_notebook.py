@@ -30,8 +30,10 @@ def test_the_example_shows_its_objects_and_serves_the_view(tmp_path: Path) -> No
         (address,) = re.findall(r'<iframe\s[^>]*src="(http[^"]+)"', view["text/html"])
         with contextlib.closing(urlopen(address, timeout=60)) as page:
             assert b"re_viewer" in page.read()
-    for shown in objects:
+    for number, shown in enumerate(objects):
         assert shown["text/plain"].startswith("<")
+        if not number:  # a recording has facts alone
+            continue
         (png,) = re.findall(r"data:image/png;base64,([^\"]+)", shown["text/html"])
         with Image.open(io.BytesIO(base64.b64decode(png))) as picture:
             assert picture.format == "PNG"

@@ -216,7 +216,9 @@ def test_what_is_shown_is_short_with_a_small_picture(given: Any) -> None:
         assert "\n" not in text
         assert "<b>" not in page
         png = re.search(r'src="data:image/png;base64,([^"]+)"', page)
-        assert png is not None
+        assert (png is None) == isinstance(held, Recording)
+        if png is None:
+            continue
         with Image.open(io.BytesIO(base64.b64decode(png[1]))) as picture:
             assert max(picture.size) <= 960
     assert len(repr(learn(given, **FEW).signals)) < 500

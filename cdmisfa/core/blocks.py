@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time_of, times_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from cdmisfa.core.shown import MOST, MOST_STREAMS, Shown, beside, curves
+from cdmisfa.core.shown import Shown
 
 UINT8 = np.dtype(np.uint8)
 """The only type whose values are pixels."""
@@ -235,22 +235,6 @@ class ClockedSource(ForwardSource, SeekableSource):
         """Move the clock to frame t; see `SeekableSource.seek`."""
         check_frame(t)
         self._t = t
-
-    def _picture(self) -> NDArray[np.uint8] | None:
-        """The next image of each stream, or the next numbers of the first; the clock stays."""
-        start, spec = self._t, self._spec
-        end = None if spec.length is None else getattr(self, "first_frame", 0) + spec.length
-        count = 1 if spec.images else MOST if end is None else min(end - start, MOST)
-        blocks = []
-        try:
-            for stream in range(min(len(spec.streams), MOST_STREAMS) if spec.images else 1):
-                self.seek(start)
-                blocks.append(self.take(stream, count).frames)
-        except (LogExhaustedError, ValueError):  # nothing is left
-            return None
-        finally:
-            self.seek(start)
-        return beside([block[0] for block in blocks]) if spec.images else curves(blocks[0][:, :8])
 
 
 def turn_to(source: FrameSource, before: int, after: int) -> None:

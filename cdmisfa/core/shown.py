@@ -1,4 +1,4 @@
-"""What a notebook shows of an object: a table of facts and a small picture."""
+"""Objects in a notebook: a table of facts, and a small image where there is one."""
 
 from __future__ import annotations
 
@@ -12,30 +12,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Largest width of an image, as a rule, and height of one of its rows, in pixels.
 WIDTH = 480
-"""Most pixels across of a picture, as a rule."""
-
 ROW = 24
-"""Pixels of the height of a row in a picture."""
-
-MOST = 200
-"""Frames of numbers that a picture shows."""
-
-MOST_STREAMS = 6
-"""Streams of images that it shows."""
 
 
 class Shown:
-    """An object with a short text, and a table and a small picture in a notebook."""
+    """An object with a short text, and a table and a small image in a notebook."""
 
     __slots__ = ()
 
     @abstractmethod
     def _facts(self) -> Mapping[str, Any]:
-        """What is told of it, by names."""
+        """Return facts about the object, by names."""
 
     def _picture(self) -> NDArray[np.uint8] | None:
-        """A picture (height, width) or (height, width, 3), if it has one."""
+        """Return an image (height, width) or (height, width, 3), if there is one."""
         return None
 
     def __repr__(self) -> str:
@@ -49,49 +41,27 @@ class Shown:
             f'<td style="text-align:left">{html.escape(str(value))}</td></tr>'
             for name, value in self._facts().items()
         )
-        picture = self._picture()
-        image = (
-            "" if picture is None else f'<img alt="" src="data:image/png;base64,{png(picture)}">'
-        )
+        image = ""
+        if (picture := self._picture()) is not None:
+            from PIL import Image
+
+            data = io.BytesIO()
+            Image.fromarray(picture).save(data, "PNG")
+            png = base64.b64encode(data.getvalue()).decode()
+            image = f'<img alt="" src="data:image/png;base64,{png}">'
         return f"<div><table>{rows}</table>{image}</div>"
 
 
-def beside(frames: list[NDArray[Any]]) -> NDArray[np.uint8]:
-    """Frames of images side by side, no wider than `WIDTH` together; one at least."""
-    wide = np.hstack(frames)
-    step = -(-wide.shape[1] // WIDTH)
-    return np.ascontiguousarray(wide[::step, ::step])
-
-
-def curves(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Numbers (n, I) over time, each in a shade, from the least to the most of all."""
-    picture = np.full((4 * ROW, WIDTH), 255, np.uint8)
-    low, high = float(values.min()), float(values.max())
-    places = np.linspace(0, WIDTH - 1, len(values)).astype(int)
-    scale = (len(picture) - 1) / (high - low) if high > low else 0.0
-    for i, line in enumerate(values.T):
-        heights = np.rint((high - line) * scale).astype(int)
-        across = np.arange(WIDTH)
-        shade = 160 * i // values.shape[1]
-        picture[np.interp(across, places, heights).astype(int), across] = shade
-    return picture
-
-
 def weights(values: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Weights (rows, columns), blue below 0, white 0, orange above, the largest in full colour."""
-    most = float(np.abs(values).max()) or 1.0
-    rest = np.rint(255 * (1 - np.abs(values) / most)).astype(np.uint8)
+    """Return an image of weights: blue below 0, white 0, orange above, the largest in full colour.
+
+    Args:
+        values: (rows, columns).
+    """
+    largest = float(np.abs(values).max()) or 1.0
+    rest = np.rint(255 * (1 - np.abs(values) / largest)).astype(np.uint8)
     full, below = np.full_like(rest, 255), values < 0
     picture = np.stack([np.where(below, rest, full), rest, np.where(below, full, rest)], axis=2)
     across = max(WIDTH // picture.shape[1], 1)
     down = across if len(picture) > 1 else ROW
     return np.repeat(np.repeat(picture, down, axis=0), across, axis=1)
-
-
-def png(picture: NDArray[np.uint8]) -> str:
-    """A picture as a PNG file, in base64."""
-    from PIL import Image
-
-    data = io.BytesIO()
-    Image.fromarray(picture).save(data, "PNG")
-    return base64.b64encode(data.getvalue()).decode()

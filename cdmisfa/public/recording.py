@@ -143,8 +143,3 @@ class Recording(Shown):
 
     def _facts(self) -> Mapping[str, Any]:
         return {"recording": ", ".join(self.words) or "arrays", **self.spec.facts()}
-
-    def _picture(self) -> NDArray[np.uint8] | None:
-        with self.source() as source:
-            found: NDArray[np.uint8] | None = source._picture()
-        return found

@@ -21,7 +21,6 @@ from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request,
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.names import ACTION, BEGINS
-from cdmisfa.core.shown import MOST_STREAMS, beside
 from recorder.images.framing import framings
 from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
 
@@ -72,13 +71,6 @@ class SteppedSource(ForwardSource):
         ]
         self._t += n
         return tuple(blocks)
-
-    def _picture(self) -> NDArray[np.uint8] | None:
-        """Return the next image of each stream, without taking it."""
-        self._ahead += islice(self._steps, 0 if self._ahead else 1)
-        if not (self._ahead and self._spec.images):
-            return None
-        return beside(list(self._ahead[0][0][:MOST_STREAMS]))
 
 
 class ArraySource(SteppedSource):
