@@ -83,10 +83,9 @@ class Program(subprocess.Popen[bytes]):
 
     def _failure(self) -> CdmisfaError:
         self._output.seek(0)
-        lines = self._output.read().decode("utf-8", "replace").split("\n")
-        last = next((line for line in reversed(lines) if line.strip()), "it does not say why")
-        why = next((line for line in lines if "panicked" in line), last)
-        return CdmisfaError(f"the viewer ended with code {self.returncode}: {why.strip()}")
+        lines = self._output.read().decode("utf-8", "replace").strip().splitlines()
+        why = [line for line in lines if "panicked" in line] + lines[-1:] + ["it does not say why"]
+        return CdmisfaError(f"the viewer ended with code {self.returncode}: {why[0].strip()}")
 
     def ask(self, question: Callable[[], Any]) -> Any:
         """Repeat a question until its answer is true; Rerun's client raises until it has one.
@@ -237,13 +236,11 @@ def frame_at(path: Path, at: str) -> int:
     """
     if at.isdecimal():
         return int(at)
-    if path.suffix == ".rrd" or not holds_run(path):
-        raise UsageError(f"--at {at}: only a run has iterations and events, name a frame")
-    if found := ITERATION.fullmatch(at.strip()):
-        for columns in read_columns(path):
-            for frame in columns.frames[columns.iterations == int(found[1])]:
-                return int(frame)
-    else:
+    if path.suffix != ".rrd" and holds_run(path):
+        if found := ITERATION.fullmatch(at.strip()):
+            for columns in read_columns(path):
+                for frame in columns.frames[columns.iterations == int(found[1])]:
+                    return int(frame)
         words = re.compile(rf"\b{re.escape(at.strip())}\b", re.IGNORECASE)
         for batch in read_batches(path, topics=(EVENT_TOPIC,)):
             for event in batch.events:

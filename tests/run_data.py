@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +15,7 @@ from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.signals import SIGNALS, BlockSignals
 from cdmisfa.modules import Module
 from replay.runs.log import read_batches, read_columns
+from replay.runs.modules import save_modules
 from replay.runs.writer import RunWriter
 
 START_NS = 1_451_606_400_000_000_000
@@ -139,6 +140,13 @@ def module_of(
     bands = {"band_mean": 0 * one, "band_sd": one, "eta": one}
     policy = np.zeros(3, dtype=int)
     return Module(**about, phi=phi, mean=np.zeros(phi.shape[1]), **bands, policy=policy)
+
+
+def save_modules_of(folder: Path, spec: SourceSpec, records: Sequence[BlockSignals]) -> None:
+    """Write a module of one output, with equal weights, for each record that saved one."""
+    phi, saves = np.ones((1, int(np.prod(spec.frame_shape)))), [r for r in records if r.saved]
+    made = [module_of(i, r.iteration, phi, r.stream) for i, r in enumerate(saves, 1)]
+    save_modules(folder / "modules.npz", made)
 
 
 def having(phi: NDArray[Any]) -> Any:

@@ -58,18 +58,6 @@ def test_every_record_is_handed_over(spec, sent):
     assert len(sent["signals/epsilon"]) == 5
 
 
-def test_the_progress_learner_is_shown_by_its_streams(sent):
-    table = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
-    with LiveView(VECTOR, {"config": {"learner": table}}, 40, 1) as view:
-        feed(view, VECTOR)
-    records = [signals for signals, _ in run_of(VECTOR, 30, saves=True)]
-    for s, name in enumerate(VECTOR.streams):
-        found = np.concatenate(sent[f"streams/log_learning_error/{s + 1}_{name}"])
-        expected = [np.log10(r.learning_error) for r in records if r.stream == s]
-        np.testing.assert_array_equal(found[np.isfinite(found)], expected)
-    assert not any(path.startswith("policy/") for path in sent)
-
-
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
 def test_it_listens_on_this_machine_only():
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:

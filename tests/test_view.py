@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import rerun as rr
 from run_data import DELTA, IMAGE, VECTOR, module_of, run_of, write_run
 from view_data import View, scalars
 
@@ -16,7 +15,6 @@ from cdmisfa.core.signals import SIGNALS
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view.build import build_view
-from replay.view.rows import image_columns
 from replay.view.summary import summary_text
 
 ITERATIONS = 24
@@ -55,13 +53,6 @@ def test_every_signal_of_every_iteration_is_there(shown):
             assert entity["frame"] == [s.t + i for s in records for i in range(count)]
         for entity, found in expected.items():
             np.testing.assert_array_equal(scalars(rows[entity]), np.concatenate(found))
-
-
-def test_all_stand_on_the_clock_of_the_log(shown):
-    spec, records, rows, _ = shown
-    assert rows["/signals/xi"]["message_log_time"] == [s.log_time for s in records]
-    last = spec.time_ns(ITERATIONS * TAU - 1)
-    assert rows["/signals/y"]["message_log_time"][-1] == last
 
 
 def test_every_frame_has_the_log_time_of_the_log_at_any_rate(tmp_path):
@@ -162,37 +153,16 @@ def test_many_streams_show_the_most_watched(tmp_path, monkeypatch):
     assert min(visits[shown]) >= np.sort(visits)[-5]
 
 
-def test_an_empty_and_a_torn_run_have_a_view_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("replay.runs.writer.CHUNK_BYTES", 4096)
+def test_an_empty_run_has_a_view_too(tmp_path):
     write_run(tmp_path / "run.mcap", VECTOR, 0)
     build_view(tmp_path, tmp_path / "empty.rrd")
     assert "/signals/y" not in View(tmp_path / "empty.rrd").rows
-    data = (tmp_path / "run.mcap").read_bytes()
-    assert len(data) > 0
-    torn = tmp_path / "torn"
-    torn.mkdir()
-    write_run(torn / "run.mcap", VECTOR, 20)
-    whole = (torn / "run.mcap").read_bytes()
-    (torn / "run.mcap").unlink()
-    (torn / "run.mcap.partial").write_bytes(whole[: len(whole) // 2])
-    build_view(torn, torn / "run.rrd")
-    assert 3 < len(View(torn / "run.rrd").rows["/signals/xi"]["frame"]) < 20
 
 
-def test_images_are_encoded_as_rerun_does():
-    images = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
-    (ours,) = image_columns(images)
-    (theirs,) = rr.Image.columns(buffer=[image.tobytes() for image in images])
-    assert ours.as_arrow_array().to_pylist() == theirs.as_arrow_array().to_pylist()
-
-
-def test_an_existing_view_is_kept_and_nothing_half_done_is_left(tmp_path):
+def test_an_existing_view_is_kept(tmp_path):
     write_run(tmp_path / "run.mcap", VECTOR, 2)
-    out = tmp_path / "run.rrd"
-    out.write_bytes(b"mine")
+    (tmp_path / "run.rrd").write_bytes(b"mine")
     with pytest.raises(UsageError, match="--force"):
-        build_view(tmp_path, out, force=False)
-    assert out.read_bytes() == b"mine"
-    with pytest.raises(UsageError, match="no such file or folder"):
-        build_view(tmp_path / "nothing", tmp_path / "b.rrd")
+        build_view(tmp_path, tmp_path / "run.rrd", force=False)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]
+    assert (tmp_path / "run.rrd").read_bytes() == b"mine"

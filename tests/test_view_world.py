@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_data import IMAGE, PROGRESS, VECTOR, module_of, write_run
+from run_data import IMAGE, PROGRESS, VECTOR, save_modules_of, write_run
 from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
@@ -22,7 +22,6 @@ from recorder.world.icub.eyes import eye_matrix
 from recorder.world.icub.head import NECK
 from recorder.world.icub.source import TRUTH
 from replay.palette import colour, packed
-from replay.runs.modules import save_modules
 from replay.view.build import build_view
 from replay.view.modules import LAST_BLOCKS
 from replay.view.wall import places_of
@@ -96,12 +95,7 @@ def test_without_the_robots_models_there_is_the_rest_and_a_line_that_says_so(tmp
 def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
     records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
     saves = [record for record in records if record.saved]
-    size = int(np.prod(VECTOR.frame_shape))
-    made = [
-        module_of(i, record.iteration, np.ones((1, size)), record.stream)
-        for i, record in enumerate(saves, 1)
-    ]
-    save_modules(tmp_path / "modules.npz", made)
+    save_modules_of(tmp_path, VECTOR, records)
     build_view(tmp_path, tmp_path / "run.rrd")
     view = View(tmp_path / "run.rrd")
     for number, save in enumerate(saves, 1):

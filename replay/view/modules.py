@@ -28,9 +28,6 @@ from replay.view.wall import BETWEEN, hang, places_of, sheet_size
 
 PHI = "abstraction/phi"
 
-# Weights that are no image, and drawn as bars: more are a tensor.
-MOST_BARS = 256
-
 # Modules whose output is shown over the quantity that it follows: the first.
 FOLLOWED = 6
 
@@ -55,42 +52,35 @@ def saved_mark() -> rr.SeriesPoints:
     )
 
 
-def hang_weights(
-    rows: Rows, path: str, outputs: int, labels: Sequence[str] = (), rgbs: Sequence[Rgb] = ()
-) -> None:
-    """Write where the weights of several outputs hang, each with a frame and words below it.
-
-    Args:
-        rows: of the recording.
-        path: the entity of the weights.
-        outputs: how many there are.
-        labels: of the outputs, by default their numbers.
-        rgbs: their colours, by default grey.
-    """
-    if not rows.spec.images or outputs == 1:
+def hang_weights(rows: Rows, path: str, labels: Sequence[str], rgbs: Sequence[Rgb] = ()) -> None:
+    """Write where the weights of several outputs hang, framed, in grey by default."""
+    if not rows.spec.images or len(labels) == 1:
         return
     height, width = rows.spec.frame_shape
-    for j, corner in enumerate(places_of(outputs, width, height)):
-        words, rgb = labels[j] if labels else str(j + 1), rgbs[j] if rgbs else GREY
+    corners = places_of(len(labels), width, height)
+    for j, (words, corner) in enumerate(zip(labels, corners, strict=True)):
+        rgb = rgbs[j] if rgbs else GREY
         hang(rows, f"{path}/{j + 1}", corner, (width, height), words, rgb)
 
 
 def write_weights(rows: Rows, path: str, t: int, iteration: int, phi: FloatArray) -> None:
-    """Show (J, I) weights at a frame and iteration: as images, bars, or a tensor.
+    """Show (J, I) weights at a frame and iteration: as images, or bars.
 
     Each output's image, at `path` or of several at `path/<number>`, is in full colour at its own
     largest weight.
     """
     shape = rows.spec.frame_shape
-    if rows.spec.images and phi.shape[1] == shape[0] * shape[1]:
-        for j, weights in enumerate(phi):
-            place = path if len(phi) == 1 else f"{path}/{j + 1}"
-            rows.log_at(place, t, iteration, rr.Image(shade(weights.reshape(shape))))
-    elif phi.size <= MOST_BARS:
+    if not rows.spec.images or phi.shape[1] != shape[0] * shape[1]:
         bars = rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST))
         rows.log_at(path, t, iteration, bars)
-    else:
-        rows.log_at(path, t, iteration, rr.Tensor(phi.copy(), dim_names=("output", "input")))
+        return
+    for j, weights in enumerate(phi):
+        place = path if len(phi) == 1 else f"{path}/{j + 1}"
+        rows.log_at(place, t, iteration, rr.Image(shade(weights.reshape(shape))))
+
+
+def _numbers(phi: FloatArray) -> list[str]:
+    return [str(j + 1) for j in range(len(phi))]
 
 
 class Weights:
@@ -124,7 +114,7 @@ class Weights:
                 self._stream = s
                 if phi is not None:
                     if not self._phi:
-                        hang_weights(self._rows, PHI, len(phi))
+                        hang_weights(self._rows, PHI, _numbers(phi))
                     self._phi[owner] = phi
                     shown = phi if owner == s else shown
                 if shown is not None:
@@ -176,6 +166,7 @@ class ModulesView:
                     self._output(number, t, batch.blocks.iteration(t), y)
             except UsageError as error:
                 del self._own[number]
+                self._first.pop(number, None)
                 self._notes.append(f"module {number} says nothing of these frames: {error}")
 
     def finish(self, outline: Outline) -> list[str]:
@@ -192,7 +183,8 @@ class ModulesView:
                 f"{j} {'slow' if is_slow else 'not slow'}" for j, is_slow in enumerate(slow, 1)
             ]
             rgbs = [colour(module.stream_index) if is_slow else GREY for is_slow in slow]
-            hang_weights(self._rows, f"{place}/weights", len(module.phi), labels, rgbs)
+            labels = labels or _numbers(module.phi)
+            hang_weights(self._rows, f"{place}/weights", labels, rgbs)
             at = saved.get(number, outline.end), module.iteration
             write_weights(self._rows, f"{place}/weights", *at, module.phi)
             if self._rows.spec.images and own.count:
@@ -209,7 +201,7 @@ class ModulesView:
             self._rows.log(f"{place}/saved", saved_mark())
             self._rows.log_at(f"{place}/saved", t + columns.tau, iteration, rr.Scalars([0.0]))
             if number not in self._own and t in weights:
-                hang_weights(self._rows, f"{place}/weights", len(weights[t]))
+                hang_weights(self._rows, f"{place}/weights", _numbers(weights[t]))
                 write_weights(self._rows, f"{place}/weights", t, iteration, weights[t])
 
     def _output(self, number: int, t: IntArray, iterations: IntArray, y: FloatArray) -> None:
@@ -227,17 +219,13 @@ class ModulesView:
         """Keep first outputs in blocks of their own streams, of learning ones the last blocks."""
         frozen = columns["y_frozen"]
         for number, blocks in self._first.items():
+            is_saved = number <= frozen.shape[1]
+            y = frozen[:, number - 1] if is_saved else columns["y"]
             own = columns["stream"] == self._own[number].module.stream_index
-            if number <= frozen.shape[1]:
-                blocks += zip(
-                    columns.frames[own].tolist(), frozen[own, number - 1, :, 0], strict=True
-                )
-                del blocks[: -FOLLOWED_FRAMES // columns.tau]
-            else:
-                own &= self._by_progress | (columns["module"] == number)
-                own &= np.isfinite(columns["y"]).all(axis=(1, 2))
-                blocks += zip(columns.frames[own].tolist(), columns["y"][own, :, 0], strict=True)
-                del blocks[:-LAST_BLOCKS]
+            own &= is_saved | self._by_progress | (columns["module"] == number)
+            own &= np.isfinite(y).all(axis=(1, 2))
+            blocks += zip(columns.frames[own].tolist(), y[own, :, 0], strict=True)
+            del blocks[: -(FOLLOWED_FRAMES // columns.tau if is_saved else LAST_BLOCKS)]
 
     def followed(self, outline: Outline) -> list[Panel]:
         """Write what the first output of each known module follows best.
@@ -252,18 +240,18 @@ class ModulesView:
         frames, values = (np.concatenate(column)[-FOLLOWED_FRAMES:] for column in parts)
         at = frames, outline.blocks.iteration(frames)
         for number, blocks in self._first.items():
-            known = [(t, block) for t, block in blocks if t >= frames[0]]
-            t = np.ravel([np.arange(t, t + len(block)) for t, block in known]).astype(np.int64)
-            y = np.ravel([block for _, block in known])
+            t = np.ravel([start + np.arange(len(y)) for start, y in blocks]).astype(np.int64)
+            known = np.isin(t, frames)
+            t, y = t[known], np.ravel([y for _, y in blocks])[known]
             best = next(iter(fits(spec.truth, values[np.searchsorted(frames, t)], y)), None)
             if best is None:
                 continue
             s, root = self._own[number].module.stream_index, f"learned/{number}"
             stream, line = spec.streams[s], best(values[:, best.column])[:, None]
-            name = f"{best.function}, fitted to it"
+            name, where = f"{best.function}, fitted to it", outline.blocks.iteration(t)
             self._rows.lines(f"{root}/followed", [name], at, line, [GREY], width=BROAD, gap=1)
-            where, name = (t, outline.blocks.iteration(t)), f"module {number} on {stream}"
-            self._rows.lines(f"{root}/output", [name], where, y[:, None], [colour(s)], gap=1)
+            name, rgbs = f"module {number} on {stream}", [colour(s)]
+            self._rows.lines(f"{root}/output", [name], (t, where), y[:, None], rgbs, gap=1)
             words = f"{label(best.function)} (grey, |r| = {best.r:.2f})"
             title = f"Module {number} on {label(stream)} has learned {words}"
             entities = f"/{root}/followed", f"/{root}/output"
