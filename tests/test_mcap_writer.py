@@ -42,7 +42,7 @@ def test_the_bytes_are_those_of_the_mcap_package(seed, monkeypatch):
         elif what < 0.2 or not channels:
             facts = {"unit": "ä"} if rng.random() < 0.5 else {}
             channels.append(theirs.register_channel("/t", "json", 0, facts))
-            assert ours.add_channel("/t", "json", 0, facts) == channels[-1]
+            assert ours.add_channel("/t", 0, encoding="json", metadata=facts) == channels[-1]
         elif what < 0.25:
             theirs.add_metadata("m", {"é": "ü", "a": ""})
             ours.add_metadata("m", {"é": "ü", "a": ""})
@@ -61,5 +61,5 @@ def test_the_bytes_are_those_of_the_mcap_package(seed, monkeypatch):
                 data = rng.randbytes(rng.randrange(300))
             ours.add_messages(messages)
     theirs.finish()
-    ours.finish()
+    ours.end()
     assert two.getvalue() == one.getvalue()

@@ -10,13 +10,12 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, Final, Self
+from typing import Any, BinaryIO, Final, Self
 from weakref import WeakSet
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-from recorder.config import Compression
 from recorder.log.files import partial_path, refuse_special, refuse_taken, to_disk
 from recorder.mcap.store import OPEN_FILES
 from recorder.mcap.writer import McapWriter
@@ -151,7 +150,7 @@ def write_error(path: Path, error: OSError) -> LogWriteError:
     )
 
 
-class LogFile:
+class LogFile(McapWriter):
     """One MCAP file: chunked, indexed, with CRCs and repeated schemas and channels.
 
     As a context manager it finishes the file on success and leaves the flushed
@@ -164,28 +163,15 @@ class LogFile:
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        force: bool = False,
-        library: str = "cdmisfa",
-        profile: str = "",
-        compression: Compression = "zstd",
-        chunk_size: int = 1024 * 1024,
-        flush_ns: int = FLUSH_NS,
-        aside: bool = False,
+        self, path: Path, *, force: bool = False, flush_ns: int = FLUSH_NS, **options: Any
     ) -> None:
         """Open NAME.partial for writing.
 
         Args:
             path: the file's name once it is finished.
             force: overwrite an earlier file.
-            library: writer of the file, as the header states.
-            profile: of the messages, as the header states.
-            compression: of the chunks.
-            chunk_size: bytes of messages at which a chunk is closed.
             flush_ns: log time after which it is flushed.
-            aside: compress in a thread of its own; the bytes are the same.
+            options: of `McapWriter`.
 
         Raises:
             UsageError: the file or its partial exists and `force` is not set, another process
@@ -198,7 +184,6 @@ class LogFile:
         self._flush_ns = flush_ns
         self._chunk_start: int | None = None
         self._named_on_disk = False
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
         refuse_taken(self.path, force=force)
         refuse_special(self.partial)
         if self.partial.exists() and not force:
@@ -208,14 +193,7 @@ class LogFile:
             )
         self._stream = AppendOnlyFile(self.partial)
         try:
-            self._writer = McapWriter(
-                self._stream,
-                library=library,
-                profile=profile,
-                compression=compression,
-                chunk_size=chunk_size,
-                aside=aside,
-            )
+            super().__init__(self._stream, **options)
         except BaseException:
             self._stream.close()
             raise
@@ -224,44 +202,6 @@ class LogFile:
     def closed(self) -> bool:
         """Whether the file was finished or abandoned."""
         return self._stream.closed
-
-    @property
-    def size(self) -> int:
-        """Bytes written so far, without the chunk in progress."""
-        self._writer.settle()
-        return self._stream.tell()
-
-    def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Register a message schema, and return its id; the same schema gets the same."""
-        key = (name, encoding, data)
-        if key not in self._schemas:
-            self._schemas[key] = self._writer.add_schema(name, encoding, data)
-        return self._schemas[key]
-
-    def add_channel(
-        self,
-        topic: str,
-        schema: int,
-        *,
-        encoding: str = "protobuf",
-        metadata: Mapping[str, str] | None = None,
-    ) -> int:
-        """Register a channel of messages on a topic, and return its id; schema 0 is none."""
-        return self._writer.add_channel(topic, encoding, schema, metadata or {})
-
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a named string map at once, outside the chunks."""
-        self._writer.add_metadata(name, values)
-        self._stream.flush()
-
-    def add_attachment(
-        self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
-    ) -> None:
-        """Write a named file at once, outside the chunks; times in nanoseconds."""
-        self._writer.add_attachment(
-            name, media_type, data, log_time=log_time, create_time=create_time
-        )
-        self._stream.flush()
 
     def write(
         self,
@@ -298,14 +238,14 @@ class LogFile:
         elif log_time - self._chunk_start >= self._flush_ns:
             self.flush()
             self._chunk_start = log_time
-        self._writer.add_messages(messages)
+        self.add_messages(messages)
 
     def flush(self) -> None:
         """Close the chunk in progress and hand everything to the operating system."""
         self._stream.check()
         self._chunk_start = None
-        self._writer.end_chunk()
-        self._writer.settle()
+        self.end_chunk()
+        self.settle()
         self._stream.flush()
 
     def sync(self) -> None:
@@ -324,7 +264,7 @@ class LogFile:
         """
         try:
             self._stream.check()
-            self._writer.finish()
+            self.end()
             self._stream.sync()
         finally:
             self._stream.close()

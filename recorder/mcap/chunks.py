@@ -43,7 +43,7 @@ Pairs = list[tuple[int, NDArray[np.uint64]]]
 
 @dataclass(frozen=True, slots=True)
 class MessageTable:
-    """The messages of one chunk in file order, one row each.
+    """Messages of one chunk in file order, one row each.
 
     Attributes:
         data: (B,) uint8, the chunk's decompressed records.
@@ -77,38 +77,40 @@ class MessageTable:
         return self.records["size"]
 
     def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
-        """The messages of some rows, given by number, (k,), or by a truth value each, (n,)."""
-        # As indexing does, in a third of its time.
+        """Return the messages of rows, given by number, (k,), or by a truth value each, (n,)."""
+        # The result of indexing, in a third of its time.
         pick = self.records.compress if rows.dtype == np.bool_ else self.records.take
         return MessageTable(self.data, pick(rows))
 
     def rows(self) -> Iterator[tuple[int, int, int, int, bytes]]:
-        """Each message: channel, sequence, log time, publish time and payload."""
+        """Yield each message: channel, sequence, log time, publish time and payload."""
         data = self.data.data
         for log_time, published, at, size, sequence, channel, _ in self.records.tolist():
             yield channel, sequence, log_time, published, bytes(data[at : at + size])
 
     def payload(self, row: int) -> bytes:
-        """A copy of a payload."""
+        """Return a copy of a payload."""
         return self.view(row).tobytes()
 
     def view(self, row: int) -> memoryview:
-        """A payload where it lies in the chunk."""
+        """Return a payload, still in the memory of the chunk."""
         at = int(self.at[row])
         return self.data[at : at + int(self.size[row])].data
 
     def index(self, channel: int) -> bytes:
-        """The message index of a channel: log time and place of each message, in file order."""
-        own = self.channel == channel
-        pairs = np.empty((int(own.sum()), 2), "<u8")
-        pairs[:, 0] = self.log_time[own]
-        pairs[:, 1] = self.at[own] - MESSAGE_HEADER.size
-        size = pairs.nbytes
-        head = INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, size + 6, channel, size)
+        """Return the message index of a channel: time and place of each message, in file order."""
+        rows = self.channel == channel
+        pairs = np.stack(
+            [self.log_time[rows], self.at[rows] - MESSAGE_HEADER.size],
+            1,
+            dtype="<u8",
+            casting="unsafe",
+        )
+        head = INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, pairs.nbytes + 6, channel, pairs.nbytes)
         return head + pairs.tobytes()
 
     def agrees(self, indexes: Pairs) -> bool:
-        """Whether message indexes name these messages, and no others."""
+        """Return whether message indexes name exactly these messages."""
         channels = np.repeat([n for n, _ in indexes], [len(pairs) for _, pairs in indexes])
         if len(channels) != len(self):
             return False
@@ -122,14 +124,14 @@ class MessageTable:
 def walked_table(
     data: ByteArray, *, cut: bool = False
 ) -> tuple[MessageTable, list[tuple[int, bytes]], tuple[int, int]]:
-    """The messages of a chunk, its definitions as (opcode, content), and its range of log times.
+    """Return a chunk's messages, definitions as (opcode, content), and range of log times.
 
     Args:
         data: (B,) its decompressed records.
         cut: leave out its end where that is broken.
 
     Raises:
-        MalformedRecord: it holds something that is no record, or that has no place there.
+        MalformedRecord: it holds bytes that are no record, or a record that may not be there.
     """
     try:
         messages, others, place, times = walk_records(data)
@@ -148,7 +150,7 @@ def walked_table(
 
 
 def _no_record(data: ByteArray, at: int) -> str:
-    """Why the bytes at a place of a chunk are no record."""
+    """Return why the bytes at a place of a chunk are no record."""
     left = len(data) - at
     if left < RECORD_HEADER.size:
         return f"{left} bytes at its end are no record"
@@ -162,21 +164,19 @@ def _no_record(data: ByteArray, at: int) -> str:
 
 
 UNUSED: Final = "(the index is not used)"
-"""How it ends what is said of an index that contradicts its chunk, which costs no message."""
-CACHE_BYTES: Final = 1024 * 1024
-"""Decoded chunks that are kept; one always is.
+"""The end of a problem with an index that contradicts its chunk, which costs no message."""
 
-Few, because reading moves forward, and memory that is used again is still in the CPU's cache.
-"""
+# Decoded chunks that are kept, one at least: few, because reading moves forward, and memory that is
+# used again is still in the CPU's cache.
+CACHE_BYTES: Final = 1024 * 1024
+# Most memory that zstd may take for its window, because a frame may ask for any.
 _WINDOW: Final = MAX_CHUNK // 2
-"""Most memory that zstd may take for its window, in bytes."""
 _PIECE: Final = 1 << 17
+# A chunk is decoded ahead if it has this many stored bytes, as handing fewer over takes as long, at
+# most this many decompressed, because of their memory, and is not hardly compressed.
 _LONG: Final = 256 * 1024
-"""Fewest stored bytes of a chunk that is decoded ahead, as handing less over takes as long."""
 _LARGE: Final = 8 * 1024 * 1024
-"""Most bytes of one, because of the memory that this takes."""
 _PACKED: Final = 0.9
-"""How small what is stored is against them: what is hardly compressed is decoded at once."""
 
 
 class _Zstd(threading.local):
@@ -191,13 +191,13 @@ _BROKEN: Final = (zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EO
 
 
 class Chunks:
-    """Decodes the chunks of a file; the last few are kept.
+    """Decode the chunks of a file, and keep the last few.
 
     Args:
         file: the log.
-        definitions: take in what the chunks define.
-        note: told (where, what) of a message index that is not of its chunk's messages, which
-            costs none of them; None where nobody wants to know.
+        definitions: those of the chunks are added.
+        note: called with (where, what) for a message index that is not of its chunk's messages,
+            which costs none of them; None if indexes are not compared.
         without_crc: called for a chunk that has no CRC of its own.
     """
 
@@ -220,11 +220,11 @@ class Chunks:
         self._thread: ThreadPoolExecutor | None = None
 
     def expect(self, segments: Sequence[Segment]) -> None:
-        """Announce the chunks that are asked for one after the other: one is decoded ahead."""
+        """Announce the chunks that are read one after the other, to decode one ahead."""
         self._following = {one.offset: two for one, two in itertools.pairwise(segments)}
 
     def table(self, segment: Segment) -> MessageTable:
-        """The messages of a chunk in file order.
+        """Return the messages of a chunk in file order.
 
         Raises:
             MalformedRecord: it is damaged.
@@ -250,12 +250,12 @@ class Chunks:
         first, stop = segment.indexes[0].offset, segment.stop
         if stop - first > MAX_CHUNK:
             raise MalformedRecord("its message index is larger than any chunk")
-        data, found = self._file.read(first, stop - first), []
+        data, indexes = self._file.read(first, stop - first), []
         for part in segment.indexes:
             if channels is None or part.channel in channels:
                 pairs = np.frombuffer(data, np.uint64, 2 * part.count, part.offset - first)
-                found.append((part.channel, pairs.reshape(-1, 2)))
-        return found
+                indexes.append((part.channel, pairs.reshape(-1, 2)))
+        return indexes
 
     def close(self) -> None:
         """Drop the decoded chunks, and end the thread; harmless when called twice."""
@@ -285,7 +285,7 @@ class Chunks:
         return table
 
     def _look_ahead(self, segment: Segment) -> None:
-        """Begin to decode the chunk after one that was asked for in order, if that takes long."""
+        """Start to decode the next chunk while this one is used, if it takes long."""
         in_order = self._following.get(self._last) is segment
         self._last = segment.offset
         following = self._following.get(segment.offset)
@@ -298,11 +298,10 @@ class Chunks:
             self._ahead = following.offset, future
 
     def _records(self, segment: Segment) -> ByteArray:
-        """The records of a chunk, whose CRC matches; another thread may call it."""
+        """Return the records of a chunk whose CRC matches; another thread may call it."""
         compression, size, begin = segment.compression, segment.size, segment.offset
         check_size(compression, 0 if segment.cut else size)
-        held = min(segment.data_end, self._file.size) - begin
-        raw = np.frombuffer(self._file.read(begin, held), np.uint8)
+        raw = np.frombuffer(self._file.read(begin, segment.data_end - begin), np.uint8)
         if segment.stated:
             confirm(segment, raw.data)
         stored = raw[segment.data_offset - begin :]
@@ -315,10 +314,10 @@ class Chunks:
 
 
 def confirm(segment: Segment, data: memoryview) -> None:
-    """Compare a chunk with what the summary says of it.
+    """Compare the head of a chunk with the summary.
 
     Args:
-        segment: what the summary says; its CRC is taken over.
+        segment: as the summary states it; its CRC is set.
         data: the bytes of the file from its first on.
 
     Raises:
@@ -344,13 +343,13 @@ def check_size(compression: str, size: int) -> None:
 
 
 def decompressed(stored: ByteArray, compression: str, size: int, *, cut: bool = False) -> ByteArray:
-    """The records of a chunk.
+    """Return the records of a chunk.
 
     Args:
         stored: its bytes.
         compression: "zstd", "lz4" or "".
         size: bytes that it states, at most `MAX_CHUNK`.
-        cut: whether what is there of a chunk that was cut is wanted, `size` bytes at most.
+        cut: return the records before the end of a chunk that was cut, `size` bytes at most.
 
     Raises:
         MalformedRecord: broken data, or another number of bytes than stated.
@@ -365,26 +364,26 @@ def decompressed(stored: ByteArray, compression: str, size: int, *, cut: bool = 
     except _BROKEN as error:
         raise MalformedRecord(f"its {compression} data is broken ({error})") from None
     if len(records) != size and not cut:
-        there = f"more than {size}" if len(records) > size else len(records)
-        raise MalformedRecord(f"it states {size} bytes decompressed and holds {there}")
+        actual = f"more than {size}" if len(records) > size else len(records)
+        raise MalformedRecord(f"it states {size} bytes decompressed and holds {actual}")
     return records
 
 
 def _from_zstd(stored: ByteArray, size: int, cut: bool) -> ByteArray:
-    """What zstd gives, with one byte more where it is more than `size`."""
+    """Decompress zstd, one byte more than `size` if there are more."""
     reader = _ZSTD.decompressor.stream_reader(stored.data, read_across_frames=True)
-    out, there = np.empty(size + 1, np.uint8), 0
+    out, done = np.empty(size + 1, np.uint8), 0
     step = _PIECE if cut else size  # where all of it fits, zstd writes straight into it
     with contextlib.suppress(zstandard.ZstdError) if cut else contextlib.nullcontext():
-        while there < size and (n := reader.readinto(out[there : min(there + step, size)].data)):
-            there += n
-        if there == size and not cut:
-            there += reader.readinto(out[size:].data)
-    return out[:there]
+        while done < size and (n := reader.readinto(out[done : min(done + step, size)].data)):
+            done += n
+        if done == size and not cut:
+            done += reader.readinto(out[size:].data)
+    return out[:done]
 
 
 def _from_lz4(stored: ByteArray, size: int, cut: bool) -> ByteArray:
-    """What LZ4 gives, with one byte more where it is more than `size`."""
+    """Decompress LZ4, one byte more than `size` if there are more."""
     lz4_frame = lz4.frame.LZ4FrameDecompressor()
     data = lz4_frame.decompress(stored.data, max_length=size + (not cut))
     if len(data) <= size and not (cut or lz4_frame.eof):

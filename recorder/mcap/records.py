@@ -1,7 +1,7 @@
-"""MCAP's records as bytes: what a log may contain, with every length checked.
+"""Parse the records of MCAP, with every length checked.
 
-Nothing here trusts a length, count or text of the file. Whoever reads a file turns
-`MalformedRecord` into an error that names it.
+Nothing here trusts a length, count or text of the file. Callers turn a `MalformedRecord` into an
+error that names the file.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from mcap.records import Channel, Schema
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 
-try:  # the same number, several times faster
+try:  # the same checksum, several times faster
     from isal.isal_zlib import crc32 as _crc32
 except ImportError:
     from zlib import crc32 as _crc32
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-"""What a file begins and ends with."""
+MAGIC: Final = b"\x89MCAP0\r\n"  # the first and the last bytes of a file
 RECORD_HEADER: Final = struct.Struct("<BQ")
-MAX_CHUNK: Final = 144 * 1024 * 1024
-"""Largest decompressed chunk, in bytes, that is read; asked for before decompressing."""
-MAX_DEFINITION: Final = 64 * 1024 * 1024
-"""Largest schema, channel or metadata record, in bytes, that is read."""
 
+# Larger chunks and definitions are refused before memory is asked for. Writers make chunks of 1 to
+# 4 MiB by default; 144 MiB hold an image of 8192x6144 in RGB.
+MAX_CHUNK: Final = 144 * 1024 * 1024
+MAX_DEFINITION: Final = 64 * 1024 * 1024
+
+# Opcode, length, channel, sequence, log time, publish time; the payload follows.
 MESSAGE_HEADER: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length, channel, sequence, log time, publish time; the payload follows."""
+# Opcode, length, channel, bytes of the pairs of log time and place in the chunk, which follow.
 INDEX_HEADER: Final = struct.Struct("<BQHI")
-"""Opcode, length, channel, bytes of the pairs, which follow: log time and place in the chunk."""
+# Opcode, length, first and last log time, size and CRC; compression and records follow.
 CHUNK_HEADER: Final = struct.Struct("<BQQQQI")
-"""Opcode, length, first and last log time, size and CRC; compression and records follow."""
+# Bytes that hold all of a chunk before its records: the name of its compression is short.
 CHUNK_PEEK: Final = 256
-"""Bytes that hold all of a chunk before its records: the name of its compression is short."""
 
 
 class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with a record, not where
-    """Bytes that are not what MCAP says they are; the reader adds file and place."""
+    """A record contradicts the format; the reader adds file and place."""
 
 
 KINDS: Final = (
@@ -51,11 +51,11 @@ KINDS: Final = (
     ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, LeRobot datasets, and arrays "
     "(.npy, .npz)"
 )
-"""What is read, for errors; docs/how-to/logs.md says more."""
+"""The formats that are read, for errors; docs/how-to/logs.md says more."""
 
 
 def no_log(path: Path) -> CdmisfaError:
-    """What is wrong with a file that begins otherwise: damage, where its name is that of a log."""
+    """Return the error for a file that does not begin as MCAP; damage if it is named as MCAP."""
     if ".mcap" in path.name:
         return LogDamagedError(f"{path}: not an MCAP file (its first bytes are not MCAP's)")
     if path.suffix in (".npy", ".npz"):
@@ -66,7 +66,7 @@ def no_log(path: Path) -> CdmisfaError:
 
 
 class Fields(ReadDataStream):
-    """The fields of one record, read one after the other within its bounds."""
+    """Read the fields of one record, one after the other, within its bounds."""
 
     def __init__(self, data: bytes | memoryview, what: str) -> None:
         super().__init__(io.BytesIO(data))
@@ -99,8 +99,16 @@ class Fields(ReadDataStream):
 
 
 def crc32(data: bytes | memoryview, value: int = 0) -> int:
-    """CRC-32 of bytes, continued from the `value` of those before."""
+    """Return the CRC-32 of bytes, continued from the `value` of the bytes before."""
     return int(_crc32(data, value))
+
+
+def chunk_head(start: int, end: int, size: int, crc: int, compression: str, stored: int) -> bytes:
+    """Return the bytes of a chunk before its records; see `Segment`."""
+    name = compression.encode()
+    length = CHUNK_HEADER.size + 12 + len(name) + stored - RECORD_HEADER.size
+    head = CHUNK_HEADER.pack(Opcode.CHUNK, length, start, end, size, crc)
+    return head + struct.pack(f"<I{len(name)}sQ", len(name), name, stored)
 
 
 Refuse = Callable[[str, str], None]
@@ -143,7 +151,7 @@ class Segment:
         indexes: the chunk's message indexes, in file order.
         counts: messages of each channel where a walk counted them.
         cut: the file ends within it.
-        stated: only the summary speaks of it, its own header was not read.
+        stated: it is known from the summary, its own header was not read.
     """
 
     offset: int
@@ -176,13 +184,8 @@ class Segment:
         return self
 
     def head(self, crc: int) -> bytes:
-        """The bytes of a chunk before its records, given their CRC."""
-        name = self.compression.encode()
-        length = self.data_end - self.offset - RECORD_HEADER.size
-        fixed = (Opcode.CHUNK, length, self.start, self.end, self.size, crc)
-        return CHUNK_HEADER.pack(*fixed) + struct.pack(
-            f"<I{len(name)}sQ", len(name), name, self.stored
-        )
+        """Return the bytes of a chunk before its records, given their CRC."""
+        return chunk_head(self.start, self.end, self.size, crc, self.compression, self.stored)
 
     @property
     def data_end(self) -> int:
@@ -199,12 +202,12 @@ class Segment:
 
     @property
     def name(self) -> str:
-        """How an error names it."""
+        """Its name in errors."""
         kind = "chunk" if self.chunked else "messages"
         return f"{kind} at byte {self.offset} (log time {self.start} to {self.end} ns)"
 
     def channel_counts(self) -> dict[int, int] | None:
-        """Messages of each channel, or None where only decoding can tell."""
+        """Return the messages of each channel, or None if only decoding can tell."""
         if self.counts is not None:
             return self.counts
         if not self.indexes:
@@ -217,7 +220,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A file within the log; `offset` and `size` are those of its bytes."""
+    """A file within the log, whose bytes are at `offset`."""
 
     name: str
     media_type: str
@@ -230,7 +233,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Something that is wrong with a log, or was lost of it."""
+    """Damage of a log, or a loss."""
 
     where: str
     what: str
@@ -258,7 +261,7 @@ class Definitions:
         self._bytes = 0
 
     def add(self, opcode: int, content: bytes, where: str) -> None:
-        """Take a Schema or Channel record in; one whose id means something else is refused.
+        """Add a Schema or Channel record; refuse one whose id has another meaning.
 
         Raises:
             MalformedRecord: it is no such record, or all of them take too much memory.

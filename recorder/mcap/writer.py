@@ -1,7 +1,7 @@
-"""Writing MCAP: chunked, compressed, indexed, with every checksum.
+"""Write MCAP: chunked, compressed, indexed, with every checksum.
 
-The bytes are those that the mcap package writes, but for how lz4 is told to compress, in a quarter
-of its time a message: of a message nothing is done until its chunk ends but to keep it.
+The bytes are those that the mcap package writes, except for the blocks of lz4, in a quarter of its
+time a message: a message is only appended to its chunk, and everything else is done for the chunk.
 """
 
 from __future__ import annotations
@@ -34,43 +34,46 @@ from mcap.records import (
 
 from recorder.config import Compression
 from recorder.mcap.records import (
-    CHUNK_HEADER,
     INDEX_HEADER,
     MAGIC,
     MESSAGE_HEADER,
+    chunk_head,
     crc32,
 )
 
 _OF_MESSAGE: Final = int(Opcode.MESSAGE)
 _MESSAGE_SIZE: Final = MESSAGE_HEADER.size
 _MESSAGE_FIELDS: Final = _MESSAGE_SIZE - 9
+# The part of the footer that the summary's checksum covers.
 _FOOTER: Final = struct.Struct("<BQQQ")
-"""What a summary's checksum counts of the footer."""
 
 _COMPRESS: Final[Mapping[Compression, tuple[str, Callable[[memoryview], bytes]]]] = {
     "zstd": ("zstd", zstandard.compress),
-    # Blocks that do not know those before take a third less time, and 3 % more room.
+    # Blocks that do not refer to earlier ones take a third less time, and 3 % more room.
     "lz4": ("lz4", partial(lz4.frame.compress, block_linked=False)),
     "none": ("", bytes),
 }
 
 
 class Appended(Protocol):
-    """What takes a file's bytes, one after the other."""
+    """A file that is only appended to."""
 
     def write(self, data: bytes | memoryview, /) -> int:
         """Append all of the bytes."""
 
     def tell(self) -> int:
-        """Bytes that were appended."""
+        """Return the number of bytes that were appended."""
+
+    def flush(self) -> None:
+        """Hand all of the bytes to the operating system."""
 
 
 class McapWriter:
-    """Writes one file, from its first byte to its last.
+    """Write one file, from its first byte to its last.
 
     Args:
-        out: what takes the bytes.
-        library: what writes the file, as its header states.
+        out: the file.
+        library: writer of the file, as its header states.
         profile: of the messages, as the header states.
         compression: of the chunks.
         chunk_size: bytes of records at which a chunk ends.
@@ -81,10 +84,10 @@ class McapWriter:
         self,
         out: Appended,
         *,
-        library: str,
-        profile: str,
-        compression: Compression,
-        chunk_size: int,
+        library: str = "cdmisfa",
+        profile: str = "",
+        compression: Compression = "zstd",
+        chunk_size: int = 1024 * 1024,
         aside: bool = False,
     ) -> None:
         self._out = out
@@ -108,24 +111,33 @@ class McapWriter:
         self._append(MAGIC)
         self._append(_encoded(Header(profile, library)))
 
+    @property
+    def size(self) -> int:
+        """Bytes written so far, without the chunk in progress."""
+        self.settle()
+        return self._out.tell()
+
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Define how messages are decoded, and return its id."""
+        """Define how messages are decoded, and return its id; the same schema gets the same."""
+        for known in self._schemas:
+            if (known.name, known.encoding, known.data) == (name, encoding, data):
+                return known.id
         schema = Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
         self._schemas.append(schema)
         self._define(schema)
         return schema.id
 
     def add_channel(
-        self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str]
+        self,
+        topic: str,
+        schema: int,
+        *,
+        encoding: str = "protobuf",
+        metadata: Mapping[str, str] | None = None,
     ) -> int:
-        """Define a channel of messages, and return its id; schema 0 is none."""
-        channel = Channel(
-            id=len(self._channels) + 1,
-            topic=topic,
-            message_encoding=encoding,
-            metadata=dict(metadata),
-            schema_id=schema,
-        )
+        """Define a channel of messages on a topic, and return its id; schema 0 is none."""
+        number, facts = len(self._channels) + 1, dict(metadata or {})
+        channel = Channel(number, topic, encoding, facts, schema)
         self._channels.append(channel)
         self._define(channel)
         return channel.id
@@ -152,40 +164,36 @@ class McapWriter:
                 self.end_chunk()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Append a named map of texts, outside the chunks."""
+        """Write a named map of texts at once, outside the chunks."""
         self.settle()
         data = _encoded(Metadata(name=name, metadata=dict(values)))
         self._metadata.append(MetadataIndex(offset=self._out.tell(), length=len(data), name=name))
         self._append(data)
+        self._out.flush()
 
     def add_attachment(
-        self, name: str, media_type: str, data: bytes, *, log_time: int, create_time: int
+        self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
     ) -> None:
-        """Append a named file, outside the chunks; times in nanoseconds."""
+        """Write a named file at once, outside the chunks; times in nanoseconds."""
         self.settle()
-        attachment = Attachment(
-            create_time=create_time,
-            log_time=log_time,
-            name=name,
-            media_type=media_type,
-            data=data,
-        )
-        stored = _encoded(attachment)
-        self._attachments.append(
-            AttachmentIndex(
-                offset=self._out.tell(),
-                length=len(stored),
-                log_time=log_time,
-                create_time=create_time,
-                data_size=len(data),
-                name=name,
-                media_type=media_type,
-            )
-        )
+        about: dict[str, Any] = {
+            "log_time": log_time,
+            "create_time": create_time,
+            "name": name,
+            "media_type": media_type,
+        }
+        stored = _encoded(Attachment(data=data, **about))
+        place: dict[str, Any] = {
+            "offset": self._out.tell(),
+            "length": len(stored),
+            "data_size": len(data),
+        }
+        self._attachments.append(AttachmentIndex(**place, **about))
         self._append(stored)
+        self._out.flush()
 
     def end_chunk(self) -> None:
-        """End the chunk in progress, where it holds a message: it is appended, or will be."""
+        """End the chunk in progress if it holds a message; it is appended now or later."""
         if not self._index:
             return
         self.settle()
@@ -198,21 +206,32 @@ class McapWriter:
             self._pending = self._aside.submit(work)
 
     def settle(self) -> None:
-        """Wait until all chunks that ended are appended; what went wrong with one is raised."""
+        """Wait until all chunks that ended are appended, and raise the error of one."""
         if self._pending is not None:
             self._pending.result()
             self._pending = None
 
-    def finish(self) -> None:
+    def end(self) -> None:
         """End the chunk in progress and append the summary."""
         self.end_chunk()
         self.settle()
         self._append(_encoded(DataEnd(self._crc)))
         start = at = self._out.tell()
+        statistics = Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=max((c.message_end_time for c in self._chunks), default=0),
+            message_start_time=min((c.message_start_time for c in self._chunks), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
         groups: list[tuple[Opcode, Iterable[McapRecord]]] = [
             (Opcode.SCHEMA, self._schemas),
             (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.STATISTICS, [statistics]),
             (Opcode.CHUNK_INDEX, self._chunks),
             (Opcode.ATTACHMENT_INDEX, self._attachments),
             (Opcode.METADATA_INDEX, self._metadata),
@@ -239,10 +258,7 @@ class McapWriter:
         first, last = min(map(min, times)), max(map(max, times))
         with buffer[:size] as records:
             stored, crc = self._compress(records), crc32(records)
-        name = self._compression.encode()
-        length = CHUNK_HEADER.size - 9 + 4 + len(name) + 8 + len(stored)
-        head = CHUNK_HEADER.pack(Opcode.CHUNK, length, first, last, size, crc)
-        head += len(name).to_bytes(4, "little") + name + len(stored).to_bytes(8, "little")
+        head = chunk_head(first, last, size, crc, self._compression, len(stored))
         chunk = len(head) + len(stored)
         offset = self._out.tell()
         self._append(head)
@@ -251,10 +267,8 @@ class McapWriter:
         for channel, pairs in index.items():
             offsets[channel] = at
             length = 8 * len(pairs)
-            parts += [
-                INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, length + 6, channel, length),
-                struct.pack(f"<{len(pairs)}Q", *pairs),
-            ]
+            parts.append(INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, length + 6, channel, length))
+            parts.append(struct.pack(f"<{len(pairs)}Q", *pairs))
             at += INDEX_HEADER.size + length
             self._counts[channel] = self._counts.get(channel, 0) + len(pairs) // 2
         self._append(b"".join(parts))
@@ -272,19 +286,6 @@ class McapWriter:
             )
         )
 
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
-            channel_message_counts=self._counts,
-            chunk_count=len(self._chunks),
-            message_count=sum(self._counts.values()),
-            message_end_time=max((c.message_end_time for c in self._chunks), default=0),
-            message_start_time=min((c.message_start_time for c in self._chunks), default=0),
-            metadata_count=len(self._metadata),
-            schema_count=len(self._schemas),
-        )
-
     def _define(self, record: McapRecord) -> None:
         data = _encoded(record)
         stop = self._size + len(data)
@@ -296,7 +297,7 @@ class McapWriter:
             self.end_chunk()
 
     def _grow(self, size: int) -> None:
-        """Make room for so many bytes of records."""
+        """Make room for `size` bytes of records."""
         grown = memoryview(bytearray(max(size, 2 * self._size)))
         grown[: self._size] = self._records[: self._size]
         self._records = grown
