@@ -1,4 +1,4 @@
-"""A recording as images, videos and a LeRobot dataset, read back by others' programs."""
+"""A recording as images, videos and a LeRobot dataset, read back by other programs."""
 
 from __future__ import annotations
 
@@ -25,17 +25,16 @@ from replay.inputs import open_recording
 
 ROOT = Path(__file__).parents[1]
 FRAMES = 53
-FIRST = 7
 TRUTH = ("ball_x", "ball_y")
+VIEWS = ("left", "right")
 
 
-def record_images(folder, shape=(24, 40), views=("left", "right"), fps=50.0, *, inverted=False):
+def record_images(folder, shape=(24, 40), views=VIEWS, fps=50.0, seed=0):
     """A recording of white noise: its pixels (views, frames, height, width), its truth."""
     folder.mkdir()
     spec = SourceSpec(views, shape, "uint8", TRUTH, fps, 10**18, None)
-    rng = np.random.default_rng(0)
-    pixels = rng.integers(0, 256, (len(views), FRAMES, *shape), dtype=np.uint8)
-    pixels = 255 - pixels if inverted else pixels
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(0, 256 >> seed, (len(views), FRAMES, *shape), dtype=np.uint8)
     truth = rng.standard_normal((FRAMES, 2))
     for stream, view in enumerate(views):
         log = ViewLog(folder, view, RecordingSpec("test", 3, spec, {}), RecordConfig())
@@ -53,22 +52,22 @@ def decoded(file):
     """Frames of a video (n, height, width), when each is shown, and the stream's facts."""
     av = pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
     with av.open(str(file)) as container:
-        pictures = list(container.decode(video=0))
+        images = list(container.decode(video=0))
         stream = container.streams.video[0]
         facts = (stream.codec.canonical_name, stream.average_rate, container.metadata)
-        values = np.array([p.to_ndarray(format="gray") for p in pictures])
-        return values, [p.time for p in pictures], facts
+        values = np.array([image.to_ndarray(format="gray") for image in images])
+        return values, [image.time for image in images], facts
 
 
 def test_a_recording_becomes_images(tmp_path):
     pixels, _ = record_images(tmp_path / "r")
     assert export(tmp_path / "r", tmp_path / "images", "images") == 2 * FRAMES
-    for stream, view in enumerate(("left", "right")):
+    for stream, view in enumerate(VIEWS):
         files = sorted((tmp_path / "images" / view).iterdir())
         assert [f.name for f in files] == [f"{t:08d}.png" for t in range(FRAMES)]
-        for t in (0, FIRST, FRAMES - 1):
-            with Image.open(files[t]) as image:
-                np.testing.assert_array_equal(np.asarray(image), pixels[stream, t])
+        for file, expected in zip(files, pixels[stream], strict=True):
+            with Image.open(file) as image:
+                np.testing.assert_array_equal(np.asarray(image), expected)
 
 
 @pytest.mark.parametrize("shape", [(24, 40), (25, 41)], ids=["even", "odd"])
@@ -76,17 +75,17 @@ def test_a_lossless_video_holds_every_pixel(shape, tmp_path):
     pixels, _ = record_images(tmp_path / "r", shape, fps=30000 / 1001)
     assert export(tmp_path / "r", tmp_path / "films", "mp4", lossless=True) == 2 * FRAMES
     assert sorted(p.name for p in (tmp_path / "films").iterdir()) == ["left.mp4", "right.mp4"]
-    for stream, view in enumerate(("left", "right")):
-        found, times, (codec, rate, about) = decoded(tmp_path / "films" / f"{view}.mp4")
-        np.testing.assert_array_equal(found, pixels[stream])
+    for stream, view in enumerate(VIEWS):
+        values, times, (codec, rate, metadata) = decoded(tmp_path / "films" / f"{view}.mp4")
+        np.testing.assert_array_equal(values, pixels[stream])
         assert (codec, str(rate)) == ("h264", "30000/1001")
         np.testing.assert_allclose(times, np.arange(FRAMES) * 1001 / 30000, atol=1e-9)
-        comment = json.loads(about["comment"])
+        comment = json.loads(metadata["comment"])
         assert (comment["view"], comment["first_frame"]) == (view, 0)
         assert comment["first_time_ns"] == 10**18
 
 
-def test_a_video_is_near_what_was_seen_and_smaller(tmp_path):
+def test_a_lossy_video_is_similar_and_smaller(tmp_path):
     record_images(tmp_path / "r", views=("left",))
     export(tmp_path / "r", tmp_path / "near.mp4", "mp4")
     export(tmp_path / "r", tmp_path / "same.mp4", "mp4", lossless=True)
@@ -94,26 +93,27 @@ def test_a_video_is_near_what_was_seen_and_smaller(tmp_path):
     same, _, _ = decoded(tmp_path / "same.mp4")
     assert (tmp_path / "near.mp4").stat().st_size < (tmp_path / "same.mp4").stat().st_size
     assert 0 < np.abs(near.astype(int) - same).mean() < 8  # of white noise, the worst case
-    # Which frame it is can still be told: none is missing, doubled or moved.
+    # Each frame is still the most similar to its own: none is missing, doubled or moved.
     far = np.abs(near[:, None].astype(int) - same[None]).mean(axis=(2, 3))
     np.testing.assert_array_equal(far.argmin(axis=1), np.arange(FRAMES))
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    """A LeRobot dataset, the pixels and the truth that are in it."""
+    """A LeRobot dataset of two recordings, the pixels and the truth of each."""
     pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
     folder = tmp_path_factory.mktemp("lerobot")
-    pixels, truth = record_images(folder / "r")
-    assert export(folder / "r", folder / "robot", "lerobot", lossless=True) == FRAMES
+    paths = [folder / "one", folder / "two"]
+    pixels, truth = zip(*(record_images(p, seed=i) for i, p in enumerate(paths)), strict=True)
+    assert export(paths, folder / "robot", "lerobot", lossless=True) == 2 * FRAMES
     return folder / "robot", pixels, truth
 
 
 def test_a_dataset_has_the_published_layout(dataset):
     folder, pixels, truth = dataset
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-    videos = {f"videos/observation.images.{v}/chunk-000/file-000.mp4" for v in ("left", "right")}
-    assert files == videos | {
+    keys = [f"observation.images.{view}" for view in VIEWS]
+    assert files == {f"videos/{key}/chunk-000/file-00{i}.mp4" for key in keys for i in (0, 1)} | {
         "data/chunk-000/file-000.parquet",
         "meta/episodes/chunk-000/file-000.parquet",
         "meta/info.json",
@@ -121,52 +121,55 @@ def test_a_dataset_has_the_published_layout(dataset):
         "meta/tasks.parquet",
     }
     info = json.loads((folder / "meta/info.json").read_text())
+    features = info["features"]
     assert info["codebase_version"] == "v3.0"
-    assert (info["fps"], info["total_frames"], info["total_episodes"]) == (50, FRAMES, 1)
+    assert (info["fps"], info["total_frames"], info["total_episodes"]) == (50, 2 * FRAMES, 2)
     data = pq.read_table(folder / info["data_path"].format(chunk_index=0, file_index=0))
-    numbers = {k for k, f in info["features"].items() if f["dtype"] != "video"}
-    assert set(data.column_names) == numbers
-    for key in numbers:
-        feature, values = info["features"][key], data[key].combine_chunks()
-        width = feature["shape"][0]
-        kind = values.type if width == 1 else values.type.value_type
-        assert str(kind) == {"float32": "float"}.get(feature["dtype"], feature["dtype"])
-    known = np.array(data["observation.environment_state"].to_pylist(), dtype=np.float32)
-    np.testing.assert_array_equal(known, truth.astype(np.float32))
-    assert info["features"]["observation.environment_state"]["names"] == list(TRUTH)
-    for stream, view in enumerate(("left", "right")):
-        key = f"observation.images.{view}"
-        assert info["features"][key]["shape"] == [24, 40, 3]
-        file = info["video_path"].format(video_key=key, chunk_index=0, file_index=0)
-        found, times, _ = decoded(folder / file)
-        np.testing.assert_array_equal(found, pixels[stream])
-        # LeRobot refuses a frame that is further than 0.1 ms from its row's time.
-        np.testing.assert_allclose(times, data["timestamp"].to_numpy(), atol=1e-4)
+    assert set(data.column_names) == {k for k, f in features.items() if f["dtype"] != "video"}
+    for key in data.column_names:
+        kind = data[key].type
+        kind = kind if features[key]["shape"] == [1] else kind.value_type
+        dtype = features[key]["dtype"]
+        assert str(kind) == {"float32": "float"}.get(dtype, dtype)
+    columns = data.to_pydict()
+    assert columns["index"] == list(range(2 * FRAMES))
+    assert columns["episode_index"] == [0] * FRAMES + [1] * FRAMES
+    assert columns["frame_index"] == [*range(FRAMES), *range(FRAMES)]
+    world = np.array(columns["observation.environment_state"], dtype=np.float32)
+    np.testing.assert_array_equal(world, np.concatenate(truth).astype(np.float32))
+    assert features["observation.environment_state"]["names"] == list(TRUTH)
+    episodes = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    for stream, key in enumerate(keys):
+        assert features[key]["shape"] == [24, 40, 3]
+        for episode, expected in zip(episodes, pixels, strict=True):
+            place = {n: episode[f"videos/{key}/{n}"] for n in ("chunk_index", "file_index")}
+            values, times, _ = decoded(folder / info["video_path"].format(video_key=key, **place))
+            np.testing.assert_array_equal(values, expected[stream])
+            # LeRobot refuses a frame that is further than 0.1 ms from its row's time.
+            np.testing.assert_allclose(times, columns["timestamp"][:FRAMES], atol=1e-4)
+            assert episode[f"videos/{key}/to_timestamp"] == FRAMES / 50
 
 
 def test_a_dataset_s_statistics_are_those_of_its_numbers(dataset):
     folder, pixels, truth = dataset
     stats = json.loads((folder / "meta/stats.json").read_text())
-    known = truth.astype(np.float32).astype(np.float64)
-    found = stats["observation.environment_state"]
-    np.testing.assert_allclose(found["mean"], known.mean(axis=0))
-    np.testing.assert_allclose(found["std"], known.std(axis=0))
-    np.testing.assert_allclose(found["q90"], np.quantile(known, 0.9, axis=0))
-    image = stats["observation.images.right"]
-    expected = pixels[1] / 255
-    for name, value in (
-        ("mean", expected.mean()),
-        ("std", expected.std()),
-        ("min", expected.min()),
-        ("max", expected.max()),
-        ("q50", np.quantile(expected, 0.5, method="inverted_cdf")),
+    episodes = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    numbers = [part.astype(np.float32).astype(np.float64) for part in truth]
+    images = [part[1].reshape(-1, 1) / 255 for part in pixels]
+    for key, parts, method in (
+        ("observation.environment_state", numbers, "linear"),
+        ("observation.images.right", images, "inverted_cdf"),
     ):
-        np.testing.assert_allclose(image[name], np.full((3, 1, 1), value))
-    assert image["count"] == [FRAMES]
-    (episode,) = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert (episode["length"], episode["dataset_to_index"]) == (FRAMES, FRAMES)
-    assert episode["videos/observation.images.left/to_timestamp"] == FRAMES / 50
-    assert episode["stats/observation.images.right/mean"] == image["mean"]
+        shape = (2,) if parts is numbers else (3, 1, 1)
+        stored = [{n: row[f"stats/{key}/{n}"] for n in stats[key]} for row in episodes]
+        for values, of in zip([*stored, stats[key]], ([parts[0]], [parts[1]], parts), strict=True):
+            whole = np.concatenate(of)
+            expected = {n: getattr(whole, n)(axis=0) for n in ("min", "max", "mean", "std")}
+            # LeRobot takes the mean of the episodes' quantiles for the whole dataset.
+            quantiles = [np.quantile(part, 0.9, axis=0, method=method) for part in of]
+            for name, value in (expected | {"q90": np.mean(quantiles, axis=0)}).items():
+                np.testing.assert_allclose(values[name], np.broadcast_to(value, shape))
+            assert values["count"] == [FRAMES * len(of)]
 
 
 def test_rerun_opens_the_dataset(dataset):
@@ -174,8 +177,8 @@ def test_rerun_opens_the_dataset(dataset):
 
     folder, _, truth = dataset
     reader = LeRobotReader(str(folder))
-    assert reader.episodes() == [0]
-    samples, known, tasks = {"left": 0, "right": 0}, {}, set()
+    assert reader.episodes() == [0, 1]
+    samples, known, tasks = dict.fromkeys(VIEWS, 0), {}, set()
     for chunk in reader.stream(0):
         batch = chunk.to_record_batch()
         names, view = batch.schema.names, chunk.entity_path.rpartition(".")[2]
@@ -186,57 +189,34 @@ def test_rerun_opens_the_dataset(dataset):
         if chunk.entity_path == "/observation.environment_state" and not chunk.is_static:
             rows = batch["Scalars:scalars"].to_pylist()
             known |= dict(zip(batch["frame_index"].to_pylist(), rows, strict=True))
-    assert samples == {"left": FRAMES, "right": FRAMES}
+    assert samples == dict.fromkeys(VIEWS, FRAMES)
     assert tasks == {"what test shows"}
-    np.testing.assert_array_equal([known[t] for t in range(FRAMES)], truth.astype(np.float32))
+    np.testing.assert_array_equal([known[t] for t in range(FRAMES)], truth[0].astype(np.float32))
 
 
-def test_several_recordings_become_episodes_of_a_dataset(cdmisfa, tmp_path):
-    pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
-    paths = [tmp_path / "one", tmp_path / "two"]
-    pixels = [record_images(path, inverted=path.name == "two")[0] for path in paths]
-    out = tmp_path / "robot"
-    words = (*paths, "--to", "lerobot", "--lossless", "-o", out, "--json")
-    assert cdmisfa("export", *words).json["rows"] == 2 * FRAMES
-    data = pq.read_table(out / "data/chunk-000/file-000.parquet").to_pydict()
-    assert data["index"] == list(range(2 * FRAMES))
-    assert data["episode_index"] == [0] * FRAMES + [1] * FRAMES
-    assert data["frame_index"] == [*range(FRAMES), *range(FRAMES)]
-    episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    stats = json.loads((out / "meta/stats.json").read_text())
-    for stream, view in enumerate(("left", "right")):
-        key = f"observation.images.{view}"
-        for episode, shown in zip(episodes, pixels, strict=True):
-            chunk, file = (episode[f"videos/{key}/{what}_index"] for what in ("chunk", "file"))
-            found, _, _ = decoded(out / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4")
-            np.testing.assert_array_equal(found, shown[stream])
-        every = np.concatenate([shown[stream] for shown in pixels]) / 255
-        np.testing.assert_allclose(stats[key]["mean"], np.full((3, 1, 1), every.mean()))
-        np.testing.assert_allclose(stats[key]["std"], np.full((3, 1, 1), every.std()))
-    before = contents(out)
-    assert export(paths, out, "lerobot", force=True, lossless=True) == 2 * FRAMES
-    assert contents(out) == before
-    record_images(tmp_path / "three", (24, 42))
-    with pytest.raises(UsageError, match="three has the frame_shape"):
-        export([paths[0], tmp_path / "three"], tmp_path / "wrong", "lerobot")
-    assert not (tmp_path / "wrong").exists()
-
-
-def test_tasks_become_states_actions_and_episodes(cdmisfa, tmp_path):
+def test_the_page_on_datasets_makes_states_actions_and_episodes(cdmisfa, tmp_path, monkeypatch):
     pytest.importorskip("gymnasium", reason="pip install 'cdmisfa[gym]'")
     pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
-    words = ("record", "gym:CartPole-v1", "--frames", 80, "--size", "40x30")
-    assert cdmisfa(*words, "-o", tmp_path / "r").code == 0
-    assert export(tmp_path / "r", tmp_path / "robot", "lerobot") == 80
-    with open_recording(tmp_path / "r") as source:
-        truth = source.take(0, 80).truth.astype(np.float32)
-    data = pq.read_table(tmp_path / "robot/data/chunk-000/file-000.parquet")
-    np.testing.assert_array_equal(data["observation.state"].to_pylist(), truth[:, :4])
-    np.testing.assert_array_equal(data["action"], truth[:, 4])
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "how-to" / "export.md").read_text("utf-8")
+    _, _, section = page.partition("## A LeRobot dataset\n")
+    (block,) = re.findall(r"^```sh\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
+    for line in block.splitlines():
+        program, *words = shlex.split(line)
+        done = cdmisfa(*words)
+        assert (program, done.code) == ("cdmisfa", 0), f"{line}: {done.err}"
+    truth = []
+    for name in ("one", "two"):
+        with open_recording(tmp_path / "recordings" / name) as source:
+            truth.append(source.take(0, 100).truth.astype(np.float32))
+    expected = np.concatenate(truth)
+    data = pq.read_table(tmp_path / "cartpole/data/chunk-000/file-000.parquet")
+    np.testing.assert_array_equal(data["observation.state"].to_pylist(), expected[:, :4])
+    np.testing.assert_array_equal(data["action"], expected[:, 4])
     begins = data["frame_index"].to_numpy() == 0
-    np.testing.assert_array_equal(begins, truth[:, 5] == 1)
-    assert begins.sum() > 1
-    (task,) = pq.read_table(tmp_path / "robot/meta/tasks.parquet").to_pylist()
+    np.testing.assert_array_equal(begins, expected[:, 5] == 1)
+    assert begins.sum() > 2
+    (task,) = pq.read_table(tmp_path / "cartpole/meta/tasks.parquet").to_pylist()
     assert task == {"task_index": 0, "__index_level_0__": "CartPole-v1"}
 
 
@@ -258,19 +238,22 @@ def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
 
 
 REFUSED = {
-    "has 2 streams: name a folder": ("mp4", "one.mp4", {}),
-    "convert --rate": ("lerobot", "out", {}),
-    r"there\.mp4 exists": ("mp4", "there.mp4", {}),
-    "did you mean npz": ("npy", "out", {}),
-    r"mine holds other files, such as thesis\.tex": ("lerobot", "mine", {"force": True}),
-    r"pip install 'cdmisfa\[video\]'": ("mp4", "out", {}),
+    "has 2 streams: name a folder": ("r", "mp4", "one.mp4", {}),
+    "convert --rate": ("r", "lerobot", "out", {}),
+    r"there\.mp4 exists": ("r", "mp4", "there.mp4", {}),
+    "did you mean npz": ("r", "npy", "out", {}),
+    r"mine holds other files, such as thesis\.tex": ("r", "lerobot", "mine", {"force": True}),
+    r"pip install 'cdmisfa\[video\]'": ("r", "mp4", "out", {}),
+    "other has the frame_shape": ("r other", "lerobot", "out", {}),
 }
 
 
 @pytest.mark.parametrize("why", REFUSED)
 def test_an_error_names_the_reason_and_leaves_every_file(why, tmp_path, monkeypatch):
-    form, out, options = REFUSED[why]
-    record_images(tmp_path / "r", fps=29.97)
+    logs, form, out, options = REFUSED[why]
+    fps = 50 if "other" in logs else 29.97
+    record_images(tmp_path / "r", fps=fps)
+    record_images(tmp_path / "other", (24, 42), fps=fps)
     (tmp_path / "there.mp4").write_text("mine")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("mine")
@@ -278,18 +261,14 @@ def test_an_error_names_the_reason_and_leaves_every_file(why, tmp_path, monkeypa
         monkeypatch.setitem(sys.modules, "av", None)
     before = contents(tmp_path)
     with pytest.raises(UsageError, match=why):
-        export(tmp_path / "r", tmp_path / out, form, **options)
+        export([tmp_path / log for log in logs.split()], tmp_path / out, form, **options)
     assert contents(tmp_path) == before
 
 
-def test_every_command_of_the_page_on_datasets_works(cdmisfa, tmp_path, monkeypatch):
-    pytest.importorskip("gymnasium", reason="pip install 'cdmisfa[gym]'")
-    pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "how-to" / "export.md").read_text("utf-8")
-    _, _, section = page.partition("## A LeRobot dataset\n")
-    (block,) = re.findall(r"^```sh\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
-    for line in block.splitlines():
-        program, *words = shlex.split(line)
-        done = cdmisfa(*words)
-        assert (program, done.code) == ("cdmisfa", 0), f"{line}: {done.err}"
+def test_force_replaces_an_earlier_export(tmp_path):
+    pixels, _ = record_images(tmp_path / "r", views=("left",))
+    for name in ("first", "second"):
+        (tmp_path / "out" / name).mkdir(parents=True)
+        (tmp_path / "out" / name / "00000000.png").touch()
+    assert export(tmp_path / "r", tmp_path / "out", "images", force=True) == len(pixels[0])
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["left"]
