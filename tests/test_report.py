@@ -54,7 +54,10 @@ def test_a_module_is_saved_where_all_rules_hold_and_nowhere_else(run: Path) -> N
 
 
 def test_the_progress_learner_is_measured_by_its_own_rules(tmp_path: Path) -> None:
-    for name in ("LIVELY", "SLOW_AGAIN", "STILL_GAINING", "PASSED_ON", "TURNING", "FULL"):
+    for name in (
+        *("VARIANCE_BOUNDS", "STILL_IMPROVING", "NO_IMPROVEMENT", "NO_DIRECTION", "FITTED_SLOW"),
+        "FULL",
+    ):
         assert getattr(measurements, name) == getattr(judging, name)
     library.learn("oscillatory", tmp_path / "run", algorithm="progress")
     outline = read_outline(tmp_path / "run")

@@ -14,8 +14,8 @@ from replay.runs.run import Outline, Save, rules_of
 
 # The progress learner's constants: replay must not import `cdmisfa/agents/progress/judging.py`,
 # where they are explained; a test compares them.
-LIVELY = (0.5, 2.0)
-SLOW_AGAIN, STILL_GAINING, PASSED_ON, TURNING, FULL = 0.65, 0.1, 0.03, 4.0, 4.5
+VARIANCE_BOUNDS = (0.5, 2.0)
+STILL_IMPROVING, NO_IMPROVEMENT, NO_DIRECTION, FITTED_SLOW, FULL = 0.1, 0.03, 4.0, 0.65, 4.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
     frames, settled = header.number("test_frames"), header.number("settled")
     window = None if frames is None else max(frames / max(outline.tau, 1), 1.0)
     was_tested = np.isfinite(tested)
-    exact = {"regret": was_tested & ~(regret > STILL_GAINING)}
+    exact = {"regret": was_tested & ~(regret > STILL_IMPROVING)}
     with np.errstate(divide="ignore", invalid="ignore"):
         disagreement = np.abs(np.log(tested / fitted))
         gain, flatness = tested / typical, fitted / typical
@@ -104,8 +104,8 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
             # As `mastered` in judging.py: the threshold grows with the windows of tests.
             windows = tests / window
             firm = change < settled * np.clip(windows / FULL, 0.0, 1.0) ** 2
-            turning = (windows >= FULL) & (change < TURNING * settled)
-            exact["change"] = was_tested & (firm | (turning & (np.abs(regret) < PASSED_ON)))
+            turning = (windows >= FULL) & (change < NO_DIRECTION * settled)
+            exact["change"] = was_tested & (firm | (turning & (np.abs(regret) < NO_IMPROVEMENT)))
     variance = lines["variance"].reshape(outline.iterations, -1)[:, 0]
     rows: list[tuple[str, str, NDArray[Any], float | None, float | None]] = [
         ("error", "Learning error: change + disagreement", lines["learning_error"], None, None),
@@ -113,10 +113,10 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
          "higher without recent gain", change, None, settled),
         ("disagreement", "Disagreement |ln(tested / fitted)| of the slowness on new and old frames",
          disagreement, None, header.number("agreement")),
-        ("variance", "Variance of the slowest output on new frames", variance, *LIVELY),
+        ("variance", "Variance of the slowest output on new frames", variance, *VARIANCE_BOUNDS),
         ("slow", "Slowness on new frames / typical slowness", gain, None, header.number("slow")),
-        ("slow before", "Slowness on old frames / typical slowness", flatness, None, SLOW_AGAIN),
-        ("regret", "Regret: log of the recent gain in slowness", regret, None, STILL_GAINING),
+        ("slow before", "Slowness on old frames / typical slowness", flatness, None, FITTED_SLOW),
+        ("regret", "Regret: log of the recent gain in slowness", regret, None, STILL_IMPROVING),
         ("tests", "Tested blocks", tests, window, None),
     ]  # fmt: skip
     return [
