@@ -38,7 +38,7 @@ REFUSED = {
     "learn uneven.mcap --topic /cam_* --set input.gaps=hold --start 0.2 --end 1": (
         "--start 0.2 --end 1 --set input.gaps=hold --align time --rate 50"
     ),
-    "view t.csv uneven.mcap --set input.time=s --save v": "these show a number and images",
+    "view t.csv uneven.mcap --set input.time=s --save v": "these show 1 number and images",
     "view apart.mcap --save v.rrd": (
         "apart.mcap: /early ends before /late begins, they have no time in common: "
         "take each by itself, with --topic"

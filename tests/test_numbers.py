@@ -280,7 +280,7 @@ def test_what_a_table_lacks_is_said(options: Any, why: str, tmp_path: Path) -> N
 def test_streams_that_differ_are_not_learned_from_together(tmp_path: Path) -> None:
     one = write_table(tmp_path / "one.csv", {"a": [1.0, 2.0], "b": [1.0, 2.0]})
     two = write_table(tmp_path / "two.csv", {"a": [1.0, 2.0]})
-    with pytest.raises(UsageError, match="these show 2 numbers and a number: take as many"):
+    with pytest.raises(UsageError, match="these show 2 numbers and 1 number: take as many"):
         external([one, two], rate=5)
     ragged = (json.dumps({"p": [0] * (3 - i % 2)}).encode() for i in range(9))
     path = write_mcap(tmp_path / "r.mcap", MessageKind("p", "json"), {"/p": every(STEP, ragged)})

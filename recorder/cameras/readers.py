@@ -11,8 +11,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
-from recorder.images.fields import rounded
-from recorder.images.framing import Framing, Vector, framings, size_of
+from recorder.images.framing import Framing, framings, size_of
 from recorder.images.options import Fit, OnLoss, Size
 from recorder.images.pixels import Shown
 
@@ -91,7 +90,7 @@ class CameraFrames:
         self._names, self._say = names, say
         self._size, self._fit, self._color = size, fit, color
         self._first: Shown | None = None
-        self._framings: dict[int, Framing | Vector] = {}
+        self._framings: dict[int, Framing] = {}
         self._changed: set[int] = set()
 
     def frame(self, camera: int, image: Shown) -> Shown | None:
@@ -108,16 +107,14 @@ class CameraFrames:
             both = [self._first, image]
             framing = framings(both, self._size, self._fit, color=self._color)[1]
             self._framings[camera] = framing
-            if isinstance(framing, Framing):
-                self._size = framing.size
+            if framing.first:
+                self._size = framing.shape[0], framing.size[1]
                 if size_of(image) != framing.size:
                     self._say(f"{name}: {framing}")
         framing = self._framings[camera]
-        if camera not in self._changed:
-            change = rounded((), image) if image.ndim == 1 else framing.change(image.shape)
-            if change:
-                self._changed.add(camera)
-                self._say(f"{name}: {change}")
+        if camera not in self._changed and (change := framing.change(image)):
+            self._changed.add(camera)
+            self._say(f"{name}: {change}")
         try:
             return framing.frame(image)
         except UsageError as error:

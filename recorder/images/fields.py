@@ -151,20 +151,6 @@ def bounded(numbers: FloatArray, bounds: Depth | None) -> FloatArray:
     return np.clip(np.where(np.isfinite(numbers), numbers, bounds[0]), *bounds)
 
 
-def rounded(fields: Sequence[str], numbers: FloatArray) -> str:
-    """Return a warning if float64 may have rounded whole numbers, or "".
-
-    Args:
-        fields: the names of the numbers' fields.
-        numbers: (I,) of a message, finite.
-    """
-    if not len(numbers) or np.abs(numbers).max() <= EXACT:
-        return ""
-    place = int(np.argmax(np.abs(numbers) > EXACT))
-    name = fields[place] if len(fields) == len(numbers) else ", ".join(fields) or "a message"
-    return f"{name} holds {numbers[place]:.17g}: whole numbers beyond 2^53 are rounded to float64"
-
-
 def members(value: Any) -> list[str]:
     """Return the names of a message's fields, whichever library decoded it; none for others."""
     if isinstance(value, Mapping):

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Final, Self, get_type_hints
+from dataclasses import asdict, dataclass, fields
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
-from cdmisfa.core.config import convert_value
+from cdmisfa.core.config import Section, key
 from cdmisfa.core.errors import UsageError, are_for
+from cdmisfa.core.names import counted
 from recorder.images.compressed import compressed_image
-from recorder.images.fields import bounded
+from recorder.images.fields import EXACT, bounded
 from recorder.images.options import Centre, Depth, Fit, Size
 from recorder.images.pixels import MalformedImage, Shown, raw_image, shrink
 
@@ -27,39 +28,50 @@ FRAME_PIXELS: Final = 48 * 128
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """How the images of one stream become frames.
+    """How the images, or the numbers, of one stream become frames.
 
     Attributes:
-        first: size of its first image.
-        size: of a frame.
+        first: size of its first image; () for numbers, which stay as they are.
+        size: of a frame, (height, width); (count,) for numbers.
         fit: see `fitted`.
         color: whether a frame shows red, green and blue beside one another.
     """
 
-    first: Size
-    size: Size
-    fit: Fit
+    first: tuple[int, ...]
+    size: tuple[int, ...]
+    fit: Fit = "crop"
     color: bool = False
 
-    def frame(self, image: ByteArray) -> ByteArray:
-        """Turn an image into a frame.
-
-        Args:
-            image: (height, width), or (height, width, 3) in colours.
+    def frame(self, image: Shown) -> Shown:
+        """Turn an image, (height, width[, 3]), or the numbers of a message into a frame.
 
         Raises:
             TooSmallError: the image is smaller than a frame, as the first one is. Images of
                 another size than the first may be smaller: they are enlarged.
+            UsageError: the message has another count of numbers.
         """
+        if not self.first:
+            if image.shape != self.size:
+                least = min(self.size[0], len(image))
+                raise UsageError(
+                    f"a message holds {len(image)} numbers, and the first {self.size[0]}: choose "
+                    f"a part of the field, as --field position[0:{least}]"
+                )
+            return image
+        height, width = self.size
         enlarge = size_of(image) != self.first
+        planes = [image] if image.ndim == 2 else [image[:, :, c].copy() for c in range(3)]
+        frames = [fitted(p, (height, width), self.fit, enlarge=enlarge) for p in planes]
         if not self.color:
-            return fitted(image, self.size, self.fit, enlarge=enlarge)
-        planes = [image] * 3 if image.ndim == 2 else [image[:, :, c].copy() for c in range(3)]
-        return np.hstack([fitted(p, self.size, self.fit, enlarge=enlarge) for p in planes])
+            return frames[0]
+        return np.hstack(frames if len(frames) == 3 else frames * 3)
 
-    def change(self, image: tuple[int, ...]) -> str:
-        """Return a warning about an image of another shape than the first, or ""."""
-        size = image[0], image[1]
+    def change(self, image: Shown) -> str:
+        """Return a warning about an image of another size, or about rounded numbers, or ""."""
+        if not self.first:
+            rounded = bool(len(image)) and np.abs(image).max() > EXACT
+            return "numbers beyond 2^53 may be rounded, to float64" if rounded else ""
+        size = size_of(image)
         if size == self.first:
             return ""
         before, now, frame = map(_in_words, (self.first, size, self.size))
@@ -68,11 +80,13 @@ class Framing:
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of a frame."""
-        return self.size[0], self.size[1] * (3 if self.color else 1)
+        return (*self.size[:-1], self.size[-1] * (3 if self.color else 1))
 
     @property
     def lossy(self) -> str:
         """What makes images of another aspect ratio fit, in words; "" for the same ratio."""
+        if not self.first:
+            return ""
         if self.fit == "crop":
             inner = _largest_within(self.first, self.size)
             return "" if inner == self.first else f"cropped to {_in_words(inner)}"
@@ -83,48 +97,15 @@ class Framing:
 
     def __str__(self) -> str:
         """How an image becomes a frame, in words."""
+        if not self.first:
+            return counted(self.size[0], "number")
         resized = "" if self.first == self.size else f"shown as {_in_words(self.size)}"
         return ", ".join(filter(None, [_in_words(self.first), self.lossy, resized]))
 
 
-@dataclass(frozen=True, slots=True)
-class Vector:
-    """How the numbers of one stream, `count` a message, become frames: unchanged."""
-
-    count: int
-    lossy = ""
-
-    def frame(self, numbers: Shown) -> Shown:
-        """Return the numbers of a message, (count,) float64.
-
-        Raises:
-            UsageError: the message has another count of numbers.
-        """
-        if numbers.shape != self.shape:
-            least = min(self.count, len(numbers))
-            raise UsageError(
-                f"a message holds {len(numbers)} numbers, and the first {self.count}: choose a "
-                f"part of the field, as --field position[0:{least}]"
-            )
-        return numbers
-
-    def change(self, numbers: tuple[int, ...]) -> str:
-        """Return "": a change is an error of `frame`."""
-        return ""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of a frame."""
-        return (self.count,)
-
-    def __str__(self) -> str:
-        """What a frame is, in words."""
-        return "a number" if self.count == 1 else f"{self.count} numbers"
-
-
 def framings(
     firsts: Sequence[Shown], size: Size | None, fit: Fit, *, color: bool = False
-) -> Sequence[Framing | Vector]:
+) -> Sequence[Framing]:
     """Choose how the images or numbers of streams become frames, all of one shape.
 
     Args:
@@ -139,7 +120,7 @@ def framings(
     if all(first.ndim > 1 for first in firsts):
         size = size or default_size(size_of(firsts[0]))
         return [Framing(size_of(first), size, fit, color) for first in firsts]
-    kinds = ["images" if first.ndim > 1 else str(Vector(len(first))) for first in firsts]
+    kinds = ["images" if first.ndim > 1 else counted(len(first), "number") for first in firsts]
     if len(set(kinds)) > 1:
         raise UsageError(
             "streams that are learned from together show frames of one shape, and these show "
@@ -149,7 +130,7 @@ def framings(
     given = {"--size": size is not None, "input.fit": fit != "crop", "--color": color}
     if refused := [option for option, chosen in given.items() if chosen]:
         raise UsageError(f"numbers are taken as they are: {are_for(refused, 'images')}")
-    return [Vector(len(first)) for first in firsts]
+    return [Framing((), first.shape) for first in firsts]
 
 
 def size_of(image: Shown) -> Size:
@@ -191,11 +172,11 @@ def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> 
     return frame
 
 
-def _in_words(size: Size) -> str:
+def _in_words(size: Sequence[int]) -> str:
     return f"{size[1]}x{size[0]}"
 
 
-def _largest_within(outer: Size, ratio: Size) -> Size:
+def _largest_within(outer: Sequence[int], ratio: Sequence[int]) -> Size:
     """Return the largest size within `outer` that has the aspect ratio of another size."""
     if outer[0] * ratio[1] > outer[1] * ratio[0]:
         return max(round(outer[1] * ratio[0] / ratio[1]), 1), outer[1]
@@ -220,7 +201,7 @@ _IMAGES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class Recipe(Section):
     """How a raw image, or numbers, become a frame; a learned module carries it.
 
     Attributes:
@@ -234,13 +215,14 @@ class Recipe:
         centre: "episode" if frames lack the mean of their episode; see `centred`.
     """
 
-    shape: tuple[int, ...]
+    prefix: ClassVar[str] = "recipe"
+    shape: tuple[int, ...] = key((), 1)
     fit: Fit = "crop"
     color: bool = False
     range: Depth | None = None
     fields: tuple[str, ...] = ()
     pixels: str = ""
-    raw: tuple[int, ...] = ()
+    raw: tuple[int, ...] = key((), 1)
     centre: Centre = "run"
 
     @classmethod
@@ -272,14 +254,13 @@ class Recipe:
         Raises:
             ValueError: the text is no recipe.
         """
-        values, hints = json.loads(text), get_type_hints(cls)
+        values, names = json.loads(text), {field.name for field in fields(cls)}
         try:
-            own = {k: convert_value(v, hints[k], k) for k, v in values.items() if k in hints}
-            recipe = cls(**own)
+            recipe = cls(**{name: value for name, value in values.items() if name in names})
         except (UsageError, AttributeError, TypeError) as error:
             raise ValueError(f"it is no recipe: {error}") from None
-        if min((*recipe.shape, *recipe.raw), default=0) < 1 or len(recipe.raw) not in (0, 2):
-            raise ValueError("a recipe has sizes above 0")
+        if not recipe.shape or len(recipe.raw) not in (0, 2):
+            raise ValueError("a recipe has a shape, and a size of raw images or none")
         return recipe
 
     def as_json(self) -> dict[str, Any]:

@@ -16,8 +16,7 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import parse_json
-from recorder.images.fields import rounded
-from recorder.images.framing import Framing, Vector, framings
+from recorder.images.framing import Framing, framings
 from recorder.images.options import COLOR_RECIPE, InputOptions
 from recorder.images.pixels import Shown
 from recorder.log.scenery import turns_of
@@ -111,7 +110,7 @@ class LoggedSource(StoredSource):
         self._first = self._t = clock.first
         self._count = len(clock.rows[0])
         length = None if self._loop else self._count
-        self.framings: Sequence[Framing | Vector | None] = [None] * len(self.streams)
+        self.framings: Sequence[Framing | None] = [None] * len(self.streams)
         if self.recorded:
             names = tuple(stream.topic for stream in self.streams)
             spec = self.streams[0].views[0].facts.spec
@@ -216,9 +215,7 @@ class LoggedSource(StoredSource):
         assert self._images is not None
         image = self._images.image(stream, row) if image is None else image
         if stream not in self.changes:
-            change = framing.change(image.shape)
-            if image.ndim == 1 and log.read is None:
-                change = rounded(log.fields, image)
+            change = framing.change(image) if image.ndim > 1 or log.read is None else ""
             if change:
                 self.changes[stream] = f"{log.name_of(row)}: {change}"
         try:
