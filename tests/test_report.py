@@ -218,7 +218,7 @@ def test_an_error_of_the_command_is_one_line(
     page, new = tmp_path / "r.html", tmp_path / "x.html"
     page.write_text("mine")
     for words, message in (
-        ((run, oscillatory_recording, "-o", new), "is no run: look at a log with"),
+        ((run, oscillatory_recording, "-o", new), "holds no run.mcap"),
         ((run, run), "name the file of the report"),
         ((run, "-o", page), "exists"),
         ((run, "-o", tmp_path / "r.pdf"), "a report is an HTML page, name it r.html"),

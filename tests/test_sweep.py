@@ -387,7 +387,7 @@ def test_results_are_printed_in_every_form(cdmisfa: Cdmisfa, known: Path) -> Non
 
 
 def test_a_folder_without_a_sweep_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="name the folder of a sweep"):
+    with pytest.raises(UsageError, match=r"sweep\.json: no regular file"):
         reading.results(tmp_path)
     (tmp_path / "sweep.json").write_text("{}")
     with pytest.raises(LogDamagedError, match=r"sweep\.json is damaged"):

@@ -23,7 +23,7 @@ from cdmisfa.agents.progress.candidate import log_ratio
 from cdmisfa.agents.progress.judging import CHANGED, PRESENT
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, unbroken
-from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
@@ -223,7 +223,7 @@ class Application:
 def _read_application(path: str, identity: str) -> Application:
     application = Application(path)
     if application.identity != identity:
-        raise UsageError(f"{path} has other modules where a worker is: share one folder")
+        raise CdmisfaError(f"{path} has other modules where a worker is: share one folder")
     return application
 
 

@@ -54,8 +54,6 @@ def _page(paths: list[Path], runs: list[Path]) -> str:
         return report_of_run(paths[0], _reproducible(paths[0]), command_again(paths[0]))
     if len(paths) == 1 and (found := runs_in(paths[0])):
         return report_of_runs(found, f"{paths[0].resolve().name}: {len(found)} runs")
-    if others := [path for path in paths if path not in runs]:
-        raise UsageError(f"{others[0]} is no run: look at a log with cdmisfa info or cdmisfa view")
     return report_of_runs(paths, f"{len(paths)} runs compared")
 
 

@@ -112,10 +112,16 @@ def restore(learner: Learner, keyframe: Keyframe, spec: SourceSpec) -> None:
 
 
 def reconfigured(learner: Learner, span: ConfigSpan, spec: SourceSpec) -> Learner:
-    """Return a learner in the state of another one; ValueError if a configuration does not fit."""
+    """Return a learner in the state of another one, with another configuration that fits it."""
     new, state = open_learner(span.config, spec, span.seed), learner.state
     policy_rng = new.state.policy_rng if "seed" in span.changed else state.policy_rng
-    new.restore(LearnerState(state.arrays, state.modules, policy_rng))
+    try:
+        new.restore(LearnerState(state.arrays, state.modules, policy_rng))
+    except ValueError as error:
+        raise UsageError(
+            f"the settings do not fit what was learned ({error}): fork with keys that keep its "
+            "shape"
+        ) from error
     return new
 
 
@@ -181,13 +187,11 @@ class Recomputation:
         again = cls(Path(run), iterations, source)
         with contextlib.ExitStack() as failing:
             failing.enter_context(again)
-            at, difference = again.compare(iterations)
+            _, difference = again.compare(iterations)
             if difference is not None:
                 raise NotReproducedError(
                     f"{again.log}: learned again, {difference}: name its own source with --source"
                 )
-            if at != iterations:
-                raise UsageError(f"{again.log} holds {at} iterations: name one of 0 to {at}")
             failing.pop_all()
         return again
 
@@ -231,11 +235,7 @@ class Recomputation:
             turn_to(self.source, block.stream, self.learner.stream)
             self.t = self.source.t
             if self._later and self._later[0].start == self.learner.iteration:
-                try:
-                    span = self._later.pop(0)
-                    self.learner = reconfigured(self.learner, span, self.header.spec)
-                except ValueError as error:
-                    raise LogDamagedError(f"{self.log}: its fork cannot be ({error})") from error
+                self.learner = reconfigured(self.learner, self._later.pop(0), self.header.spec)
             yield signals
 
     def compare(
@@ -265,6 +265,8 @@ class Recomputation:
             at += len(logged)
             if both := [difference for difference in (found, other) if difference is not None]:
                 return at, min(both, key=lambda difference: difference.iteration)
+        if stop is not None and at != stop:
+            raise UsageError(f"{self.log} holds {at} iterations: choose of these")
         return at, None
 
     def _logged(self, stop: int | None) -> Iterator[SignalColumns]:
@@ -292,10 +294,7 @@ class Recomputation:
         return None
 
     def other_files(self) -> list[str]:
-        """Return the names of files of the source that changed since the run learned from them.
-
-        None are named of a given source, and of one that was not needed.
-        """
+        """Return the names of files of the run's own source that changed since it learned."""
         if self._source is None or self._given:
             return []
         return changed_files(stated_source(self.log), description(self._source, at_once=True))
@@ -394,7 +393,6 @@ def check_run(
         first = again.learner.iteration
         at, difference = again.compare(stop, read_keyframes(again.log, first))
         others = tuple(again.other_files())
-    empty = at <= start and bool(at or stop)
-    if difference is None and (empty or at != (stop or at)):
-        raise UsageError(f"{again.log} holds {at} iterations: choose a part FIRST:END of these")
+        if difference is None and 0 < at <= start:
+            again.compare(start + 1)  # refuses, as the log or the part ends before
     return Checked(first, at, difference, others)

@@ -143,7 +143,7 @@ def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     if first in SCENES:
         scene = config.get("scene", {})
         if scene.get("kind") != first:
-            raise UsageError(f"{run} did not learn from the scene {first}: name its own source")
+            scene = {"kind": first, "seed": 0}
         record = build(RecordConfig, "record", config.get("record", {}))
         return open_scene(first, build(SCENES[first].config, "scene", scene), record)
     keys = config.get("input", {})

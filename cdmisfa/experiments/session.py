@@ -223,13 +223,7 @@ class Session:
                 command=command_of(words, options, folder) if words else None,
                 force=force,
             )
-            try:
-                session.learner = reconfigured(stopped.learner, span, spec)
-            except ValueError as error:
-                raise UsageError(
-                    f"the settings do not fit what was learned ({error}): fork with keys that "
-                    "keep its shape"
-                ) from error
+            session.learner = reconfigured(stopped.learner, span, spec)
             session.manifest[FORK] = {
                 "parent": os.path.relpath(log.parent, folder),
                 "at": at,

@@ -19,7 +19,6 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.experiments.loop import ending
 from cdmisfa.modules import Module
@@ -98,13 +97,11 @@ def run_trial(
         curves: keep what every iteration came to.
 
     Raises:
-        UsageError: the learner is in Python.
+        ValueError: the learner is in Python.
     """
     learner = open_learner(config, OscillatorySource(streams).spec, seed)
     if not isinstance(learner, CuriousLearner):
-        raise UsageError(
-            f"learner.algorithm {config.algorithm} has no whole trials: use learn for it"
-        )
+        raise ValueError(f"the learner {config.algorithm} has no whole trials")
     tables = [one_period(name) for name in streams]
     frames, x = _expand(config, tables)
     limit = max_modules if max_modules is not None else len(streams)

@@ -108,15 +108,15 @@ class Recording(Shown):
             stop: by default the end; needed where it begins again at its end.
 
         Raises:
-            UsageError: there is no such stream, or no such frames.
+            ValueError: there is no such stream, or no such frames.
         """
         names, length = self.spec.streams, self.spec.length
         index = names.index(stream) if stream in names else stream
         if not isinstance(index, int) or not 0 <= index < len(names):
-            raise UsageError(f"no stream {stream!r}: there are {', '.join(names)}")
+            raise ValueError(f"no stream {stream!r}: there are {', '.join(names)}")
         stop = length if stop is None else stop
         if stop is None or not 0 <= start <= stop or (length is not None and stop > length):
-            raise UsageError(f"no frames [{start}, {stop}): there are [0, {length or '...'})")
+            raise ValueError(f"no frames [{start}, {stop}): there are [0, {length or '...'})")
         found = [np.empty((0, *self.spec.frame_shape), self.spec.dtype)]
         with self.source() as source:
             first = getattr(source, "first_frame", 0)

@@ -141,12 +141,12 @@ class Run(Shown, replay.runs.run.Run):
         all.
 
         Raises:
-            UsageError: there are no such iterations.
+            ValueError: there are no such iterations.
         """
         count = len(self.signals["iteration"])
         stop = count if stop is None else stop
         if not 0 <= start < stop <= count:
-            raise UsageError(
+            raise ValueError(
                 f"{self.path} has no iterations [{start}, {stop}): it has [0, {count})"
             )
         starts, tau = self.signals["t"], self.signals["y"].shape[1]
