@@ -110,8 +110,8 @@ def test_a_conversion_is_resumed_by_convert(cdmisfa: Cdmisfa, tmp_path: Path) ->
         record(external([log], size=(12, 16)), folder, stop=lambda: True)
     for scene in ((), ("oscillatory",)):
         refused = cdmisfa("record", *scene, "--resume", "-o", folder)
-        remedy = f"resume it with cdmisfa convert SOURCE -o {folder} --resume"
-        line = f"cdmisfa: {folder} is an unfinished conversion: {remedy}\n"
+        remedy = f"resume a conversion with cdmisfa convert SOURCE -o {folder} --resume"
+        line = f"cdmisfa: {folder} is of no scene: {remedy}\n"
         assert (refused.code, refused.err) == (2, line)
     done = cdmisfa("convert", log, "-o", folder, "--resume", "--size", "16x12")
     assert done.code == 0, done.err

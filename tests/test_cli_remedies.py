@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import re
 import tomllib
 from pathlib import Path
@@ -12,47 +11,7 @@ import pytest
 from conftest import Cdmisfa
 from waiting import python
 
-from cdmisfa.cli.commands.doctor import EXTRAS
-from cdmisfa.kernels import WIDE
-
 ROOT = Path(__file__).parents[1]
-
-
-def test_doctor_says_how_to_get_each_extra(
-    cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "s3fs" else find(n))
-    done = cdmisfa("doctor", "--json")
-    details = {check["what"]: check["detail"] for check in json.loads(done.out)["checks"]}
-    assert details["extra cloud"] == "pip install 'cdmisfa[cloud]'"
-    assert {f"extra {name}" for name in EXTRAS} <= details.keys()
-
-
-def test_doctor_says_which_kernels_run(cdmisfa: Cdmisfa) -> None:
-    checks = cdmisfa("doctor", "--json").json["checks"]
-    detail = next(check["detail"] for check in checks if check["what"] == "kernels")
-    assert detail.startswith("for AVX2 and FMA" if WIDE else "for any processor")
-
-
-def test_what_is_too_slow_to_convert_is_converted_as_is_said(
-    cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    rows = [f"{1800 * row},{row % 7}" for row in range(50)]
-    (tmp_path / "slow.csv").write_text("\n".join(["time,x", *rows]))
-    convert = (
-        "convert",
-        tmp_path / "slow.csv",
-        "--set",
-        "input.time=time:s",
-        "-o",
-        tmp_path / "out",
-    )
-    refused = cdmisfa(*convert)
-    assert refused.code == 2
-    assert "0.001 to 1000000 frames a second, not 0.000555556" in refused.err
-    assert "logs are read at another rate with --align time --rate" in refused.err
-    assert cdmisfa(*convert, "--align", "time", "--rate", 0.001).code == 0
 
 
 HAS_SIMULATOR = importlib.util.find_spec("pybullet") is not None

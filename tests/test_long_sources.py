@@ -181,7 +181,7 @@ def test_a_checksum_of_the_data_that_does_not_match_is_told_at_the_end(
     words = ("learn", recording, "-o", tmp_path / "run", "--no-rerun", "--max-iterations", "3")
     done = cdmisfa(*words)
     assert (done.code, "x1.mcap: data section: its CRC does not match" in done.err) == (3, True)
-    assert "waiting for the SHA-256 of what is learned from" in done.err
+    assert "computing the SHA-256 of the source" in done.err
     assert not (tmp_path / "run" / "run.json").exists()
     assert cdmisfa("info", tmp_path / "run", "--json").json["state"] == "cut short"
 

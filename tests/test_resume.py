@@ -329,7 +329,6 @@ class TestWithoutItsSource:
         words = ("oscillatory", *self.WORDS[:2], *limit)
         whole = cdmisfa("learn", *words, "-o", tmp_path / "run", "--no-rerun", "--json").json
         ended = cdmisfa("learn", "--resume", "-o", tmp_path / "run", "--no-rerun", "--json")
-        assert ended.err == "nothing was left to do: the run had come as far before\n"
         assert ended.json["signals_sha256"] == whole["signals_sha256"]
         more = ("--resume", "-o", tmp_path / "run", limit[0], limit[1] + 1, "--max-iterations", 12)
         assert cdmisfa("learn", *more, "--no-rerun", "--json").json["iterations"] > 9

@@ -1,126 +1,138 @@
-"""The group of commands, and how every way out of them becomes an exit code.
+"""The `cdmisfa` command group: its table of commands, its help page, and its exit codes.
 
-A command's module is imported only when that command runs, and imports the library inside the
-command, so that `--help` never waits for numpy, PyBullet or Rerun.
+`--help` imports no command: the module of a command is imported when the command runs, and imports
+the library inside the command, so that no help page waits for numpy, PyBullet or Rerun.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import gc
 import importlib
 import io
 import os
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NoReturn
 
 import click
 
 from cdmisfa.cli.interrupts import end_at_once, ignore_at_the_end, interruptible
 from cdmisfa.cli.options import quiet
-from cdmisfa.cli.printing import Stderr
-from cdmisfa.core.errors import CdmisfaError, UsageError, did_you_mean
-from cdmisfa.core.untrusted import printable
-from replay.storage.location import with_urls
+from cdmisfa.cli.printing import Stderr, line
+from cdmisfa.core.errors import CdmisfaError
 
-GROUPS: Mapping[str, Mapping[str, str]] = {
-    "Record": {"record": "record", "convert": "record"},
-    "Learn": {"learn": "learn", "fork": "moments", "sweep": "trials", "apply": "apply"},
-    "Look": {
-        "view": "view",
-        "report": "report",
-        "info": "info",
-        "results": "trials",
-        "signals": "logs",
+HELP = {
+    "Record": {
+        "record": ("record", "Record a simulated scene or live cameras, one MCAP file per view."),
+        "convert": ("record", "Convert camera logs, videos, images or tables to a recording."),
     },
-    "Compare and check": {"compare": "logs", "check": "moments", "at": "moments"},
-    "Keep": {"verify": "logs", "recover": "logs", "export": "logs"},
-    "Many logs": {"index": "corpus"},
-    "Studies": {"reproduce": "trials", "demo": "trials"},
-    "This machine": {"doctor": "doctor"},
+    "Learn": {
+        "learn": ("learn", "Learn slow features from a scene, a recording, logs or live cameras."),
+        "fork": ("learn", "Continue a run from an earlier iteration with other settings."),
+        "sweep": ("trials", "Learn from one source many times: a grid of settings and seeds."),
+        "apply": ("apply", "Compute the features that a run learned on other logs or cameras."),
+    },
+    "Look at results": {
+        "view": ("view", "Show a run, recording or log in the Rerun viewer, or save the view."),
+        "report": ("view", "Write an HTML report of one run, or of several runs side by side."),
+        "info": ("logs", "Show what a log, recording or run contains."),
+        "results": ("trials", "Print mean and standard deviation over the seeds of a sweep."),
+        "signals": ("runs", "List the signals that every run records."),
+    },
+    "Compare and reproduce": {
+        "compare": ("runs", "Compare runs: signals bit for bit, results and settings."),
+        "check": ("runs", "Learn a run again from its source and compare every signal."),
+        "at": ("runs", "Print the exact state of the learner after K iterations of a run."),
+    },
+    "Logs": {
+        "verify": ("logs", "Verify that logs are complete: structure, checksums, no lost data."),
+        "recover": ("logs", "Repair a damaged MCAP file: save what can be read into a new file."),
+        "export": ("logs", "Export signals as a table, or images as PNG, MP4 or LeRobot dataset."),
+        "index": ("logs", "Index many logs: streams, times and damage in one Parquet file."),
+    },
+    "Studies": {
+        "reproduce": ("trials", "Reproduce an experiment of the CD-MISFA paper."),
+        "demo": ("trials", "Record, learn, check and show an example in a few minutes."),
+    },
+    "This machine": {
+        "doctor": ("doctor", "Check which required and optional software is installed."),
+    },
 }
-"""Each command by its heading of --help, with its module in this package."""
+"""Commands by their heading on the help page: module in `cdmisfa.cli.commands`, first sentence.
 
-COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
-"""The same without headings."""
+The sentence repeats the first line of the command's docstring, which --help does not import.
+"""
 
-LONGEST_NAME = 255
-"""Bytes of a file's name that file systems take."""
-
-CREATED = 10_000
-"""Objects after which Python collects garbage: imports create many and leave none, and with the
-default of 700 collecting took a seventh of a short command's time."""
+COMMANDS = {name: command for commands in HELP.values() for name, command in commands.items()}
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command's module only when the command is wanted."""
+    """A group that imports the module of a command when the command runs."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names in the order in which a user meets them."""
+        """Return the names in the order of the help page."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import the command."""
+        """Import a command."""
         if cmd_name not in COMMANDS:
             return None
-        module = importlib.import_module(f"cdmisfa.cli.commands.{COMMANDS[cmd_name]}")
+        module = importlib.import_module(f"cdmisfa.cli.commands.{COMMANDS[cmd_name][0]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command, or name the nearest one."""
+        """Return the command that the arguments name, or suggest a similar name."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            from cdmisfa.core.errors import did_you_mean
+
             ctx.fail(f"no command {args[0]!r}: {did_you_mean(args[0], COMMANDS)}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands below their headings."""
-        width = max(map(len, COMMANDS))  # one for all groups
-        for heading, names in GROUPS.items():
-            commands = {name: self.get_command(ctx, name) for name in names}
+        """Write the commands below their headings."""
+        width = max(map(len, COMMANDS))  # so that the columns of all headings align
+        for heading, commands in HELP.items():
             with formatter.section(heading):
                 formatter.write_dl(
-                    [
-                        (name.ljust(width), (command.help or "").partition("\n")[0])
-                        for name, command in commands.items()
-                        if command is not None
-                    ]
+                    [(name.ljust(width), text) for name, (_, text) in commands.items()]
                 )
 
 
-@click.group(
-    cls=LazyGroup,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @quiet
 @click.version_option(package_name="cdmisfa", message="cdmisfa %(version)s")
 def cli() -> None:
-    """Record what a curious robot sees, learn from it live or from the log, and look.
+    """Learn slow features from cameras and robot logs.
 
-    cdmisfa COMMAND --help explains a command. Each that prints takes --json: one document on
-    stdout, nothing else. An error is one line on stderr, with --json too. With -q it is all that
-    is said there.
+    Slow features are those functions of the images that change most slowly. In practice they tell
+    where an object is, how a joint is turned, or how bright the room is. The learner attends to
+    one stream at a time, chooses by curiosity which one, and logs everything that it computes.
 
-    Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 log damaged or only partly recovered, 4 not
-    reproduced or not the same, 130 interrupted (143 by SIGTERM, 129 when its terminal is closed).
+    cdmisfa COMMAND --help lists the options of a command. With --json a command prints one JSON
+    document on stdout. Progress, warnings and errors go to stderr; an error is one line.
+
+    Exit codes: 0 success, 1 failure, 2 wrong usage, 3 damaged or only partly recovered log,
+    4 results differ or are not reproduced, 130 interrupted (143 by SIGTERM, 129 by SIGHUP).
     """
 
 
 def main() -> NoReturn:
     """Run the command line of this process."""
-    gc.set_threshold(CREATED)
+    # Imports create many objects and free none. With Python's threshold of 700, collecting garbage
+    # took a seventh of the time of a short command.
+    gc.set_threshold(10_000)
     _open_standard_streams()
-    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may lack Greek letters
         sys.stdout.reconfigure(errors="replace")
     ignore_at_the_end()
     code = run(sys.argv[1:])
     end_at_once(code)
-    # An interrupt inside of an exec, as imports have them, is remembered until the next one:
+    # Python remembers an interrupt inside of an exec, as imports have them, until the next exec:
     # `python -m` would end by SIGINT, whatever the code.
     exec("")
     sys.exit(code)
@@ -139,12 +151,11 @@ def _open_standard_streams() -> None:
 
 
 def run(args: Sequence[str]) -> int:
-    """Run one command and return its exit code; no exception but SystemExit's comes out."""
+    """Run one command and return its exit code; raise nothing."""
     Stderr.quiet = False
     with interruptible() as stop:
         try:
             try:
-                _refuse_odd_names(args)
                 # without standalone mode, Context.exit(code) comes back as the value
                 code = cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
                 sys.stdout.flush()
@@ -168,25 +179,16 @@ def run(args: Sequence[str]) -> int:
 
 
 def _was_interrupt(error: BaseException | None) -> bool:
-    """Whether an interrupt became this error; Python 3.11 makes one in `__set_name__` another."""
-    if isinstance(error, CdmisfaError | OSError):  # what failed on the way out is said
+    """Return whether an interrupt caused an error; Python 3.11 wraps one in `__set_name__`."""
+    if isinstance(error, CdmisfaError | OSError):  # errors of cleaning up are reported
         return False
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
-def _refuse_odd_names(args: Sequence[str]) -> None:
-    """Refuse arguments that are not UTF-8, before any work is done."""
-    for arg in args:
-        try:
-            arg.encode()
-        except UnicodeEncodeError:
-            shown = os.fsencode(arg).decode(errors="backslashreplace")
-            raise UsageError(f"{shown} is not UTF-8: give it another name") from None
-
-
 def _explain(error: Exception) -> int:
+    """Print an error in one line and return the exit code."""
     match error:
         case CdmisfaError():
             return _fail(str(error), error.exit_code)
@@ -197,27 +199,16 @@ def _explain(error: Exception) -> int:
             command = error.ctx.command_path if error.ctx else "cdmisfa"
             message = error.format_message().rstrip(".")
             return _fail(f"{message} (see {command} --help)", error.exit_code)
-        case click.ClickException():
-            return _fail(error.format_message(), error.exit_code)
-        case OSError(errno=errno.ENAMETOOLONG):
-            path = os.fspath(error.filename)
-            name = max(path.split(os.sep), key=len)
-            what = "name" if len(os.fsencode(name)) > LONGEST_NAME else "path"
-            long = name if what == "name" else path
-            return _fail(f"{long[:20]}... has {len(long)} letters: choose a shorter {what}", 2)
         case OSError():
             where = f"{error.filename}: " if error.filename else ""
             return _fail(f"{where}{error.strerror or error}", 1)
         case MemoryError():
             return _fail("out of memory", 1)
-        case _:
-            frame = traceback.extract_tb(error.__traceback__)[-1]
-            place = f"{os.path.basename(frame.filename)}:{frame.lineno}"
-            return _fail(
-                f"unexpected {type(error).__name__} at {place}: {error} (please report it)", 1
-            )
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{os.path.basename(frame.filename)}:{frame.lineno}"
+    return _fail(f"unexpected {type(error).__name__} at {place}: {error} (please report it)", 1)
 
 
 def _fail(message: str, code: int) -> int:
-    click.echo(printable(with_urls(f"cdmisfa: {' '.join(message.split())}")), err=True)
+    line(f"cdmisfa: {' '.join(message.split())}", err=True)
     return code

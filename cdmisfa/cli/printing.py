@@ -1,4 +1,4 @@
-"""What is printed: results on stdout; progress, and what the user should know, on stderr."""
+"""Print results to stdout; print messages and warnings to stderr."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.core.names import counted
 from cdmisfa.core.untrusted import printable
-from replay.storage.location import with_urls
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
@@ -24,202 +22,189 @@ SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
 
 
+class Stderr:
+    """State of standard error: `quiet` is true with -q, which suppresses all but errors."""
+
+    quiet = False
+
+
 def quoted(path: str | Path) -> str:
-    """A path as a shell takes it in a command to copy."""
+    """Return a path as a shell takes it, for a command to copy."""
     return shlex.quote(str(path))
 
 
-def print_line(line: object = "", *, err: bool = False) -> None:
-    """A line on stdout, or stderr; names in it cannot steer the terminal."""
-    click.echo(printable(with_urls(str(line))), err=err)
+def _safe(value: object) -> str:
+    """Return a text that cannot steer the terminal, with URLs in place of their local copies."""
+    from replay.storage.location import with_urls
+
+    return printable(with_urls(str(value)))
 
 
-def print_text(text: str) -> None:
-    """Several lines on stdout."""
-    for line in text.removesuffix("\n").split("\n"):
-        print_line(line)
+def line(text: object = "", *, err: bool = False) -> None:
+    """Print a line to stdout, or to stderr even with -q."""
+    click.echo(_safe(text), err=err)
 
 
-def print_json(document: Mapping[str, Any]) -> None:
-    """One JSON document on stdout; see `plain`."""
+def lines(text: str) -> None:
+    """Print several lines to stdout."""
+    for each_line in text.removesuffix("\n").split("\n"):
+        line(each_line)
+
+
+def status(text: str) -> None:
+    """Print a message to stderr, unless -q is given."""
+    if not Stderr.quiet:
+        line(text, err=True)
+
+
+def warning(text: str) -> None:
+    """Print a warning to stderr, unless -q is given."""
+    status(f"warning: {text}")
+
+
+def json_document(document: Mapping[str, Any]) -> None:
+    """Print a JSON document to stdout."""
     from cdmisfa.experiments.documents import plain
 
-    print_line(json.dumps(plain(document), allow_nan=False))
+    line(json.dumps(plain(document), allow_nan=False))
 
 
-def print_document(**each: Any) -> None:
-    """One JSON document of these keys on stdout, with `SCHEMA`."""
-    print_json({"schema": SCHEMA, **each})
+def document(**values: Any) -> None:
+    """Print a JSON document with these keys and `SCHEMA` to stdout."""
+    json_document({"schema": SCHEMA, **values})
 
 
-def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print rows of cells in columns below a head, on stdout.
-
-    A terminal gets a table that fits, with long cells broken; other programs get a line a row.
-    """
-    cells = [[printable(with_urls(str(cell))) for cell in row] for row in (head, *rows)]
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a table to stdout: wrapped to fit a terminal, else with one line for each row."""
+    cells = [[_safe(cell) for cell in row] for row in (head, *rows)]
     if sys.stdout.isatty():
         from rich.console import Console  # takes a tenth of a second
         from rich.table import Table
         from rich.text import Text
 
-        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="")
+        grid = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="")
         for name in cells[0]:
-            table.add_column(Text(name), overflow="fold")
+            grid.add_column(Text(name), overflow="fold")
         for row in cells[1:]:
-            table.add_row(*map(Text, row))
-        Console().print(table)
+            grid.add_row(*map(Text, row))
+        Console().print(grid)
         return
-    from rich.cells import cell_len  # wide letters take two places, accents none
+    from rich.cells import cell_len  # wide letters take two columns, accents none
 
     widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
     cells.insert(1, ["-" * width for width in widths])
     for row in cells:
-        filled = (c + " " * (w - cell_len(c)) for c, w in zip(row, widths, strict=True))
-        print_line("  ".join(filled).rstrip())
+        padded = (c + " " * (w - cell_len(c)) for c, w in zip(row, widths, strict=True))
+        line("  ".join(padded).rstrip())
 
 
-def print_columns(columns: Mapping[str, Sequence[Any]]) -> None:
-    """Columns below their names, as `print_table` does."""
-    print_table(list(columns), list(zip(*columns.values(), strict=True)))
+# Sources
 
 
-def say_failed(rows: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
-    """Say which trials failed."""
-    for row in rows:
-        at = " ".join(f"{key}={value}" for key, value in row["point"].items())
-        print_line(f"failed: {at} seed {row['seed']}: {row['error']}", err=err)
-
-
-class Stderr:
-    """Standard error.
-
-    Attributes:
-        quiet: whether the command prints nothing there but errors (-q).
-    """
-
-    quiet = False
-
-
-def tell(line: str) -> None:
-    """Print a line on stderr, unless that is to be quiet."""
-    if not Stderr.quiet:
-        print_line(line, err=True)
-
-
-def warn(line: str) -> None:
-    """A warning on stderr."""
-    tell(f"warning: {line}")
-
-
-def say_counts(source: FrameSource) -> None:
-    """Say on stderr what became of each live stream's pictures, or messages with numbers."""
-    what = "pictures" if source.spec.images else "messages"
-    for name, counts in getattr(source, "alignment", {}).items():
-        tell(
-            f"{name}: {counts['messages']} {what}; "
-            f"{counted(counts['repeated'], 'frame')} repeated, {counts['missing']} missing; "
-            f"{what}: {counts['dropped']} between frames, "
-            f"{counts['late']} late, {counts['disordered']} out of order, {counts['lost']} thrown "
-            "away"
+def source(frames: FrameSource) -> None:
+    """Print warnings about a source, how its images become frames, and how its streams align."""
+    for text in getattr(frames, "warnings", ()):
+        warning(text)
+    for note in getattr(frames, "notes", ()):
+        status(note)
+    for name, framing in zip(frames.spec.streams, getattr(frames, "framings", ()), strict=False):
+        if "," in str(framing):  # else the frame is the image itself
+            status(f"{name}: {framing}")
+    unit = "images" if frames.spec.images else "messages"
+    for name, counts in getattr(frames, "alignment", {}).items():
+        status(
+            f"{name}: {counts['messages']} {unit}, {counts['repeated']} frames repeated, "
+            f"{counts['dropped']} {unit} dropped"
         )
 
 
-def say_about(source: FrameSource) -> None:
-    """Say on stderr what the user should know of a source, and how images became frames."""
-    for warning in getattr(source, "warnings", ()):
-        warn(warning)
-    for note in getattr(source, "notes", ()):
-        tell(note)
-    for name, framing in zip(source.spec.streams, getattr(source, "framings", ()), strict=False):
-        if "," in str(framing):  # not the image itself
-            tell(f"{name}: {framing}")
-    what = "images" if source.spec.images else "messages"
-    for name, counts in getattr(source, "alignment", {}).items():
-        tell(
-            f"{name}: {counts['messages']} {what}, "
-            f"{counted(counts['repeated'], 'frame')} repeated, {counts['dropped']} {what} dropped"
+def source_changes(frames: FrameSource) -> None:
+    """Print damage that showed while a log was read, or the counts of live streams."""
+    if not hasattr(frames, "stop"):
+        changes = getattr(frames, "changes", {}).values()
+        for text in (*changes, *getattr(frames, "salvaged", list)()):
+            warning(text)
+        return
+    unit = "images" if frames.spec.images else "messages"
+    for name, counts in getattr(frames, "alignment", {}).items():
+        status(
+            f"{name}: {counts['messages']} {unit}; frames: {counts['repeated']} repeated, "
+            f"{counts['missing']} missing; {unit}: {counts['dropped']} between frames, "
+            f"{counts['late']} late, {counts['disordered']} out of order, {counts['lost']} lost"
         )
 
 
-def say_changes(source: FrameSource) -> None:
-    """Say on stderr what showed while a source was read: changes of size, broken images."""
-    changes = getattr(source, "changes", {}).values()  # only logs of others have these
-    for line in (*changes, *getattr(source, "salvaged", list)()):
-        warn(line)
+# Results of runs
 
 
-def outcome_line(outcome: Mapping[str, Any]) -> str:
-    """What became of a stream, in words."""
-    came = "not decided" if outcome["state"] == "learning" else outcome["state"].replace("_", " ")
-    if outcome["module"] is not None:
-        came += f" by module {outcome['module']}"
-    if outcome["slowness"] is not None:
-        came += f", slowness {outcome['slowness']:.4f} on frames not learned from"
-    because = f": {outcome['why']}" if outcome["why"] else ""
-    after = counted(outcome["blocks"], "block")
-    return f"{outcome['stream']}: {came}, after {after}{because}"
-
-
-def print_modules(modules: Sequence[ModuleInfo], *, policies: bool) -> None:
-    """Print a table of modules, with the policies that led to them where there are some."""
-    from cdmisfa.core.signals import ACTIONS
-
-    if not modules:
-        print_line("no module was learned")
-        return
-    columns: dict[str, list[object]] = {
-        "module": [m.index for m in modules],
-        "stream": [m.stream for m in modules],
-        "iteration": [m.iteration for m in modules],
-        "policy": [" ".join(ACTIONS[action] for action in m.policy) for m in modules],
-        "slowness": [slownesses(m.slowness, m.slow) for m in modules],
-    }
-    if not policies:
-        del columns["policy"]
-    print_columns(columns)
-    if any(0 in m.slow for m in modules):
-        print_line("in brackets: not slow on frames that were not learned from")
-
-
-def slownesses(eta: Sequence[float], slow: Sequence[int]) -> str:
-    """The slowness of each output; in brackets that of those known not to be slow."""
-    marks = slow if len(slow) else [1] * len(eta)
-    return ", ".join(
-        f"{value:.4f}" if mark else f"({value:.4f})" for value, mark in zip(eta, marks, strict=True)
-    )
-
-
-def print_held_out(found: Mapping[str, Any]) -> None:
-    """Print how slow modules are on frames that were held out, beside batch SFA."""
-    if not found["modules"]:
-        return
-    start, stop = found["frames"]
-    print_line(f"slowness on the frames {start} to {stop - 1}, which were held out:")
-    for one in found["modules"]:
-        own, batch = (slownesses(one[key], ()) for key in ("slowness", "of_batch"))
-        print_line(f"module {one['module']} of {one['stream']}: {own}; batch SFA: {batch}")
-
-
-def print_result(result: RunResult, *, as_json: bool) -> None:
-    """Print what a run came to."""
+def result(run: RunResult, *, as_json: bool) -> None:
+    """Print the result of a run that has ended."""
+    from cdmisfa.core.names import counted
     from cdmisfa.experiments.loop import ENDINGS
     from replay.integrity.learned import ModuleInfo
 
     if as_json:
-        print_json(result.as_json())
+        json_document(run.as_json())
         return
-    modules = [ModuleInfo.of(module) for module in result.modules]
-    print_modules(modules, policies="streams" not in result.summary)
-    if "streams" in result.summary:
-        for outcome in result.summary["streams"]:
-            print_line(outcome_line(outcome))
-    elif result.undecided:
-        print_line(f"not decided: {', '.join(result.undecided)}")
-    if result.held_out:
-        print_held_out(result.held_out)
-    print_line(f"ended after {counted(result.iterations, 'iteration')}: {ENDINGS[result.ended]}")
-    print_line(f"signals sha256 {result.signals_sha256}")
-    if result.run is not None:
-        look = f"look at it: cdmisfa view {quoted(result.run)}"
-        print_line(f"run {result.run}    {look}")
+    streams = run.summary.get("streams")
+    modules([ModuleInfo.of(m) for m in run.modules], policies=streams is None)
+    for stream in streams or ():
+        stream_outcome(stream)
+    if streams is None and run.undecided:
+        line(f"not decided: {', '.join(run.undecided)}")
+    if run.held_out:
+        held_out(run.held_out)
+    line(f"ended after {counted(run.iterations, 'iteration')}: {ENDINGS[run.ended]}")
+    line(f"signals sha256 {run.signals_sha256}")
+    if run.run is not None:
+        line(f"run {run.run}    look at it: cdmisfa view {quoted(run.run)}")
+
+
+def modules(learned: Sequence[ModuleInfo], *, policies: bool) -> None:
+    """Print a table of modules, on request with the policies that led to them."""
+    from cdmisfa.core.signals import ACTIONS
+
+    if not learned:
+        line("no module was learned")
+        return
+    head = ["module", "stream", "iteration", "slowness"]
+    rows = [[m.index, m.stream, m.iteration, slownesses(m.slowness, m.slow)] for m in learned]
+    if policies:
+        head.insert(3, "policy")
+        for row, module in zip(rows, learned, strict=True):
+            row.insert(3, " ".join(ACTIONS[action] for action in module.policy))
+    table(head, rows)
+    if any(0 in m.slow for m in learned):
+        line("in brackets: not slow on frames that were not learned from")
+
+
+def slownesses(eta: Sequence[float], slow: Sequence[int] = ()) -> str:
+    """Return the slowness of each output as text; in brackets if the output is not slow."""
+    texts = [f"{value:.4f}" for value in eta]
+    for i, is_slow in enumerate(slow):
+        texts[i] = texts[i] if is_slow else f"({texts[i]})"
+    return ", ".join(texts)
+
+
+def stream_outcome(stream: Mapping[str, Any]) -> None:
+    """Print what the progress learner decided about a stream."""
+    from cdmisfa.core.names import counted
+
+    text = "not decided" if stream["state"] == "learning" else stream["state"].replace("_", " ")
+    if stream["module"] is not None:
+        text += f" by module {stream['module']}"
+    if stream["slowness"] is not None:
+        text += f", slowness {stream['slowness']:.4f} on frames not learned from"
+    reason = f": {stream['why']}" if stream["why"] else ""
+    line(f"{stream['stream']}: {text}, after {counted(stream['blocks'], 'block')}{reason}")
+
+
+def held_out(judged: Mapping[str, Any]) -> None:
+    """Print the slowness of modules on held-out frames, beside that of batch SFA."""
+    if not judged["modules"]:
+        return
+    start, stop = judged["frames"]
+    line(f"slowness on the frames {start} to {stop - 1}, which were held out:")
+    for module in judged["modules"]:
+        online, batch = (slownesses(module[key]) for key in ("slowness", "of_batch"))
+        line(f"module {module['module']} of {module['stream']}: {online}; batch SFA: {batch}")

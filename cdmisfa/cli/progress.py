@@ -1,4 +1,4 @@
-"""How far a command is: a bar on a terminal, with what a run watches and saved last."""
+"""Show the progress of a command: a bar on a terminal, with the stream a run attends to."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import sys
 import time
 from collections.abc import Iterator
 from datetime import timedelta
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.printing import Stderr, tell
+from cdmisfa.cli.printing import Stderr, status
 from cdmisfa.core.learning import Sink
 from cdmisfa.core.untrusted import printable
 
@@ -26,31 +27,34 @@ if TYPE_CHECKING:
 TICK = 0.1
 """Seconds between two updates of the bar: a block may take only microseconds."""
 
-BYTES, MEGABYTE, GIGABYTE = "bytes", 10**6, 10**9
-"""A unit of bars that is shown in megabytes."""
+GIGABYTE = 10**9
 
 
 class Bar:
-    """What a command reports to: how far it is, and lines worth reading."""
+    """Progress of a command where no terminal shows it: only messages are printed."""
 
     def update(self, done: float, total: float | None = None, note: str = "") -> None:
-        """So much is done, of so much where that is known; `note` stands below the bar."""
+        """Show how much is done, of how much if that is known, and a note below the bar."""
 
-    def turn_to(self, title: str, unit: str) -> None:
-        """Show something else from now on."""
+    def restart(self, title: str, unit: str) -> None:
+        """Show the progress of another step from now on."""
 
     def say(self, line: str) -> None:
-        """A line that stays, above the bar."""
-        tell(line)
+        """Print a message above the bar."""
+        status(line)
+
+    def trials(self, finished: int, failed: int, total: int) -> None:
+        """Show how many trials, or logs, are finished and failed."""
+        self.update(finished, total, f"{failed} failed" if failed else "")
 
     def sink(self, spec: SourceSpec, max_iterations: int | None, *, events: bool = True) -> Sink:
-        """A sink that shows a run; see `Reporter`."""
-        return Reporter(self, spec, max_iterations, events=events)
+        """Return a sink that shows the progress of a run; see `RunProgress`."""
+        return RunProgress(self, spec, max_iterations, events=events)
 
 
 @contextlib.contextmanager
 def bar(title: str, unit: str) -> Iterator[Bar]:
-    """Show progress while the body runs, if anyone is looking; the unit is what is counted."""
+    """Show progress on a terminal while the body runs; the unit is what is counted."""
     if Stderr.quiet or not sys.stderr.isatty():
         yield Bar()
         return
@@ -62,7 +66,7 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
         def render(self, task: Task) -> Text:
             return Text(figures(task, unit), no_wrap=True, overflow="ellipsis")
 
-    class WithNote(Progress):
+    class ProgressWithNote(Progress):
         note = ""
 
         def get_renderables(self) -> Iterator[RenderableType]:
@@ -70,22 +74,17 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
             if self.note:
                 yield Text(f"  {self.note}", no_wrap=True, overflow="ellipsis")
 
-    progress = WithNote(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=16),
-        Figures(),
-        console=Console(stderr=True),
-        transient=True,
-    )
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=16), Figures()
+    progress = ProgressWithNote(*columns, console=Console(stderr=True), transient=True)
 
     class TerminalBar(Bar):
         def update(self, done: float, total: float | None = None, note: str = "") -> None:
             progress.note = printable(note)
             progress.update(task, completed=done, total=total)
 
-        def turn_to(self, title: str, what: str) -> None:
+        def restart(self, title: str, new_unit: str) -> None:
             nonlocal unit
-            unit, progress.note = what, ""
+            unit, progress.note = new_unit, ""
             progress.reset(task, description=title, total=None)
 
         def say(self, line: str) -> None:
@@ -96,96 +95,103 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
         yield TerminalBar()
 
 
+@contextlib.contextmanager
+def resumable_bar(out: Path, title: str, unit: str) -> Iterator[Bar]:
+    """Show progress; if a signal interrupts the body, say that the same command continues it."""
+    try:
+        with bar(title, unit) as shown:
+            yield shown
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"{out} keeps what is finished: run the same command to continue"
+        ) from None
+
+
 def figures(task: Task, unit: str) -> str:
-    """How much of a task is done, how fast, and how long it takes, or took where nobody knows."""
-    scale, digits = (MEGABYTE, 1) if unit == BYTES else (1, 0)
-    done = f"{task.completed / scale:,.{digits}f}"
+    """Return how much of a task is done, how fast, and the time left, or else the time taken."""
+    done = f"{task.completed:,.0f}"
     if task.total is not None:
-        done += f" of {task.total / scale:,.{digits}f}"
-    told = [f"{done} {'MB' if unit == BYTES else unit}"]
+        done += f" of {task.total:,.0f}"
+    parts = [f"{done} {unit}"]
     if (speed := task.finished_speed or task.speed) is not None:
-        told.append(f"{speed / scale:,.{digits}f} a second")
+        parts.append(f"{speed:,.0f} a second")
     if (left := task.time_remaining) is not None:
-        told.append(f"{timedelta(seconds=round(left))} left")
+        parts.append(f"{timedelta(seconds=round(left))} left")
     elif task.elapsed is not None:
-        told.append(f"{timedelta(seconds=round(task.elapsed))}")
-    return ", ".join(told)
+        parts.append(f"{timedelta(seconds=round(task.elapsed))}")
+    return ", ".join(parts)
 
 
-class Reporter(Sink):
-    """Shows a run's progress: every module once, the rest a few times a second.
+class RunProgress(Sink):
+    """Sink that shows the progress of a run: every event once, numbers a few times a second.
 
     Args:
-        shown: where.
-        spec: of what is learned from.
+        shown: the bar.
+        spec: of the source.
         max_iterations: after which the run ends.
-        events: each is said, as a module that is saved.
-
-    Attributes:
-        told: whether any block was learned.
+        events: also print events, as a module that is saved.
     """
 
     def __init__(
         self, shown: Bar, spec: SourceSpec, max_iterations: int | None, *, events: bool = True
     ) -> None:
-        self.told = self._hashing = False
-        self._events = events
-        self._shown, self._spec, self._max_iterations = shown, spec, max_iterations
-        self._next = 0.0
+        self._bar, self._spec, self._events = shown, spec, events
+        self._max_iterations = max_iterations
+        self._next_update = 0.0
+        self._hashing = False
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """See `Sink`."""
-        self.told = True
+        """Show a block."""
         for text in learner.events if self._events else ():
-            self._shown.say(f"iteration {signals.iteration}: {text}")
+            self._bar.say(f"iteration {signals.iteration}: {text}")
         now = time.monotonic()
-        if now >= self._next:
-            self._next = now + TICK
+        if now >= self._next_update:
+            self._next_update = now + TICK
             if self._hashing:
                 self._hashing = False
-                self._shown.turn_to("learning", "blocks")
-            self._shown.update(
-                learner.iteration, self._total(block, learner), self._note(signals, learner)
-            )
+                self._bar.restart("learning", "blocks")
+            total = self._total(block, learner)
+            self._bar.update(learner.iteration, total, self._note(signals, learner))
 
     def _total(self, block: Block, learner: Learner) -> int | None:
-        """Iterations of the whole run, as far as the frames last or it was told to go."""
-        total = self._max_iterations
-        if self._spec.length is not None:
-            left = (self._spec.length - block.t - len(block.frames)) // learner.tau
-            whole = learner.iteration + max(left, 0)
-            total = whole if total is None else min(total, whole)
-        return total
+        """Return the iterations of the whole run: until the source or the limit ends it."""
+        if self._spec.length is None:
+            return self._max_iterations
+        left = (self._spec.length - block.t - len(block.frames)) // learner.tau
+        total = learner.iteration + max(left, 0)
+        return total if self._max_iterations is None else min(total, self._max_iterations)
 
     def _note(self, signals: BlockSignals, learner: Learner) -> str:
-        """What is watched, what was saved last, and how much there is to learn."""
-        names, modules = self._spec.streams, learner.modules
+        """Return the attended stream, the module saved last, and how much is left to learn."""
+        streams, modules = self._spec.streams, learner.modules
         saved = "nothing saved yet"
         if modules:
             saved = f"saved last: module {modules[-1].index} of {modules[-1].stream}"
         learning = int((signals.state == 0).sum())
-        left = (
-            f"{learning} of {len(names)} being learned" if learning else f"ε {signals.epsilon:.2f}"
-        )
-        return f"watching {names[signals.stream]}, {saved}, {left}"
+        left = f"ε {signals.epsilon:.2f}"
+        if learning:
+            left = f"{learning} of {len(streams)} being learned"
+        return f"watching {streams[signals.stream]}, {saved}, {left}"
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-        """See `Sink`."""
+        """Print a warning."""
         if level == "WARNING":
-            self._shown.say(text)
+            self._bar.say(text)
 
     def hashing(self, done: int, size: int) -> None:
-        """Show how far the source's files are hashed, once that is waited for."""
+        """Show how many bytes of the source's files are hashed while the run waits for that."""
         if not self._hashing:
             self._hashing = True
-            self._shown.turn_to("hashing", BYTES)
-            read = f"{done / GIGABYTE:.1f} of {size / GIGABYTE:.1f} GB are read"
-            self._shown.say(f"waiting for the SHA-256 of what is learned from: {read}")
-        self._shown.update(done, size)
+            self._bar.restart("hashing", "MB")
+            self._bar.say(
+                f"computing the SHA-256 of the source: {done / GIGABYTE:.1f} of "
+                f"{size / GIGABYTE:.1f} GB are read"
+            )
+        self._bar.update(done / 1e6, size / 1e6)
 
 
 @contextlib.contextmanager
-def learning(spec: SourceSpec, max_iterations: int | None) -> Iterator[tuple[Stop, Reporter]]:
-    """Show the progress of a run on what is described so, and end it at a signal."""
+def learning(spec: SourceSpec, max_iterations: int | None) -> Iterator[tuple[Stop, RunProgress]]:
+    """Show the progress of a run while the body runs; the first signal asks it to stop."""
     with bar("learning", "blocks") as shown, stoppable() as stop:
-        yield stop, Reporter(shown, spec, max_iterations)
+        yield stop, RunProgress(shown, spec, max_iterations)

@@ -1,70 +1,57 @@
-"""`cdmisfa apply`: frozen modules over other logs."""
+"""`cdmisfa apply`: compute the outputs of a run's modules on other logs or live streams."""
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import options
+from cdmisfa.cli import options, printing
 from cdmisfa.cli.interrupts import Stop, stoppable
-from cdmisfa.cli.printing import (
-    print_document,
-    print_line,
-    print_table,
-    say_about,
-    say_changes,
-    say_counts,
-    tell,
-    warn,
-)
-from cdmisfa.cli.progress import bar
+from cdmisfa.cli.progress import bar, resumable_bar
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.names import counted
-from recorder.images.options import InputOptions
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.apply import Application, Totals
+    from cdmisfa.experiments.apply_logs import AppliedLogs
     from recorder.images.options import InputOptions
 
-MOST_SAID = 20
-"""Logs of which is said what went wrong."""
+MOST_LINES = 20
+"""Number of warnings and of failed logs that are printed."""
 
 FILE_FORMS = ("parquet", "csv", "mcap", "rrd")
 STDOUT = "stdout"
 
 
 @click.command("apply")
-@options.path_argument("run")
+@click.argument("run", type=options.LOCAL)
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out(
-    "The file of one log, .parquet, .csv, .mcap or .rrd (a view); or a folder, of a file a log."
+    "File for the outputs on one log: .parquet, .csv, .mcap or .rrd (a view). Or a folder, "
+    "with a file for each log."
 )
 @click.option(
     "--to",
     type=click.Choice([*FILE_FORMS, STDOUT]),
-    help=f"Format of the files in a folder, by default {FILE_FORMS[0]}; or {STDOUT}: print each "
-    "block as a JSON line as soon as it is complete.",
+    help="Format of the files in a folder, by default parquet. stdout prints each block as a JSON "
+    "line as soon as it is complete.",
 )
-@click.option("--frames", type=click.IntRange(1), help="End after so many frames of each stream.")
+@click.option("--frames", type=options.COUNT, help="End after this many frames per stream.")
 @options.loop
 @options.salvage
-@options.input_options("topics", "fields", "rate", "start", "end", "align", keys=True)
+@options.inputs("topics", "fields", "rate", "start", "end", "align", "settings")
 @options.jobs
 @options.scheduler
 @options.retry_failed
 @options.force
 @options.as_json
 @options.quiet
-@click.pass_context
 def apply_command(
-    ctx: click.Context,
-    /,
     run: Path,
     source: tuple[str, ...],
     out: Path | None,
@@ -73,255 +60,203 @@ def apply_command(
     loop: bool,
     salvage: bool,
     inputs: InputOptions,
+    jobs: int,
+    scheduler: str | None,
+    retry_failed: bool,
     force: bool,
     as_json: bool,
-    **where: Any,
-) -> None:
-    """Apply the modules of a run to other logs.
+) -> int:
+    """Compute the features that a run learned on other logs or cameras.
 
-    SOURCE is what cdmisfa learn takes: recordings, logs of others, a scene, live streams. Each log
-    is by itself, live streams are on one clock; pictures of any size become frames as those of the
-    run did. A row a frame has the outputs of each module, their slowness within the block, whether
-    the module is alive there, and how novel the block is: from 1 on the module does not know it.
+    SOURCE is what cdmisfa learn takes. Images of any size become frames like those of the run. For
+    each frame the result has the outputs of each module, their slowness within the block, whether
+    the module is alive there, and how novel the block is: above 1 the module does not know it.
 
-    With a folder as -o, SOURCE is also a folder with many logs, or an index of them: OUT gets a
-    file a log, which together are one table. The same command does what is missing.
+    With a folder as -o, SOURCE may be a folder with many logs, or an index of them. All files are
+    one table. The same command continues where it was stopped, and skips what is done.
 
-    A log that cannot be read does not end the rest; the exit code is then 3, or 2.
-    """
-    from cdmisfa.experiments.apply import Application
-
-    form, lines = None if to == STDOUT else to, to == STDOUT
-    refuse_unfit(source, again=loop or salvage, lines=lines, as_json=as_json)
-    if out is not None and is_folder(out) and are_logs(source):
-        if lines:
-            raise UsageError("--to stdout is for what is applied at once: leave out -o FOLDER")
-        where |= {"form": form or FILE_FORMS[0], "inputs": inputs, "force": force}
-        where |= {"frames": frames, "loop": loop, "salvage": salvage}
-        _apply_to_many(ctx, run, source, out, as_json=as_json, **where)
-        return
-    typed = click.core.ParameterSource.COMMANDLINE
-    if given := [name for name in where if ctx.get_parameter_source(name) == typed]:
-        raise UsageError(f"--{given[0].replace('_', '-')} goes with logs, and a folder as -o")
-    if form is not None and (out is None or out.suffix != f".{form}"):
-        raise UsageError(f"--to {form}: name it with -o, a folder or a file like out.{form}")
-    logs = logs_of(source)
-    place = place_of(out, logs, force=force)
-    application = Application(run)
-    told: dict[str, Any] = {"inputs": inputs, "loop": loop, "salvage": salvage, "say": tell}
-    rows, failed = list[dict[str, Any]](), list[CdmisfaError]()
-    with stoppable() as stop:
-        for words in logs:
-            row: dict[str, Any] = {"log": " ".join(words), "out": place and str(place)}
-            try:
-                with contextlib.closing(application.open(words, **told)) as opened:
-                    totals = applied(
-                        application, opened, place, frames, stop, lines=lines, force=force
-                    )
-            except CdmisfaError as error:
-                if len(logs) == 1:
-                    raise
-                warn(str(error))
-                failed.append(error)
-                rows.append(row | {"out": None, "frames": 0, "error": str(error), "modules": []})
-                continue
-            rows.append(row | {"frames": totals.frames, "error": None, "modules": totals.rows()})
-            if (damaged := totals.damaged) is not None:
-                tell(f"{damaged}: what came before was applied, and is kept")
-                failed.append(damaged)
-                rows[-1]["error"] = str(damaged)
-            if stop.number:
-                break
-    if not lines:
-        print_applied(str(run), rows, as_json=as_json)
-    if stop.number:
-        ctx.exit(stop.exit_code)
-    if failed:
-        ctx.exit(max(error.exit_code for error in failed))
-
-
-def _apply_to_many(
-    ctx: click.Context, run: Path, source: Sequence[str], out: Path, *, as_json: bool, **how: Any
-) -> None:
-    """Apply modules to each of many logs, into a folder, and print what became of them."""
-    from cdmisfa.experiments.apply_logs import apply_to_logs
-
-    calls = itertools.count()
-    with bar("indexing", "logs") as shown:
-
-        def progress(finished: int, failed: int, total: int) -> None:
-            if next(calls) == 0:
-                shown.turn_to("applying", "logs")
-            shown.update(finished, total, f"{failed} failed" if failed else "")
-
-        try:
-            found = apply_to_logs(run, source, out, **how, indexing=shown.update, progress=progress)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"{out} keeps the outputs that are finished: say the same again to go on"
-            ) from None
-    said = (f"{row['log']}: {line}" for row in found.logs for line in row["warnings"])
-    for line in itertools.islice(said, MOST_SAID):
-        warn(line)
-    if as_json:
-        counts = {name: getattr(found, name) for name in ("computed", "skipped")}
-        rows = [{k: v for k, v in row.items() if k != "exit_code"} for row in found.logs]
-        print_document(run=run, out=found.out, **counts, logs=rows)
-    else:
-        print_line(
-            f"{counted(len(found.logs), 'log')}: {found.computed} tried now, "
-            f"{found.skipped} before; of these {len(found.failed)} failed, or ended early"
-        )
-        for row in found.failed[:MOST_SAID]:
-            print_line(f"failed: {row['log']}: {row['error']}")
-        if (more := len(found.failed) - MOST_SAID) > 0:
-            print_line(f"failed: {more} more, which --json lists")
-        print_line(f"outputs {out}")
-    if found.exit_code:
-        ctx.exit(found.exit_code)
-
-
-def refuse_unfit(source: Sequence[str], *, again: bool, lines: bool, as_json: bool) -> None:
-    """Refuse options that do not go with the source, or with one another.
-
-    Raises:
-        UsageError: some are given.
+    If a log cannot be read, the others are still processed; the exit code is then 3, or 2.
     """
     from recorder.cameras.words import is_live
-
-    if lines and as_json:
-        raise UsageError("--to stdout prints JSON lines, --json one document: use one of them")
-    if again and any(map(is_live, source)):
-        raise UsageError("live streams cannot go back: leave out --loop and --salvage")
-
-
-def applied(
-    application: Application,
-    source: FrameSource,
-    place: Path | None,
-    frames: int | None,
-    stop: Stop,
-    *,
-    lines: bool,
-    force: bool,
-) -> Totals:
-    """Apply modules to an open source, into its file and to where blocks go as they come."""
-    from cdmisfa.experiments.apply import Totals, follow
-    from cdmisfa.experiments.apply_logs import written_to
-    from replay.export.applied import line
-
-    live = hasattr(source, "stop")
-    if hasattr(source, "stop"):
-        source.stop = stop  # waiting for frames ends with a signal, too
-    else:
-        say_about(source)
-    modules, spec = application.modules, source.spec
-    totals, sinks = Totals(spec, modules), []
-    with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
-        if place is not None:
-            sinks.append(stack.enter_context(written_to(place, spec, modules, force=force)))
-        if lines:
-            sinks.append(lambda block: print_line(line(block, spec, modules)))
-        blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))
-        total = None if spec.length is None else spec.length * len(spec.streams)
-        follow(blocks, sinks, totals, lambda: shown.update(totals.frames, total))
-    if live:
-        say_counts(source)
-    else:
-        say_changes(source)
-    return totals
-
-
-def place_of(out: Path | None, logs: Sequence[Sequence[str]], *, force: bool) -> Path | None:
-    """Return the file that is written of one log; None where nothing is.
-
-    Raises:
-        UsageError: a file for several logs, or it exists.
-    """
     from recorder.log.files import refuse_taken
+    from recorder.world.scenes import SCENES
 
+    ending = "" if out is None else out.suffix.lower().removeprefix(".")
+    is_stored = not any(is_live(word) or word in SCENES for word in source)
+    if out is not None and is_stored and to != STDOUT and (out.is_dir() or not ending):
+        from cdmisfa.experiments.apply_logs import apply_to_logs
+
+        with resumable_bar(out, "applying", "logs") as shown:
+            applied = apply_to_logs(
+                run,
+                source,
+                out,
+                form=to or FILE_FORMS[0],
+                inputs=inputs,
+                frames=frames,
+                loop=loop,
+                salvage=salvage,
+                jobs=jobs,
+                scheduler=scheduler,
+                retry_failed=retry_failed,
+                force=force,
+                indexing=shown.update,
+                progress=shown.trials,
+            )
+        _print_applied_logs(run, applied, as_json)
+        return applied.exit_code
+    logs = _logs(source)
     if out is None:
-        return None
-    ending = out.suffix.lower().removeprefix(".")
-    if is_folder(out):
-        raise UsageError(f"{out}: name a file, {' '.join(logs[0])} is none of many logs")
-    if len(logs) > 1:
+        fits = to in (None, STDOUT)
+    else:
+        fits = ending in FILE_FORMS and to in (None, STDOUT, ending) and len(logs) == 1
+        refuse_taken(out, force=force)
+    if not fits:
         raise UsageError(
-            f"{len(logs)} logs are a file each: name a folder with -o, without .{ending}"
+            f"-o is a file {', '.join(f'.{form}' for form in FILE_FORMS)} for one log or live "
+            "stream, or a folder for several logs; --to names the format of files in a folder"
         )
-    refuse_taken(out, force=force)
-    return out
+    return _apply_to_each(run, logs, out, inputs, frames, loop, salvage, to == STDOUT, as_json)
 
 
-def is_folder(out: Path) -> bool:
-    """Whether what is written is a folder, by its name.
+def _logs(source: Sequence[str]) -> list[list[str]]:
+    """Return the words of each log: of each match of a pattern, and of each log of an index.
 
-    Raises:
-        UsageError: it has the ending of something else.
-    """
-    ending = out.suffix.lower().removeprefix(".")
-    if out.is_dir() or not ending:
-        return True
-    if ending not in FILE_FORMS:
-        endings = ", ".join(f".{one}" for one in FILE_FORMS)
-        raise UsageError(f"{out}: name a file with {endings}, or a folder without an ending")
-    return False
-
-
-def are_logs(source: Sequence[str]) -> bool:
-    """Whether all of a source is stored."""
-    from recorder.cameras.words import is_live
-    from recorder.world.scenes import SCENES
-
-    return not any(is_live(word) or word in SCENES for word in source)
-
-
-def logs_of(source: Sequence[str]) -> list[list[str]]:
-    """The words of each log, of a pattern those that match it; live streams are together.
-
-    Of a corpus they are those of each log in its index.
+    Live streams are one log together.
     """
     from recorder.cameras.words import is_live
     from recorder.world.scenes import SCENES
-    from replay.corpus.finding import may_be_corpus
+    from replay.corpus.logs import logs_of_corpus
     from replay.inputs import locations
 
     if any(map(is_live, source)):
         return [list(source)]
-    found: list[list[str]] = []
+    logs: list[list[str]] = []
     for word in source:
         if word in SCENES:
-            found.append([word])
-            continue
-        logs: Sequence[Sequence[Path]] | None = None
-        if may_be_corpus([word]):
-            from replay.corpus.logs import logs_of_corpus
-
-            logs = logs_of_corpus([word])
-        for log in logs or [[place] for place in locations([word])]:
-            found.append(list(map(str, log)))
-    return found
+            logs.append([word])
+        else:
+            paths = logs_of_corpus([word]) or [[path] for path in locations([word])]
+            logs += [list(map(str, log)) for log in paths]
+    return logs
 
 
-def print_applied(run: str, rows: Sequence[dict[str, Any]], *, as_json: bool) -> None:
-    """Print what modules came to on each log."""
-    if as_json:
-        print_document(run=run, logs=rows)
-        return
+def _apply_to_each(
+    run: Path,
+    logs: Sequence[Sequence[str]],
+    out: Path | None,
+    inputs: InputOptions,
+    frames: int | None,
+    loop: bool,
+    salvage: bool,
+    as_lines: bool,
+    as_json: bool,
+) -> int:
+    """Apply modules to one log after the other and print the results; return the exit code."""
+    from cdmisfa.experiments.apply import Application
+
+    application = Application(run)
+    rows: list[dict[str, Any]] = []
+    code = 0
+    with stoppable() as stop:
+        for words in logs:
+            row: dict[str, Any] = {"log": " ".join(words), "out": out and str(out)}
+            try:
+                with contextlib.closing(
+                    application.open(words, inputs, loop=loop, salvage=salvage, say=printing.status)
+                ) as source:
+                    totals = _apply(application, source, out, frames, stop, as_lines)
+            except CdmisfaError as error:
+                if len(logs) == 1:
+                    raise
+                printing.warning(str(error))
+                code = max(code, error.exit_code)
+                rows.append(row | {"out": None, "frames": 0, "error": str(error), "modules": []})
+                continue
+            damaged = totals.damaged
+            if damaged is not None:
+                printing.status(f"{damaged}: outputs up to the damage are kept")
+                code = max(code, damaged.exit_code)
+            rows.append(
+                row
+                | {
+                    "frames": totals.frames,
+                    "error": damaged and str(damaged),
+                    "modules": totals.rows(),
+                }
+            )
+            if stop():
+                break
+    if as_json and not as_lines:
+        printing.document(run=str(run), logs=rows)
+    elif not as_lines:
+        _print_rows(rows)
+    return stop.exit_code if stop() else code
+
+
+def _apply(
+    application: Application,
+    source: FrameSource,
+    out: Path | None,
+    frames: int | None,
+    stop: Stop,
+    as_lines: bool,
+) -> Totals:
+    """Apply modules to an open source; write the outputs to a file, and to stdout as lines."""
+    from cdmisfa.experiments.apply import Totals, follow
+    from cdmisfa.experiments.apply_logs import written_to
+    from replay.export.applied import line
+
+    if hasattr(source, "stop"):
+        source.stop = stop  # so that a signal also ends waiting for frames
+    else:
+        printing.source(source)
+    modules, spec = application.modules, source.spec
+    totals, sinks = Totals(spec, modules), []
+    with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
+        if out is not None:
+            sinks.append(stack.enter_context(written_to(out, spec, modules, force=True)))
+        if as_lines:
+            sinks.append(lambda block: printing.line(line(block, spec, modules)))
+        blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))
+        total = None if spec.length is None else spec.length * len(spec.streams)
+        follow(blocks, sinks, totals, lambda: shown.update(totals.frames, total))
+    printing.source_changes(source)
+    return totals
+
+
+def _print_rows(rows: Sequence[dict[str, Any]]) -> None:
+    """Print for each log how each module fits the frames of each stream."""
     for row in rows:
         if not row["modules"]:
             continue
-        print_line(f"{row['log']}: {counted(row['frames'], 'frame')}")
-        cells = [
-            (
-                one["stream"],
-                one["module"],
-                "-" if one["slowness"] is None else f"{one['slowness']:.4f}",
-                f"{one['alive']:.0%}",
-                f"{one['known']:.0%}",
-            )
-            for one in row["modules"]
-        ]
-        print_table(("stream", "module", "slowness", "alive", "known"), cells)
+        printing.line(f"{row['log']}: {counted(row['frames'], 'frame')}")
+        cells = []
+        for module in row["modules"]:
+            slowness = "-" if module["slowness"] is None else f"{module['slowness']:.4f}"
+            shares = f"{module['alive']:.0%}", f"{module['known']:.0%}"
+            cells.append((module["stream"], module["module"], slowness, *shares))
+        printing.table(("stream", "module", "slowness", "alive", "known"), cells)
         if row["out"] is not None:
-            print_line(f"outputs {row['out']}")
+            printing.line(f"outputs {row['out']}")
+
+
+def _print_applied_logs(run: Path, applied: AppliedLogs, as_json: bool) -> None:
+    """Print the outcome of applying modules to many logs."""
+    warnings = [f"{row['log']}: {text}" for row in applied.logs for text in row["warnings"]]
+    for warning in warnings[:MOST_LINES]:
+        printing.warning(warning)
+    if as_json:
+        rows = [{k: v for k, v in row.items() if k != "exit_code"} for row in applied.logs]
+        counts = {"computed": applied.computed, "skipped": applied.skipped}
+        printing.document(run=run, out=applied.out, **counts, logs=rows)
+        return
+    printing.line(
+        f"{counted(len(applied.logs), 'log')}: {applied.computed} processed now, "
+        f"{applied.skipped} before; of these {len(applied.failed)} failed, or ended early"
+    )
+    for row in applied.failed[:MOST_LINES]:
+        printing.line(f"failed: {row['log']}: {row['error']}")
+    if (more := len(applied.failed) - MOST_LINES) > 0:
+        printing.line(f"failed: {more} more, which --json lists")
+    printing.line(f"outputs {applied.out}")

@@ -1,258 +1,311 @@
-"""`cdmisfa learn`: learn modules from a live scene or a recording."""
+"""`cdmisfa learn` and `fork`: learn modules from a source, or continue a run differently."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from cdmisfa.cli import options
-from cdmisfa.cli.commands.report import report_beside
-from cdmisfa.cli.printing import (
-    print_result,
-    quoted,
-    say_about,
-    say_changes,
-    say_counts,
-    tell,
-)
-from cdmisfa.cli.progress import bar, learning
-from cdmisfa.core.errors import LogDamagedError, UsageError, are_for
+from cdmisfa.cli import options, printing
+from cdmisfa.cli.interrupts import Stop
+from cdmisfa.cli.progress import RunProgress, bar, learning
+from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
+    from cdmisfa.experiments.run_folder import RunResult
+    from cdmisfa.experiments.session import Session
     from cdmisfa.experiments.sources import Configuration
     from recorder.images.options import InputOptions
-
-OPENED = ("preset", "seed", "loop", "salvage", "episodes")
-"""Options that say how a source is opened."""
-
-KEPT = ("seed", "max_iterations", "max_modules")
-"""Options that are handed on to the run as they are."""
 
 
 @click.command("learn")
 @click.argument("source", nargs=-1, type=options.WORD)
 @options.out("Folder of the run; without it nothing is written.")
-@options.seed()
+@options.seed
 @options.preset
 @options.settings()
 @click.option(
     "--algorithm",
     metavar="NAME",
-    help="The learner, short for --set learner.algorithm=: 2.0, 1.0, progress, or a "
-    "class of your own, package.module:Class. "
-    "By default 2.0 for scenes and their recordings, progress for all other streams.",
+    help="The learner: 2.0, 1.0 or progress, or your own class, package.module:Class. By default "
+    "2.0 for scenes and their recordings, progress for all other streams.",
 )
-@options.end_after("iterations", "End after so many iterations.")
-@options.end_after(
-    "modules",
-    "End after so many modules; by default the paper's learners end after as many as there are "
-    "streams.",
-)
+@options.max_iterations
+@options.max_modules
 @options.loop
 @click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
 @options.salvage
 @click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
 @options.no_rerun
-@click.option("--episodes", is_flag=True, help="Take each log as an episode, one after the other.")
+@click.option("--episodes", is_flag=True, help="Learn from each log as a separate episode.")
 @click.option(
     "--record",
     "record_to",
-    type=options.OUT,
+    type=options.LOCAL,
     metavar="DIR",
-    help="Record what every live stream shows while learning, to learn the same from it again.",
+    help="Also record all live streams, so that the same can be learned from the recording.",
 )
-@options.input_options()
+@options.inputs(*options.ALL_INPUTS)
 @options.force
 @options.as_json
 @options.quiet
 @click.pass_context
 def learn_command(
     ctx: click.Context,
-    /,
     source: tuple[str, ...],
     out: Path | None,
+    seed: int,
+    preset: str | None,
+    settings: tuple[str, ...],
+    algorithm: str | None,
+    max_iterations: int | None,
+    max_modules: int | None,
+    loop: bool,
     resume: bool,
+    salvage: bool,
+    live_view: bool,
+    no_rerun: bool,
+    episodes: bool,
+    record_to: Path | None,
+    inputs: InputOptions,
     force: bool,
     as_json: bool,
-    inputs: InputOptions,
-    **told: Any,
-) -> None:
-    """Learn slow feature modules from a scene, a recording, logs or cameras.
+) -> int:
+    """Learn slow features from a scene, a recording, logs or live cameras.
 
-    SOURCE is a live scene (icub, oscillatory), the folder of a recording, or the MCAP
-    files of its views. The same seed gives the same signals, bit for bit, from each.
+    SOURCE is a simulated scene (icub, oscillatory), the folder of a recording, or the MCAP files
+    of its views. The same seed gives the same signals, bit for bit, from each.
 
-    Or it is a corpus, a folder that cdmisfa index indexed: its logs are episodes, one after the
-    other by when each begins and then by its path, and nothing is learned across two of them.
-
-    Or it is other people's logs: MCAP files, ROS bags, LeRobot datasets, tables of numbers (CSV,
-    Parquet), or a video or a folder of pictures for each stream. Logs may be URLs: s3://, http://
+    Or SOURCE is external logs: MCAP files, ROS bags, LeRobot datasets, tables of numbers (CSV,
+    Parquet), or a video or a folder of images for each stream. Logs may be URLs: s3://, http://
     and https://.
 
-    Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
-    av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
+    Or SOURCE is a folder that cdmisfa index has indexed: its logs are episodes, ordered by their
+    start times, and nothing is learned across two of them.
 
-    With --resume it need not be given: it is what the run learned from.
+    Or SOURCE is one or several live streams: camera:/dev/video0, rtsp://, http://.../x.mjpg,
+    tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
+
+    With --resume, SOURCE and options are by default those of the interrupted run.
     """
-    if resume and out is None:
-        raise click.UsageError("--resume needs -o RUN, the run to resume")
-    if resume and force:
-        raise click.UsageError("--force starts anew and --resume goes on: use one of them")
-    if not source:
-        resume_as_started(ctx, out if resume else None)
-        return
-    from cdmisfa.experiments.loop import INTERRUPTED
     from cdmisfa.experiments.run_folder import command_of
-    from cdmisfa.experiments.session import run
+    from cdmisfa.experiments.session import Session
     from recorder.cameras.words import is_live
 
-    of_cameras = any(map(is_live, source))
-    opened = opened_live if of_cameras else opened_logs
-    with opened(ctx.params, source, inputs) as (frames, configuration):
-        color = getattr(frames, "color", inputs.color)  # what auto chose stays
-        with learning(frames.spec, told["max_iterations"]) as (stop, reporter):
-            if hasattr(frames, "stop"):
-                frames.stop = stop  # waiting for frames ends with a signal, too
-            result = run(
-                frames,
-                configuration.learner,
-                out,
-                sections=configuration.tables(),
-                command=command_of(source, {**ctx.params, "color": color}, out or Path()),
-                force=force,
-                resume=resume,
-                rerun=not told["no_rerun"],
-                live=_watched() if told["live_view"] else None,
-                sinks=(reporter,),
-                stop=stop,
-                hashing=reporter.hashing,
-                **{name: told[name] for name in KEPT},
-            )
-    if resume and not reporter.told and not stop():
-        tell("nothing was left to do: the run had come as far before")
-    print_result(result, as_json=as_json)
-    if result.run is not None and result.ended != INTERRUPTED:
-        report_beside(result.run, quiet=as_json)
-    if result.ended == INTERRUPTED:
-        if result.run is not None and not of_cameras:
-            tell(f"go on with cdmisfa learn --resume -o {quoted(result.run)}")
-        ctx.exit(stop.exit_code)
-    if getattr(frames, "left_out", ()):
-        ctx.exit(LogDamagedError.exit_code)
-
-
-def _watched() -> Callable[[str], contextlib.AbstractContextManager[None]]:
-    from replay.viewer import watched
-
-    return partial(watched, say=tell)
-
-
-@contextlib.contextmanager
-def opened_logs(
-    told: Mapping[str, Any], source: tuple[str, ...], inputs: InputOptions
-) -> Iterator[tuple[FrameSource, Configuration]]:
-    """A scene, a recording or logs, and what is said of them before and after.
-
-    Args:
-        told: the options of the command.
-        source: its words.
-        inputs: how images of others become frames.
-    """
-    from cdmisfa.experiments.holdout import hold_out
-    from cdmisfa.experiments.sources import is_scene, open_source
-
-    vain = [f"--{name}" for name in ("loop", "salvage") if told[name]]
-    if vain and is_scene(source):
-        raise UsageError(f"{source[0]} is a scene: {are_for(vain, 'logs')}")
-    if told["record_to"] is not None:
-        raise UsageError("--record is for live streams: leave it out, or see cdmisfa record")
-    with bar("opening", "logs") as shown:
-        frames, configuration = open_source(
-            source,
-            settings=settings_of(told),
-            inputs=inputs,
-            resumed=told["resume"],
-            told=shown.update,
-            **{name: told[name] for name in OPENED},
+    if resume and (out is None or force):
+        raise click.UsageError("--resume needs -o RUN, the run to resume, and no --force")
+    if not source:
+        return _learn_as_started(ctx, out if resume else None)
+    if algorithm is not None:
+        settings = (*settings, f"learner.algorithm={algorithm}")
+    live = any(map(is_live, source))
+    with (
+        _opened(
+            *(source, inputs, preset, settings, seed, out, record_to, force),
+            loop=loop,
+            salvage=salvage,
+            episodes=episodes,
+            resumed=resume,
+        ) as (frames, configuration),
+        learning(frames.spec, max_iterations) as (stop, progress),
+    ):
+        color = getattr(frames, "color", inputs.color)  # the choice of auto is kept
+        session = Session(
+            frames,
+            configuration.learner,
+            out,
+            seed=seed,
+            max_iterations=max_iterations,
+            max_modules=max_modules,
+            sections=configuration.tables(),
+            command=command_of(source, {**ctx.params, "color": color}, out or Path()),
+            force=force,
+            resume=resume,
+            hashing=progress.hashing,
         )
-    with contextlib.closing(frames):
-        hold_out(frames, configuration)
-        say_about(frames)
-        try:
-            yield frames, configuration
-        finally:
-            say_changes(frames)
+        result = _learned(session, stop, progress, rerun=not no_rerun, live_view=live_view)
+    code = _print_run(result, stop, can_resume=not live, as_json=as_json)
+    return code or (LogDamagedError.exit_code if getattr(frames, "left_out", ()) else 0)
 
 
-@contextlib.contextmanager
-def opened_live(
-    told: Mapping[str, Any], source: tuple[str, ...], inputs: InputOptions
-) -> Iterator[tuple[FrameSource, Configuration]]:
-    """Live streams, recorded meanwhile where that is asked for; see `opened_logs`."""
-    from cdmisfa.experiments.sources import open_source
-    from recorder.live import RecordedWhileWatched
-    from recorder.log.files import refuse_existing
-
-    refused = ("resume", "loop", "salvage", "episodes")
-    if any(told[name] for name in refused):
-        raise UsageError(
-            "live streams cannot go back: leave out --resume, --loop, --salvage and --episodes, "
-            "or learn from a recording of them"
-        )
-    out, record_to, force = told["out"], told["record_to"], told["force"]
-    for folder in (out, record_to):
-        if folder is not None:
-            refuse_existing(folder, force=force, goes_on=False)
-    frames, configuration = open_source(
-        source,
-        inputs=inputs,
-        preset=told["preset"],
-        settings=settings_of(told),
-        seed=told["seed"],
-        say=tell,
-    )
-    with contextlib.closing(frames):
-        try:
-            if record_to is None:
-                yield frames, configuration
-                return
-            with RecordedWhileWatched(
-                frames,
-                record_to,
-                settings=configuration.record,
-                force=force,
-            ) as recorded:
-                yield recorded, configuration
-            tell(f"recording {record_to}")
-        finally:
-            say_counts(frames)
-
-
-def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:
-    """The settings of a command, --algorithm among them."""
-    algorithm = told["algorithm"]
-    named = () if algorithm is None else (f"learner.algorithm={algorithm}",)
-    return (*told["settings"], *named)
-
-
-def resume_as_started(ctx: click.Context, run: Path | None) -> None:
-    """Resume a run with the source and options it was started with; options given now win."""
+def _learn_as_started(ctx: click.Context, run: Path | None) -> int:
+    """Resume a run with its own source and options; options that are given now win."""
     from cdmisfa.experiments.run_folder import read_command
 
     if run is None:
         source = next(param for param in ctx.command.params if param.name == "source")
         raise click.MissingParameter(ctx=ctx, param=source)
-    words, begun = read_command(run)
+    words, stored = read_command(run)
     kept = {
         name: value
-        for name, value in begun.items()
+        for name, value in stored.items()
         if ctx.get_parameter_source(name) is not click.core.ParameterSource.COMMANDLINE
     }
-    kept["settings"] = (*begun.get("settings", ()), *ctx.params["settings"])
-    ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
+    kept["settings"] = (*stored.get("settings", ()), *ctx.params["settings"])
+    code: int = ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
+    return code
+
+
+@contextlib.contextmanager
+def _opened(
+    words: Sequence[str],
+    inputs: InputOptions,
+    preset: str | None,
+    settings: Sequence[str],
+    seed: int,
+    out: Path | None,
+    record_to: Path | None,
+    force: bool,
+    *,
+    loop: bool,
+    salvage: bool,
+    episodes: bool,
+    resumed: bool,
+) -> Iterator[tuple[FrameSource, Configuration]]:
+    """Open a source, and print what there is to know of it before and after it is read."""
+    from cdmisfa.experiments.holdout import hold_out
+    from cdmisfa.experiments.sources import open_source
+    from recorder.cameras.words import is_live
+    from recorder.log.files import refuse_existing
+
+    live = any(map(is_live, words))
+    if record_to is not None and not live:
+        raise UsageError("--record is for live streams: leave it out")
+    for folder in filter(None, (out, record_to) if live else ()):
+        refuse_existing(folder, force=force, goes_on=False)
+    with bar("opening", "logs") as shown:
+        frames, configuration = open_source(
+            words,
+            inputs=inputs,
+            preset=preset,
+            settings=settings,
+            seed=seed,
+            loop=loop,
+            salvage=salvage,
+            episodes=episodes,
+            resumed=resumed,
+            told=shown.update,
+            say=printing.status,
+        )
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.closing(frames))
+        if not live:
+            hold_out(frames, configuration)
+            printing.source(frames)
+        stack.callback(printing.source_changes, frames)
+        if record_to is not None:
+            from recorder.live import RecordedWhileWatched
+
+            stack.callback(printing.status, f"recording {record_to}")
+            recorded = RecordedWhileWatched(
+                frames, record_to, settings=configuration.record, force=force
+            )
+            frames = stack.enter_context(recorded)
+        yield frames, configuration
+
+
+def _learned(
+    session: Session, stop: Stop, progress: RunProgress, *, rerun: bool, live_view: bool = False
+) -> RunResult:
+    """Learn, on request with a live view, until the run ends or a signal stops it."""
+    viewer = None
+    if live_view:
+        from replay.viewer import watched
+
+        viewer = partial(watched, say=printing.status)
+    if hasattr(session.source, "stop"):
+        session.source.stop = stop  # so that a signal also ends waiting for frames
+    session.hashing = progress.hashing
+    return session.learn(sinks=(progress,), stop=stop, rerun=rerun, live=viewer)
+
+
+def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool) -> int:
+    """Print the result of a run, write its report unless interrupted; return the exit code."""
+    from cdmisfa.experiments.loop import INTERRUPTED
+    from cdmisfa.experiments.reports import write_report
+
+    printing.result(result, as_json=as_json)
+    folder = printing.quoted(result.run or "")
+    if result.ended == INTERRUPTED:
+        if folder and can_resume:
+            printing.status(f"go on with cdmisfa learn --resume -o {folder}")
+        return stop.exit_code
+    if result.run is None:
+        return 0
+    try:
+        page = write_report([result.run])
+    except Exception as error:  # the run is complete, whatever makes its report fail
+        reason = f"{result.run} has no report ({one_line(error)})"
+        printing.warning(f"{reason}: cdmisfa report {folder} says why")
+        return 0
+    if not as_json:
+        printing.line(f"report {page}")
+    return 0
+
+
+@click.command("fork")
+@click.argument("run", type=options.LOCAL)
+@click.option(
+    "--iteration",
+    type=click.IntRange(0),
+    required=True,
+    metavar="K",
+    help="Keep K iterations of RUN.",
+)
+@options.out("Folder of the new run.", required=True)
+@options.settings("Set a key learner.* from iteration K on. Repeatable.")
+@click.option("--seed", type=options.SEED, help="Seed of random choices from iteration K on.")
+@options.max_iterations
+@options.max_modules
+@options.source
+@options.no_rerun
+@options.force
+@options.as_json
+@options.quiet
+def fork_command(
+    run: Path,
+    iteration: int,
+    out: Path,
+    settings: tuple[str, ...],
+    seed: int | None,
+    max_iterations: int | None,
+    max_modules: int | None,
+    source: tuple[str, ...],
+    no_rerun: bool,
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Continue a run from an earlier iteration with other settings.
+
+    The new run begins with the first K iterations of RUN; resume, check and view it like any run.
+    Limits that are not given are those of RUN.
+    """
+    from cdmisfa.experiments.session import Session
+
+    limits: dict[str, int] = {}
+    if max_iterations is not None:
+        limits["max_iterations"] = max_iterations
+    if max_modules is not None:
+        limits["max_modules"] = max_modules
+    with (
+        Session.fork(
+            run,
+            iteration,
+            out,
+            settings=settings,
+            seed=seed,
+            source=source,
+            limits=limits,
+            force=force,
+        ) as session,
+        learning(session.source.spec, max_iterations) as (stop, progress),
+    ):
+        result = _learned(session, stop, progress, rerun=not no_rerun)
+    both = f"{printing.quoted(run)} {printing.quoted(out)}"
+    printing.status(f"both in one view: cdmisfa compare {both} --save both.rrd")
+    return _print_run(result, stop, can_resume=True, as_json=as_json)

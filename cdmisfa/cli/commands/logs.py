@@ -1,246 +1,350 @@
-"""Commands on what is there: logs, recordings, runs, and what can be made of them."""
+"""`cdmisfa info`, `verify`, `recover`, `export` and `index`: logs, recordings and runs as files."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from cdmisfa.cli import options
-from cdmisfa.cli.printing import (
-    print_document,
-    print_json,
-    print_line,
-    print_table,
-    print_text,
-    quoted,
-    say_about,
-    tell,
-)
-from cdmisfa.core.errors import LogDamagedError, NotReproducedError
+from cdmisfa.cli import options, printing
+from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.progress import bar
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.names import counted, lasting
 
 if TYPE_CHECKING:
-    from replay.runs.compare import Row
+    from recorder.images.options import InputOptions
+    from replay.corpus.index import Indexed
+    from replay.integrity.learned import RunInfo
+    from replay.integrity.report import ChannelInfo, LogReport, SizeInfo
+
+MOST_STREAMS = 8
+"""Number of streams of a run that `info` names."""
+
+MOST_GONE = 5
+"""Number of removed logs that `index` names."""
+
+
+@click.command("info")
+@click.argument("path", nargs=-1, required=True, type=options.WORD)
+@options.as_json
+def info_command(path: tuple[str, ...], as_json: bool) -> int:
+    """Show what a log, recording or run contains.
+
+    PATH is one or several files, folders, URLs or patterns such as 'logs/*.mcap'. The exit code is
+    3 if a log is cut short or damaged, else 2 if one of several is no log. Contents that only
+    cdmisfa verify reads are reported as unchecked: images, videos, bags, tables, files above 1 GiB.
+    """
+    from replay.integrity.info import describe
+    from replay.integrity.report import EXIT_CODES
+
+    info = describe(*path)
+    if as_json:
+        printing.json_document(info.as_json())
+    else:
+        _print_info(info)
+    return EXIT_CODES[info.state]
+
+
+def _print_info(info: LogReport) -> None:
+    """Print the description of a log, a recording, a run, or several of them."""
+    together = all(file.path.startswith(info.path) for file in info.files)
+    for part in [info] if together else info.files:
+        words: list[str] = [part.state]
+        if part.state != "not read":
+            words = [part.kind, part.state.replace("unchecked", "contents unchecked")]
+            words += [f"checksums {part.crc}"]
+            words += [] if part.seed is None else [f"seed {part.seed}"]
+        printing.line(f"{part.path}: {', '.join(words)}")
+    for line in (*(f"{p.where}: {p.what}" for p in info.problems), *info.notes):
+        printing.line(line)
+    if info.run is not None:
+        _print_run(info, info.run)
+    if info.span is not None:
+        printing.line(_length(info, *info.span))
+    if info.size.file:
+        printing.line(", ".join(_storage(info.size, info.library)))
+    _print_channels(info.channels)
+
+
+def _print_run(info: LogReport, run: RunInfo) -> None:
+    """Print what a run learned, with which learner, and why it ended."""
+    from cdmisfa.experiments.loop import ENDINGS
+
+    more = len(run.streams) - MOST_STREAMS
+    names = ", ".join(run.streams[:MOST_STREAMS]) + (f" and {more} more" if more > 0 else "")
+    printing.line(f"learner {run.algorithm}, {counted(len(run.streams), 'stream')}: {names}")
+    if info.modules or info.ended is not None:  # else the modules are in the log alone
+        printing.modules(info.modules, policies=not run.outcomes)
+    for outcome in run.outcomes:
+        printing.stream_outcome(outcome)
+    if info.held_out is not None:
+        printing.held_out(info.held_out)
+    done = f"{counted(run.iterations, 'iteration')} of {counted(run.tau, 'frame')}"
+    if info.ended is None:
+        printing.line(
+            f"not ended: {done} so far; it learns, or was stopped before its modules were kept"
+        )
+    else:
+        printing.line(f"ended after {done}: {ENDINGS.get(info.ended, info.ended)}")
+
+
+def _length(info: LogReport, start: int, end: int) -> str:
+    """Return the number of messages of a log, its duration, and its first and last time."""
+    seconds = (end - start) / 1e9
+    duration = f"{seconds:.3f} s"
+    if seconds >= 60:
+        duration += f" ({timedelta(seconds=round(seconds))})"
+    encodings = {channel.encoding for channel in info.channels}
+    shared = f"{encodings.pop()} " if len(encodings) == 1 else ""
+    messages = counted(info.messages, f"{shared}message")
+    return f"{messages}, {duration}, from {_utc(start)} to {_utc(end)}"
+
+
+def _utc(ns: int) -> str:
+    """Return a log time as date and time of day, to the millisecond."""
+    seconds, rest = divmod(ns, 10**9)
+    return f"{datetime.fromtimestamp(seconds, tz=UTC):%Y-%m-%d %H:%M:%S}.{rest // 10**6:03}Z"
+
+
+def _storage(size: SizeInfo, library: str) -> Iterator[str]:
+    """Yield the size of a log, its compression, and the library that wrote it."""
+    from rich.filesize import decimal
+
+    yield decimal(size.file)
+    for name, count in sorted(size.compression.items()):
+        yield counted(count, f"{name} chunk")
+    if size.decompressed > size.stored:
+        saved = 1 - size.stored / size.decompressed
+        yield f"{decimal(size.decompressed)} decompressed ({saved:.0%} saved)"
+    if library:
+        yield f"written by {library}"
+
+
+def _print_channels(channels: Sequence[ChannelInfo]) -> None:
+    """Print a table of channels; times are seconds since the first message of all."""
+    first = min((c.start_ns for c in channels if c.start_ns is not None), default=0)
+
+    def since(ns: int | None) -> str:
+        return "-" if ns is None else f"{(ns - first) / 1e9:.3f}"
+
+    columns: dict[str, list[object]] = {
+        "topic": [c.topic for c in channels],
+        "messages": [c.messages for c in channels],
+        "Hz": ["-" if c.rate is None else f"{c.rate:.4g}" for c in channels],
+        "from, s": [since(c.start_ns) for c in channels],
+        "to, s": [since(c.end_ns) for c in channels],
+        "encoding": [c.encoding for c in channels],
+        "schema": [c.schema for c in channels],
+        "file": [c.file for c in channels],
+    }
+    for name in ("encoding", "file"):  # what all channels share is printed above
+        if len(set(columns[name])) < 2:
+            del columns[name]
+    printing.table(list(columns), list(zip(*columns.values(), strict=True)))
 
 
 @click.command("verify")
 @click.argument("path", nargs=-1, required=True, type=options.WORD)
 @options.as_json
-@click.pass_context
-def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
-    """Check that a log is whole: structure, checksums, nothing lost.
+def verify_command(path: tuple[str, ...], as_json: bool) -> int:
+    """Verify that logs are complete: structure, checksums, no lost data.
 
-    Of a camera log without checksums every image is decoded. PATH may be several, a pattern such
-    as 'logs/*.mcap', or a URL. Exits with 3 when anything is wrong, else with 2 when one of
-    several is no log.
+    PATH is one or several files, folders, URLs or patterns such as 'logs/*.mcap'. Every image of a
+    camera log without checksums is decoded. The exit code is 3 if anything is wrong, else 2 if one
+    of several is no log.
     """
     from replay.integrity.report import EXIT_CODES
     from replay.integrity.verify import check_logs
 
-    found = check_logs(*path)
+    checked = check_logs(*path)
     if as_json:
-        print_json(found.check_json())
+        printing.json_document(checked.check_json())
     else:
-        if found.problems:
-            print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
-        print_line(f"{' '.join(path)}: {found.state}")
-        for note in found.notes:
-            print_line(note)
-    ctx.exit(EXIT_CODES[found.state])
+        if checked.problems:
+            printing.table(("where", "what"), [(p.where, p.what) for p in checked.problems])
+        printing.line(f"{' '.join(path)}: {checked.state}")
+        for note in checked.notes:
+            printing.line(note)
+    return EXIT_CODES[checked.state]
 
 
 @click.command("recover")
 @click.argument("path", type=options.WORD)
-@options.out("The whole log to write.", required=True)
+@options.out("New MCAP file to write.", required=True)
 @options.force
 @options.as_json
-@click.pass_context
-def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_json: bool) -> None:
-    """Save what can be read of a damaged log as a whole one.
+def recover_command(path: str, out: Path, force: bool, as_json: bool) -> int:
+    """Repair a damaged MCAP file: save what can be read into a new file.
 
-    PATH is an MCAP file, as a view of a recording or the run.mcap of a run, or its URL. Exits with
-    3 when something could not be saved.
+    PATH is an MCAP file or its URL, as a view of a recording or the run.mcap of a run. The exit
+    code is 3 if something could not be saved.
     """
     from replay.integrity.recover import recover_log
 
-    found = recover_log(path, out, force=force)
+    recovery = recover_log(path, out, force=force)
     if as_json:
-        print_json(found.as_json())
+        printing.json_document(recovery.as_json())
     else:
-        print_table(
+        printing.table(
             ("topic", "kept", "lost"),
-            [(c.topic, c.kept, "unknown" if c.lost is None else c.lost) for c in found.channels],
+            [(c.topic, c.kept, "unknown" if c.lost is None else c.lost) for c in recovery.channels],
         )
-        if found.lost:
-            print_table(("lost", "what"), [(p.where, p.what) for p in found.lost])
-        for mended in found.mended:
-            tell(f"{mended.where}: {mended.what}")
-        print_line(f"written {out}")
-    if not found.complete:
-        ctx.exit(LogDamagedError.exit_code)
-
-
-@click.command("compare")
-@options.log_argument("runs", nargs=-1)
-@options.path("--save", "F.rrd", "Also write their curves, one over the other, as a view.")
-@options.force
-@options.as_json
-@click.pass_context
-def compare_command(
-    ctx: click.Context, runs: tuple[Path, ...], save: Path | None, force: bool, as_json: bool
-) -> None:
-    """Check that runs' signals are the same bits, and show their curves.
-
-    Of two runs it says whether they came to the same, where they first differ, in which signals
-    there, and what they were told or computed otherwise, and exits with 4 if they do. Of more it
-    prints a table, each run compared with the first, and exits with 0. A run may be the URL of
-    its run.mcap, of which a copy is made.
-    """
-    if len(runs) < 2:
-        raise click.UsageError("name two runs, or more")
-    from replay.runs.compare import side_by_side
-
-    rows = side_by_side(runs)
-    if save is not None:
-        from replay.view.overlay import build_overlay  # takes half a second
-
-        build_overlay(runs, rows, save, force=force)
-    different = [row.difference for row in rows if row.difference is not None]
-    if as_json:
-        print_document(
-            identical=not different,
-            first_difference=different[0].as_json() if different else None,
-            signals=different[0].signals if different and len(runs) == 2 else {},
-            runs=[row.as_json() for row in rows],
-            view=save,
-        )
-    else:
-        _print_comparison(rows)
-    if save is not None and not as_json:
-        tell(f"view {save}    look at it: cdmisfa view {quoted(save)}")
-    if different and len(runs) == 2:
-        ctx.exit(NotReproducedError.exit_code)
-
-
-def _print_comparison(rows: Sequence[Row]) -> None:
-    """Print the outcome of each run, and where two runs differ."""
-    from replay.runs.compare import HEAD, differing_outcomes
-
-    one, *others = rows
-    if len(others) > 1:
-        print_table(HEAD, [row.cells() for row in rows])
-    else:
-        (other,) = others
-        both = one.name, other.name
-        print_line(other.verdict)
-        if outcomes := differing_outcomes(one.outline, other.outline):
-            print_table(("", *both), outcomes)
-        if other.difference is not None:
-            print_line(f"first difference: {other.difference}")
-    for explanation in filter(None, (row.explanation() for row in rows)):
-        print_text(explanation)
-    if len(others) == 1 and other.difference and other.difference.signal:
-        print_line(f"signals of iteration {other.difference.iteration} that differ:")
-        print_table(("signal", *both), other.difference.differing_signals())
+        if recovery.lost:
+            printing.table(("lost", "what"), [(p.where, p.what) for p in recovery.lost])
+        for mended in recovery.mended:
+            printing.status(f"{mended.where}: {mended.what}")
+        printing.line(f"written {out}")
+    return 0 if recovery.complete else LogDamagedError.exit_code
 
 
 @click.command("export")
-@options.log_argument("path", nargs=-1)
+@options.log_argument("path")
 @click.option(
     "--to",
     "form",
     metavar="FORM",
-    help="Form: parquet, npz, csv, images, mp4, lerobot; by default what the file's name ends in.",
+    help="parquet, npz, csv, images, mp4 or lerobot; by default the ending of the file's name.",
 )
-@options.out("The file to write, for a recording the folder.", required=True)
-@click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
+@options.out("File to write, for images a folder.", required=True)
+@click.option("--lossless", is_flag=True, help="Keep every pixel value in a video.")
 @click.option(
-    "--task", metavar="TEXT", help="What is done in a LeRobot dataset; by default what a log says."
+    "--task",
+    metavar="TEXT",
+    help="Task that a LeRobot dataset shows; by default as the log states it.",
 )
-@options.look_options
+@options.inputs("topics", "fields", "rate", "settings")
 @options.force
 @options.as_json
 def export_command(
     path: tuple[Path, ...],
     form: str | None,
     out: Path,
+    lossless: bool,
+    task: str | None,
+    inputs: InputOptions,
     force: bool,
     as_json: bool,
-    **chosen: Any,
 ) -> None:
-    """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
+    """Export signals as a table, or images as PNG, MP4 or LeRobot dataset.
 
-    Signals go to one file, Parquet, CSV or NumPy's npz. CSV has no room for the
-    outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
-    PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
-    camera logs of others, several at once, too, and numbers in them with --field. Folders of
-    several recordings become episodes of one dataset.
+    The signals of a run go to one file: Parquet, CSV or NumPy's npz. CSV leaves out the outputs
+    frame by frame (y, y_frozen). Recordings and external logs go to a folder: PNG files, one MP4
+    file per view (a single view also to a file), or a LeRobot dataset v3.0, in which several
+    recordings are episodes. --field exports numbers of external logs.
     """
     from replay.export.forms import export
     from replay.export.tables import CSV_LEAVES_OUT, TABLES
 
-    if str(out) == "-":
-        raise click.UsageError("-o - would be a file of this name: name another")
     form = form or out.suffix.removeprefix(".")
-    rows = export(path, out, form, force=force, about=say_about, **chosen)
+    rows = export(
+        path,
+        out,
+        form,
+        inputs=inputs,
+        lossless=lossless,
+        task=task,
+        force=force,
+        about=printing.source,
+    )
     if form == "csv":
-        left_out = " and ".join(CSV_LEAVES_OUT)
-        tell(f"CSV leaves out {left_out}: Parquet and npz hold them")
-    if form in ("mp4", "lerobot") and not chosen["lossless"] and _is_film(out):
-        tell("H.264 changes pixels a little: --lossless keeps them all")
+        printing.status(f"CSV leaves out {' and '.join(CSV_LEAVES_OUT)}: Parquet and npz hold them")
+    videos = out.is_file() or next(out.rglob("*.mp4"), None) is not None
+    if form in ("mp4", "lerobot") and videos and not lossless:
+        printing.status("H.264 changes pixels a little: --lossless keeps them all")
     if as_json:
-        print_document(path=" ".join(map(str, path)), file=str(out), rows=rows)
+        printing.document(path=" ".join(map(str, path)), file=str(out), rows=rows)
         return
     unit = "iterations" if form in TABLES else "images" if form == "images" else "frames"
-    print_line(f"{rows} {unit} written to {out}")
+    printing.line(f"{rows} {unit} written to {out}")
 
 
-def _is_film(out: Path) -> bool:
-    """Whether there is a video in what was exported: a dataset of numbers has none."""
-    return out.is_file() or next(out.rglob("*.mp4"), None) is not None
-
-
-@click.command("signals")
-@click.option("--markdown", is_flag=True, help="Print the page docs/reference/signals.md.")
+@click.command("index")
+@click.argument("corpus", nargs=-1, required=True, type=options.WORD)
+@options.out("The index, a .parquet file; by default corpus.parquet in the folder.")
+@click.option(
+    "--deep",
+    is_flag=True,
+    help="Decode every log, to find shapes, gaps, and damage that no summary shows.",
+)
+@click.option(
+    "--jobs",
+    type=click.IntRange(1, 1024),
+    help="Parallel processes; by default as many as there are processors.",
+)
 @options.as_json
-def signals_command(markdown: bool, as_json: bool) -> None:
-    """List every signal that a run records.
+@options.quiet
+def index_command(
+    corpus: tuple[str, ...],
+    out: Path | None,
+    deep: bool,
+    jobs: int | None,
+    as_json: bool,
+) -> int:
+    """Index many logs: streams, times and damage in one Parquet file.
 
-    Of each there is more with --json and --markdown: its type, and how it is shown.
+    CORPUS is a folder with everything below it, or several folders, files, URLs or patterns such
+    as 'logs/**/*.mcap'. The index has a row for each stream; a log that cannot be read is a row
+    with its problem. When the command runs again, it reads only new and changed logs.
     """
-    from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
+    from replay.corpus.index import index_logs
 
-    signals = [dataclasses.asdict(signal) for signal in SIGNALS.values()]
+    with bar("indexing", "logs") as shown, stoppable() as stop:
+        indexed = index_logs(
+            corpus,
+            out,
+            deep=deep,
+            jobs=jobs or os.cpu_count() or 1,
+            told=shown.update,
+            stop=stop,
+        )
+    if indexed.anew:
+        printing.warning(indexed.anew)
     if as_json:
-        print_document(signals_version=SCHEMA_VERSION, signals=signals)
-        return
-    more = ("dtype", "show") if markdown else ()
-    columns = ("name", "symbol", "equation", "unit", "dims", *more, "about")
-    rows = [[signal[column] for column in columns] for signal in signals]
-    if markdown:
-        print_text(_page(SCHEMA_VERSION, columns, rows))
+        printing.document(
+            index=indexed.index,
+            logs=indexed.logs,
+            streams=indexed.streams,
+            read=indexed.read,
+            kept=indexed.kept,
+            gone=indexed.gone,
+            broken=indexed.broken,
+            kinds=indexed.kinds,
+            problems=indexed.problems,
+            complete=not indexed.stopped,
+        )
     else:
-        print_table(columns, rows)
+        _print_index(indexed)
+    if indexed.stopped:
+        printing.status("stopped before all logs were read: run the same command to continue")
+        return stop.exit_code
+    return 0
 
 
-def _page(version: int, columns: tuple[str, ...], rows: list[list[Any]]) -> str:
-    from cdmisfa.experiments.documents import markdown
+def _print_index(indexed: Indexed) -> None:
+    """Print what was indexed now, how much there is of each kind of log, and problems."""
+    from rich.filesize import decimal
 
-    return "\n".join(
-        [
-            "# Signals",
-            "",
-            "Made by `cdmisfa signals --markdown`; a test fails when page and code differ.",
-            f"Version {version} of the record. One record is one iteration, that is one block of",
-            "T = `learner.tau` frames. A signal that does not exist in an iteration is NaN.",
-            "",
-            "Letters of `dims`: T frames of the block, J outputs of an abstraction, M frozen",
-            "modules, S streams, A actions (stay, switch); nothing is a scalar. `equation` is the",
-            "paper's number. `show` is how the viewer shows it.",
-            "",
-            markdown(columns, [[f"`{row[0]}`", *row[1:]] for row in rows]),
-        ]
+    printing.line(
+        f"{counted(indexed.logs, 'log')}, {counted(indexed.streams, 'stream')}: "
+        f"{indexed.read} read, {indexed.kept} unchanged, {len(indexed.gone)} gone, "
+        f"{indexed.broken} with a problem"
     )
+    for path in indexed.gone[:MOST_GONE]:
+        printing.line(f"gone: {path}")
+    if (more := len(indexed.gone) - MOST_GONE) > 0:
+        printing.line(f"gone: {more} more")
+    if indexed.kinds:
+        head = "kind", "logs", "files", "streams", "length", "size"
+        counts = [[row[name] for name in head[:4]] for row in indexed.kinds]
+        sizes = [[lasting(row["seconds"]), decimal(row["bytes"])] for row in indexed.kinds]
+        printing.table(head, [[*a, *b] for a, b in zip(counts, sizes, strict=True)])
+    for row in indexed.problems:
+        printing.line(f"{row['path']}: {row['problem']}")
+    if (more := indexed.broken - len(indexed.problems)) > 0:
+        printing.line(f"and {more} more logs with a problem")
+    printing.line(f"written {indexed.index}")

@@ -1,39 +1,26 @@
-"""`cdmisfa record` and `convert`: write recordings of scenes, of cameras, of logs of others."""
+"""`cdmisfa record` and `convert`: write recordings of scenes, of live streams, of external logs."""
 
 from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
-from click.core import ParameterSource
 
-from cdmisfa.cli import options
+from cdmisfa.cli import options, printing
 from cdmisfa.cli.interrupts import Stop, stoppable
-from cdmisfa.cli.printing import (
-    print_document,
-    print_table,
-    say_about,
-    say_changes,
-    say_counts,
-    tell,
-)
-from cdmisfa.cli.progress import bar
+from cdmisfa.cli.progress import Bar, bar
 from cdmisfa.core.errors import LogDamagedError, UsageError
 
 if TYPE_CHECKING:
     from recorder.images.options import InputOptions
-    from recorder.log.manifest import RecordingStart
     from recorder.recording import ViewRecording
 
-CONVERTED = "foreign"
-"""What a recording names as its source where it was converted from camera logs."""
-
-LIVE = ("cameras", "gym")
-"""What it names where it is of live streams."""
+NO_SCENES = ("foreign", "cameras", "gym")
+"""What recordings of external logs and of live streams state in place of their scene."""
 
 
 @click.command("record")
@@ -41,12 +28,16 @@ LIVE = ("cameras", "gym")
 @options.out("Folder of the recording.", required=True)
 @click.option(
     "--frames",
-    type=click.IntRange(1),
-    help="Frames of each view; by default 1000, with --resume as many as first asked for, and of "
+    type=options.COUNT,
+    help="Frames of each view. By default 1000, with --resume as many as first asked for, and of "
     "cameras all until Ctrl-C.",
 )
-@options.seed()
-@click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view; repeatable.")
+@click.option(
+    "--seed",
+    type=options.SEED,
+    help="Seed of every random choice; by default 0, with --resume that of the recording.",
+)
+@click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view. Repeatable.")
 @options.jobs
 @options.preset
 @options.settings()
@@ -54,99 +45,110 @@ LIVE = ("cameras", "gym")
 @click.option(
     "--split",
     metavar="TIME",
-    help="Begin a new file of each view after this time: 90s, 10min; by default, with --resume as "
+    help="Begin a new file of each view after this time: 90s, 10min. With --resume by default as "
     "first asked for.",
 )
-@options.input_options("fields", "size", "rate", "color")
+@options.inputs("fields", "size", "rate", "color")
 @options.force
 @options.as_json
 @options.quiet
-@click.pass_context
 def record_command(
-    ctx: click.Context,
-    /,
     source: tuple[str, ...],
     out: Path,
-    seed: int,
+    frames: int | None,
+    seed: int | None,
+    views: tuple[str, ...],
+    jobs: int,
     preset: str | None,
     settings: tuple[str, ...],
-    as_json: bool,
+    resume: bool,
+    split: str | None,
     inputs: InputOptions,
-    **writing: Any,
-) -> None:
-    """Record what a scene or cameras show, one MCAP file per view.
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Record a simulated scene or live cameras, one MCAP file per view.
 
-    SOURCE is a scene, icub or oscillatory; the same seed gives the same bytes. With --resume it
-    need not be given, nor the seed or the split: they are those of what was begun.
+    SOURCE is a scene, icub or oscillatory; the same seed gives the same bytes. With --resume the
+    scene, the seed and the split are by default those of the interrupted recording.
 
-    Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
-    av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. Logs of others are written by cdmisfa convert.
+    Or SOURCE is one or several live streams: camera:/dev/video0, rtsp://, http://.../x.mjpg,
+    tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. For existing logs see cdmisfa convert.
     """
     from cdmisfa.experiments.sources import configure
     from recorder.cameras.words import is_live
-    from recorder.log.manifest import RecordingStart
-    from recorder.recording import recorded
+    from recorder.config import parse_split
+    from recorder.log.manifest import RecordingStart, read_start
+    from recorder.recording import DEFAULT_FRAMES, record_scene, recorded
     from recorder.world.scenes import SCENES
 
+    limit = parse_split(split) if split else None
     if any(map(is_live, source)):
-        views, jobs, resume = (writing.pop(name) for name in ("views", "jobs", "resume"))
         if resume or views or jobs > 1:
-            raise UsageError(
-                "live streams cannot go back, and all of it is recorded: leave out --resume, "
-                "--view and --jobs"
-            )
-        writing |= {"preset": preset, "settings": settings, "seed": seed, "as_json": as_json}
-        _record_streams(ctx, source, out, inputs, **writing)
-        return
-    _refuse_logs(source)
-    resumed = out if writing["resume"] else None
-    start = RecordingStart() if resumed is None else _start(resumed)
-    named = "".join(source) or start.scene
-    given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
-    asked = named or given_seed or writing["frames"] or writing["split"]
-    if resumed is not None and not asked and (files := recorded(resumed)):
-        say_complete(resumed)
-        _print_recording(resumed, files, as_json=as_json)
-        return
-    if not named:
-        where = "" if resumed is None else f"{resumed} does not say of what it is: "
-        raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
-    seed = seed if given_seed or start.seed is None else start.seed
-    configuration = configure(named, preset, settings, seed, inputs)
-    files = _record_scene(ctx, configuration, out, **writing)
-    _print_recording(out, files, as_json=as_json)
+            raise UsageError("live streams: leave out --resume, --view and --jobs")
+        return _record_live(
+            source, out, inputs, preset, settings, seed or 0, frames, limit, force, as_json
+        )
+    if any(w not in SCENES and (Path(w).exists() or set("*?:") & set(w)) for w in source):
+        command = f"cdmisfa convert {shlex.join(source)} -o REC"
+        raise UsageError(f"{source[0]} is a log, no scene: write it as a recording with {command}")
+    start = read_start(out) if resume else RecordingStart()
+    if start.scene in NO_SCENES:
+        command = f"cdmisfa convert SOURCE -o {printing.quoted(out)} --resume"
+        raise UsageError(f"{out} is of no scene: resume a conversion with {command}")
+    scene = " ".join(source) or start.scene
+    if not scene and resume and not (frames or split) and (files := recorded(out)):
+        printing.status(f"{out} is complete: nothing was left to record")
+        return _print_recording(out, files, as_json)
+    if not scene:
+        raise click.UsageError(f"name the SCENE, {' or '.join(SCENES)}")
+    seed = seed if seed is not None else start.seed or 0
+    configuration = configure(scene, preset, settings, seed, inputs)
+    with _writing(out, "recording", notice="") as (shown, stop):
+        files = record_scene(
+            scene,
+            out,
+            configuration.scene,
+            configuration.record,
+            frames=frames,
+            views=views or None,
+            jobs=jobs,
+            split=limit,
+            resume=resume,
+            stop=stop,
+            progress=lambda done: shown.update(done, max(done, frames or DEFAULT_FRAMES)),
+            force=force,
+        )
+    return _print_recording(out, files, as_json)
 
 
-def _record_streams(
-    ctx: click.Context,
+def _record_live(
     words: Sequence[str],
     out: Path,
     inputs: InputOptions,
-    *,
-    as_json: bool,
+    preset: str | None,
+    settings: Sequence[str],
+    seed: int,
+    frames: int | None,
+    split: float | None,
     force: bool,
-    frames: int | None = None,
-    split: str | None = None,
-    **how: Any,
-) -> None:
-    """Record live streams until there are so many frames, they end, or Ctrl-C."""
+    as_json: bool,
+) -> int:
+    """Record live streams until there are enough frames, they end, or Ctrl-C."""
     from cdmisfa.experiments.sources import open_source
-    from recorder.config import parse_split
     from recorder.live import RecordedWhileWatched, record_watched
     from recorder.log.files import refuse_existing
     from recorder.recording import DEFAULT_FRAMES
 
     refuse_existing(out, force=force, goes_on=False)
-    source, configuration = open_source(words, inputs=inputs, say=tell, **how)
+    source, configuration = open_source(
+        words, inputs=inputs, preset=preset, settings=settings, seed=seed, say=printing.status
+    )
     notice = "finishing the recording; again to stop at once\n"
-    with contextlib.closing(source), stoppable(notice=notice) as stop:
+    with contextlib.closing(source), stoppable(notice) as stop:
         frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)
         recorded = RecordedWhileWatched(
-            source,
-            out,
-            settings=configuration.record,
-            split=parse_split(split) if split else None,
-            force=force,
+            source, out, settings=configuration.record, split=split, force=force
         )
         with bar("recording", "frames") as shown:
             record_watched(
@@ -156,111 +158,35 @@ def _record_streams(
                 progress=lambda done: shown.update(done, frames),
             )
     if recorded.ended and not stop():
-        tell(f"ended at frame {recorded.t}: {recorded.ended}")
-    say_counts(recorded)
-    _print_recording(out, recorded.files, as_json=as_json)
-    if stop() and frames is not None and recorded.t < frames:
-        ctx.exit(stop.exit_code)
-
-
-def _refuse_logs(words: Sequence[str]) -> None:
-    """Refuse what is recorded already, and more than one scene."""
-    from recorder.world.scenes import SCENES
-
-    logs = [w for w in words if w and w not in SCENES and (Path(w).exists() or set("*?:") & set(w))]
-    if logs:
-        convert = f"cdmisfa convert {shlex.join(logs)} -o REC"
-        raise UsageError(f"{logs[0]} is a log, no scene: write it as a recording with {convert}")
-    if len(words) > 1:
-        raise UsageError(f"{' '.join(words)}: record one scene at a time")
-
-
-def _print_recording(folder: Path, files: Sequence[ViewRecording], *, as_json: bool) -> None:
-    """Print the file of each view of a recording."""
-    if as_json:
-        frames = sum(file.frames for file in files if file.name == files[0].name)
-        rows = [file.as_json() for file in files]
-        print_document(recording=str(folder), frames=frames, views=rows)
-        return
-    print_table(
-        ("view", "file", "frames", "bytes", "sha256"),
-        [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files],
-    )
-
-
-def _start(folder: Path) -> RecordingStart:
-    """How a recording was started that is to be resumed."""
-    from recorder.log.manifest import read_start
-
-    start = read_start(folder)
-    if start.scene in LIVE:
-        raise UsageError(
-            f"{folder} is of live streams, which cannot go back: what is recorded can be read, "
-            "record the rest into another folder"
-        )
-    if start.scene == CONVERTED:
-        command = f"cdmisfa convert SOURCE -o {shlex.quote(str(folder))} --resume"
-        raise UsageError(f"{folder} is an unfinished conversion: resume it with {command}")
-    return start
-
-
-def _record_scene(
-    ctx: click.Context,
-    configuration: Any,
-    out: Path,
-    *,
-    frames: int | None,
-    views: tuple[str, ...],
-    split: str | None,
-    resume: bool,
-    **how: Any,
-) -> list[ViewRecording]:
-    """Record a scene, or the rest of it."""
-    from recorder.config import parse_split
-    from recorder.recording import DEFAULT_FRAMES, record_scene
-
-    with recording(ctx, out, resume=resume, notice="") as (report, stop):
-        return record_scene(
-            configuration.scene.kind,
-            out,
-            configuration.scene,
-            configuration.record,
-            frames=frames,
-            views=views or None,
-            split=parse_split(split) if split else None,
-            resume=resume,
-            stop=stop,
-            progress=lambda done: report(done, max(done, frames or DEFAULT_FRAMES)),
-            **how,
-        )
+        printing.status(f"ended at frame {recorded.t}: {recorded.ended}")
+    printing.source_changes(recorded)
+    _print_recording(out, recorded.files, as_json)
+    return stop.exit_code if stop() and frames is not None and recorded.t < frames else 0
 
 
 @click.command("convert")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.out("Folder of the recording.", required=True)
-@options.input_options(keys=True)
+@options.inputs(*options.ALL_INPUTS, "settings")
 @options.salvage
-@click.option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
+@click.option("--resume", is_flag=True, help="Resume an interrupted conversion.")
 @options.force
 @options.as_json
 @options.quiet
-@click.pass_context
 def convert_command(
-    ctx: click.Context,
-    /,
     source: tuple[str, ...],
     out: Path,
+    inputs: InputOptions,
     salvage: bool,
     resume: bool,
     force: bool,
     as_json: bool,
-    inputs: InputOptions,
-) -> None:
-    """Write camera logs of others as a recording.
+) -> int:
+    """Convert camera logs, videos, images or tables to a recording.
 
     SOURCE is MCAP files or their URLs, ROS bags, LeRobot datasets, tables of numbers (CSV,
-    Parquet), or a video or a folder of pictures for each stream; several, or a pattern such as
-    'logs/*.mcap'. What was interrupted is resumed with --resume.
+    Parquet), or a video or a folder of images for each stream; several, or a pattern such as
+    'logs/*.mcap'.
     """
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
@@ -269,54 +195,48 @@ def convert_command(
 
     if live := next(filter(is_live, source), None):
         raise UsageError(f"{live} is a live stream: cdmisfa record {shlex.join(source)} -o REC")
-    named = locations(source)
-    for place in named:
-        refuse_what_is_no_log(place)
+    paths = locations(source)
+    for path in paths:
+        refuse_what_is_no_log(path)
     if not resume:
         refuse_existing(out, force=force)
-    opened = open_external(named, inputs, salvage=salvage, goal=("convert", str(out)))
+    opened = open_external(paths, inputs, salvage=salvage, goal=("convert", str(out)))
     with contextlib.closing(opened) as frames:
-        say_about(frames)
-        with recording(ctx, out, resume=resume) as (report, stop):
+        printing.source(frames)
+        with _writing(out, "converting") as (shown, stop):
             files = record(
                 frames,
                 out,
                 resume=resume,
                 stop=stop,
-                progress=lambda done: report(done, frames.spec.length or 0),
+                progress=lambda done: shown.update(done, frames.spec.length),
                 force=force,
             )
-        say_changes(frames)
-    _print_recording(out, files, as_json=as_json)
-    if frames.left_out:
-        ctx.exit(LogDamagedError.exit_code)
-
-
-def say_complete(folder: Path) -> None:
-    """Say that there was nothing to resume."""
-    tell(f"{folder} is complete: nothing was left to record")
+        printing.source_changes(frames)
+    _print_recording(out, files, as_json)
+    return LogDamagedError.exit_code if frames.left_out else 0
 
 
 @contextlib.contextmanager
-def recording(
-    ctx: click.Context, out: Path, *, resume: bool, **notice: Any
-) -> Iterator[tuple[Callable[[float, float], None], Stop]]:
-    """Show how far a recording is; a signal ends its block, says how to resume, and exits."""
+def _writing(out: Path, title: str, **notice: str) -> Iterator[tuple[Bar, Stop]]:
+    """Show the progress of writing a recording; exit if a signal stops it."""
     from recorder.recording import RecordingStoppedError
 
-    nothing_left = resume
-
-    def report(done: float, total: float) -> None:
-        nonlocal nothing_left
-        nothing_left = False
-        shown.update(done, total)
-
-    title = "recording" if ctx.command.name == "record" else "converting"
     with bar(title, "frames") as shown, stoppable(**notice) as stop:
         try:
-            yield report, stop
+            yield shown, stop
         except (RecordingStoppedError, KeyboardInterrupt):
-            tell(f"cdmisfa: interrupted: {out} is not finished: go on with --resume")
-            ctx.exit(stop.exit_code)
-    if nothing_left:
-        say_complete(out)
+            printing.status(f"cdmisfa: interrupted: {out} is not finished: go on with --resume")
+            raise SystemExit(stop.exit_code) from None
+
+
+def _print_recording(folder: Path, files: Sequence[ViewRecording], as_json: bool) -> int:
+    """Print the file of each view of a recording; return the exit code 0."""
+    if as_json:
+        frames = sum(file.frames for file in files if file.name == files[0].name)
+        views = [file.as_json() for file in files]
+        printing.document(recording=str(folder), frames=frames, views=views)
+    else:
+        rows = [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files]
+        printing.table(("view", "file", "frames", "bytes", "sha256"), rows)
+    return 0

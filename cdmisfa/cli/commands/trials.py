@@ -1,4 +1,4 @@
-"""`cdmisfa sweep`, `results`, `reproduce` and `demo`: many trials, and the whole story."""
+"""`cdmisfa sweep`, `results`, `reproduce` and `demo`: many trials, and complete examples."""
 
 from __future__ import annotations
 
@@ -8,34 +8,30 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
-from cdmisfa.cli import options
-from cdmisfa.cli.printing import (
-    print_document,
-    print_json,
-    print_line,
-    print_table,
-    print_text,
-    quoted,
-    say_failed,
-    tell,
-)
-from cdmisfa.cli.progress import Bar, bar
+from cdmisfa.cli import options, printing
+from cdmisfa.cli.progress import Bar, bar, resumable_bar
+
+if TYPE_CHECKING:
+    from recorder.images.options import InputOptions
 
 MOST_SEEDS = 1_000_000
+"""Number of seeds of a sweep, so that a typing error does not fill the memory."""
 
 
 @click.command("sweep")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
-@options.out("Folder of the sweep; what is finished in it is not computed again.", required=True)
+@options.out(
+    "Folder of the sweep. Trials that are finished in it are not computed again.", required=True
+)
 @click.option(
     "--grid",
     metavar="KEY=V1,V2,...",
     multiple=True,
-    help="Values to try for a configuration key; several grids multiply.",
+    help="Values to try for a configuration key. Repeatable; several grids multiply.",
 )
 @click.option(
     "--seeds",
@@ -46,77 +42,90 @@ MOST_SEEDS = 1_000_000
 )
 @options.preset
 @options.settings()
-@options.end_after("iterations", "End each trial after so many iterations.")
-@options.end_after("modules", "End each trial after so many modules.")
+@options.max_iterations
+@options.max_modules
 @options.loop
-@options.input_options()
+@options.inputs(*options.ALL_INPUTS)
 @options.jobs
 @options.scheduler
 @options.retry_failed
 @options.as_json
 @options.quiet
-@click.pass_context
 def sweep_command(
-    ctx: click.Context,
-    /,
     source: tuple[str, ...],
     out: Path,
     grid: tuple[str, ...],
     seeds: str,
+    preset: str | None,
+    settings: tuple[str, ...],
+    max_iterations: int | None,
+    max_modules: int | None,
+    loop: bool,
+    inputs: InputOptions,
+    jobs: int,
+    scheduler: str | None,
+    retry_failed: bool,
     as_json: bool,
-    **how: Any,
-) -> None:
-    """Learn from a source many times, over a grid of settings and seeds.
+) -> int:
+    """Learn from one source many times: a grid of settings and seeds.
 
-    SOURCE is what learn takes, but for live streams: record these first. A sweep that was
-    stopped is resumed when it is asked for again. Look at what it found with: cdmisfa results DIR
+    SOURCE is what learn takes, except live streams. The same command resumes an interrupted sweep.
+    cdmisfa results DIR prints the results.
     """
     from cdmisfa.experiments.sweep import sweep
 
     values, numbers = parse_grid(grid), parse_seeds(seeds)
-    with bar("sweep", "trials") as shown:
-
-        def progress(finished: int, failed: int, total: int) -> None:
-            shown.update(finished, total, f"{failed} failed" if failed else "")
-
-        try:
-            report = sweep(source, out, grid=values, seeds=numbers, progress=progress, **how)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"{out} keeps the trials that are finished: say the same again to go on"
-            ) from None
+    with resumable_bar(out, "sweep", "trials") as shown:
+        report = sweep(
+            source,
+            out,
+            grid=values,
+            seeds=numbers,
+            preset=preset,
+            settings=settings,
+            max_iterations=max_iterations,
+            max_modules=max_modules,
+            loop=loop,
+            inputs=inputs,
+            jobs=jobs,
+            scheduler=scheduler,
+            retry_failed=retry_failed,
+            progress=shown.trials,
+        )
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if as_json:
-        counts = ("trials", "skipped", "computed")
-        each = {name: getattr(report, name) for name in counts}
-        print_document(sweep=report.folder, **each, failed=failed)
+        printing.document(
+            sweep=report.folder,
+            trials=report.trials,
+            skipped=report.skipped,
+            computed=report.computed,
+            failed=failed,
+        )
     else:
-        print_line(
+        printing.line(
             f"{report.trials} trials: {report.computed} computed, {report.skipped} finished "
             f"before, {len(failed)} failed"
         )
-        say_failed(failed)
-        print_line(f"look at it: cdmisfa results {quoted(out)}")
-    if failed:
-        ctx.exit(1)
+        for row in failed:
+            point = " ".join(f"{key}={value}" for key, value in row["point"].items())
+            printing.line(f"failed: {point} seed {row['seed']}: {row['error']}")
+        printing.line(f"look at it: cdmisfa results {printing.quoted(out)}")
+    return 1 if failed else 0
 
 
 def parse_grid(words: tuple[str, ...]) -> dict[str, list[str]]:
-    """`KEY=V1,V2` words as values by key."""
+    """Return the values of `KEY=V1,V2` words by key."""
     grid: dict[str, list[str]] = {}
-    for each in words:
-        key, equals, values = each.partition("=")
-        found = [value.strip() for value in values.split(",") if value.strip()]
-        if not (equals and key.strip() and found):
-            raise click.UsageError(f"--grid {each}: write it as section.key=value,value")
-        if key.strip() in grid:
-            raise click.UsageError(f"--grid {key.strip()} is given twice: put all values in one")
-        grid[key.strip()] = found
+    for word in words:
+        key, _, values = word.partition("=")
+        grid[key.strip()] = [value.strip() for value in values.split(",") if value.strip()]
+        if not key.strip() or not grid[key.strip()]:
+            raise click.UsageError(f"--grid {word}: write it as section.key=value,value")
     return grid
 
 
 def parse_seeds(text: str) -> list[int]:
-    """`0:20` (without 20), `3`, or `1,5,9:12` as seeds."""
+    """Return the seeds of `0:20` (without 20), `3`, or `1,5,9:12`."""
     seeds: list[int] = []
     try:
         for part in text.split(","):
@@ -125,56 +134,64 @@ def parse_seeds(text: str) -> list[int]:
             if not span or span[0] < 0 or len(seeds) + len(span) > MOST_SEEDS:
                 raise ValueError
             seeds.extend(span)
+        if max(Counter(seeds).values()) > 1:
+            raise ValueError
     except ValueError:
-        raise click.UsageError(f"--seeds {text}: write it as 0:20 or 1,5,9") from None
-    if twice := [seed for seed, times in Counter(seeds).items() if times > 1]:
-        raise click.UsageError(f"--seeds {text}: {twice[0]} stands there twice")
+        raise click.UsageError(f"--seeds {text}: write each seed once, as 0:20 or 1,5,9") from None
     return seeds
 
 
 @click.command("results")
-@options.path_argument("folder")
+@click.argument("folder", type=options.LOCAL)
 @click.option("--csv", is_flag=True, help="Print comma-separated values.")
 @options.as_json
 def results_command(folder: Path, csv: bool, as_json: bool) -> None:
-    """Print mean and standard deviation over seeds at each point of a sweep.
+    """Print mean and standard deviation over the seeds of a sweep.
 
-    FOLDER is that of the sweep, the trials are those that it was asked for last.
+    FOLDER is that of the sweep; the trials are those that the last sweep command asked for.
     """
     from cdmisfa.experiments import results
 
-    if csv and as_json:
-        raise click.UsageError("choose one of --csv and --json")
     points = results.results(folder)
     for key, values in results.varied(points).items():
-        tell(f"{key} differs: {', '.join(map(str, values))}")
+        printing.status(f"{key} differs: {', '.join(map(str, values))}")
     if as_json:
-        print_json(results.as_json(points))
+        printing.json_document(results.as_json(points))
     elif csv:
-        print_text(results.as_csv(points))
+        printing.lines(results.as_csv(points))
     else:
-        print_table(*results.as_table(points))
+        printing.table(*results.as_table(points))
 
 
 @click.command("reproduce")
 @click.argument("name")
 @options.out("Folder of the results [default: reproduction].")
 @click.option(
-    "--trials", type=click.IntRange(1), help="Trials per condition, instead of the paper's number."
+    "--trials", type=options.COUNT, help="Trials per condition, instead of the paper's number."
 )
 @options.jobs
 @options.scheduler
-@options.path("--recording", "DIR", "Recording of the iCub scene.")
-@click.option("--quick", is_flag=True, help="Few trials, enough to test the claim.")
+@click.option(
+    "--recording", type=options.LOCAL, metavar="DIR", help="Existing recording of the iCub scene."
+)
+@click.option("--quick", is_flag=True, help="Run few trials, enough to test the claim.")
 @options.as_json
 @options.quiet
 def reproduce_command(
-    name: str, out: Path | None, recording: Path | None, as_json: bool, **how: Any
+    name: str,
+    out: Path | None,
+    trials: int | None,
+    jobs: int,
+    scheduler: str | None,
+    recording: Path | None,
+    quick: bool,
+    as_json: bool,
 ) -> None:
-    """Reproduce an experiment of the paper: numbers, tables and figures.
+    """Reproduce an experiment of the CD-MISFA paper.
 
-    NAME is oscillatory, five, stability, nonstationary, icub or all. Finished trials are kept and
-    not run again. Exit code 4 says that a claim of the paper did not come out.
+    NAME is oscillatory, five, stability, nonstationary, icub or all. It writes numbers, tables and
+    figures. Finished trials are not run again. The exit code is 4 if a claim of the paper is not
+    reproduced.
     """
     from cdmisfa.studies.paper.reproduce import (
         EXPERIMENTS,
@@ -184,57 +201,75 @@ def reproduce_command(
     )
 
     root, documents = out or Path("reproduction"), []
-    for each in EXPERIMENTS if name == "all" else (name,):
-        if each == "icub" and recording is None:
-            tell(f"{each}: records the scene into {root}/icub-recording, unless it is there")
-        with bar(each, "trials") as shown:
+    for experiment in EXPERIMENTS if name == "all" else (name,):
+        if experiment == "icub" and recording is None:
+            printing.status(
+                f"icub: the scene is recorded into {root}/icub-recording, if not yet done"
+            )
+        with bar(experiment, "trials") as shown:
             document = reproduce(
-                each, root / each, recording=recording, progress=shown.update, **how
+                experiment,
+                root / experiment,
+                trials=trials,
+                jobs=jobs,
+                scheduler=scheduler,
+                recording=recording,
+                quick=quick,
+                progress=shown.update,
             )
         documents.append(document)
     if as_json:
-        print_document(experiments=documents)
+        printing.document(experiments=documents)
     else:
-        print_text("\n".join(f"{d['title']}\n\n{markdown_tables(d)}" for d in documents))
+        printing.lines("\n".join(f"{d['title']}\n\n{markdown_tables(d)}" for d in documents))
     for document in documents:
         check_claims(document)
 
 
 @click.command("demo")
-@options.out("Folder of the recordings and runs; by default the one you are in.")
-@options.seed()
+@options.out("Folder of the recordings and runs; by default the current folder.")
+@options.seed
 @click.option(
-    "--frames", type=click.IntRange(400), show_default=True, default=8000, help="Frames a view."
+    "--frames",
+    type=click.IntRange(400),
+    show_default=True,
+    default=8000,
+    help="Frames of each view.",
 )
 @options.jobs
 @options.as_json
 @options.quiet
-def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
-    """Record, learn, check and show: the whole story in minutes.
+def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: bool) -> None:
+    """Record, learn, check and show an example in a few minutes.
 
-    It replaces the results of an earlier demo in the same folder. Without PyBullet, which has
-    wheels for Python 3.11 and older, it records the scene oscillatory instead of icub.
+    It replaces the results of an earlier demo in the same folder. Without PyBullet, which needs
+    Python 3.11 or older, it records the scene oscillatory instead of icub.
     """
     from cdmisfa.studies.demo import demo
 
-    report = demo(out or Path(), stage=_stage, **how)
+    report = demo(out or Path(), stage=_stage, seed=seed, frames=frames, jobs=jobs)
     if as_json:
-        print_json(report)
+        printing.json_document(report)
         return
     head = ("module", "view", "policy", "iteration", "follows", "correlation")
-    told = {"policy": " ".join, "correlation": "{:.3f}".format}
-    rows = [[told.get(key, str)(module[key]) for key in head] for module in report["modules"]]
-    print_table(head, rows)
-    print_line()
-    print_line(f"report     {report['report'].resolve().as_uri()}")
-    print_line(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
+    rows = [
+        (m["module"], m["view"], " ".join(m["policy"]), m["iteration"], m["follows"],
+         f"{m['correlation']:.3f}")
+        for m in report["modules"]
+    ]  # fmt: skip
+    printing.table(head, rows)
+    printing.line()
+    printing.line(f"report     {report['report'].resolve().as_uri()}")
+    printing.line(
+        f"look at it {printing.quoted(sys.argv[0])} view {printing.quoted(report['run'])}"
+    )
 
 
 @contextmanager
 def _stage(title: str, unit: str) -> Iterator[Bar]:
-    """Announce a stage and say how long it took, also where nobody sees a bar."""
+    """Print the title of a stage, show its progress, and print how long it took."""
     start = time.monotonic()
-    tell(title)
+    printing.status(title)
     with bar("", unit) as shown:
         yield shown
-    tell(f"    {time.monotonic() - start:.0f} s")
+    printing.status(f"    {time.monotonic() - start:.0f} s")

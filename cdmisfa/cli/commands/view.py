@@ -1,43 +1,46 @@
-"""`cdmisfa view`: look at a run or a recording."""
+"""`cdmisfa view` and `report`: show runs, recordings and logs in Rerun or as an HTML page."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from cdmisfa.cli import options
-from cdmisfa.cli.printing import say_about, tell
+from cdmisfa.cli import options, printing
 from cdmisfa.core.errors import UsageError
-from recorder.log.files import refuse_taken, refuse_unless
+
+if TYPE_CHECKING:
+    from recorder.images.options import InputOptions
 
 
 @click.command("view")
-@options.log_argument("run", nargs=-1)
-@options.path("--save", "F.rrd", "Write the view to a file.")
-@click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
-@options.path("--screenshot", "F.png", "Draw the view into a file, without a screen.")
+@options.log_argument("run")
+@click.option("--save", type=options.LOCAL, metavar="F.rrd", help="Write the view to a file.")
+@click.option("--web", is_flag=True, help="Serve the view to browsers on this machine only.")
+@click.option(
+    "--screenshot",
+    type=options.LOCAL,
+    metavar="F.png",
+    help="Draw the view into an image file; needs no screen.",
+)
 @click.option(
     "--at",
     metavar="WHEN",
-    help='Moment to open it at: a frame, "iteration 500", or words of an event, as "module 2".',
+    help='Time at which the view opens: a frame, "iteration 500", or words of an event, as '
+    '"module 2".',
 )
 @click.option("--tab", metavar="NAME", help="Name of the open tab; by default the first.")
-@click.option(
-    "--port",
-    type=click.IntRange(1, 65535),
-    help="Port of the page of --web; by default a free one.",
-)
+@click.option("--port", type=click.IntRange(1, 65535), help="Port of --web; by default a free one.")
 @click.option(
     "--every",
-    type=click.IntRange(1),
+    type=options.COUNT,
     metavar="N",
     show_default=True,
     default=10,
-    help="Show the images of every Nth frame; numbers are all shown.",
+    help="Show every Nth image; numbers are all shown.",
 )
-@options.look_options
+@options.inputs("topics", "fields", "rate", "settings")
 @options.force
 def view_command(
     run: tuple[Path, ...],
@@ -45,21 +48,22 @@ def view_command(
     web: bool,
     screenshot: Path | None,
     at: str | None,
+    tab: str | None,
     port: int | None,
+    every: int,
+    inputs: InputOptions,
     force: bool,
-    **shown: Any,
 ) -> None:
-    """Open a run or a recording in the Rerun viewer, or save, serve or draw it.
+    """Show a run, recording or log in the Rerun viewer, or save the view.
 
     RUN is the folder of a run, or its run.mcap, a recording, an .rrd file, or one or several
-    camera logs; of a log behind a URL a copy is made.
+    camera logs, as paths or URLs.
     """
-    if sum((save is not None, web, screenshot is not None)) > 1:
-        raise click.UsageError("choose one of --save, --web and --screenshot")
-    if at is not None and (web or save is not None):
-        raise click.UsageError("--at goes with a window or --screenshot")
-    if port is not None and not web:
-        raise click.UsageError("--port goes with --web")
+    if sum((save is not None, web, screenshot is not None)) > 1 or (at and (web or save)):
+        raise click.UsageError(
+            "choose one of --save, --web and --screenshot; --at goes with a window or --screenshot"
+        )
+    from recorder.log.files import refuse_taken, refuse_unless
     from replay.runs.folders import runs_in
 
     path, *beside = run
@@ -70,22 +74,53 @@ def view_command(
         refuse_taken(screenshot, force=force)
     from replay.view.build import build_view, view_of
 
-    shown |= {"beside": beside, "about": say_about}
+    content: Any = {
+        "tab": tab,
+        "every": every,
+        "inputs": inputs,
+        "beside": beside,
+        "about": printing.source,
+    }
     if save is not None:
-        build_view(path, save, force=force, **shown)
-        tell(f"view {save}")
+        build_view(path, save, force=force, **content)
+        printing.status(f"view {save}")
         return
     from replay.viewer import frame_at, open_window, served
     from replay.viewer import screenshot as draw
 
     frame = None if at is None else frame_at(path, at)
-    with view_of(path, **shown) as view:
+    with view_of(path, **content) as view:
         if screenshot is not None:
             draw(view, screenshot, frame)
-            tell(f"screenshot {screenshot}")
+            printing.status(f"screenshot {screenshot}")
         elif web:
             with served(view, port or 0) as (server, address):
-                tell(address)
+                printing.status(address)
                 server.until_end()
         else:
             open_window(view, frame)
+
+
+@click.command("report")
+@options.log_argument("run")
+@options.out("HTML file to write; by default report.html in the folder of a single run.")
+@options.force
+@options.as_json
+def report_command(run: tuple[Path, ...], out: Path | None, force: bool, as_json: bool) -> None:
+    """Write an HTML report of one run, or of several runs side by side.
+
+    RUN is the folder of a run, several of them, or a folder of runs. The page needs no network and
+    no other file. It shows what was learned and when, which stream the learner attended to, why
+    it ended, what each module distinguishes, and whether the run is reproducible. `learn` writes
+    the same page as report.html into its run.
+    """
+    from cdmisfa.experiments.reports import write_report
+    from replay.storage.location import with_urls
+
+    if out is None and any(with_urls(str(path)) != str(path) for path in run):
+        raise click.UsageError("for a run behind a URL name the page to write with -o F.html")
+    page = write_report(run, out, force=force)
+    if as_json:
+        printing.document(report=page, bytes=page.stat().st_size)
+    else:
+        printing.line(page)

@@ -1,0 +1,211 @@
+"""`cdmisfa compare`, `check`, `at` and `signals`: the signals of runs, and how exact they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from cdmisfa.cli import options, printing
+from cdmisfa.core.errors import NotReproducedError
+
+if TYPE_CHECKING:
+    from replay.runs.compare import Row
+
+
+@click.command("compare")
+@options.log_argument("runs")
+@click.option(
+    "--save",
+    type=options.LOCAL,
+    metavar="F.rrd",
+    help="Also write a view with the curves of all runs.",
+)
+@options.force
+@options.as_json
+def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_json: bool) -> int:
+    """Compare runs: signals bit for bit, results and settings.
+
+    For two runs it prints where their signals first differ, which signals those are, and which
+    settings and results differ; the exit code is then 4. For more runs it prints a table in which
+    each is compared with the first. RUNS may be URLs of run.mcap files.
+    """
+    from replay.runs.compare import side_by_side
+
+    if len(runs) < 2:
+        raise click.UsageError("name two runs, or more")
+    rows = side_by_side(runs)
+    if save is not None:
+        from replay.view.overlay import build_overlay  # takes half a second
+
+        build_overlay(runs, rows, save, force=force)
+    different = [row.difference for row in rows if row.difference is not None]
+    if as_json:
+        printing.document(
+            identical=not different,
+            first_difference=different[0].as_json() if different else None,
+            signals=different[0].signals if different and len(runs) == 2 else {},
+            runs=[row.as_json() for row in rows],
+            view=save,
+        )
+    else:
+        _print_comparison(rows)
+        if save is not None:
+            printing.status(f"view {save}    look at it: cdmisfa view {printing.quoted(save)}")
+    return NotReproducedError.exit_code if different and len(runs) == 2 else 0
+
+
+def _print_comparison(rows: Sequence[Row]) -> None:
+    """Print how runs compare, and for two runs the signals that differ first."""
+    from replay.runs.compare import HEAD, differing_outcomes
+
+    first, second = rows[:2]
+    names = first.name, second.name
+    if len(rows) > 2:
+        printing.table(HEAD, [row.cells() for row in rows])
+    else:
+        printing.line(second.verdict)
+        if outcomes := differing_outcomes(first.outline, second.outline):
+            printing.table(("", *names), outcomes)
+        if second.difference is not None:
+            printing.line(f"first difference: {second.difference}")
+    for explanation in filter(None, (row.explanation() for row in rows)):
+        printing.lines(explanation)
+    if len(rows) == 2 and second.difference and second.difference.signal:
+        printing.line(f"signals of iteration {second.difference.iteration} that differ:")
+        printing.table(("signal", *names), second.difference.differing_signals())
+
+
+def _iterations(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[int, int | None]:
+    """Parse FIRST:END; without END as (FIRST, None)."""
+    match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", value or ":", re.ASCII)
+    if match is None:
+        raise click.BadParameter(f"{value!r} is no range: write FIRST:END, as 100:200")
+    first, end = match.groups()
+    return int(first or 0), int(end) if end else None
+
+
+@click.command("check")
+@click.argument("run", type=options.LOCAL)
+@click.option(
+    "--iterations",
+    metavar="FIRST:END",
+    callback=_iterations,
+    help="Check only these iterations, without END; by default all.",
+)
+@options.source
+@options.as_json
+def check_command(
+    run: Path,
+    iterations: tuple[int, int | None],
+    source: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Learn a run again from its source and compare every signal.
+
+    Signals and stored states of the learner must be equal bit for bit. If not, it prints the first
+    difference and the source files that have changed, and the exit code is 4. With --iterations it
+    begins at the last stored state before FIRST.
+    """
+    from cdmisfa.experiments.resume import check_run
+
+    checked = check_run(run, source, *iterations)
+    if as_json:
+        printing.document(run=str(run), **checked.as_json())
+    else:
+        printing.line(str(checked))
+    return 0 if checked.holds else NotReproducedError.exit_code
+
+
+@click.command("at")
+@click.argument("run", type=options.LOCAL)
+@click.argument("iterations", metavar="K", type=click.IntRange(0))
+@options.source
+@options.as_json
+def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: bool) -> None:
+    """Print the exact state of the learner after K iterations of a run.
+
+    The learner starts from the last state that is stored in the log of the run, and learns the
+    rest again from the source of the run. --json prints all of its memory.
+    """
+    from cdmisfa.core.names import counted
+    from cdmisfa.core.signals import ACTIONS
+    from cdmisfa.experiments.resume import Recomputation
+    from cdmisfa.experiments.run_folder import module_table
+
+    with Recomputation.after(run, iterations, source) as again:
+        log, learner, t = again.log, again.learner, again.t
+    state, streams = learner.state, learner.spec.streams  # type: ignore[attr-defined]
+    summary = learner.summary()
+    if as_json:
+        printing.document(
+            run=str(log.parent),
+            iterations=iterations,
+            t=t,
+            stream=streams[learner.stream],
+            modules=[module_table(module) for module in learner.modules],
+            **summary,
+            policy_rng=state.policy_rng,
+            arrays=state.arrays,
+        )
+        return
+    done = counted(iterations, "iteration")
+    printing.line(f"after {done}: frame {t}, next {streams[learner.stream]}")
+    modules = ", ".join(f"{m.index} {m.stream}" for m in learner.modules)
+    printing.line(f"modules: {modules or 'none'}")
+    for outcome in summary.get("streams", ()):
+        printing.stream_outcome(outcome)
+    if "streams" not in summary and "final_policy" in summary:
+        policy = zip(streams, summary["final_policy"], strict=True)
+        printing.line(
+            f"policy: {', '.join(f'{name} {ACTIONS[action]}' for name, action in policy)}"
+        )
+    size = sum(array.nbytes for array in state.arrays.values()) / 1000
+    printing.line(f"memory: {len(state.arrays)} arrays, {size:.1f} kB; --json prints all of it")
+
+
+SIGNALS_PAGE = """\
+# Signals
+
+Made by `cdmisfa signals --markdown`; a test fails when page and code differ.
+Version {version} of the record. One record is one iteration, that is one block of
+T = `learner.tau` frames. A signal that does not exist in an iteration is NaN.
+
+Letters of `dims`: T frames of the block, J outputs of an abstraction, M frozen
+modules, S streams, A actions (stay, switch); nothing is a scalar. `equation` is the
+paper's number. `show` is how the viewer shows it.
+
+{table}
+"""
+
+
+@click.command("signals")
+@click.option("--markdown", is_flag=True, help="Print the page docs/reference/signals.md.")
+@options.as_json
+def signals_command(markdown: bool, as_json: bool) -> None:
+    """List the signals that every run records.
+
+    --json and --markdown also print the type of each signal and how the viewer shows it.
+    """
+    from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
+
+    signals: list[dict[str, Any]] = [dataclasses.asdict(signal) for signal in SIGNALS.values()]
+    if as_json:
+        printing.document(signals_version=SCHEMA_VERSION, signals=signals)
+        return
+    more = ("dtype", "show") if markdown else ()
+    columns = ("name", "symbol", "equation", "unit", "dims", *more, "about")
+    rows = [[signal[column] for column in columns] for signal in signals]
+    if not markdown:
+        printing.table(columns, rows)
+        return
+    from cdmisfa.experiments import documents
+
+    table = documents.markdown(columns, [[f"`{name}`", *cells] for name, *cells in rows])
+    printing.lines(SIGNALS_PAGE.format(version=SCHEMA_VERSION, table=table))
