@@ -14,7 +14,7 @@ from cdmisfa import kernels
 from cdmisfa.agents.agent import OUTCOME, Frozen, as_struct, new_agent, rules
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.trial import run_trial
-from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_of, paper_config
+from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_text, paper_config
 from cdmisfa.studies.paper.oscillatory import ALGORITHMS, ITERATIONS, NEVER, STREAMS
 
 WORLDS = ((3, 0), (3, 3), (60, 0))
@@ -84,9 +84,16 @@ def tables(trials: Sequence[Trial]) -> list[Table]:
     rows = []
     for (streams, modules), group in groups(trials, "streams", "modules").items():
         old, new = (np.array([t.row[a] for t in group]) for a in ALGORITHMS)
-        row = [f"{streams}, {modules}", mean_of(old, 2), mean_of(new, 2), mean_of(old / new, 2)]
+        row = [
+            f"{streams}, {modules}",
+            mean_text(old, 2),
+            mean_text(new, 2),
+            mean_text(old / new, 2),
+        ]
         whole = np.array([t.row["whole"] for t in group if not modules])
-        ratio = [mean_of(whole, 1), mean_of((whole - new + old) / whole, 3)] if len(whole) else []
+        ratio = (
+            [mean_text(whole, 1), mean_text((whole - new + old) / whole, 3)] if len(whole) else []
+        )
         rows.append([*row, *(ratio or ("-", "-"))])
     head = ("streams, frozen modules", "only 1.0, us", "only 2.0, us", "1.0 over 2.0 in these")
     keys = [[name, len(used_keys(name))] for name in ALGORITHMS]

@@ -16,7 +16,7 @@ from cdmisfa.experiments.results import correlation
 from cdmisfa.features.following import batch_outputs
 from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.sfa import slowness
-from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_of, paper_config
+from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_text, paper_config
 from cdmisfa.studies.paper.oscillatory import STREAMS
 from recorder.world.oscillatory import one_period
 from replay.inputs import open_recording
@@ -83,7 +83,7 @@ def tables(trials: Sequence[Trial]) -> list[Table]:
         needed = [t.row["frames"] or math.inf for t in group]
         row = [scene, stream + 1, f"{eta:.4f}", "yes" if eta < LEARNABLE else "no"]
         learned = sum(map(math.isfinite, needed))
-        rows.append([*row, learned, f"{np.median(needed):.0f}", mean_of(needed, 0)])
+        rows.append([*row, learned, f"{np.median(needed):.0f}", mean_text(needed, 0)])
     head = (
         "scene",
         "stream",

@@ -10,7 +10,7 @@ from benchmarks.paper import Table, study
 from cdmisfa.core.config import load_preset
 from cdmisfa.experiments.sources import configure
 from cdmisfa.studies.paper import icub
-from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_of, of_all
+from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_text, of_all
 
 ADDED: Mapping[str, tuple[str, ...]] = {
     "plain": (),
@@ -56,7 +56,7 @@ def tables(trials: Sequence[Trial]) -> list[Table]:
             row += [of_all(icub.follow_both(group), len(group)), f"{alone[0]}, {alone[1]}"]
         ended = [t.row for t in group if t.row["iterations"] < icub.ITERATIONS]
         away = sum(1 not in row["streams"] for row in ended)
-        row += [of_all(away, len(group)), mean_of([row["iterations"] for row in ended], 0)]
+        row += [of_all(away, len(group)), mean_text([row["iterations"] for row in ended], 0)]
         rows.append(row)
     head = [f"{name}: {what}" for name in LEARNERS for what in ("both objects", "object 1, 3")]
     return [(("scene", *head, "center given up", "blocks until decided"), rows)]

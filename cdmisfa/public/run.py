@@ -18,7 +18,7 @@ from cdmisfa.core.shown import Shown
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.resume import Recomputation
 from cdmisfa.public.recording import Recording, as_words
-from cdmisfa.public.shown import view, watched
+from cdmisfa.public.shown import attended_image, view
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
 from replay.runs.modules import SlowFeatures
 from replay.runs.run import read_outline
@@ -226,4 +226,4 @@ class Run(Shown, replay.runs.run.Run):
 
     def _picture(self) -> NDArray[np.uint8] | None:
         streams = self.signals["stream"]
-        return watched(streams, len(self.streams)) if len(streams) else None
+        return attended_image(streams, len(self.streams)) if len(streams) else None

@@ -20,8 +20,8 @@ HEIGHT = 600
 """Pixels of the height of a view in a notebook."""
 
 
-def watched(streams: NDArray[Any], count: int) -> NDArray[np.uint8]:
-    """Which stream was watched when: a row a stream, time to the right.
+def attended_image(streams: NDArray[Any], count: int) -> NDArray[np.uint8]:
+    """Return an image of the attended stream over time: a row a stream, time to the right.
 
     Args:
         streams: (n,) the stream of each iteration.

@@ -137,7 +137,7 @@ def of_all(good: int, n: int) -> str:
     return f"{good} of {n}" if good == n else f"**{good} of {n}**"
 
 
-def mean_of(values: ArrayLike, digits: int) -> str:
+def mean_text(values: ArrayLike, digits: int) -> str:
     """Return mean and SD as a table has them; "-" where there is no value."""
     found = summary(values)
     spread = f" ± {found.sd:.{digits}f}" if found.n > 1 else ""

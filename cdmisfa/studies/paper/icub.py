@@ -31,7 +31,7 @@ from cdmisfa.studies.paper.experiment import (
     first_above,
     groups,
     learned_order,
-    mean_of,
+    mean_text,
     module_row,
     of_all,
     paper_config,
@@ -93,9 +93,9 @@ class Icub(Experiment):
         for (algorithm, error), group in by_learner.items():
             row = ["2.0" if algorithm == "2.0" else f"1.0, threshold {error:g}"]
             row += [of_all(count(group), len(group)) for count in (in_order, follow_both)]
-            row += [mean_of([best(t.row, number) for t in group], 3) for number in (0, 1)]
+            row += [mean_text([best(t.row, number) for t in group], 3) for number in (0, 1)]
             saved = [t.row["saved_at"] for t in group]
-            row += [mean_of([at[k] for at in saved if len(at) > k], 0) for k in (0, 1)]
+            row += [mean_text([at[k] for at in saved if len(at) > k], 0) for k in (0, 1)]
             rows.append(row)
         head = ("learner", "order and policies as the paper's", f"both objects, |r| >= {FOLLOWS}")
         of = ("|r| with object 1", "|r| with object 3", "first saved at", "second saved at")
@@ -178,7 +178,7 @@ def best(row: Mapping[str, Any], number: int) -> float:
     return max((of[number] for of in row["follows"]), default=0.0)
 
 
-class Curves(Sink):
+class RewardCurves(Sink):
     """Keeps what the figures show: some signals, and each module's last outputs.
 
     Attributes:
@@ -214,7 +214,7 @@ class Curves(Sink):
 
 def learn_curves(source: LoggedSource, config: LearnerConfig, seed: int) -> Output:
     """Learn from a recording; return a trial's row, curves, and each module's last outputs."""
-    curves = Curves(config.tau, source.spec.truth)
+    curves = RewardCurves(config.tau, source.spec.truth)
     row = learn_and_judge(source, config, seed, source.frames - HELD_OUT, curves)
     row |= stay_rewards(curves.arrays, config)
     source.seek(0)

@@ -91,7 +91,7 @@ def reproduce(
     for condition in experiment.conditions(quick, recording):
         for seed in range(FIRST_SEED, FIRST_SEED + (trials or experiment.trials[quick])):
             point = {**condition, "seed": seed}
-            call = partial(run_one, name, point)
+            call = partial(run_trial, name, point)
             tasks.append(make_trial(call, name, point, point=point, seed=seed))
     report = run_trials(
         tasks,
@@ -125,7 +125,7 @@ def reproduce(
     return document
 
 
-def run_one(name: str, settings: Settings) -> dict[str, Any]:
+def run_trial(name: str, settings: Settings) -> dict[str, Any]:
     """Run one trial of an experiment; return its row and arrays as JSON values."""
     row, arrays = load(name).run(settings)
     file = io.BytesIO()

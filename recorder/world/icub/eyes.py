@@ -40,10 +40,10 @@ def eye_matrix(eyes: EyesConfig, neck: FloatArray, yaw: float, side: int) -> Mat
     up = bent((0.0, 0.0, 1.0), eyes.pitch)
     place = neck + eyes.forward * forward + side * eyes.half_distance * left + eyes.up * up
     gaze = math.cos(tilt) * forward + math.sin(tilt) * up
-    return look(place, place + gaze)
+    return view_matrix(place, place + gaze)
 
 
-def look(place: FloatArray, target: FloatArray) -> Matrix:
+def view_matrix(place: FloatArray, target: FloatArray) -> Matrix:
     """Return the view matrix of an upright camera at `place` that looks at `target`."""
     gaze = (target - place) / np.linalg.norm(target - place)
     right = np.cross(gaze, [0.0, 0.0, 1.0])

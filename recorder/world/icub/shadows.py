@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
-from recorder.world.icub.eyes import AFAR, Matrix, from_afar, look, metres, seen_from
+from recorder.world.icub.eyes import AFAR, Matrix, from_afar, metres, seen_from, view_matrix
 from recorder.world.icub.room import Room
 from recorder.world.icub.world import World
 
@@ -44,7 +44,7 @@ class RoomShadows:
         casting = [i for i, piece in enumerate(room.pieces) if piece.casts]
         world.show_room(casting, robot=robot)
         middle = np.array(_MIDDLE)
-        self._view = look(middle + np.array(LAMP) * (AFAR / math.hypot(*LAMP)), middle)
+        self._view = view_matrix(middle + np.array(LAMP) * (AFAR / math.hypot(*LAMP)), middle)
         picture = from_afar(_REACH)
         _, depth = world.render(self._view, picture, _SIDE, _SIDE, LAMP)
         self._depth = metres(depth, picture)

@@ -87,7 +87,7 @@ def die(base: Colour, seed: int, spots: int) -> Pixels:
     return image
 
 
-def label(base: Colour, seed: int, bands: int) -> Pixels:
+def box_label(base: Colour, seed: int, bands: int) -> Pixels:
     """Draw bands around a can or a ball, every other one light."""
     image = _painted(base, 0.85 + 0.25 * cloud(12, 12, seed))
     light = (np.arange(SIDE) * (2 * bands + 1) // SIDE) % 2 == 1
@@ -104,7 +104,7 @@ TEXTURES: dict[str, Callable[[Colour, int, int], Pixels]] = {
     "tiles": tiles,
     "plaster": plaster,
     "die": die,
-    "label": label,
+    "label": box_label,
 }
 """By name: functions of a colour, a seed, and a count of boards, tiles, spots ..."""
 
