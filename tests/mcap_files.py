@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-import itertools
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import lz4.frame
@@ -18,7 +17,6 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = range(1, 8)
 CHUNK_INDEX, ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA = range(8, 13)
 METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(13, 16)
 
-KINDS = ("none", "one", "ten", "attachment", "metadata", "schemaless")
 PADDING = b"\x01\xff\xff"
 
 
@@ -99,120 +97,3 @@ def written(
         writer.add_message(channels[i % 2], time, payload(i), max(time - 7, 0), i)
     writer.finish()
     return stream.getvalue()
-
-
-def variants() -> Iterator[tuple[str, frozenset[str]]]:
-    """Every kind of content with every combination of features that applies to it."""
-    for kind in KINDS:
-        has = {
-            "none": ("st", "sum", "pad"),
-            "attachment": ("ax", "st", "sum", "pad"),
-            "metadata": ("mdx", "st", "sum", "pad"),
-        }.get(kind, ("ch", "chx", "mx", "rch", "rsh", "st", "sum", "pad"))
-        if kind == "schemaless":
-            has = tuple(f for f in has if f != "rsh")
-        for count in range(len(has) + 1):
-            for chosen in itertools.combinations(has, count):
-                if "ch" in chosen or not {"chx", "mx"} & set(chosen):
-                    yield kind, frozenset(chosen)
-
-
-def messages_of(kind: str) -> list[tuple[int, int, int, bytes]]:
-    """(sequence, log time, publish time, data) of the messages a kind has."""
-    count = {"one": 1, "ten": 10, "schemaless": 1}.get(kind, 0)
-    return [(10 + i, 2 + i, 1 + i, bytes([1, 2, i])) for i in range(count)]
-
-
-def variant(kind: str, features: frozenset[str], compression: str = "", crc: bool = True) -> bytes:
-    """A valid file with some content, written with some of the format's options."""
-    padding = PADDING if "pad" in features else b""
-    outside = b"" if "ch" in features else padding
-    out = bytearray(MAGIC + header(padding))
-    definitions: list[tuple[int, bytes]] = []
-    messages = messages_of(kind)
-    if messages and kind != "schemaless":
-        definitions.append((SCHEMA, schema() + outside))
-    if messages:
-        definitions.append((CHANNEL, channel(schema_id=0 if kind == "schemaless" else 1) + outside))
-    body = b"".join(record(*d) for d in definitions)
-    index: list[tuple[int, int]] = []
-    for sequence, log_time, publish, data in messages:
-        index.append((log_time, len(body)))
-        body += record(MESSAGE, message(1, sequence, log_time, publish, data))
-    groups: dict[int, bytes] = {}
-    if messages and "ch" in features:
-        place, times = len(out), (messages[0][1], messages[-1][1])
-        made = chunk(body, *times, compression=compression, crc=crc)
-        out += made
-        index_at = len(out)
-        if "mx" in features:
-            pairs = b"".join(struct.pack("<QQ", *pair) for pair in index)
-            content = struct.pack("<HI", 1, len(pairs)) + pairs
-            out += record(MESSAGE_INDEX, content + padding)
-        if "chx" in features:
-            offsets = struct.pack("<HQ", 1, index_at) if "mx" in features else b""
-            groups[CHUNK_INDEX] = record(
-                CHUNK_INDEX,
-                struct.pack("<QQQQ", *times, place, len(made))
-                + struct.pack("<I", len(offsets))
-                + offsets
-                + struct.pack("<Q", len(out) - index_at)
-                + text(compression)
-                + struct.pack("<QQ", len(compress(body, compression)), len(body))
-                + padding,
-            )
-    else:
-        out += body
-    if kind == "attachment":
-        content = struct.pack("<QQ", 2, 1) + text("myFile") + text("application/octet-stream")
-        content += struct.pack("<Q", 3) + b"\x01\x02\x03"
-        made = record(ATTACHMENT, content + struct.pack("<I", zlib.crc32(content) if crc else 0))
-        if "ax" in features:
-            groups[ATTACHMENT_INDEX] = record(
-                ATTACHMENT_INDEX,
-                struct.pack("<QQQQQ", len(out), len(made), 2, 1, 3)
-                + text("myFile")
-                + text("application/octet-stream")
-                + padding,
-            )
-        out += made
-    if kind == "metadata":
-        made = record(METADATA, text("myMetadata") + texts({"foo": "bar"}) + padding)
-        if "mdx" in features:
-            groups[METADATA_INDEX] = record(
-                METADATA_INDEX,
-                struct.pack("<QQ", len(out), len(made)) + text("myMetadata") + padding,
-            )
-        out += made
-    for opcode, content in definitions:
-        if ("rsh" if opcode == SCHEMA else "rch") in features:
-            groups[opcode] = record(opcode, content)
-    if "st" in features:
-        counts = struct.pack("<HQ", 1, len(messages)) if messages else b""
-        groups[STATISTICS] = record(
-            STATISTICS,
-            struct.pack(
-                "<QHIIII",
-                len(messages),
-                sum(opcode == SCHEMA for opcode, _ in definitions),
-                1 if messages else 0,
-                int(kind == "attachment"),
-                int(kind == "metadata"),
-                1 if messages and "ch" in features else 0,
-            )
-            + struct.pack("<QQI", 2, 1 + len(messages), len(counts))
-            + counts
-            + padding,
-        )
-    data = bytes(out)
-    start = len(data) + len(record(DATA_END, b"1234"))
-    summary, offsets = b"", b""
-    for opcode, content in groups.items():
-        where = start + len(summary)
-        offsets += record(
-            SUMMARY_OFFSET, struct.pack("<BQQ", opcode, where, len(content)) + padding
-        )
-        summary += content
-    if "sum" not in features or not summary:
-        return finish(data, summary, crc=crc)
-    return finish(data, summary + offsets, crc=crc, offsets=start + len(summary))

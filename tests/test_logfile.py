@@ -150,12 +150,3 @@ def test_a_full_disk_is_an_error_and_not_a_loss(tmp_path, monkeypatch):
         log.add_metadata("m", {"a": "b"})
     log.abandon()
     assert not (tmp_path / "a.mcap").exists()
-
-
-def test_the_same_calls_give_the_same_bytes(tmp_path):
-    for name in ("a", "b"):
-        log, channel = open_log(tmp_path / f"{name}.mcap")
-        with log:
-            for i in range(120):
-                log.write(channel, i * SECOND // 50, bytes([i]) * 40, i)
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()

@@ -241,13 +241,6 @@ def test_a_recovered_folder_plays(copy: Path, tmp_path: Path) -> None:
     same(open_recording(tmp_path / "saved").take(1, 90), OscillatorySource().take(1, 90))
 
 
-def test_recovering_a_whole_log_keeps_everything(vectors: Path, tmp_path: Path) -> None:
-    report = recover_log(vectors, tmp_path / "saved")
-    assert report.complete
-    assert not report.lost
-    assert check_log(tmp_path / "saved").ok
-
-
 def test_memory_does_not_grow_with_the_length(pictures: Path) -> None:
     source, peaks = open_recording(pictures, loop=True), []
     for blocks in (10, 60):

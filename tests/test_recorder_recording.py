@@ -20,7 +20,7 @@ from recorder.log.files import RECORDING, held, partial_path
 from recorder.log.manifest import RecordingStart, read_start, store_start
 from recorder.log.messages import RECORDING_METADATA
 from recorder.log.resume import frames_held
-from recorder.recording import RecordingStoppedError, record, record_scene
+from recorder.recording import RecordingStoppedError, record_scene
 from recorder.world.icub.config import IcubConfig
 from recorder.world.scenes import SCENES, open_scene
 
@@ -348,18 +348,6 @@ def test_the_sample_logs_are_what_their_card_says():
         name = log.relative_to(folder).as_posix()
         assert f"| `{name}` | {log.stat().st_size:,} | `{sha256(log)}` |" in card
     assert "CC BY-SA 4.0" in card
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_a_source_that_was_opened_by_name_is_recorded_as_by_name(name: str, tmp_path: Path) -> None:
-    if name == "icub":
-        pytest.importorskip("pybullet")
-    clock = RecordConfig(fps=25.0, compression="lz4")
-    config = SCENES[name].config(seed=3)
-    record_scene(name, tmp_path / "name", config, clock, frames=20)
-    with open_scene(name, config, clock) as source:
-        record(source, tmp_path / "source", frames=20)
-    assert contents(tmp_path / "name") == contents(tmp_path / "source")
 
 
 def test_a_recording_stores_what_its_unfinished_views_shall_be(tmp_path: Path) -> None:
