@@ -58,7 +58,12 @@ def grid(rng: Rng, n: int, name: str, columns: int, rest: int) -> Footage:
 
 
 def atari(rng: Rng, n: int, game: str, memory: Sequence[int]) -> Footage:
-    """An Atari game and, of its memory, the bytes at some addresses."""
+    """Return an Atari game and, of its memory, the bytes at some addresses."""
+    import ale_py
+    import gymnasium
+
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
+    gymnasium.register_envs(ale_py)
     task = make_environment(f"ALE/{game}-v5", obs_type="rgb", frameskip=2)
     console = task.unwrapped.ale
     return _play(task, rng, n, 4, lambda seen: (_framed(seen), console.getRAM()[list(memory)]))

@@ -96,7 +96,7 @@ class _Stream:
         self.newest = -1
         self._coming: deque[Stamped] = deque()
         self._last: Stamped | None = None
-        self._shown = True
+        self._used = True
 
     def put(self, stamped: Stamped, decided: int) -> None:
         """Add an image; ticks up to `decided` (ns) do not change any more."""
@@ -111,13 +111,13 @@ class _Stream:
     def show(self, tick: int, hold: int) -> Shown | None:
         """Return the image at a tick, None for a gap; both in nanoseconds."""
         while self._coming and self._coming[0].time_ns <= tick:
-            self.counts["dropped"] += not self._shown
-            self._last, self._shown = self._coming.popleft(), False
+            self.counts["dropped"] += not self._used
+            self._last, self._used = self._coming.popleft(), False
         if self._last is None or tick - self._last.time_ns > hold:
             self.counts["missing"] += 1
             return None
-        self.counts["repeated"] += self._shown
-        self._shown = True
+        self.counts["repeated"] += self._used
+        self._used = True
         return self._last.image
 
 
@@ -256,15 +256,15 @@ class LiveSource(ForwardSource):
         while True:
             now = readers.now()
             missing = []
-            for name, state, own in zip(names, readers.states, images, strict=True):
+            for name, state, stamps in zip(names, readers.states, images, strict=True):
                 why = state.over
-                measured = measure and own is images[0] and not state.camera.rate
+                measured = measure and stamps is images[0] and not state.camera.rate
                 wanted = _MEASURED if measured else 1
-                while len(own) < wanted and (stamped := readers.take(state)):
-                    own.append(stamped)
-                if not own and (why or now >= deadline):
+                while len(stamps) < wanted and (stamped := readers.take(state)):
+                    stamps.append(stamped)
+                if not stamps and (why or now >= deadline):
                     raise UsageError(why or f"{name} shows no image: check the camera and its name")
-                if not why and len(own) < wanted:
+                if not why and len(stamps) < wanted:
                     missing.append(name)
             if not missing or now >= deadline:
                 return images

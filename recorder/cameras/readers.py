@@ -123,11 +123,11 @@ class CameraFrames:
 
 @dataclass(eq=False)
 class CameraState:
-    """What is known of a camera while it is read.
+    """The state of a camera that is being read.
 
     Attributes:
         number: of the camera.
-        heard: when its last image came, or its reading began.
+        last_ns: time of its last image, or of the start of reading.
         connection: number of the thread that reads the camera: a thread that hangs is abandoned,
             and may still return.
         queue: images that nobody took yet.
@@ -135,20 +135,20 @@ class CameraState:
         lost: number of images that were discarded because the queue was full.
         over: why no more images come; "" while they may.
         silent: whether its silence has been reported.
-        came: whether any image ever came.
+        started: whether any image ever came.
         away: whether it is not being read: it is gone, or its next connection is not due yet.
     """
 
     number: int
     camera: Camera
-    heard: int
+    last_ns: int
     connection: int = 0
     queue: deque[Stamped] = field(default_factory=deque)
     bytes: int = 0
     lost: int = 0
     over: str = ""
     silent: bool = False
-    came: bool = False
+    started: bool = False
     away: bool = False
 
 
@@ -206,8 +206,8 @@ class Readers:
     def wait(self, until: int) -> None:
         """Return when an image came in since the last wait, or at a time."""
         for state in self.states:
-            read = state.came and not state.away and not state.over
-            if read and self.now() - state.heard > self._stall:
+            read = state.started and not state.away and not state.over
+            if read and self.now() - state.last_ns > self._stall:
                 self._handle_stall(state)
         self._news.wait(max((until - self.now()) / NANOSECONDS, 0))
         self._news.clear()
@@ -230,7 +230,7 @@ class Readers:
         shortest, longest = _DELAYS
         delay, name = shortest, state.camera.name
         while self._is_current(state, connection):
-            came = False
+            received = False
             try:
                 for age, image in state.camera.images():
                     taken = self.now() - age
@@ -239,8 +239,8 @@ class Readers:
                         continue
                     if not self._put(state, connection, Stamped(taken, frame)):
                         return
-                    came, delay = True, shortest
-                why = f"{name} ended{'' if state.came else ' before an image of it came'}"
+                    received, delay = True, shortest
+                why = f"{name} ended{'' if state.started else ' before an image of it came'}"
             except CdmisfaError as error:
                 why = str(error)
             except Exception as error:  # whatever the library of the camera raises
@@ -250,16 +250,21 @@ class Readers:
             state.away = True
             waits = self._on_loss == "wait"
             alone = all(other.away or other.over for other in self.states)
-            if not state.came or state.camera.finite or self._on_loss == "end" or (waits and alone):
+            if (
+                not state.started
+                or state.camera.finite
+                or self._on_loss == "end"
+                or (waits and alone)
+            ):
                 self._end(state, why)
                 return
             if waits:
                 self._say(f"{why}: the other cameras continue without it")
                 return
-            if came or delay == shortest:
+            if received or delay == shortest:
                 self._say(f"{why}: reconnecting")
             self._closed.wait(delay)
-            state.away, state.heard = False, self.now()
+            state.away, state.last_ns = False, self.now()
             delay = min(2 * delay, longest)
 
     def _is_current(self, state: CameraState, connection: int) -> bool:
@@ -280,7 +285,7 @@ class Readers:
             state.queue.append(stamped)
             state.bytes += size
             back = state.silent
-            state.heard, state.silent, state.came = self.now(), False, True
+            state.last_ns, state.silent, state.started = self.now(), False, True
         self._news.set()
         if back:
             self._say(f"{name} shows images again")
@@ -300,5 +305,5 @@ class Readers:
         if self._on_loss == "reconnect":
             with self._lock:
                 state.connection += 1  # abandons the thread that hangs
-                state.heard = self.now()
+                state.last_ns = self.now()
             self._threads[state.number] = self._connect(state)

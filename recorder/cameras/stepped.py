@@ -5,7 +5,6 @@ They are iterators of frames, which take a step together.
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
@@ -63,11 +62,11 @@ class SteppedSource(ForwardSource):
             raise LogExhaustedError(
                 f"{len(self._ahead)} frames are left at frame {self._t}, {n} are needed"
             )
-        shown, self._ahead = self._ahead[:n], self._ahead[n:]
-        truth = freeze(np.stack([values for _, values in shown]))
+        steps, self._ahead = self._ahead[:n], self._ahead[n:]
+        truth = freeze(np.stack([values for _, values in steps]))
         blocks = [
-            Block(stream, self._t, freeze(np.stack([frames[stream] for frames, _ in shown])), truth)
-            for stream in range(len(self._spec.streams))
+            Block(stream, self._t, freeze(np.stack(frames)), truth)
+            for stream, frames in enumerate(zip(*(frames for frames, _ in steps), strict=True))
         ]
         self._t += n
         return tuple(blocks)
@@ -220,8 +219,8 @@ class GymSource(SteppedSource):
             spaces += [(e.action_space, a) for e, a in zip(environments, actions, strict=True)]
             numbers = [np.ravel(values) for space, values in spaces if _count(space)]
             images = [np.asarray(e.render()) for e in environments]
-            shown = images if color else [gray_picture(image) for image in images]
-            yield shown, np.concatenate([*numbers, begins]).astype(np.float64)
+            frames = images if color else [gray_picture(image) for image in images]
+            yield frames, np.concatenate([*numbers, begins]).astype(np.float64)
 
     def describe(self) -> Mapping[str, Any]:
         """Return the environments, their seed, and how they were played."""
@@ -263,7 +262,7 @@ def play(
 
 
 def make_environment(task: str, **options: Any) -> Any:
-    """Make an environment of Gymnasium or Atari that renders.
+    """Make an environment of Gymnasium that renders.
 
     Args:
         task: its id.
@@ -273,11 +272,12 @@ def make_environment(task: str, **options: Any) -> Any:
         UsageError: Gymnasium is missing, or there is no such environment.
     """
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs no screen
-    gymnasium = _package("gymnasium", "gym")
-    if task.startswith("ALE/"):
-        ale = _package("ale_py", "bench")
-        ale.ALEInterface.setLoggerMode(ale.LoggerMode.Error)
-        gymnasium.register_envs(ale)
+    try:
+        import gymnasium
+    except ImportError:
+        raise UsageError(
+            f"gym:{task} needs gymnasium, which is missing: pip install 'cdmisfa[gym]'"
+        ) from None
     try:
         return gymnasium.make(task, render_mode="rgb_array", **options)
     except Exception as error:  # whatever an environment raises
@@ -287,14 +287,6 @@ def make_environment(task: str, **options: Any) -> Any:
 def gray_picture(seen: Any) -> ByteArray:
     """Convert a colour image, (height, width, 3), to gray, (height, width) uint8."""
     return np.asarray(Image.fromarray(seen).convert("L"))
-
-
-def _package(name: str, extra: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        missing = f"it needs {name}, which is missing: pip install 'cdmisfa[{extra}]'"
-        raise UsageError(missing) from error
 
 
 def _count(space: Any) -> int:

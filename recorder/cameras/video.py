@@ -52,7 +52,7 @@ class VideoCamera:
         self.name = name
         self.rate: float | None = None
         self._av = pyav(word)
-        self._shown_word = _SECRET.sub("", word)
+        self._public_word = _SECRET.sub("", word)
         self._form: str | None = None
         self._address = word
         head, _, rest = word.partition(":")
@@ -74,7 +74,7 @@ class VideoCamera:
         """See `Camera`."""
         with self._open() as container:
             if not container.streams.video:
-                raise CdmisfaError(f"{self._shown_word}: there is no video in it")
+                raise CdmisfaError(f"{self._public_word}: there is no video in it")
             video = container.streams.video[0]
             context = video.codec_context
             self._check_size(context, context.codec)
@@ -85,22 +85,22 @@ class VideoCamera:
             timed = not (self._remote and container.format.flags & _TIMELESS)
             stated = timed and (video.average_rate or video.guessed_rate)
             self.rate = float(stated) if stated else None
-            steady, begun = Steady(), None
+            steady, start = Steady(), None
             try:
                 for frame in container.decode(video):
                     self._check_size(frame, context.codec)
                     presented = frame.time if timed else None
                     if presented is not None and not self._remote:
                         now = time.monotonic()
-                        begun = now - presented if begun is None else begun
-                        time.sleep(max(begun + presented - now, 0))
+                        start = now - presented if start is None else start
+                        time.sleep(max(start + presented - now, 0))
                     yield steady.age(time.monotonic(), presented), self._convert(frame)
             except (OSError, ValueError, self._av.FFmpegError) as error:
                 raise CdmisfaError(f"{self.name} is gone: {_reason(error)}") from None
 
     def describe(self) -> Mapping[str, Any]:
         """Return the word, without a password."""
-        return {"camera": self._shown_word}
+        return {"camera": self._public_word}
 
     def _open(self) -> Any:
         """Open the container within the memory budget; decoding runs without one, in threads."""
@@ -116,14 +116,14 @@ class VideoCamera:
                     self._address, format=self._form, options=options, timeout=timeout
                 )
         except (OSError, ValueError, MemoryError, self._av.FFmpegError) as error:
-            raise CdmisfaError(f"{self._shown_word} cannot be opened: {_reason(error)}") from None
+            raise CdmisfaError(f"{self._public_word} cannot be opened: {_reason(error)}") from None
 
     def _check_size(self, image: Any, codec: Any) -> None:
         """Reject images that take too much memory, by a stated width, height and format."""
         most = most_pixels(image.format, codec)
         if not 0 < image.width * image.height <= most:
             raise CdmisfaError(
-                f"{self._shown_word}: images of {image.width}x{image.height}, live ones of this "
+                f"{self._public_word}: images of {image.width}x{image.height}, live ones of this "
                 f"kind have 1 to {most} pixels"
             )
 
