@@ -50,7 +50,7 @@ FORBIDDEN = {
     "replay.export": ("replay.view.build", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer", "rerun"),
     "replay.logs": ("replay.inputs", "replay.view.build", "recorder.recording", "rerun"),
-    "replay.logs.formats": ("replay.logs.source", "replay.runs.log", "recorder.recording"),
+    "replay.logs.formats": ("replay.inputs", "replay.runs.log", "recorder.recording"),
     "replay.report": ("replay.view.build", "replay.export.frames", "rerun"),
     "replay.runs": ("replay.logs.source", "replay.view.build", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
