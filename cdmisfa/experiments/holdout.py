@@ -36,7 +36,7 @@ def hold_out(source: FrameSource, configuration: Configuration) -> None:
     """Keep the last frames of a log from the progress learner, which is judged on them at its end.
 
     Args:
-        source: what it learns from.
+        source: the source of the run.
         configuration: its `input.holdout` is the share; without one `HOLDOUT`, where possible.
 
     Raises:
@@ -90,7 +90,7 @@ def judged(
     if not isinstance(source, StoredSource) or not source.held_out:
         return {}
     fitted = source.first_frame, source.t
-    held = source.end, source.end + source.held_out
+    judged_on = source.end, source.end + source.held_out
     rows: dict[int, dict[str, Any]] = {}
     try:
         for stream in sorted({module.stream_index for module in modules}):
@@ -101,7 +101,7 @@ def judged(
                 pieces(*fitted), fitted[1] - fitted[0], components, outputs
             )
             weights = [(module.phi, module.mean) for module in ours]
-            *slow, of_batch = following_slowness(pieces(*held), [*weights, (phi, mean)])
+            *slow, of_batch = following_slowness(pieces(*judged_on), [*weights, (phi, mean)])
             for module, slowness in zip(ours, slow, strict=True):
                 rows[module.index] = {
                     "module": module.index,
@@ -112,7 +112,7 @@ def judged(
     except _StoppedError:
         return None
     return {
-        "frames": list(held),
+        "frames": list(judged_on),
         "fitted": list(fitted),
         "modules": [rows[index] for index in sorted(rows)],
     }

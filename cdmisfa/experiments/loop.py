@@ -110,7 +110,7 @@ class Keyframes(Sink):
 
     Args:
         log: the run's log.
-        source: what it learns from.
+        source: the source of the run.
         learner: the learner.
         versions: versions of the packages that compute it.
         every: iterations between two keyframes, 0 writes one at the end only; None for every

@@ -182,7 +182,7 @@ class Recomputation:
         Raises:
             UsageError: there is no such run or iteration, or a source is needed and missing.
             LogDamagedError: the log cannot be read.
-            NotReproducedError: the signals differ from those of the log.
+            NotReproducedError: the signals differ from the log.
         """
         again = cls(Path(run), iterations, source)
         with contextlib.ExitStack() as failing:
@@ -340,7 +340,7 @@ def _first_element(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], s
 class Checked:
     """Result of computing the iterations [start, stop) of a run again.
 
-    `other_files` are those that changed since the run learned from them.
+    `other_files` changed since the run learned from them.
     """
 
     start: int
@@ -392,7 +392,7 @@ def check_run(
     with Recomputation(run, start, source) as again:
         first = again.learner.iteration
         at, difference = again.compare(stop, read_keyframes(again.log, first))
-        others = tuple(again.other_files())
+        changed = tuple(again.other_files())
         if difference is None and 0 < at <= start:
             again.compare(start + 1)  # refuses, as the log or the part ends before
-    return Checked(first, at, difference, others)
+    return Checked(first, at, difference, changed)

@@ -84,7 +84,7 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     """
     command = read_header(log_to_resume(run)).manifest.get(COMMAND)
     if not isinstance(command, Mapping) or not isinstance(command.get("source"), list):
-        raise UsageError(f"{run} does not state what it learned from: name its source")
+        raise UsageError(f"{run} does not state its source: name it")
     options = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in command.items()
@@ -127,7 +127,7 @@ def log_to_resume(run: Path) -> Path:
 
 
 def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
-    """Open what a run learned from, as its command states, or what other words name.
+    """Open the source of a run, as its command states, or the source that other words name.
 
     Raises:
         UsageError: the run does not state its source, or there is no such source.
@@ -250,12 +250,12 @@ def opened_log(
 ) -> Iterator[RunWriter]:
     """Open the log of a run, which is to be finished in the context, and lock its folder.
 
-    On failure the log is left as a readable prefix; the message of an interrupt then says what is
-    missing.
+    On failure the log is left as a readable prefix; the message of an interrupt then names the
+    missing part.
 
     Args:
         folder: the run's folder.
-        source: what it learns from.
+        source: the source of the run.
         manifest: see `RunWriter`.
         force: replace the contents of the folder.
         resumed: whether the run is resumed; its earlier log is moved to `SET_ASIDE`.

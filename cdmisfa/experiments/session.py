@@ -56,7 +56,7 @@ class Session:
     """A run that is started, resumed or forked; `learn` then learns to its end.
 
     Attributes:
-        source: what it learns from; left open.
+        source: the source of the run; left open.
         learner: the learner.
         folder: the run's folder, or None where nothing is stored.
         manifest: what its log states at its beginning.
@@ -93,7 +93,7 @@ class Session:
             command: how the run is started, stored with it; see `command_of`.
             force: replace an existing run.
             resume: put learner and source to the newest keyframe of the run in the folder; the
-                signals become those of a run that was never stopped.
+                signals equal those of an uninterrupted run.
             hashing: see `Hashing`.
 
         Raises:
@@ -351,7 +351,7 @@ def run(
 ) -> RunResult:
     """Start a run, or resume the one in `folder`, and learn to its end.
 
-    The arguments are those of `Session` and of `Session.learn`.
+    For the arguments see `Session` and `Session.learn`.
     """
     names = Session.learn.__kwdefaults__ or {}
     learning = {name: how.pop(name) for name in names if name in how}

@@ -92,7 +92,7 @@ def compute(trial: Trial) -> Mapping[str, Any]:
     """Return the result of a trial, or under "error" why there is none.
 
     Raises:
-        LogWriteError: the disk refuses a file, and would refuse those of other trials too.
+        LogWriteError: the disk refuses a file, and would refuse the files of other trials too.
     """
     version = code(*trial.modules)
     if trial.code != version:
@@ -115,7 +115,7 @@ class SweepReport:
         trials: the number of trials that were asked for.
         skipped: the number that were finished before.
         computed: the number that finished now.
-        failed: rows of those that failed, now or before.
+        failed: rows of failed trials, now or before.
     """
 
     folder: Path

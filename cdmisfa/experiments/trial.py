@@ -45,18 +45,18 @@ class Swap:
 
 @dataclass(frozen=True, slots=True)
 class TrialResult:
-    """What a trial came to; the words of `ended` are those of a run.
+    """Result of a trial.
 
     Attributes:
-        modules: what was learned, in order.
-        iterations: iterations in all.
-        frames: frames in all.
+        modules: the learned modules, in order.
+        iterations: the number of iterations.
+        frames: the number of frames.
         final_policy: policy of the abstraction being learned at the end.
         epsilon: its probability of a random action.
-        ended: "max_modules", "max_iterations" or "nothing_left".
-        swapped: iteration from which on the swapped signal was shown; -1 never.
-        curves: where asked for, what every iteration came to, an array a signal, named as in
-            `BlockSignals` and equal to it: the fields of `OUTCOME` (N,), eta_dot (N, J), R (N, S)
+        ended: why, as for a run: "max_modules", "max_iterations" or "nothing_left".
+        swapped: the iteration from which on the swapped signal was shown; -1 never.
+        curves: if asked for, the signals of all iterations as arrays, named as in `BlockSignals`
+            and equal to it: the fields of `OUTCOME` (N,), eta_dot (N, J), R (N, S)
             of the stay entries, Q (N, S, 2) and policy (N, S).
     """
 
@@ -91,10 +91,10 @@ def run_trial(
         config: the learner's configuration.
         streams: signals the streams show.
         seed: seed of the policy and of the abstractions' first weights.
-        max_iterations: end after so many.
-        max_modules: end after so many modules; by default as many as there are streams.
+        max_iterations: end after this many.
+        max_modules: end after this many modules; by default as many as there are streams.
         swap: an abrupt change.
-        curves: keep what every iteration came to.
+        curves: keep the signals of all iterations.
 
     Raises:
         ValueError: the learner is in Python.

@@ -1,1 +1,1 @@
-"""What a program or a notebook holds in hand: runs, recordings, and `learn`."""
+"""The Python interface: `learn`, `Run` and `Recording`."""

@@ -1,4 +1,4 @@
-"""`cdmisfa.learn`: from anything that shows frames to a run on disk."""
+"""`cdmisfa.learn`: learn from any source of frames, and write a run."""
 
 from __future__ import annotations
 
@@ -58,27 +58,27 @@ def learn(
             paths, URLs or patterns of logs, one or a list; a `Recording`, where a log needs
             options; the name of a scene ("oscillatory", "icub"); words of live streams
             ("camera:/dev/video0", "gym:CartPole-v1"); or an open source, which is left open.
-        out: the run's folder; by default a temporary one, which goes with the run.
-        algorithm: "progress", the default but of scenes, "2.0", "1.0", or a class of yours as
-            "package.module:Class".
-        seed: of the random choices, and of scenes and simulated tasks.
-        max_iterations: end after so many.
-        max_modules: end after so many; by default the learner ends by itself, and any learner
+        out: the run's folder; by default a temporary one, removed with the run.
+        algorithm: "2.0", the default of scenes, "progress", that of other streams, "1.0", or a
+            class of yours as "package.module:Class".
+        seed: the seed of random choices, scenes and simulated tasks.
+        max_iterations: end after this many.
+        max_modules: end after this many; by default the learner ends by itself, and any learner
             where the source ends.
         preset: settings by name or from a .toml file.
-        holdout: the share of a camera log, at its end, that is kept from the progress learner, to
-            judge on it what was learned; by default a tenth.
-        loop: begin logs or arrays again at their end.
+        holdout: the share of a log, at its end, that the progress learner does not learn from and
+            is judged on; by default a tenth.
+        loop: start logs or arrays again at their end.
         episodes: see `Recording`.
         centre: "episode" learns from frames without the mean of their episode.
         force: replace an existing run.
         view: also write the view, run.rrd.
         sinks: called with every iteration; one that raises ends the run.
-        stop: asked before every iteration; true ends the run.
+        stop: called before every iteration; true ends the run.
         settings: keys of the learner: `tau=20`, `outputs=4`; see docs/reference/configuration.md.
 
     Raises:
-        UsageError: a source, setting or folder that cannot be; the line names it.
+        UsageError: the source, a setting or the folder is wrong; the line names it.
         LogDamagedError: a log is damaged.
         LogExhaustedError: the source has not enough frames for a single block.
     """

@@ -1,4 +1,4 @@
-"""What can be learned from, in hand: recordings, logs of others, and arrays."""
+"""Sources in a program: recordings, external logs, and arrays."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from recorder.images.options import InputOptions
 from replay.inputs import open_arrays
 
 Given: TypeAlias = Any
-"""What `learn` takes: arrays, tables, mappings of these by streams' names, paths and URLs of logs,
-names of scenes, words of live streams, or an open source."""
+"""A source for `learn`: arrays, tables, mappings of these by names of streams, paths and URLs of
+logs, names of scenes, words of live streams, or an open source."""
 
 
 def as_words(given: Given) -> tuple[str, ...]:
@@ -30,17 +30,17 @@ def as_words(given: Given) -> tuple[str, ...]:
 
 
 class Recording(Shown):
-    """A recording, logs of others, or arrays, to be looked at and learned from.
+    """A recording, external logs, or arrays, to look at and to learn from.
 
     Args:
         given: paths, URLs or patterns: a recording's folder, MCAP files, ROS bags, videos, folders
-            of pictures, tables, LeRobot datasets, .npy and .npz files; or one array, table, or
+            of images, tables, LeRobot datasets, .npy and .npz files; or one array, table, or
             mapping of them by the streams' names. Arrays hold numbers, (n,) or (n, values), or
-            pictures, (n, height, width) or (n, height, width, 3), the i-th of all at once.
-        loop: begin again at the end.
-        salvage: leave out what is damaged.
-        episodes: each path is an episode, one after the other; those of a corpus, a folder that
-            cdmisfa index indexed, always are.
+            images, (n, height, width) or (n, height, width, 3), the i-th of all at once.
+        loop: start again at the end.
+        salvage: skip damaged parts.
+        episodes: each path is an episode, one after the other; the logs of a folder that
+            `cdmisfa index` indexed always are.
         options: which streams, and how they become frames: the input options of `cdmisfa learn`,
             `topics`, `fields`, `size`, `rate`, `start`, `end`, `align`, `color`, and the keys
             `input.*`, as `fit="pad"` or `centre="episode"`; see docs/reference/configuration.md.
@@ -76,16 +76,16 @@ class Recording(Shown):
 
     @classmethod
     def of(cls, given: Given) -> Self:
-        """A recording as it is, or of paths in a list, of one path or of arrays."""
+        """Return a recording as it is, or one of paths in a list, of one path or of arrays."""
         if isinstance(given, cls):
             return given
         return cls(*given) if isinstance(given, list | tuple) and as_words(given) else cls(given)
 
     def source(self, *, loop: bool = False) -> Any:
-        """Its streams, open to be read, for `with`: a `SeekableSource`.
+        """Open its streams for a `with` statement: a `SeekableSource`.
 
         Args:
-            loop: begin again at the end, also where that was not said before.
+            loop: start again at the end, also if the recording does not.
         """
         loop = loop or self.loop
         if self.words:
@@ -100,12 +100,12 @@ class Recording(Shown):
     def frames(
         self, stream: str | int = 0, start: int = 0, stop: int | None = None
     ) -> NDArray[Any]:
-        """The frames [start, stop) of a stream, without those of gaps, (n, *frame_shape).
+        """Return the frames [start, stop) of a stream without its gaps, (n, *frame_shape).
 
         Args:
             stream: its name, or its number from 0.
             start: counted from the first frame.
-            stop: by default the end; needed where it begins again at its end.
+            stop: by default the end; needed if it starts again at its end.
 
         Raises:
             ValueError: there is no such stream, or no such frames.
@@ -117,14 +117,14 @@ class Recording(Shown):
         stop = length if stop is None else stop
         if stop is None or not 0 <= start <= stop or (length is not None and stop > length):
             raise ValueError(f"no frames [{start}, {stop}): there are [0, {length or '...'})")
-        found = [np.empty((0, *self.spec.frame_shape), self.spec.dtype)]
+        parts = [np.empty((0, *self.spec.frame_shape), self.spec.dtype)]
         with self.source() as source:
             first = getattr(source, "first_frame", 0)
-            held = source.spans(index, first + start, first + stop) if stop > start else []
-            for low, high in held:
+            spans = source.spans(index, first + start, first + stop) if stop > start else []
+            for low, high in spans:
                 source.seek(low)
-                found.append(source.take(index, high - low).frames)
-        return np.concatenate(found)
+                parts.append(source.take(index, high - low).frames)
+        return np.concatenate(parts)
 
     def view(self, save: str | Path | None = None, *, tab: str | None = None) -> None:
         """Show it in the Rerun viewer: in a notebook below the cell, else until a window is closed.

@@ -1,4 +1,4 @@
-"""A run on disk: its signals as arrays and tables, what it learned, its learner at any moment."""
+"""A run on disk: its signals as arrays and tables, its modules, its learner at any iteration."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class UnknownSignalError(UsageError, KeyError):
 
 
 class Signals(Shown, Mapping[str, "NDArray[Any]"]):
-    """The signals of a run: arrays by name, and one table of a row an iteration.
+    """The signals of a run: arrays by name, and one table with a row per iteration.
 
-    `signals["reward"]` is an array (iterations, ...), NaN where a value is missing. In tables what
-    is missing is null. `cdmisfa.SIGNALS` says what each signal is.
+    `signals["reward"]` is an array (iterations, ...), NaN where a value is missing. In tables
+    missing values are null. `cdmisfa.SIGNALS` explains each signal.
     """
 
     def __init__(self, log: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -57,10 +57,10 @@ class Signals(Shown, Mapping[str, "NDArray[Any]"]):
         return {"run": self._log.parent, "signals": ", ".join(self)}
 
     def to_arrow(self, *names: str) -> Any:
-        """A table of pyarrow, a row an iteration; what is missing is null.
+        """Return a table of pyarrow with a row per iteration; missing values are null.
 
         Args:
-            names: of signals; by default all of one number an iteration. Others are lists.
+            names: signals; by default all of one number an iteration. Others become lists.
 
         Raises:
             UsageError: there is no such signal; it is a KeyError, too.
@@ -73,12 +73,12 @@ class Signals(Shown, Mapping[str, "NDArray[Any]"]):
         return signals_table(self._log, names or SCALARS)
 
     def to_pandas(self, *names: str) -> Any:
-        """The same as a DataFrame of pandas, by iterations where these are among the columns."""
+        """Return the table as a DataFrame of pandas, indexed by the column `iteration`."""
         table = self.to_arrow(*names).to_pandas()
         return table.set_index("iteration") if "iteration" in table else table
 
     def to_polars(self, *names: str) -> Any:
-        """The same as a DataFrame of Polars."""
+        """Return the table as a DataFrame of Polars."""
         import polars
 
         return polars.from_arrow(self.to_arrow(*names))
@@ -90,16 +90,16 @@ def _refuse_unknown(name: str, known: Collection[str]) -> None:
 
 
 class Run(Shown, replay.runs.run.Run):
-    """A run on disk, of which is read what is asked for.
+    """A run on disk; each part is read when it is first used.
 
     Args:
         path: the run's folder, or its log.
 
     Attributes:
         signals: a mapping of arrays by name; `signals.to_pandas()` is a table.
-        modules: what was learned, in order; `module.transform(frames)` gives its outputs.
-        streams: names of what it learned from.
-        result: the document of `cdmisfa learn --json`; None where it was broken off.
+        modules: the learned modules in order; `module.transform(frames)` gives its outputs.
+        streams: the names of the streams.
+        result: the document of `cdmisfa learn --json`; None if the run was interrupted.
         log: its run.mcap.
 
     Raises:
@@ -124,21 +124,19 @@ class Run(Shown, replay.runs.run.Run):
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """What it was told, by sections: `run.config["learner"]["tau"]`."""
-        found: Mapping[str, Any] = self.header.manifest.get("config", {})
-        return found
+        """Its configuration by sections: `run.config["learner"]["tau"]`."""
+        return dict(self.header.manifest.get("config", {}))
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
-        """What happened, in words: each has `t`, `iteration`, `text` and `level`."""
+        """Its events in words: each has `t`, `iteration`, `text` and `level`."""
         batches = read_batches(self.log, self.header, topics=(EVENT_TOPIC,))
         return tuple(event for batch in batches for event in batch.events)
 
     def frames(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """The frames that were watched in the iterations [start, stop), (n, *frame_shape).
+        """Return the frames that were watched in the iterations [start, stop), (n, *frame_shape).
 
-        Of numbers all of them, of images every tenth, as the log has them; `Recording.frames` has
-        all.
+        The log has every frame of numbers, and every tenth image; `Recording.frames` has all.
 
         Raises:
             ValueError: there are no such iterations.
@@ -151,25 +149,25 @@ class Run(Shown, replay.runs.run.Run):
             )
         starts, tau = self.signals["t"], self.signals["y"].shape[1]
         first, last = int(starts[start]), int(starts[stop - 1]) + tau
-        found = [np.empty((0, *self.header.spec.frame_shape), self.header.spec.dtype)]
+        parts = [np.empty((0, *self.header.spec.frame_shape), self.header.spec.dtype)]
         for batch in read_batches(self.log, self.header, topics=(WATCHED_TOPIC,), start=first):
             for t, frames in batch.watched:
-                found.append(frames[(t >= first) & (t < last)])
+                parts.append(frames[(t >= first) & (t < last)])
                 if t[-1] >= last:
-                    return np.concatenate(found)
-        return np.concatenate(found)
+                    return np.concatenate(parts)
+        return np.concatenate(parts)
 
     def at(self, iterations: int, source: Any = ()) -> Learner:
-        """Its learner as it was after so many iterations, bit for bit.
+        """Return its learner after this many iterations, bit for bit.
 
         Args:
-            iterations: done before; 0 is the beginning.
-            source: what it learned from, as `cdmisfa.learn` takes it, where the run cannot say or
-                finds it no more.
+            iterations: iterations done; 0 is the beginning.
+            source: its source, as `cdmisfa.learn` takes it, if the run does not state it or the
+                source has moved.
 
         Raises:
-            UsageError: it has not so many, or its source is not there; what stands in its log, a
-                keyframe every some hundred iterations, needs none.
+            UsageError: the run has fewer iterations, or its source is missing. Right after a
+                keyframe of the log, one every some hundred iterations, no source is needed.
             NotReproducedError: learning again gives other signals than its log holds.
         """
         if isinstance(source, tuple) and not source:
@@ -182,13 +180,13 @@ class Run(Shown, replay.runs.run.Run):
                 return again.learner
 
     def summary(self) -> str:
-        """What came of it, in words, as Markdown: what the first page of its view says."""
+        """Return its results in words, as Markdown: the first page of its view."""
         from replay.view.summary import summary_text
 
         return summary_text(read_outline(self.log), self.path.name, [e.text for e in self.events])
 
     def report(self, out: str | Path | None = None) -> Path:
-        """Write what came of it as one HTML page that needs no network and no other file.
+        """Write its results as one HTML page that needs no network and no other file.
 
         Args:
             out: the file, *.html; by default report.html in its folder, replaced.
@@ -214,14 +212,13 @@ class Run(Shown, replay.runs.run.Run):
         view([self.path], save, tab=tab)
 
     def _facts(self) -> Mapping[str, Any]:
-        learned = (f"{m.index}: {m.stream}, η {m.eta[0]:.3g}" for m in self.modules)
-        ended = (self.result or {}).get("ended", "broken off")
+        modules = [f"{m.index}: {m.stream}, η {m.eta[0]:.3g}" for m in self.modules]
         return {
             "run": self.path,
             "streams": ", ".join(self.streams),
             "iterations": len(self.signals["iteration"]),
-            "modules": "; ".join(learned) or "none",
-            "ended": ended,
+            "modules": "; ".join(modules) or "none",
+            "ended": (self.result or {}).get("ended", "broken off"),
         }
 
     def _picture(self) -> NDArray[np.uint8] | None:

@@ -44,7 +44,7 @@ def demo(
 
     Args:
         out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
-        preset: of scene and learner; by default `PRESET`, or that of the scene that stands in.
+        preset: of scene and learner; by default `PRESET`, or that of the stand-in scene.
         seed: of world and learner.
         frames: of the recording; the learner starts it again at its end.
         jobs: processes that render.

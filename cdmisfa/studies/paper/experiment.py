@@ -40,8 +40,8 @@ class Findings:
     """The results of an experiment.
 
     Attributes:
-        lines: of its table: what was measured, the paper's value as text ("-" where it has none),
-            mean, SD and number of trials, the 95 % interval of a share, and decimals to print.
+        lines: of its table: the measured quantity, the paper's value as text, "-" where it has
+            none, mean, SD and number of trials, the 95 % interval of a share, decimals to print.
         tables: others, each its head and rows of texts.
         claims: statements of the paper, and whether they came out: true, false, or None where
             that cannot be judged.
@@ -58,11 +58,11 @@ class Findings:
         self, quantity: str, values: ArrayLike, paper: str = "-", *, digits: int = 3
     ) -> None:
         """Add mean and SD of values to the table."""
-        found = {"quantity": quantity, "paper": paper, **asdict(summary(values)), "interval": None}
-        self.lines.append({**found, "digits": digits})
+        line = {"quantity": quantity, "paper": paper, **asdict(summary(values)), "interval": None}
+        self.lines.append({**line, "digits": digits})
 
     def share(self, quantity: str, paper: str, good: int, n: int) -> None:
-        """Add how many of n trials did what is named."""
+        """Add the share of n trials that are good."""
         self.measured(quantity, [1.0] * good + [0.0] * (n - good), paper)
         self.lines[-1]["interval"] = wilson(good, n)
 
@@ -111,7 +111,7 @@ class Experiment(ABC):
         """Run one trial, in any process."""
 
     @abstractmethod
-    def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
+    def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
         """Add tables and claims."""
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
@@ -126,10 +126,10 @@ def paper_config(scene: str, **keys: Any) -> LearnerConfig:
 
 def groups(trials: Sequence[Trial], *keys: str) -> dict[tuple[Any, ...], list[Trial]]:
     """Return the trials by the values of some settings, in order."""
-    found: dict[tuple[Any, ...], list[Trial]] = {}
+    groups_by_key: dict[tuple[Any, ...], list[Trial]] = {}
     for trial in trials:
-        found.setdefault(tuple(trial.settings[key] for key in keys), []).append(trial)
-    return found
+        groups_by_key.setdefault(tuple(trial.settings[key] for key in keys), []).append(trial)
+    return groups_by_key
 
 
 def of_all(good: int, n: int) -> str:
@@ -139,9 +139,9 @@ def of_all(good: int, n: int) -> str:
 
 def mean_text(values: ArrayLike, digits: int) -> str:
     """Return mean and SD as a table has them; "-" where there is no value."""
-    found = summary(values)
-    spread = f" ± {found.sd:.{digits}f}" if found.n > 1 else ""
-    return f"{found.mean:.{digits}f}{spread}" if found.n else "-"
+    result = summary(values)
+    spread = f" ± {result.sd:.{digits}f}" if result.n > 1 else ""
+    return f"{result.mean:.{digits}f}{spread}" if result.n else "-"
 
 
 def first_above(first: ArrayLike, *others: ArrayLike) -> bool | None:
@@ -153,7 +153,7 @@ def first_above(first: ArrayLike, *others: ArrayLike) -> bool | None:
 
 
 def module_row(modules: Sequence[Module]) -> dict[str, list[Any]]:
-    """Return what a row says of the modules of a trial; a policy is as "011", 0 stay, 1 switch."""
+    """Return the modules of a trial as part of its row; a policy is as "011", 0 stay, 1 switch."""
     return {
         "streams": [m.stream_index for m in modules],
         "policies": ["".join(map(str, m.policy)) for m in modules],

@@ -85,7 +85,7 @@ class Icub(Experiment):
         with contextlib.closing(open_recording(settings["recording"])) as source:
             return learn_curves(source, paper_config("icub", **keys), settings["seed"])
 
-    def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
+    def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
         """Object 1, then object 3, with the optimal policies, and no third module; by 2.0 only."""
         by_learner = groups(trials, "algorithm", "roc_error")
         new, old, loose = (by_learner[which] for which in LEARNERS)
@@ -99,25 +99,25 @@ class Icub(Experiment):
             rows.append(row)
         head = ("learner", "order and policies as the paper's", f"both objects, |r| >= {FOLLOWS}")
         of = ("|r| with object 1", "|r| with object 3", "first saved at", "second saved at")
-        found.table((*head, *of), rows)
+        findings.table((*head, *of), rows)
         n, good, both = len(new), in_order(new), follow_both(new)
         ended = sum(len(t.row["streams"]) <= 2 for t in new)
-        found.claim_all("iCub: object 1 with [0,1,1], then object 3 with [1,1,0]", good, n)
-        found.claim_all("iCub: the modules encode the positions of objects 1 and 3", both, n)
-        found.claim_all("iCub: no third module is learned", ended, n)
+        findings.claim_all("iCub: object 1 with [0,1,1], then object 3 with [1,1,0]", good, n)
+        findings.claim_all("iCub: the modules encode the positions of objects 1 and 3", both, n)
+        findings.claim_all("iCub: no third module is learned", ended, n)
         for part, key in (("curiosity reward", "curiosity"), ("reward in all", "reward")):
             earned = np.array([t.row[key] for t in new]).T
             means = ", ".join(f"{value:.5f}" for value in earned.mean(axis=1))
             most = first_above(*earned)
-            found.claim(f"iCub: view 1 earns more {part} than views 2 and 3", most, means)
+            findings.claim(f"iCub: view 1 earns more {part} than views 2 and 3", most, means)
         tight, wide = (follow_both(group) for group in (old, loose))
-        found.claim(
+        findings.claim(
             "1.0 does not do on the iCub",
             max(tight, wide) < n,
             f"both objects in {tight} of {len(old)} trials, with a loose threshold in {wide} of "
             f"{len(loose)}, where {in_order(loose)} have the paper's order and policies",
         )
-        found.notes.append(
+        findings.notes.append(
             f"|r|: the largest of the modules', on {HELD_OUT} frames after those learned from. 1.0 "
             "is given the head's positions as labels. All seeds learn from one recording."
         )
@@ -129,7 +129,7 @@ class Icub(Experiment):
         views = np.pad(trials[0].arrays["shown"], ((0, 0), (1, 1), (0, 0)), constant_values=255)
         axes[0, 0].imshow(np.concatenate(views), cmap="gray", vmin=0, vmax=255)
         axes[0, 0].set(xticks=[], yticks=[])
-        figures.letter_panel(axes[0, 0], "a", "what it sees: left, center, right", "")
+        figures.letter_panel(axes[0, 0], "a", "views: left, center, right", "")
         figure, axes = figures.new_figure(1, 3)
         Q, policy, eta_dot = ([t.arrays[k] for t in trials] for k in ("Q", "policy", "eta_dot"))
         figures.draw_means(axes[0, 0], gains(Q), "c", GAIN)

@@ -128,7 +128,7 @@ class NonStationary(Experiment):
         rewarded = int(np.isfinite(before).sum())
         return {"policy": "".join(map(str, policy)), "rewarded": rewarded}, {}
 
-    def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
+    def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
         """Judge what of both tables comes out, and what of the text, where that can be judged."""
         judged = _judged(trials)
         limit = max(t.settings["epsilon_c"] for t in judged)
@@ -140,9 +140,9 @@ class NonStationary(Experiment):
             paper, ends = f"{COLUMNS[key][value]:g}", f"{turn.n - turn.neither} of {turn.n}"
             rows.append([f"{key} = {value:g}", paper, str(turn), between, ends])
         head = ("at", "paper's epsilon^d", "ours", "95 % interval, by seeds", "old or new optimum")
-        found.table(head, rows)
-        _claim_about_changes(found, judged, turns)
-        _claim_about_order(found, turns)
+        findings.table(head, rows)
+        _claim_about_changes(findings, judged, turns)
+        _claim_about_order(findings, turns)
         rewarded = ", ".join(
             f"{epsilon:g}: {_rewarded(group):.0f}"
             for (epsilon,), group in groups(trials, "epsilon_c").items()
@@ -154,7 +154,7 @@ class NonStationary(Experiment):
             "there are left out, and where epsilon^d lies there it is only said to be above "
             f"{limit:g}."
         )
-        found.notes = [note, CONTRADICTION]
+        findings.notes = [note, CONTRADICTION]
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
         """Draw policies against epsilon^c for two values of sigma, grey where it is not judged."""
@@ -191,7 +191,7 @@ def _is_new(trial: Trial) -> bool:
 
 
 def _claim_about_changes(
-    found: Findings, judged: Sequence[Trial], turns: Mapping[tuple[str, float], Turn]
+    findings: Findings, judged: Sequence[Trial], turns: Mapping[tuple[str, float], Turn]
 ) -> None:
     """Claim that changes are followed early, and not late, and where the others end."""
     smallest = min(value for key, value in turns if key == "sigma")
@@ -201,21 +201,21 @@ def _claim_about_changes(
     last = min(t.settings["epsilon_c"] for t in judged)
     late = groups(judged, "key", "epsilon_c")["sigma", last]
     followed, kept = sum(map(_is_new, early)), sum(not _is_new(t) for t in late)
-    found.claim(
+    findings.claim(
         "a change above epsilon^d is followed (smallest sigma, largest epsilon^c judged)",
         followed >= 0.8 * len(early),
         f"{followed} of {len(early)} trials with epsilon^c = {largest:g}",
     )
     detail = f"{kept} of {len(late)} trials with epsilon^c = {last:g}"
-    found.claim("a change while epsilon is small is not followed", kept == len(late), detail)
+    findings.claim("a change while epsilon is small is not followed", kept == len(late), detail)
     lost, n = (sum(getattr(t, name) for t in turns.values()) for name in ("neither", "n"))
     (key, value), worst = max(turns.items(), key=lambda item: item[1].neither / item[1].n)
     most = f", most at {key} = {value:g} ({worst.neither} of {worst.n})" if lost else ""
     ends = "the policy ends in the old or in the new optimum"
-    found.claim(ends, lost == 0, f"{lost} of {n} trials in neither{most}")
+    findings.claim(ends, lost == 0, f"{lost} of {n} trials in neither{most}")
 
 
-def _claim_about_order(found: Findings, turns: Mapping[tuple[str, float], Turn]) -> None:
+def _claim_about_order(findings: Findings, turns: Mapping[tuple[str, float], Turn]) -> None:
     """Claim how epsilon^d depends on sigma and, where trials vary them, on nu and tau."""
     columns: dict[str, dict[float, Turn]] = {}
     for (key, value), turn in sorted(turns.items()):
@@ -224,7 +224,7 @@ def _claim_about_order(found: Findings, turns: Mapping[tuple[str, float], Turn])
     order = [min(turn.rank, turn.limit) for turn in of_sigma]
     falls = order == sorted(order, reverse=True) and order[0] > order[-1]
     words = ", ".join(map(str, of_sigma))
-    found.claim("epsilon^d falls with sigma, and nowhere rises", falls, words)
+    findings.claim("epsilon^d falls with sigma, and nowhere rises", falls, words)
     for key, reference, claim in (
         ("nu", 0.05, "nu has no significant effect on epsilon^d"),
         ("tau", 100, "tau of 30 and more has none"),
@@ -242,12 +242,12 @@ def _claim_about_order(found: Findings, turns: Mapping[tuple[str, float], Turn])
         same: bool | None = all(low <= 0 <= high for low, high in differ.values())
         if same and any(turn.rank > turn.limit for turn in of_key.values()):
             same = None  # where one of them lies cannot be judged
-        found.claim(claim, same, f"against {reference:g}, 95 % intervals: {words}")
+        findings.claim(claim, same, f"against {reference:g}, 95 % intervals: {words}")
     if "tau" in columns:
         shortest, *others = columns["tau"].values()
         words = ", ".join(map(str, columns["tau"].values()))
         higher = shortest.rank > max(turn.rank for turn in others)
-        found.claim("epsilon^d is higher at tau = 10", higher, words)
+        findings.claim("epsilon^d is higher at tau = 10", higher, words)
 
 
 def _judged(trials: Sequence[Trial]) -> list[Trial]:

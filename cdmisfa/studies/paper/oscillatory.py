@@ -1,4 +1,4 @@
-"""The oscillatory streams: what is learned in which order, and CD-MISFA 1.0 against 2.0."""
+"""The oscillatory streams: the order of learning, and CD-MISFA 1.0 against 2.0."""
 
 from __future__ import annotations
 
@@ -93,28 +93,28 @@ class Oscillatory(Experiment):
         }
         return row, {name: curves[name] for name in ("eta_dot", "R", "Q", "policy")}
 
-    def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
+    def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
         """Every trial must learn x1, x2, x3 in this order with the optimal policies."""
         good, n = sum(learned_order(t.row) == self.optimal for t in trials), len(trials)
-        found.share("trials with order and policies optimal", "20 of 20 (text)", good, n)
+        findings.share("trials with order and policies optimal", "20 of 20 (text)", good, n)
         iterations = [t.row["iterations"] for t in trials]
-        found.measured("iterations until the third module", iterations, digits=0)
+        findings.measured("iterations until the third module", iterations, digits=0)
         for i, frequency in enumerate((4, 3, 2)):
             learned = [t.row for t in trials if len(t.row["streams"]) > i]
             saved, eta = ([row[key][i] for row in learned] for key in ("saved_at", "eta"))
-            found.measured(f"module {i + 1} saved at iteration", saved, digits=0)
+            findings.measured(f"module {i + 1} saved at iteration", saved, digits=0)
             slowness = f"slowness of module {i + 1} on its stream (paper: its frequency)"
-            found.measured(slowness, eta, f"{frequency / 500:.4f} (equation)", digits=4)
+            findings.measured(slowness, eta, f"{frequency / 500:.4f} (equation)", digits=4)
         earned = np.array([t.row["curiosity"] for t in trials]).T
         for name, values in zip(STREAMS, earned, strict=True):
             quantity = f"curiosity reward of a stay in {name}, while exploring"
-            found.measured(quantity, values, digits=5)
+            findings.measured(quantity, values, digits=5)
         order = "modules x1, x2, x3 in this order, policies [0,1,1], [1,0,1], [1,1,0]"
-        found.claim_all(order, good, n)
+        findings.claim_all(order, good, n)
         one, two, three = earned
         falls = first_above(one, two) and first_above(two, three)
         means = ", ".join(f"{value:.5f}" for value in earned.mean(axis=1))
-        found.claim("x1 earns more curiosity reward than x2, and x2 than x3", falls, means)
+        findings.claim("x1 earns more curiosity reward than x2, and x2 than x3", falls, means)
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
         """Draw the paper's four panels."""
@@ -151,19 +151,19 @@ class FiveStreams(Experiment):
         result = run_trial(config, self.streams, seed=seed, max_iterations=MAX_ITERATIONS)
         return module_row(result.modules), {}
 
-    def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
+    def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
         """Every trial must learn the third stream, then the first, with the example's policies."""
         good, n = sum(learned_order(t.row)[:2] == self.optimal for t in trials), len(trials)
         third = [[self.streams[s] for s in t.row["streams"][2:]] for t in trials]
-        found.share("trials with both policies as in the example", "all (text)", good, n)
+        findings.share("trials with both policies as in the example", "all (text)", good, n)
         for i, (stream, _) in enumerate(self.optimal):
             quantity = f"module {i + 1} (stream {stream + 1}) saved at iteration"
             saved = [t.row["saved_at"][i] for t in trials if len(t.row["saved_at"]) > i]
-            found.measured(quantity, saved, digits=0)
-        found.claim_all("five streams: policies [1,1,0,1,1], then [0,1,1,1,1]", good, n)
+            findings.measured(quantity, saved, digits=0)
+        findings.claim_all("five streams: policies [1,1,0,1,1], then [0,1,1,1,1]", good, n)
         encode = "a module may encode several streams: one for all three x3, and no fourth module"
-        found.claim_all(encode, sum(streams == ["x3"] for streams in third), n)
-        found.notes.append(f"The paper names no streams; these show {', '.join(self.streams)}.")
+        findings.claim_all(encode, sum(streams == ["x3"] for streams in third), n)
+        findings.notes.append(f"The paper names no streams; these show {', '.join(self.streams)}.")
 
 
 class Stability(Experiment):
@@ -177,7 +177,7 @@ class Stability(Experiment):
         return [{"algorithm": algorithm} for algorithm in ALGORITHMS]
 
     def run(self, settings: Settings) -> Output:
-        """Epsilon falls by .998 an iteration, is 0 from .8 on; the policy's changes then count."""
+        """Let epsilon fall to 0.8 and then be 0; count the changes of the policy from there on."""
         keys = {"algorithm": settings["algorithm"], "epsilon_decay": 0.998}
         config = paper_config("oscillatory", **keys, epsilon_tail_decay=0.0, **NEVER)
         result = run_trial(
@@ -192,7 +192,7 @@ class Stability(Experiment):
         }
         return row, {name: curves[name] for name in ("R", "policy")}
 
-    def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
+    def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
         """2.0 must never change its policy, 1.0 at least once in every trial."""
         old, new = (groups(trials, "algorithm")[a,] for a in ALGORITHMS)
         changes, n = [t.row["changes"] for t in old], len(new)
@@ -200,12 +200,12 @@ class Stability(Experiment):
         stable = sum(t.row["changes"] == 0 for t in new)
         optimal = sum(t.row["after"] == "011" for t in new)
         changed, seen = "1.0: changes of policy after epsilon = 0", "all (figure)"
-        found.share("2.0: trials without a change of policy", seen, stable, n)
-        found.share("1.0: trials with a change of policy", seen, unstable, n)
-        found.measured(changed, changes, ">= 1 (figure)", digits=1)
-        found.share("2.0: trials that end with [0,1,1]", seen, optimal, n)
-        found.claim_all("2.0 keeps its policy after epsilon = 0", stable, n)
-        found.claim_all("1.0 changes its policy after epsilon = 0", unstable, n)
+        findings.share("2.0: trials without a change of policy", seen, stable, n)
+        findings.share("1.0: trials with a change of policy", seen, unstable, n)
+        findings.measured(changed, changes, ">= 1 (figure)", digits=1)
+        findings.share("2.0: trials that end with [0,1,1]", seen, optimal, n)
+        findings.claim_all("2.0 keeps its policy after epsilon = 0", stable, n)
+        findings.claim_all("1.0 changes its policy after epsilon = 0", unstable, n)
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
         """Draw the paper's four panels: one trial's reward function and policy, 1.0 above 2.0."""

@@ -106,8 +106,8 @@ def reproduce(
         raise CdmisfaError(f"{name} trial {row['point']}: {row['error']}; the others are kept")
     rows = {row["id"]: row for row in read_rows(folder)}
     finished = [_finished(folder, rows[task.id]) for task in tasks]
-    found = Findings()
-    experiment.evaluate(finished, found)
+    findings = Findings()
+    experiment.evaluate(finished, findings)
     document: dict[str, Any] = plain(
         {
             "schema": 2,
@@ -115,7 +115,7 @@ def reproduce(
             "title": experiment.title,
             "quick": quick,
             "trials": len(finished),
-            **found.as_json(),
+            **findings.as_json(),
             "figures": [figure.name for figure in experiment.draw(finished, folder)],
             "code": code(),
             "versions": versions(),
