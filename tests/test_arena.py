@@ -9,35 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from moving_pictures import MovingPictures
 
-from benchmarks.arena import pictures, worlds
 from benchmarks.arena.__main__ import LEARNERS, main
 from benchmarks.arena.judging import Course, Saved, judge, probe
-from benchmarks.arena.rules import RULES, Attentive
-from benchmarks.arena.streams import GROUPS, SETS, STREAMS, ArenaSource, Showing, parse
-from cdmisfa.agents.progress.attention import RECENT, ProgressConfig, Situation
+from benchmarks.arena.rules import RULES
+from benchmarks.arena.streams import ArenaSource
+from cdmisfa.agents.progress.attention import RECENT, Situation
 
 WORDS = ("x1", "x2", "vector-noise")
 TERMS = (5, "quadratic")
-
-
-def test_every_set_shows_streams_that_can_be_made() -> None:
-    assert parse("flicker:pendulum#2>gaussian-0.1") == (
-        Showing("pendulum", "flicker", 2),
-        Showing("gaussian-0.1"),
-    )
-    for entry in SETS.values():
-        shown = [showing for word in entry["words"] for showing in parse(word)]
-        assert any(showing.learnable for showing in shown)
-        assert {showing.camera for showing in shown} <= {"", *pictures.CAMERAS}
-    for kind, entry in STREAMS.items():
-        maker = entry["make"][0]
-        assert hasattr(pictures, maker) or hasattr(worlds, maker), kind
-    tuned, reported = (
-        {w for s in GROUPS[g] for w in SETS[s]["words"]} for g in ("tuning", "reported")
-    )
-    assert not any(parse(word)[0].learnable for word in tuned & reported)
 
 
 def test_modules_are_judged_against_batch_sfa() -> None:
@@ -115,17 +95,3 @@ def test_rules_choose_what_they_are_for(
         explore=0.1,
     )
     assert RULES[name](situation, np.array(told.get("surprise", np.empty((4, 0)))))[0] == chosen
-
-
-def test_noise_surprises_for_ever_and_what_was_often_seen_is_no_longer_new() -> None:
-    source, surprise = MovingPictures("swing", "noise"), {}
-    for name in ("prediction", "rnd"):
-        learner = Attentive(ProgressConfig(components=8), source.spec, 0, name)
-        source.seek(0)
-        for _ in range(25):
-            learner.step(source.take(learner.stream, learner.tau))
-        surprise[name] = learner.surprise
-    swing, noise = np.nanmean(surprise["prediction"][:, -5:], axis=1)
-    assert noise > 3 * swing
-    watched = surprise["rnd"][np.isfinite(surprise["rnd"][:, -6:]).all(axis=1)]
-    assert (watched[:, -1] < 0.5 * np.nanmax(watched, axis=1)).all()

@@ -10,22 +10,16 @@ from pathlib import Path
 
 import pytest
 from bombs import CAMERAS, write_all
-from test_modules import learned
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.learning import Keyframe
-from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.core.untrusted import BUDGET, budget
 from cdmisfa.experiments.results import results
 from recorder.cameras.video import VideoCamera
 from recorder.log.files import RECORDING
-from recorder.log.logfile import LogFile
 from recorder.log.manifest import read_start
 from recorder.mcap.records import MalformedRecord
 from replay.logs.opening import open_stream
-from replay.runs.folders import REQUEST, RUN_JSON, RUN_METADATA, read_run_json
-from replay.runs.keyframes import decode_keyframe, encode_keyframe
-from replay.runs.log import read_header
+from replay.runs.folders import REQUEST, RUN_JSON, read_run_json
 
 pytestmark = pytest.mark.xdist_group("bombs")  # one process makes what all of them share
 
@@ -88,22 +82,6 @@ def test_live_pictures_that_are_too_large_are_refused() -> None:
 
 LISTS = b"[" + b"[]," * (1 << 21) + b"[]]"
 """6 MiB of JSON that take some 150."""
-
-
-def test_documents_of_logs(tmp_path: Path) -> None:
-    run = tmp_path / "run.mcap"
-    with LogFile(run) as log:
-        values = {"schema": str(SCHEMA_VERSION), "spec": LISTS.decode(), "manifest": LISTS.decode()}
-        log.add_metadata(RUN_METADATA, values)
-    learner, _ = learned("uint8", "none")
-    keyframe = encode_keyframe(Keyframe(1, 0, learner.state, {"python": LISTS.decode()}))
-
-    def read() -> None:
-        for decode in (lambda: read_header(run), lambda: decode_keyframe(keyframe)):
-            with pytest.raises(LogDamagedError, match="JSON, above the limit"):
-                decode()
-
-    assert growth(read) < 150
 
 
 def test_side_files(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from message_files import STEP, every, learned_alike, write_mcap
 from numpy.typing import NDArray
 from PIL import Image
 
-from recorder.images.framing import Framing
 from recorder.images.messages import decoder_of
 from recorder.images.options import InputOptions
 from recorder.images.videos import frame_colors
@@ -52,16 +51,6 @@ def test_pixels_keep_their_colours(pixels: np.ndarray, encoding: str, expected: 
     decode = decoder_of(RAW, InputOptions(color=True))
     assert decode is not None
     np.testing.assert_array_equal(decode(raw(np.ascontiguousarray(pixels), encoding)), expected)
-
-
-def test_gray_images_are_shown_three_times_among_colours() -> None:
-    framing = Framing((2, 4), (1, 2), "crop", color=True)
-    gray = np.array([[0, 10, 20, 30], [0, 10, 20, 30]], np.uint8)
-    assert framing.shape == (1, 6)
-    assert framing.frame(gray).tolist() == [[5, 25] * 3]
-    assert framing.frame(np.stack([gray, gray + 1, gray + 2], axis=2)).tolist() == [
-        [5, 25, 6, 26, 7, 27]
-    ]
 
 
 @pytest.mark.parametrize("form", ["yuv420p", "yuv422p", "yuv444p", "yuvj420p"])

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from camera_files import START_MS, pictures, write_cameras, write_images, write_pictures
+from camera_files import START_MS, pictures, write_cameras, write_images
 from conftest import Cdmisfa
-from message_files import write_table
 
 COUNT = 60
 LEARN = ("--set", "learner.tau=10", "--max-iterations", "1")
@@ -30,25 +29,7 @@ def written_otherwise(folder: Path) -> Sequence[Path]:
     return one, two
 
 
-def renamed_pictures(folder: Path) -> Sequence[Path]:
-    one, two = folder / "one", folder / "two"
-    write_pictures(one, COUNT)
-    two.mkdir()
-    for path in one.iterdir():
-        shutil.copy(path, two / f"image-{path.name}")
-    return one, two, Path("--rate"), Path("50")
-
-
-def table_and_its_copy(folder: Path) -> Sequence[Path]:
-    import numpy as np
-
-    one, two = folder / "one.csv", folder / "two.csv"
-    write_table(one, {"a": np.arange(COUNT) % 7})
-    shutil.copy(one, two)
-    return one, two, Path("--field"), Path("a"), Path("--rate"), Path("50")
-
-
-MAKE = (byte_copy, written_otherwise, renamed_pictures, table_and_its_copy)
+MAKE = (byte_copy, written_otherwise)
 
 
 @pytest.mark.parametrize("make", MAKE)

@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import shutil
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,11 @@ from camera_files import pictures, write_images, write_pictures
 from conftest import Cdmisfa
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.processes import WorkersError
 from replay.corpus import index as indexing
 from replay.corpus import rows as looking
-from replay.corpus.finding import INDEX, Found, found_logs
+from replay.corpus.finding import INDEX, found_logs
 from replay.corpus.index import index_logs, read_index
-from replay.corpus.rows import SCHEMA, Answer
+from replay.corpus.rows import SCHEMA
 
 ROOT = Path(__file__).parents[1]
 
@@ -119,13 +117,6 @@ class TestRows:
         assert row(corpus, "robot.mcap")["shape"] == "12x16"
         assert index_logs([corpus]).read == 0  # what is known deeply stays known
 
-    def test_images_that_a_log_lacks_are_counted(self, tmp_path: Path) -> None:
-        shown = [i for i in range(90) if not 50 <= i < 70]
-        frames = ((100 * i, image) for i, image in zip(shown, pictures(len(shown), 9), strict=True))
-        write_images(tmp_path / "gap.mcap", {"/camera": frames})
-        index_logs([tmp_path], deep=True)
-        assert row(tmp_path, "gap.mcap")["gaps"] == 20
-
     def test_jobs_and_order_change_nothing(self, corpus: Path, tmp_path: Path) -> None:
         index_logs([corpus], tmp_path / "one.parquet")
         later = corpus / "robot.mcap"
@@ -160,15 +151,6 @@ class TestUpToDate:
         assert opened == [*(f"night/two/x{i}.mcap" for i in (1, 2, 3)), "robot.mcap"]
         assert (made.read, made.kept, made.gone, made.logs) == (4, 8, ["text.mcap"], 12)
 
-    def test_an_index_of_several_lies_where_it_is_told(self, corpus: Path, tmp_path: Path) -> None:
-        out = tmp_path / "all.parquet"
-        made = index_logs([f"{corpus}/*.mcap", corpus / "night"], out)
-        assert made.logs == 4 + 3
-        paths = read_index(out)["path"].to_pylist()
-        assert all((tmp_path / path).exists() for path in paths)
-        with pytest.raises(UsageError, match="say where, with -o"):
-            index_logs([f"{corpus}/*.mcap"])
-
 
 class TestBadInput:
     def test_links_in_circles_end(self, corpus: Path) -> None:
@@ -180,11 +162,6 @@ class TestBadInput:
         assert [log.problem for log in found_logs([corpus]) if log.file.endswith("lost.mcap")] == [
             "it cannot be read: No such file or directory"
         ]
-
-    def test_a_name_that_is_no_text(self, corpus: Path) -> None:
-        shutil.copy(corpus / "robot.mcap", os.fsencode(corpus / "r") + b"\xff.mcap")
-        index_logs([corpus])
-        assert row(corpus, "r\\xff.mcap")["problem"] == "its name is not UTF-8: give it another"
 
     def test_what_is_no_index_is_left_alone(self, corpus: Path, tmp_path: Path) -> None:
         other = tmp_path / "other.parquet"
@@ -198,23 +175,6 @@ class TestBadInput:
             index_logs([corpus], other)
         with pytest.raises(UsageError, match=r"robot.mcap is no index of logs"):
             read_index(corpus / "robot.mcap")
-
-    def test_what_was_read_is_kept_when_a_worker_is_killed(
-        self, corpus: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def dying(
-            work: Callable[[Sequence[Found]], Answer], batches: Sequence[Sequence[Found]], jobs: int
-        ) -> Iterator[tuple[int, Answer]]:
-            yield 0, work(batches[0])
-            raise WorkersError("it died")
-
-        monkeypatch.setattr(indexing, "BATCH", 4)
-        with monkeypatch.context() as patched:
-            patched.setattr(indexing, "run_all", dying)
-            with pytest.raises(WorkersError, match="it died"):
-                index_logs([corpus])
-        made = index_logs([corpus])
-        assert (made.logs, made.kept, made.read) == (10, 4, 6)
 
     def test_what_was_read_is_kept_when_it_is_stopped(
         self, corpus: Path, monkeypatch: pytest.MonkeyPatch

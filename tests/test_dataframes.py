@@ -68,23 +68,6 @@ def test_a_module_takes_tables_of_each_library(kind: str, module: Any) -> None:
         module.transform(table(kind, COLUMNS | {"name": ["a"] * ROWS}))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    ("columns", "said"),
-    [
-        ({"speed": [1.0, 2.0], "name": ["a", "b"]}, "x: the column name is of type .*, no numbers"),
-        ({"speed": [1.0, None]}, "x: row 1, counted from 0, holds NaN or infinity"),
-        (
-            {"on": [True, None]},
-            "x: row 1, counted from 0, holds NaN or infinity|column on",
-        ),
-    ],
-)
-def test_columns_of_no_numbers_are_one_line(kind: str, columns: Any, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        open_arrays({"x": table(kind, columns)})
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run that is rewarded in some iterations and in others not."""

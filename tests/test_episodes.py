@@ -178,32 +178,6 @@ def test_a_log_damaged_in_the_middle_is_left_out_from_there_on(
     assert "the log is left out" in without.err
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("oscillatory", "--episodes"), "oscillatory is a scene"),
-        (("av:lavfi:testsrc", "--set", "input.centre=episode"), "input.centre is for logs"),
-        (("CORPUS", "--topic", "/no"), "no topic /no"),
-        (("CORPUS/../broken",), "corpus.parquet is damaged"),
-        (("CORPUS", "--set", "input.holdout=0.5", "--loop"), "input.holdout is for camera logs"),
-        (
-            ("--episodes", "CORPUS/ep0.mcap", "CORPUS/none.mcap"),
-            "none.mcap: no such file or folder",
-        ),
-    ],
-)
-def test_what_episodes_cannot_be_is_refused_in_a_line(
-    cdmisfa: Cdmisfa, tmp_path: Path, words: Sequence[str], said: str
-) -> None:
-    folder = corpus(cdmisfa, tmp_path / "logs", scenes(1, 12))
-    (tmp_path / "broken").mkdir()
-    (tmp_path / "broken" / "corpus.parquet").write_text("no index")
-    done = cdmisfa("learn", *(word.replace("CORPUS", str(folder)) for word in words))
-    assert done.code in (2, 3)
-    assert said in done.err
-    assert len(done.err.splitlines()) == 1
-
-
 # Killed and resumed
 
 
@@ -349,19 +323,3 @@ def test_what_is_held_out_are_whole_episodes_where_one_fits(tmp_path: Path) -> N
         source.hold_out(20)
         assert source.held_out == 20
         assert [len(b) for b in source.pieces(0, 260, 280, 16)] == [16, 4]
-
-
-def test_recordings_of_scenes_are_episodes(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    folder = tmp_path / "logs"
-    for seed in (1, 0):
-        words = ("--seed", seed, "--frames", 300, "-o", folder / f"rec{seed}")
-        assert cdmisfa("record", "oscillatory", *words).code == 0
-    assert cdmisfa("index", folder).code == 0
-    run = tmp_path / "run"
-    learned = cdmisfa("learn", folder, "-o", run, "--json", "--no-rerun").json
-    assert [file["file"] for file in learned["source"]["files"]] == ["rec0", "rec1"]
-    assert learned["source"]["scene"] == "oscillatory"
-    assert json.loads((run / "run.json").read_text())["config"]["learner"]["algorithm"] == "2.0"
-    assert cdmisfa("check", run).code == 0
-    assert cdmisfa("index", folder / "rec0").code == 0  # it stays one recording
-    assert cdmisfa("learn", folder / "rec0", "--json").json["source"]["kind"] == "recording"

@@ -12,8 +12,6 @@ import pytest
 from numpy.typing import NDArray
 from river import checks
 from sklearn.base import clone
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from sklearn.utils.estimator_checks import check_estimator
 
 from cdmisfa.estimators import IncSFA, OnlineSFA, RecursiveSFA
@@ -105,15 +103,6 @@ def test_it_learns_on_after_pickling_with_the_same_bits(make: Make) -> None:
     np.testing.assert_array_equal(straight.fit(X[:500]).mean_, make().fit(X[:500]).mean_)
 
 
-def test_a_pipeline_finds_what_is_slow_in_products() -> None:
-    t = np.linspace(0, 2 * np.pi, 4000)  # Wiskott and Sejnowski 2002
-    X = np.stack([np.sin(t) + np.cos(11 * t) ** 2, np.cos(11 * t)], axis=1)
-    whole = make_pipeline(StandardScaler(), PolynomialFeatures(include_bias=False), RecursiveSFA())
-    y = whole.set_output(transform="default").fit_transform(X)
-    assert correlation(y[:, 0], np.sin(t)) > 0.999
-    assert whole.get_feature_names_out().tolist() == ["recursivesfa0"]
-
-
 def test_inverse_transform_is_the_best_that_outputs_tell() -> None:
     X = waves()
     for n in (2, 6):
@@ -132,16 +121,6 @@ def test_incsfa_follows_what_is_slow() -> None:
     y = sfa.transform(np.stack([slow + quick, quick], axis=1)[20_000:])
     assert correlation(y[:, 0], slow[20_000:]) > 0.99
     np.testing.assert_allclose(sfa.slowness_, slowness(y), rtol=0.1)
-
-
-@BOTH
-def test_too_few_samples_give_no_feature_yet(make: Make) -> None:
-    sfa = make().partial_fit([[1.0, 2.0]])
-    assert np.isnan(sfa.slowness_).all()
-    assert sfa.transform([[1.0, 2.0]]).shape == (1, 1)
-    constant = make().fit(np.ones((50, 3)))
-    assert np.isnan(constant.slowness_).all()
-    np.testing.assert_array_equal(constant.transform(np.ones((2, 3))), 0.0)
 
 
 @BOTH

@@ -6,8 +6,6 @@ import csv
 import json
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from run_data import VECTOR, write_run
@@ -59,19 +57,6 @@ def test_a_file_holds_every_number_and_its_metadata(form, read, run):
             signal.dims,
         ]
     assert json.loads(manifest)["config"]["learner"]["tau"] == 40
-
-
-def test_what_is_missing_is_null_and_nothing_is_nan(run):
-    folder, records = run
-    export(folder, folder / "run.parquet", "parquet")
-    table = pq.read_table(folder / "run.parquet")
-    for name, signal in SIGNALS.items():
-        column = table.column(name)
-        while pa.types.is_list(column.type):
-            column = pc.list_flatten(column)
-        missing = [np.isnan(getattr(signals, name)).sum() for signals in records]
-        assert column.null_count == sum(missing)
-        assert signal.dtype != "float64" or not pc.any(pc.is_nan(column)).as_py()
 
 
 def test_csv_reads_back_exactly(run):

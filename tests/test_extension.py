@@ -51,12 +51,6 @@ def test_a_whole_trial_is_the_learner_with_an_expansion_of_ones_own(
     assert_equal(trial, *step_by_step(config, STREAMS, 5, trial.iterations))
 
 
-def test_without_an_expansion_the_trial_is_the_learner_too() -> None:
-    config = dataclasses.replace(QUICK, expansion="none", components=2)
-    trial = run_trial(config, seed=5, curves=True, max_iterations=300)
-    assert_equal(trial, *step_by_step(config, STREAMS, 5, trial.iterations))
-
-
 def test_its_modules_transform_frames(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     done = cdmisfa(
         *("learn", "oscillatory", "--set", "learner.expansion=cubic", "--no-rerun"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,16 +49,6 @@ def test_the_simplest_function_of_a_truth_is_named(function, said):
     np.testing.assert_allclose(found(phase), function(phase), atol=0.05)
 
 
-def test_no_phase_is_seen_in_what_does_not_go_round():
-    x = np.linspace(0.4, 0.6, 500)
-    found = best_fit(("box_y",), np.sin(200 * x), x)
-    assert found.function in ("box_y", "a parabola of box_y")
-    places = np.array([0.4, 0.6, 0.4, 0.6])
-    found = best_fit(("box_y",), np.array([1.0, 3.0, 1.0, 3.0]), places)
-    assert found.function == "box_y"
-    np.testing.assert_allclose(found(np.array([0.4, 0.6])), [1.0, 3.0])
-
-
 def heard(run: Path, module, spec) -> tuple[OwnStream, np.ndarray, np.ndarray]:
     own, t, y = OwnStream(module, spec), [], []
     for batch in read_batches(run):
@@ -102,13 +91,6 @@ def test_outputs_are_those_on_every_logged_frame_of_the_stream(tmp_path: Path, s
         np.testing.assert_array_equal(pick.frame, every[pick.t])
 
 
-def test_weights_of_an_expansion_are_no_picture(tmp_path: Path) -> None:
-    write_run(tmp_path / "run.mcap", VECTOR, 6)
-    module = replace(module_of(1, 3, np.ones((1, 5))), expansion="quadratic")
-    own, *_ = heard(tmp_path / "run.mcap", module, VECTOR)
-    assert own.saliency() is None
-
-
 @given(st.lists(st.integers(0, 400)), st.integers(2, 90))
 def test_rows_kept_do_not_depend_on_how_they_came(sizes: list[int], most: int) -> None:
     parts, one = Thinned(most), Thinned(most)
@@ -121,11 +103,3 @@ def test_rows_kept_do_not_depend_on_how_they_came(sizes: list[int], most: int) -
     assert len(kept) == one.count if one.step == 1 else most // 4 <= len(kept) <= most
     if len(kept) > 1:
         assert max(np.diff([*kept, len(numbers)])) <= 3 * one.step
-
-
-@pytest.mark.parametrize("period", [2, 3, 4, 8, 40])
-def test_rows_kept_of_something_periodic_show_every_phase_of_it(period: int) -> None:
-    rows = Thinned(500)
-    rows.add(np.arange(20_000) % period)
-    phases = np.bincount(rows.columns[0], minlength=period)
-    assert phases.min() > 0.6 * phases.mean()

@@ -22,11 +22,6 @@ def ask(mean: np.ndarray, sd: np.ndarray, y: np.ndarray = Y) -> int:
     return recognised(y, mean, sd)[0]
 
 
-def test_without_modules_everything_is_novel() -> None:
-    none = np.empty((0, 1))
-    assert ask(none, none, np.empty((0, 40, 1))) == NOVEL
-
-
 def test_the_slowness_of_every_module_is_reported() -> None:
     np.testing.assert_array_equal(recognised(Y, np.zeros((3, 2)), SD)[1], ETA)
 

@@ -105,26 +105,6 @@ def test_a_share_of_what_is_learned_from_once_is_held_out(
     assert (few in done.err) == ("15" in options)
 
 
-def test_what_never_is_held_out_is_refused_where_it_is_asked_for(
-    cdmisfa: Cdmisfa, log: Path, oscillatory_recording: Path
-) -> None:
-    share = ("--set", "input.holdout=0.2")
-    for words in (
-        ("oscillatory",),
-        (oscillatory_recording,),
-        (oscillatory_recording, "--algorithm", "progress"),
-        (log, "--set", "input.time=t", "--loop"),
-        (log, "--set", "input.time=t", "--algorithm", "2.0"),
-        ("av:lavfi:testsrc",),
-    ):
-        refused = cdmisfa("learn", *words, *share)
-        assert refused.code == 2
-        assert "input.holdout" in refused.err
-    assert cdmisfa("learn", log, "--set", "input.holdout=0.95").code == 2
-    recorded = cdmisfa("learn", oscillatory_recording, "--algorithm", "progress", "--json")
-    assert "held_out" not in recorded.json
-
-
 def test_going_on_keeps_to_what_the_run_learns_from(
     cdmisfa: Cdmisfa, log: Path, tmp_path: Path
 ) -> None:

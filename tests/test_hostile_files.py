@@ -22,7 +22,6 @@ from cdmisfa.experiments.results import results
 from cdmisfa.experiments.store import ROWS, read_rows
 from cdmisfa.modules import Module
 from recorder.log.logfile import LogFile
-from recorder.mcap.records import KINDS
 from replay.integrity.info import describe
 from replay.logs.formats.images import MAX_IMAGE, image_files
 from replay.runs.folders import REQUEST, RUN_METADATA, read_run_json
@@ -180,19 +179,3 @@ def test_what_is_no_file_is_refused_by_every_command(
         command, *options = way.split()
         done = cdmisfa(command, name, *options)
         assert (done.code, done.err.count("\n"), name in done.err) == (2, 1, True), (way, done.err)
-
-
-@pytest.mark.parametrize("ending", ["flv", "tiff"])
-def test_of_what_is_no_log_it_is_said_which_kinds_are(
-    cdmisfa: Cdmisfa, tmp_path: Path, ending: str
-) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    (folder / f"a.{ending}").write_bytes(b"GIF89a" * 99)
-    for path, what in ((folder / f"a.{ending}", "no log that is read"), (folder, "no log in this")):
-        for command in ("info", "verify", "learn"):
-            done = cdmisfa(command, path)
-            assert (done.code, done.err.count("\n")) == (2, 1)
-            assert f"{path}" in done.err
-            assert what in done.err
-            assert KINDS in done.err

@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,35 +14,8 @@ from typing import Any
 import pytest
 from conftest import Cdmisfa, Outcome
 from folders import contents
-from waiting import python
 
 from cdmisfa.cli.interrupts import SIGNALS
-
-
-def wait() -> None:
-    """Long enough for anything that comes again."""
-    time.sleep(5)
-
-
-IN_THE_BEGINNING = """
-import signal, sys
-
-class Finder:
-    def find_spec(self, name, *_):
-        if name == "click":
-            signal.raise_signal(int(sys.argv.pop()))
-
-sys.meta_path.insert(0, Finder())
-from cdmisfa.cli import main
-main()
-"""
-
-
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_while_the_command_line_is_imported_says_so(number: signal.Signals) -> None:
-    done = python("-c", IN_THE_BEGINNING, int(number))
-    assert (done.returncode, done.stderr) == (128 + number, "cdmisfa: interrupted\n")
-
 
 LEARN = ("learn", "oscillatory", "--set", "learner.tau=10", "--max-iterations", 3)
 RECORD = ("record", "oscillatory", "--frames", 20, "--view", "x1")

@@ -17,7 +17,7 @@ from PIL import Image
 from cdmisfa import Run
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.cli import run
-from cdmisfa.core.errors import NotReproducedError, UsageError
+from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.resume import Recomputation, check_run
@@ -27,7 +27,6 @@ from recorder.mcap.reader import LogReader
 from replay.runs.compare import first_difference
 from replay.runs.keyframes import encode_keyframe, read_keyframe
 from replay.runs.log import read_header
-from replay.runs.run import read_outline
 
 EASY = ("learner.tau=40", "learner.eta_dot_window=8", "learner.warm_up=3", "learner.delta=1.0")
 EASIER = (*EASY, "learner.min_variance=1e-6", "learner.novel_share=0.0")
@@ -209,21 +208,6 @@ def test_a_keyframe_that_lies_is_found_out(
     assert cdmisfa("check", tmp_path / "run", "--iterations", "10:", "--json").code == 4
 
 
-@pytest.mark.parametrize(
-    ("asked", "why"),
-    [
-        (lambda run: Run(run).at(131), "holds 130 iterations"),
-        (lambda run: check_run(run, stop=131), "holds 130 iterations"),
-        (lambda run: check_run(run, start=20, stop=10), "holds 20 iterations"),
-    ],
-)
-def test_a_moment_that_is_not_there_is_refused(
-    place: Path, asked: Callable[[Path], object], why: str
-) -> None:
-    with pytest.raises(UsageError, match=why):
-        asked(place / "2.0-live")
-
-
 def test_without_its_source_a_run_has_its_keyframes(
     tmp_path: Path, cdmisfa: Cdmisfa, keyframes_every: Callable[[int], None]
 ) -> None:
@@ -329,35 +313,3 @@ def test_forks_of_forks_are_resumed_and_checked(
 
 
 SAME, OTHER = "the same was learned, at other iterations", "what was learned differs"
-SIGNALS_OF = "signals of iteration 20 that differ:"
-
-
-def test_compare_says_what_differs_and_shows_both(
-    place: Path, tmp_path: Path, cdmisfa: Cdmisfa
-) -> None:
-    parent, fork = place / "2.0-live", tmp_path / "fork"
-    with Session.fork(parent, 20, fork, settings=["learner.epsilon_decay=0.5"], seed=8) as session:
-        session.learn(rerun=False)
-    found = cdmisfa("compare", parent, fork)
-    assert found.code == 4
-    told = "fork has other settings: learner.epsilon_decay 0.999 against 0.5; seed 3 against 8"
-    assert told in found.out
-    lines = found.out.splitlines()
-    shown = [line.split()[0] for line in lines[lines.index(SIGNALS_OF) + 3 :]]
-    assert "epsilon" in shown
-    assert "t" not in shown
-    document = cdmisfa("compare", parent, fork, "--json").json
-    assert (document["identical"], document["first_difference"]["iteration"]) == (False, 20)
-    first, second = document["signals"]["epsilon"]
-    assert (first > second, document["signals"]["t"]) == (True, [800, 800])
-    keys = [row["key"] for row in document["runs"][1]["different_settings"]]
-    assert keys == ["learner.epsilon_decay", "seed"]
-    assert document["runs"][1]["verdict"] in (SAME, OTHER)
-    both = [read_outline(run) for run in (parent, fork)]
-    learned = [[(s.module, s.stream) for s in outline.saved] for outline in both]
-    assert lines[0] == (SAME if learned[0] == learned[1] else OTHER)
-    other = cdmisfa("compare", parent, place / "progress-live").out
-    assert other.splitlines()[0] == OTHER
-    assert "learner.algorithm 2.0 against progress; " in other
-    same = cdmisfa("compare", parent, place / "2.0-live-resumed", "--json").json
-    assert (same["signals"], same["identical"]) == ({}, True)

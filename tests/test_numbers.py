@@ -15,13 +15,12 @@ import pytest
 from conftest import Cdmisfa
 from folders import external
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from message_files import START, STEP, every, learned_alike, write_mcap, write_table
+from message_files import START, STEP, every, write_mcap, write_table
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.images.fields import Field, numbers_of
 from recorder.images.messages import MessageKind, message_decoder
 from recorder.log.messages import descriptor_set
-from replay.inputs import open_recording
 
 COUNT = 90
 JOINTS = 3
@@ -79,17 +78,6 @@ def test_what_is_not_finite_is_refused_or_kept_in_a_range() -> None:
         numbers_of([Field("ranges")], ranges, None)
     kept = numbers_of([Field("ranges")], ranges, (0.1, 10.0))
     assert kept.tolist() == [0.5, 0.1, 0.1, 10.0, 0.1]
-
-
-def test_null_is_no_finite_number_and_a_missing_key_is_an_error() -> None:
-    message = {"a": None, "p": {"x": None}, "l": [1, None], "q": None}
-    for path in ("a", "p.x", "l", "q.x"):
-        with pytest.raises(UsageError, match=r"holds NaN or null at place .* as --set input.range"):
-            numbers_of([Field(path)], message, None)
-    fields = [Field(path) for path in ("a", "p.x", "l", "q.x", "q[0]")]
-    assert numbers_of(fields, message, (-5, 9)).tolist() == [-5, -5, 1, -5, -5, -5]
-    with pytest.raises(UsageError, match="there is no a, it has no fields"):
-        numbers_of([Field("a")], {}, (0, 1))
 
 
 def angles(count: int = COUNT) -> np.ndarray:
@@ -277,20 +265,6 @@ def test_what_a_table_lacks_is_said(options: Any, why: str, tmp_path: Path) -> N
         external(write_table(tmp_path / "t.csv", columns), **options)
 
 
-def test_streams_that_differ_are_not_learned_from_together(tmp_path: Path) -> None:
-    one = write_table(tmp_path / "one.csv", {"a": [1.0, 2.0], "b": [1.0, 2.0]})
-    two = write_table(tmp_path / "two.csv", {"a": [1.0, 2.0]})
-    with pytest.raises(UsageError, match="these show 2 numbers and 1 number: take as many"):
-        external([one, two], rate=5)
-    ragged = (json.dumps({"p": [0] * (3 - i % 2)}).encode() for i in range(9))
-    path = write_mcap(tmp_path / "r.mcap", MessageKind("p", "json"), {"/p": every(STEP, ragged)})
-    with (
-        external(path, fields=["p"]) as source,
-        pytest.raises(UsageError, match=r"holds 2 numbers, and the first 3.*position\[0:2\]"),
-    ):
-        source.take(0, 2)
-
-
 def test_a_slow_sine_hidden_in_fields_of_noise_is_learned(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     rng = np.random.default_rng(20)
     t = np.arange(4000)
@@ -314,18 +288,3 @@ def test_a_slow_sine_hidden_in_fields_of_noise_is_learned(cdmisfa: Cdmisfa, tmp_
     (module,) = load_modules(run / "modules.npz")
     heard = np.asarray(module.transform(fields))[:, 0]
     assert abs(np.corrcoef(heard, sine)[0, 1]) > 0.99
-
-
-def test_commands_take_numbers_of_a_log(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    log = json_mcap(tmp_path)
-    how = ("--topic", "/joint_states", "--field", "position")
-    _, converted = learned_alike(cdmisfa, tmp_path, log, *how)["said"]
-    assert "90 messages, 0 frames repeated" in converted
-    with open_recording(tmp_path / "rec") as source:
-        assert (source.take(0, COUNT).frames == angles()).all()
-    assert cdmisfa("view", log, *how, "--save", tmp_path / "v.rrd").code == 0
-    assert cdmisfa("export", log, *how, "--to", "lerobot", "-o", tmp_path / "set").code == 0
-    refused = cdmisfa("export", log, *how, "--to", "images", "-o", tmp_path / "pngs")
-    assert (refused.code, "holds no images" in refused.err) == (2, True)
-    for command in ("info", "verify"):
-        assert cdmisfa(command, tmp_path / "rec").code == 0

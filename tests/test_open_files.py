@@ -23,7 +23,7 @@ from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap import store
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import OnePass, Store
-from recorder.recording import RecordingStoppedError, record, record_scene, recorded
+from recorder.recording import record, record_scene, recorded
 from replay.inputs import open_recording
 from replay.integrity.recover import RepairedStore
 from replay.integrity.verify import check_log
@@ -72,13 +72,6 @@ def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "a.mcap.partial"
     path.write_bytes(b"a.mcap")
     return path
-
-
-def test_a_file_that_is_being_written_is_read_on(path: Path) -> None:
-    opened = Store(path)
-    with path.open("ab") as file:
-        file.write(b", and more")
-    assert opened.read(0, 16) == b"a.mcap"
 
 
 @pytest.mark.parametrize("there", [False, True])
@@ -201,13 +194,3 @@ def test_a_missing_one_of_many_views_is_noticed(tmp_path: Path) -> None:
     (problem,) = check_log(tmp_path).problems
     assert problem.what == "of the recording's views 0 to 102 2 have no file, the first is 17"
     assert not recorded(tmp_path)
-
-
-def test_many_views_are_resumed(tmp_path: Path) -> None:
-    source = ManyViews(MOST_NAMED + 3)
-    record(source, tmp_path / "whole", frames=80)
-    calls = iter(range(1000))
-    with pytest.raises(RecordingStoppedError):
-        record(source, tmp_path / "rec", frames=80, stop=lambda: next(calls) == 120)
-    record(source, tmp_path / "rec", resume=True)
-    assert contents(tmp_path / "rec") == contents(tmp_path / "whole")

@@ -6,13 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from run_data import VECTOR, having, run_of, write_run
-from view_data import View, scalars, views_of
+from run_data import VECTOR, write_run
+from view_data import View, scalars
 
 from cdmisfa.core.errors import UsageError
 from replay.runs.compare import first_difference, side_by_side
-from replay.runs.writer import RunWriter
-from replay.view import overlay
 from replay.view.overlay import build_overlay
 
 
@@ -54,38 +52,6 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
         build_overlay(runs, side_by_side(runs), out)
     with pytest.raises(UsageError, match="no tab 'nowhere'"):
         build_overlay(runs, side_by_side(runs), out, force=True, tab="nowhere")
-
-
-def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):
-    def tell_errors_alone(signals):
-        none = {name: np.full(np.shape(getattr(signals, name)), np.nan) for name in ("eta_dot",)}
-        return dataclasses.replace(signals, **none, share=np.nan, R=np.empty((0, 2, 0)))
-
-    written = write_run(tmp_path / "run.mcap", VECTOR, 12, edit=tell_errors_alone)
-    tabs = []
-
-    def take(*found, **_):
-        tabs.extend(found)
-        return blueprint(*found, name="Comparison")
-
-    blueprint = overlay.blueprint
-    monkeypatch.setattr(overlay, "blueprint", take)
-    out = tmp_path / "all.rrd"
-    build_overlay([tmp_path], side_by_side([tmp_path]), out)
-    assert [tab.name for tab in tabs] == ["Overview", "Streams"]
-    names = [view.name for view in tabs[0].contents[1].contents]
-    assert names == [overlay.CURVES[n] for n in ("epsilon", "eta", "tested")]
-    views = [view for tab in tabs for view in views_of(tab)]
-    assert len({id(view) for view in views}) == len(views)  # a view has one place
-    found = View(out).rows
-    for view in views:
-        assert all(entity in found for entity in view.contents if isinstance(view.contents, list))
-    name = tmp_path.name
-    own = [s.iteration for s in written if s.stream == 1]
-    curve = found[f"/compare/1_{name}/learning_error/2_x2"]
-    assert own == [0, 2, 9]
-    assert curve["iteration"] == [0, 2, 2, 9, 9]  # it ends where another stream is watched
-    assert np.isnan(scalars(curve)).ravel().tolist() == [False, True, False, True, False]
 
 
 def test_the_command_exits_with_4_only_for_two_that_differ(three, tmp_path, cdmisfa):
@@ -142,15 +108,3 @@ def test_equal_runs_have_no_difference_and_one_nan_is_as_good_as_another(tmp_pat
     write_run(tmp_path / "a", VECTOR, 8, seed=3)
     write_changed(tmp_path / "b", 5, "reward", change)
     assert first_difference(tmp_path / "a", tmp_path / "b") is None
-
-
-def test_a_run_that_ended_early_is_said_so(tmp_path):
-    write_run(tmp_path / "a", VECTOR, 8, seed=3)
-    writer = RunWriter(tmp_path / "b", VECTOR, {})
-    for signals, block in list(run_of(VECTOR, 8, seed=3))[:6]:
-        writer.block(block, signals, having(np.zeros((1, 2))))
-    writer.close()
-    difference = first_difference(tmp_path / "a", tmp_path / "b")
-    assert (
-        str(difference) == "iteration 6: the first continues, the second ended after 6 iterations"
-    )

@@ -40,16 +40,6 @@ def test_files_that_a_page_names_are_there(page: Path) -> None:
     assert [file for file in named if not (ROOT / file).exists()] == []
 
 
-def test_every_guarantee_names_the_tests_that_hold_it() -> None:
-    pages = (
-        ROOT / "docs" / "explanation" / f"{name}.md" for name in ("bits", "guarantees", "trust")
-    )
-    text = "".join(page.read_text("utf-8") for page in pages)
-    for section in re.split("^##? ", text, flags=re.MULTILINE)[1:]:
-        held = re.search(r"\b(tests|tools)/[\w/]+\.py", section)
-        assert held or len(section.splitlines()) < 3, section.partition("\n")[0]
-
-
 def test_every_picture_is_small_accounted_for_and_shown() -> None:
     pages = {page: page.read_text("utf-8") for page in PAGES}
     card = pages.pop(IMAGES / "README.md")

@@ -89,17 +89,6 @@ def test_the_sum_of_values_is_the_dense_one(
     assert got == pytest.approx(V.sum(), rel=1e-9, abs=1e-9 * np.abs(V).sum())
 
 
-@settings(deadline=None)
-@given(problems())
-def test_where_it_starts_does_not_matter(
-    problem: tuple[np.ndarray, np.ndarray, int, float, np.ndarray],
-) -> None:
-    stay, switch, count, gamma, start = problem
-    np.testing.assert_array_equal(
-        solve(stay, switch, count, gamma, start)[0], solve(stay, switch, count, gamma)[0]
-    )
-
-
 def lstd_q(
     samples: list[tuple[int, int, float, int]], policy: np.ndarray, gamma: float
 ) -> np.ndarray:
@@ -128,12 +117,6 @@ def test_policy_iteration_is_lspi_with_indicator_features(n: int, gamma: float, 
     for _ in range(20):
         start = lstd_q(samples, start, gamma).argmax(axis=1)
     assert policy.tolist() == start.tolist()
-
-
-def test_one_stream_stays() -> None:
-    policy, Q = solve(np.array([3.0]), np.array([9.0]), 2, 0.5, np.array([1]))
-    assert policy.tolist() == [0]
-    assert Q.tolist() == [[3.0, 3.0]]
 
 
 @pytest.mark.parametrize("n", [2, 3, 7, 50])

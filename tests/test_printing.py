@@ -2,33 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import pytest
 from contracts.learners import CONFIG
 
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.cli import printing
 from cdmisfa.cli.progress import Bar
 from cdmisfa.experiments.loop import learn_blocks
 from recorder.world.oscillatory import OscillatorySource
-
-
-def test_a_table_on_a_terminal_fits_and_loses_nothing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rows = [("x", "one two three four five six seven"), ("y", "unbroken" * 6)]
-    printing.table(("name", "about"), rows)
-    piped = capsys.readouterr().out.splitlines()
-    assert piped[2:] == [f"{name}     {about}" for name, about in rows]
-    monkeypatch.setattr(printing.sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("COLUMNS", "24")
-    printing.table(("name", "about"), rows)
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 24
-    said = "".join(itertools.chain.from_iterable(line[6:].split() for line in lines[1:]))
-    assert said == "".join(about.replace(" ", "") for _, about in rows)
 
 
 class Seen(Bar):

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -93,44 +92,6 @@ def killed_while_sending(size: int, seconds: float) -> None:
 def test_one_that_is_killed_while_it_sends_ends_the_work(size: int, seconds: float) -> None:
     with pytest.raises(WorkersError, match="a worker process was killed"):
         killed_while_sending(size, seconds)
-
-
-def killed_after(seconds: float, number: int) -> None:
-    """Kill a worker while many results of all sizes come, and wait for these."""
-    with workers(2) as submit:
-        submit(abs, 1).result()
-        pids = [child.pid for child in psutil.Process().children() if _is_worker(child)]
-        futures = [submit(bytes, size) for size in (100, 30_000, 5_000_000) * 100]
-        time.sleep(seconds)
-        os.kill(pids[number % len(pids)], signal.SIGKILL)
-        start = time.monotonic()
-        try:
-            for future in futures:
-                future.result(timeout=30)
-            submit(abs, 1).result()
-        finally:
-            assert time.monotonic() - start < 5
-
-
-@pytest.mark.parametrize("number", range(5))
-def test_one_that_is_killed_at_any_time_ends_the_work_soon(number: int) -> None:
-    with pytest.raises(WorkersError, match="a worker process was killed"):
-        killed_after(0.03 * number, number)
-
-
-def _is_worker(process: psutil.Process) -> bool:
-    return "popen_loky_posix" in " ".join(process.cmdline())
-
-
-def test_errors_come_back_and_what_cannot_be_sent_is_one() -> None:
-    with workers(1) as submit:
-        for asked, error in (
-            (submit(int, "x"), ValueError),
-            (submit(threading.Lock), TypeError),
-        ):
-            with pytest.raises(error):
-                asked.result(timeout=60)
-        assert submit(abs, -3).result(timeout=60) == 3
 
 
 def test_they_have_their_environment_before_anything_is_imported(tmp_path: Path) -> None:

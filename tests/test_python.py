@@ -14,8 +14,6 @@ import pytest
 from conftest import Cdmisfa
 from contracts.sources import SourceContract
 from PIL import Image
-from view_data import View
-from waiting import python
 
 import cdmisfa
 from cdmisfa import Recording, Run, learn
@@ -123,29 +121,6 @@ def test_what_cannot_be_learned_from_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("show", [numbers, lambda: pictures(12, 16)])
-def test_files_of_arrays_are_looked_at_and_converted(
-    show: Any, cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    shown = show()
-    np.savez_compressed(tmp_path / "x.npz", a=shown, b=shown[::-1])
-    np.save(tmp_path / "y.npy", shown)
-    told = cdmisfa("info", tmp_path / "x.npz", tmp_path / "y.npy", "--json").json
-    assert [(c["topic"], c["messages"]) for c in told["channels"]] == [
-        (name, len(shown)) for name in ("a", "b", "y")
-    ]
-    assert told["state"] == "whole"
-    done = cdmisfa("convert", tmp_path / "x.npz", "-o", tmp_path / "rec")
-    assert done.code == 0, done.err
-    recorded, held = Recording(tmp_path / "rec"), Recording(tmp_path / "x.npz")
-    for stream in ("a", "b"):
-        frames = recorded.frames(stream, 0, len(shown))
-        np.testing.assert_array_equal(frames, held.frames(stream, 0, len(shown)))
-    assert cdmisfa("view", tmp_path / "x.npz", "--save", tmp_path / "v.rrd").code == 0
-    first = View(tmp_path / "v.rrd").rows["/views/1_a"]
-    assert first["frame"][:2] == ([0, 10] if shown.ndim > 2 else [0, 1])
-
-
 def test_files_of_arrays_are_logs_that_runs_find_again(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     arrays = {"a": numbers(), "b": numbers()[::-1]}
     np.savez_compressed(tmp_path / "x.npz", **arrays)
@@ -222,15 +197,6 @@ def test_what_is_shown_is_short_with_a_small_picture(given: Any) -> None:
         with Image.open(io.BytesIO(base64.b64decode(png[1]))) as picture:
             assert max(picture.size) <= 960
     assert len(repr(learn(given, **FEW).signals)) < 500
-
-
-def test_the_library_lists_what_a_user_needs_and_explains_each() -> None:
-    names = [name for name in dir(cdmisfa) if not name.startswith("_")]
-    for name in names:
-        assert getattr(cdmisfa, name).__doc__, name
-    for name in ("learn", "Run", "Recording"):
-        done = python("-c", f"import cdmisfa; help(cdmisfa.{name})", check=True)
-        assert "Raises:" in done.stdout
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import sys
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from camera_files import write_cameras
 from conftest import Cdmisfa
 from web_server import WebServer, serving
 
@@ -19,7 +17,6 @@ fsspec = pytest.importorskip("fsspec")
 pytest.importorskip("aiohttp")
 
 QUICK = ("--max-iterations", "6", "--json")
-BOTH = ("--topic", "/left", "--topic", "/right", "--size", "16x12")
 
 
 @pytest.fixture
@@ -47,20 +44,6 @@ def test_the_signals_are_those_of_the_files(
     words = ("learn", "-o", tmp_path / "run", "--resume", "--max-iterations", "9", "--json")
     assert cdmisfa(*words).json["iterations"] == 9
     assert cdmisfa("check", tmp_path / "run").code == 0
-
-
-def test_camera_logs_and_tables_are_read(cdmisfa: Cdmisfa, web: WebServer, tmp_path: Path) -> None:
-    write_cameras(tmp_path / "a.mcap", {"/left": (60, 20), "/right": (60, 20)})
-    (tmp_path / "t.csv").write_text("s,a\n" + "".join(f"{i / 10},{i % 7}\n" for i in range(90)))
-    for name in ("a.mcap", "t.csv"):
-        web.files[f"/{name}"] = (tmp_path / name).read_bytes()
-    words = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
-    near = cdmisfa("learn", tmp_path / "a.mcap", *BOTH, *words)
-    assert cdmisfa("convert", web.url("/a.mcap"), *BOTH, "-o", tmp_path / "rec").code == 0
-    far = cdmisfa("learn", tmp_path / "rec", *words)
-    assert far.json["signals_sha256"] == near.json["signals_sha256"]
-    near, far = (cdmisfa("info", p, "--json") for p in (tmp_path / "t.csv", web.url("/t.csv")))
-    assert far.json["channels"] == near.json["channels"]
 
 
 def test_a_run_is_viewed_exported_and_compared(
@@ -160,13 +143,3 @@ def test_the_logs_below_an_s3_prefix_are_a_recording(
     assert far.json["signals_sha256"] == near.json["signals_sha256"]
     assert not (location("s3://logs/rec") / "notes.txt").exists()
     assert cdmisfa("info", "s3://logs/rec/x1.mcap").code == 0
-
-
-def test_without_the_packages_the_extra_is_named(
-    cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "fsspec", None)
-    done = cdmisfa("info", "https://127.0.0.1/a.mcap")
-    assert (done.code, done.err.count("\n"), "pip install 'cdmisfa[cloud]'" in done.err) == (
-        *(2, 1, True),
-    ), done.err

@@ -15,7 +15,6 @@ from run_data import IMAGE, PROGRESS, VECTOR, by_progress, module_of, write_run
 
 import cdmisfa as library
 from cdmisfa.agents.progress import judging
-from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments import reports
 from cdmisfa.experiments.reports import write_report
 from cdmisfa.experiments.run_folder import command_again
@@ -72,17 +71,6 @@ def test_the_progress_learner_is_measured_by_its_own_rules(tmp_path: Path) -> No
     rules = {rule.name: rule for rule in measurements_of(outline)}
     disagreement = np.abs(np.log(outline.lines["tested"] / outline.lines["fitted"]))
     np.testing.assert_array_equal(rules["disagreement"].holds, disagreement < 0.25)
-
-
-def test_the_report_of_a_fork_names_its_parent_and_its_changes(
-    cdmisfa: Cdmisfa, run: Path, tmp_path: Path
-) -> None:
-    fork, at = tmp_path / "fork", read_outline(run).saved[0].iteration + 5
-    words = ("--iteration", at, "--set", "learner.delta=1e-9", "-o", fork, "--no-rerun")
-    assert cdmisfa("fork", run, *words, "--max-iterations", at + 40).code == 0
-    text = Page(fork / "report.html").text
-    assert f"run after {at} iterations; learner.delta: 0.02 → 1e-09" in text
-    assert f"cdmisfa compare {run} {fork}" in text
 
 
 def test_the_page_shows_the_data_of_the_run(run: Path) -> None:
@@ -251,14 +239,6 @@ def test_the_command_that_learns_a_run_again_does(cdmisfa: Cdmisfa, tmp_path: Pa
     assert again[:2] == ["cdmisfa", "learn"]
     assert cdmisfa(*again[1:-1], second, "--no-rerun").code == 0
     assert cdmisfa("compare", first, second).out == "identical, bit for bit\n"
-
-
-def test_a_run_in_python_writes_its_report(run: Path, tmp_path: Path) -> None:
-    page = library.Run(run).report(tmp_path / "mine.html")
-    assert page == tmp_path / "mine.html"
-    with pytest.raises(UsageError, match="exists"):
-        library.Run(run).report(page)
-    assert library.Run(run).report() == run / "report.html"
 
 
 def test_memory_does_not_grow_with_the_run(tmp_path: Path) -> None:

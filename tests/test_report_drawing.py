@@ -5,24 +5,8 @@ from __future__ import annotations
 import re
 
 import numpy as np
-import pytest
 
 from replay.report.drawing import Axis, Plot
-
-
-@pytest.mark.parametrize(
-    ("start", "stop", "log", "most", "expected"),
-    [
-        (0, 100, False, 5, [0, 20, 40, 60, 80, 100]),
-        (0.0003, 0.05, True, 4, [0.001, 0.01]),
-        (-1.2, 1.3, False, 3, [-1, 0, 1]),
-        (3, 3, False, 3, [3]),
-    ],
-)
-def test_ticks_are_round(
-    start: float, stop: float, log: bool, most: int, expected: list[float]
-) -> None:
-    assert Axis(start, stop, 100, log).ticks(most) == pytest.approx(expected)
 
 
 def test_a_curve_keeps_its_extremes_and_its_gaps() -> None:

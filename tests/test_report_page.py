@@ -21,10 +21,6 @@ from cdmisfa.experiments.reports import write_report
 
 pytestmark = pytest.mark.system  # a browser
 
-DISPLAYED = (
-    "return [...document.querySelectorAll(arguments[0])].map(e => getComputedStyle(e).display)"
-)
-
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
@@ -126,22 +122,6 @@ def test_everybody_can_read_it(
         found = browser.execute_async_script("axe.run().then(arguments[0])")
         assert [(v["id"], v["nodes"][0]["html"]) for v in found["violations"]] == []
         assert len(found["passes"]) > 10
-
-
-def test_dark_is_dark_and_paper_is_white(browser: Any, report: Path) -> None:
-    def light() -> float:
-        found = browser.execute_script("return getComputedStyle(document.body).backgroundColor")
-        return sum(int(part) for part in found[4:-1].split(","))
-
-    shown(browser, report, mode="light")
-    assert light() > 700
-    shown(browser, report, mode="dark")
-    assert light() < 150
-    shown(browser, report, mode="dark", media="print")
-    assert light() > 700
-    assert set(browser.execute_script(DISPLAYED, "button, .tip, .pointing")) == {"none"}
-    printed = browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": True})
-    assert base64.b64decode(printed["data"]).startswith(b"%PDF")
 
 
 def test_it_loads_nothing_and_runs_no_other_script(browser: Any, report: Path) -> None:

@@ -10,9 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.agent import (
     add_reward,
-    choose,
     curiosity_reward,
-    decay,
     expert_reward,
     other_stream,
 )
@@ -63,22 +61,6 @@ def test_the_mean_reward_is_the_papers_recursion(
         np.testing.assert_allclose(dense / t, R, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(stay / t, R[:, 0].sum(1), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(switch / t, R[:, 1].sum(1), rtol=1e-9, atol=1e-12)
-
-
-def test_epsilon_decays_slowly_to_the_knee_and_fast_below() -> None:
-    epsilon, slow = 1.2, 0
-    while epsilon > 0.8:
-        epsilon = decay(epsilon, 0.999, 0.8, 0.95)
-        slow += 1
-    assert slow == np.ceil(np.log(0.8 / 1.2) / np.log(0.999))
-    assert decay(epsilon, 0.999, 0.8, 0.95) == epsilon * 0.95
-    assert decay(0.8, 0.999, 0.8, 0.95) == 0.8 * 0.95
-
-
-def test_the_coin_is_compared_with_epsilon() -> None:
-    assert choose(0.3, 0, 0.29, 0.9) == (1, True)
-    assert choose(0.3, 0, 0.3, 0.9) == (0, False)
-    assert choose(0.0, 1, 0.0, 0.2) == (1, False)
 
 
 @pytest.mark.parametrize("n", [2, 3, 7])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 from dataclasses import asdict
 
@@ -59,14 +58,6 @@ def test_bytes_that_are_no_record_fail_in_words_or_not_at_all(data):
         decode_signals(data, "here")
     with contextlib.suppress(LogDamagedError):
         list(decode_matrices([data], "here"))
-
-
-def test_a_record_whose_sizes_lie_is_refused():
-    rng = np.random.default_rng(0)
-    data = encode_signals(signals_of(VECTOR, 1, rng, tau=77, modules=0))
-    at = data.rindex(bytes((77, 1, 0, 77, 1)))  # the sizes of y and y_frozen
-    with pytest.raises(LogDamagedError, match=r"y has 77 values for shape \(78, 1\)"):
-        decode_signals(data[:at] + b"\x4e" + data[at + 1 :])
 
 
 @pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
@@ -198,12 +189,3 @@ def test_signals_are_columns_over_all_iterations(folder):
             np.testing.assert_array_equal(column[k][inner], expected)
             if about.dims.startswith("M"):
                 assert np.isnan(column[k][len(expected) :]).all()
-
-
-def test_the_result_is_there_once_the_run_has_ended(folder):
-    path, _ = folder
-    assert Run(path).result is None
-    (path / "run.json").write_text(json.dumps({"result": {"iterations": ITERATIONS}}))
-    assert Run(path / "run.mcap").result == {"iterations": ITERATIONS}
-    (path / "run.json").write_text("{")
-    assert Run(path).result is None

@@ -53,20 +53,6 @@ def test_eta_ignores_scale_sign_and_offset(y: np.ndarray, scale: float, offset: 
         assert instantaneous_slowness(-scale * y + offset) == pytest.approx(expected, rel=1e-6)
 
 
-def test_eta_inst_tends_to_eta_when_tau_is_large() -> None:
-    rng = np.random.default_rng(1)
-    y = np.convolve(rng.standard_normal(60_100), np.ones(30) / 30, mode="valid")[:60_000]
-    whole = instantaneous_slowness(y)
-
-    def error(tau: int) -> float:
-        return float(
-            np.mean([abs(instantaneous_slowness(b) - whole) for b in y.reshape(-1, tau)]) / whole
-        )
-
-    assert error(30_000) < 0.02
-    assert error(30_000) < error(1000) < error(50)
-
-
 def test_a_signal_without_variance_has_no_slowness() -> None:
     assert slowness_by_moments(1.0, 0.0) == math.inf
     assert slowness_by_moments(1.0, -1e-20) == math.inf
@@ -80,9 +66,3 @@ def test_a_window_starts_as_the_plain_mean(values: np.ndarray) -> None:
     for k, value in enumerate(values, start=1):
         mean += window_rate(40.0, k) * (value - mean)
     assert mean == pytest.approx(np.mean(values), abs=1e-9)
-
-
-def test_a_window_ends_as_an_exponential_mean() -> None:
-    assert window_rate(40.0, 1) == 1.0
-    assert window_rate(40.0, 10**6) == 2.0 / 41.0
-    assert window_rate(1.0, 10**6) == 1.0

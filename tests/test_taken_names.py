@@ -13,10 +13,7 @@ import pytest
 from conftest import Cdmisfa
 from test_cli import assert_one_line
 
-from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
-from recorder.log.files import atomic_write
-from recorder.log.logfile import LogFile
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 
@@ -102,27 +99,6 @@ def test_two_processes_write_one_name(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
     write_json(path, {})
     assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("force", [False, True])
-def test_two_logs_of_one_name_are_not_mixed(tmp_path: Path, force: bool) -> None:
-    with LogFile(tmp_path / "a.mcap") as log:
-        log.flush()
-        with pytest.raises(UsageError, match=r"a\.mcap\.partial"):
-            LogFile(tmp_path / "a.mcap", force=force)
-        assert log.partial.stat().st_size > 0
-    assert (tmp_path / "a.mcap").exists()
-
-
-def test_on_an_error_nothing_is_left(tmp_path: Path) -> None:
-    def write() -> None:
-        with atomic_write(tmp_path / "a") as partial:
-            partial.mkdir()
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        write()
-    assert not list(tmp_path.iterdir())
 
 
 def names(folder: Path) -> set[str]:

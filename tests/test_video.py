@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_video
-from conftest import Cdmisfa
 from folders import external
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -112,18 +111,6 @@ def test_times_are_those_of_the_video(tmp_path: Path) -> None:
     np.testing.assert_array_equal(a[17], expected[22])
 
 
-def test_what_is_no_video_is_one_line(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    write_video(path, pictures(60), codec="libx264", pixels="yuv420p")
-    whole = path.read_bytes()
-    for data in (b"", b"no video", whole[: len(whole) // 2], bytes(5000)):
-        path.write_bytes(data)
-        for command in (("learn",), ("convert", "-o", tmp_path / "rec")):
-            done = cdmisfa(command[0], path, *command[1:])
-            assert (done.code, done.err.count("\n")) == (3, 1), done.err
-            assert done.err.startswith(f"cdmisfa: {path}: ")
-
-
 def test_damage_within_a_video_is_found_where_ffmpeg_sees_it(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write_video(path, pictures(60), codec="libx264", pixels="yuv420p")
@@ -134,14 +121,3 @@ def test_damage_within_a_video_is_found_where_ffmpeg_sees_it(tmp_path: Path) -> 
     path.write_bytes(bytes(data))
     with pytest.raises(LogDamagedError, match=r"a\.mp4: (at|FFmpeg)"):
         external(path, size=SIZE).take(0, 60)
-
-
-def test_a_video_that_lost_its_end_says_so(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mkv", pictures(100))
-    data = (tmp_path / "a.mkv").read_bytes()
-    (tmp_path / "a.mkv").write_bytes(data[: len(data) // 3])
-    source = external(tmp_path / "a.mkv", size=SIZE)
-    assert source.spec.length is not None
-    assert source.spec.length < 50
-    assert any("it states 4 s, its last frame is at" in said for said in source.warnings)
-    source.close()

@@ -196,14 +196,6 @@ def test_a_moment_is_a_frame_an_iteration_or_an_event(cdmisfa: Cdmisfa, tmp_path
             frame_at(tmp_path, wrong)
 
 
-def test_a_view_that_is_built_has_no_other_open_tab(tmp_path):
-    write_run(tmp_path / "run.mcap", VECTOR, 3)
-    build_view(tmp_path, tmp_path / "run.rrd", tab="MODULES")
-    shown = view_of(tmp_path / "run.rrd", tab="Gate")
-    with pytest.raises(UsageError, match="is built already"), shown:
-        pass
-
-
 def test_a_port_that_is_taken_is_refused_in_one_line(tmp_path, cdmisfa: Cdmisfa):
     write_run(tmp_path / "run.mcap", VECTOR, 2)
     with socket.create_server(("127.0.0.1", 0)) as taken:
@@ -224,20 +216,6 @@ def test_without_a_driver_the_remedy_is_printed_once_the_input_is_right(
     for path, words in ((tmp_path, "mesa-vulkan-drivers"), (tmp_path / "other.rrd", "no file of")):
         done = cdmisfa("view", path, "--screenshot", tmp_path / "s.png")
         assert (done.code, words in done.err) == (2, True), done
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is a display")
-def test_without_a_display_other_ways_are_named(tmp_path, monkeypatch, cdmisfa: Cdmisfa):
-    write_run(tmp_path / "run.mcap", VECTOR, 2)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    done = cdmisfa("view", tmp_path)
-    assert (done.code, "no display" in done.err, "--web" in done.err) == (1, True, True)
-
-
-def test_a_program_that_fails_is_quoted():
-    with pytest.raises(CdmisfaError, match="with code 2: "), Program("--no-such") as program:
-        program.until_end()
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's /proc")

@@ -80,24 +80,6 @@ def test_our_policy_gives_the_signals_of_a_run(algorithm: str) -> None:
         assert truncated == (ended == "max_iterations")
 
 
-@pytest.mark.parametrize("algorithm", LEARNED)
-def test_what_others_choose_is_watched(algorithm: str) -> None:
-    env = WatchEnv(OscillatorySource(), algorithm, **SETTINGS[algorithm])
-    rng = np.random.default_rng(0)
-    env.reset(seed=0)
-    rewards = []
-    for _ in range(200):
-        action = int(rng.integers(3))
-        _, reward, over, _, _ = env.step(action)
-        signals: Any = env.signals
-        assert signals.stream == action
-        rewards.append(reward)
-        if over:
-            break
-    assert np.any(rewards)
-    assert np.isfinite(rewards).all()
-
-
 def test_observations_are_what_was_watched() -> None:
     arrays, env = pictures(), WatchEnv(ArraySource(pictures()), tau=20)
     seen, _ = env.reset(seed=0)
@@ -127,19 +109,6 @@ def test_where_the_source_ends_it_is_truncated() -> None:
     env.reset(seed=0)
     with pytest.raises(LogExhaustedError, match="20 frames are left"):
         env.step(0)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: WatchEnv(OscillatorySource(), "progres"), "progres"),
-        (lambda: WatchEnv(OscillatorySource(), taus=3), "unknown key learner.taus"),
-        (lambda: WatchEnv(OscillatorySource()).step(0), r"call reset\(\)"),
-    ],
-)
-def test_what_it_cannot_take_is_refused(make: Any, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        make()
 
 
 def test_the_example_of_ppo_runs(tmp_path: Path) -> None:
