@@ -28,9 +28,7 @@ def hostile_log(folder: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    "words", ["info", "verify", "learn", "convert -o rec", "export -o x.parquet"]
-)
+@pytest.mark.parametrize("words", ["info", "verify", "learn", "convert -o rec"])
 def test_names_in_logs_do_not_steer_the_terminal(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:

@@ -85,8 +85,3 @@ def test_an_abrupt_swap_takes_the_signal_but_not_the_clock() -> None:
 def test_unknown_streams_are_named_with_the_known_ones() -> None:
     with pytest.raises(UsageError, match="'x9': there are x1, x2, x3, zero"):
         OscillatorySource(("x1", "x9"))
-
-
-def test_a_source_has_at_least_one_stream() -> None:
-    with pytest.raises(UsageError, match="at least one stream"):
-        OscillatorySource(())
