@@ -143,7 +143,7 @@ def test_a_write_that_failed_is_named_once_and_for_all(tmp_path, aside):
 
 
 def test_a_full_disk_is_an_error_and_not_a_loss(tmp_path, monkeypatch):
-    monkeypatch.setattr("recorder.log.logfile.refuse_special", lambda _: None)
+    monkeypatch.setattr("recorder.log.files.refuse_special", lambda _: None)
     (tmp_path / "a.mcap.partial").symlink_to("/dev/full")
     log = LogFile(tmp_path / "a.mcap", force=True)
     with pytest.raises(LogWriteError, match="No space left"):

@@ -274,7 +274,7 @@ def test_a_finished_recording_is_made_longer_and_never_shorter(oscillatory, tmp_
         ({"views": ["left"]}, "no view 'left': name one of x1, x2, x3"),
         ({"force": True, "resume": True}, "one of them"),
         ({"settings": RecordConfig(fps=25)}, r"x3\.mcap cannot be continued: its fps is '50\.0'"),
-        ({}, r"x2\.mcap holds no frames of x2"),
+        ({}, r"x2\.mcap is there, but not frame 0 of x2"),
     ],
 )
 def test_what_cannot_be_resumed_is_named_and_nothing_changes(tmp_path, options, words):

@@ -52,10 +52,9 @@ def refuse_file(folder: Path) -> None:
 def refuse_taken(path: Path, *, force: bool) -> None:
     """Refuse to write a file where something is; with `force`, where that is no file."""
     refuse_special(path)
-    if path.is_dir():
-        raise UsageError(f"{path} is a folder: name the file to write")
-    if path.exists() and not force:
-        raise UsageError(f"{path} exists: choose another name or overwrite with --force")
+    if path.is_dir() or (path.exists() and not force):
+        what = "is a folder" if path.is_dir() else "exists"
+        raise UsageError(f"{path} {what}: choose another name, or overwrite a file with --force")
 
 
 def refuse_unless(path: Path, what: str, *endings: str) -> None:

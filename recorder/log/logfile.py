@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Final, Self
 from weakref import WeakSet
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-from recorder.log.files import partial_path, refuse_special, refuse_taken, to_disk
+from recorder.log.files import partial_path, refuse_taken, to_disk
 from recorder.mcap.store import OPEN_FILES
 from recorder.mcap.writer import McapWriter
 
@@ -126,17 +126,17 @@ class AppendOnlyFile:
         """Keep other processes from writing the file while it is open."""
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+            # Another process may have given it its final name since it was opened here.
+            mine = os.path.samestat(os.stat(self._path), os.fstat(file.fileno()))
+        except (BlockingIOError, FileNotFoundError):
+            mine = False
+        except OSError:
+            mine = True  # a file system without locks: nothing can be held there
+        if not mine:
             raise UsageError(
                 f"{self._path} is being written by another process: wait for it, or choose another "
                 "name"
-            ) from error
-        except OSError:
-            return  # a file system without locks: nothing can be held there
-        # The other process may have given it its final name since it was opened here.
-        opened = os.fstat(file.fileno())
-        if not (self._path.exists() and os.path.samestat(os.stat(self._path), opened)):
-            raise UsageError(f"{self._path} was just finished by another process")
+            )
 
 
 _STAY_OPEN: Final[WeakSet[AppendOnlyFile]] = WeakSet()
@@ -185,12 +185,7 @@ class LogFile(McapWriter):
         self._chunk_start: int | None = None
         self._named_on_disk = False
         refuse_taken(self.path, force=force)
-        refuse_special(self.partial)
-        if self.partial.exists() and not force:
-            raise UsageError(
-                f"{self.partial} is left from a writing that was cut short: "
-                "recover or remove it, or overwrite with --force"
-            )
+        refuse_taken(self.partial, force=force)
         self._stream = AppendOnlyFile(self.partial)
         try:
             super().__init__(self._stream, **options)

@@ -179,11 +179,17 @@ def resume_views(
         lengths.append(held.end)
     frames = frames or max(lengths)
     places = {}
+    others: list[Path] = []
     for view, files in earlier.items():
-        ended = recording.gaps and view not in start.frames
-        places[view] = _resume_view(folder, view, recording, split, files, frames, ended=ended)
-    if others := other_recordings(folder, recording):
-        raise UsageError(f"{others[0]} is of another recording: overwrite with --force")
+        others += [p for p in files if (part_number(p, view) is None) != (split is None)]
+        if not others:
+            ended = recording.gaps and view not in start.frames
+            places[view] = _resume_view(folder, view, recording, split, files, frames, ended=ended)
+    if others := others or other_recordings(folder, recording):
+        raise UsageError(
+            f"{others[0]} is of another recording, or was recorded with another --split: use the "
+            "same, or overwrite with --force"
+        )
     return places, split, frames
 
 
@@ -212,12 +218,6 @@ def _resume_view(
         UsageError: the files are of something else, or split in another way.
     """
     numbers = {path: part_number(path, view) for path in files}
-    for path, number in numbers.items():
-        if (number is None) != (split is None):
-            how = "with" if split is None else "without"
-            raise UsageError(
-                f"{path} was recorded {how} --split: use the same, or overwrite with --force"
-            )
     parts: list[tuple[Path, int]] = []
     stale: list[Path] = []
     first = 0
@@ -230,10 +230,6 @@ def _resume_view(
         stop = files[log].stop_from(first) if attempts else first
         if stop > first:
             _refuse_other(log, recording.metadata(view, first))
-        elif path in attempts:
-            raise UsageError(
-                f"{path} holds no frames of {view} from {first} on: overwrite with --force"
-            )
         follows = any(files[p].end or p.suffix == ".mcap" for p in later)
         if stop > first and log == path and (follows or stop == frames or ended):
             parts.append((path, files[path].frames))
@@ -242,10 +238,12 @@ def _resume_view(
             if follows:
                 continue
             return ViewResume(path, tuple(parts), first, stale=(*stale, *later), complete=True)
-        if whole := next((p for p in later if p.suffix == ".mcap"), None):
+        # A file with its final name was finished once: it is not written over without --force.
+        replaced = later if stop > first else [*attempts, *later]
+        if finished := [p for p in replaced if p.suffix == ".mcap"]:
             raise UsageError(
-                f"{whole} is there, {path.name} before it is not whole: recover that "
-                "part first, or overwrite with --force"
+                f"{finished[0]} is there, but not frame {stop} of {view} before it: recover that "
+                "part, or overwrite with --force"
             )
         if stop > first:
             return ViewResume(path, tuple(parts), first, log, stop, (*stale, *later))
