@@ -165,7 +165,7 @@ def served(view: Path, port: int = 0) -> Iterator[tuple[Program, str]]:
 
 
 @contextlib.contextmanager
-def watched(data: str, say: Callable[[str], None]) -> Iterator[None]:
+def live_window(data: str, say: Callable[[str], None]) -> Iterator[None]:
     """Show a live view in a window, or where there is no display at a page.
 
     The window stays open afterwards, and keeps what it shows.

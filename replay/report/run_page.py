@@ -214,10 +214,7 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
         t, values, y = module.frames.columns
         texts = [f"frame {k:,}: output {v:+.2f}" for k, v in zip(t.tolist(), y, strict=True)]
         frames[key] = frames_to_point_at(plot, t, values, texts, images=images)
-    extremes = module.stream.sheet()
-    for title, picks in (
-        ("least", extremes.least), ("middle", extremes.middle), ("greatest", extremes.greatest)
-    ):  # fmt: skip
+    for title, picks in module.stream.sheet().items():
         if picks:
             small = [reduced(pick.frame, FRAME) for pick in picks] if images else []
             section["extremes"].append(

@@ -15,7 +15,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.modules import Module, columns_of
 from replay.view.build import recording_to, view_entities
 from replay.view.layouts import NEAR, blueprint, images, lines
-from replay.view.rows import MOST_STREAMS, Rows, label, part
+from replay.view.rows import MOST_STREAMS, Rows, drawable, part
 
 if TYPE_CHECKING:
     from replay.export.applied import Applied, AppliedSink
@@ -69,7 +69,7 @@ class ViewSink:
 
     def _tab(self, s: int) -> rrb.Container:
         """Return a stream's tab: its images, how novel they are, and the outputs of each module."""
-        stream, name = part(self._spec.streams, s), label(self._spec.streams[s])
+        stream, name = part(self._spec.streams, s), drawable(self._spec.streams[s])
         entity, end = f"/{view_entities(self._spec)[s]}", self._end
         column = rrb.Vertical(
             images(entity, name) if self._spec.images else lines(name, [entity], end),

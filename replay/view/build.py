@@ -29,7 +29,7 @@ from replay.runs.modules import load_modules
 from replay.runs.run import Tally, read_outline
 from replay.view.layouts import blueprint, images, lines, scene
 from replay.view.panels import run_layout
-from replay.view.rows import MOST_STREAMS, Rows, label, part
+from replay.view.rows import MOST_STREAMS, Rows, drawable, part
 from replay.view.run import RunView
 from replay.view.scene import SceneView, scenery_of_recording
 from replay.view.summary import summary_text
@@ -136,7 +136,7 @@ def recording_to(
             recording.save(partial)
             if not partial.exists():
                 raise CdmisfaError(f"{out}: Rerun writes nothing, unset the variable RERUN")
-            recording.send_recording_name(label(name))
+            recording.send_recording_name(drawable(name))
             yield recording
             recording.flush(timeout_sec=FLUSH_SECONDS)
         except RuntimeError as error:
@@ -161,7 +161,7 @@ def _write_run(recording: rr.RecordingStream, log: Path, every: int, tab: str | 
         events += [event.text for event in batch.events]
     outline = tally.outline()
     view.finish(outline)
-    text = label(summary_text(outline, log.resolve().parent.name, events))
+    text = drawable(summary_text(outline, log.resolve().parent.name, events))
     rows.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
     layout = run_layout(
         outline,
@@ -193,7 +193,8 @@ def _write_recording(
         for note in (*source.warnings, *(world.notes if world is not None else ())):
             rows.event(first, None, note, "WARN")
         _write_frames(rows, source, every, world)
-    properties: Any = {"frames": count, "streams": label(", ".join(spec.streams)), "fps": spec.fps}
+    names = drawable(", ".join(spec.streams))
+    properties: Any = {"frames": count, "streams": names, "fps": spec.fps}
     recording.send_property("recording", rr.AnyValues(**properties))
     layout = recording_layout(spec, first + count, has_scene=world is not None, tab=tab)
     recording.send_blueprint(layout)
@@ -234,7 +235,7 @@ def recording_layout(
         has_scene: the world is there in 3D.
         tab: name of the one that is open.
     """
-    places = list(zip(view_entities(spec), map(label, spec.streams), strict=True))
+    places = list(zip(view_entities(spec), map(drawable, spec.streams), strict=True))
     tabs = list[rrb.Container]()
     views: rrb.Container = rrb.Vertical(
         *(lines(name, [f"/{entity}"], end) for entity, name in places)

@@ -20,7 +20,7 @@ from replay import palette
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
-from replay.view.rows import Rows, label, part
+from replay.view.rows import Rows, drawable, part
 
 # Gives the code of each block's state, (n,).
 Codes = Callable[[SignalColumns], IntArray]
@@ -54,7 +54,7 @@ class Lanes:
         self, rows: Rows, shown: Sequence[int], *, by_progress: bool, piece: int | None = None
     ) -> None:
         streams, count = rows.spec.streams, len(rows.spec.streams)
-        names, (stay, switch) = [label(name) for name in streams], ACTIONS
+        names, (stay, switch) = [drawable(name) for name in streams], ACTIONS
         self._known_by = np.zeros(count, dtype=np.int64)
         self._lanes: list[tuple[Codes, Lane]] = []
 

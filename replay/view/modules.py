@@ -7,7 +7,7 @@ off or is still learning, it holds what the signals say, from the save on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -17,13 +17,13 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.modules import Module
 from replay.following import fits
-from replay.outputs import OwnStream, Sheet
+from replay.outputs import OwnStream, Pick
 from replay.palette import BRICK, DARK, GREY, MIST, Colour, Rgb, colour, faint, packed, shade
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, Frames
 from replay.runs.run import Outline
 from replay.view.layouts import Panel
-from replay.view.rows import Rows, label
+from replay.view.rows import Rows, drawable
 from replay.view.wall import BETWEEN, hang, places_of, sheet_size
 
 PHI = "abstraction/phi"
@@ -189,7 +189,7 @@ class ModulesView:
             write_weights(self._rows, f"{place}/weights", *at, module.phi)
             if self._rows.spec.images and own.count:
                 self.sheets.add(number)
-                self._sheet(place, own.sheet())
+                self._write_sheet(place, own.sheet())
         return self._notes
 
     def _saved(self, columns: SignalColumns, weights: dict[int, FloatArray]) -> None:
@@ -252,24 +252,25 @@ class ModulesView:
             self._rows.lines(f"{root}/followed", [name], at, line, [GREY], width=BROAD, gap=1)
             name, rgbs = f"module {number} on {stream}", [colour(s)]
             self._rows.lines(f"{root}/output", [name], (t, where), y[:, None], rgbs, gap=1)
-            words = f"{label(best.function)} (grey, |r| = {best.r:.2f})"
-            title = f"Module {number} on {label(stream)} has learned {words}"
+            words = f"{drawable(best.function)} (grey, |r| = {best.r:.2f})"
+            title = f"Module {number} on {drawable(stream)} has learned {words}"
             entities = f"/{root}/followed", f"/{root}/output"
             panels.append(Panel(title, entities, "near", fit=True, legend=False))
         self._rows.flush()
         return panels
 
-    def _sheet(self, place: str, sheet: Sheet) -> None:
+    def _write_sheet(self, place: str, sheet: Mapping[str, Sequence[Pick]]) -> None:
         """Hang frames of least, middle and greatest output below one another."""
         height, width = self._rows.spec.frame_shape
         gap = np.full((height, BETWEEN), DARK[0], dtype=np.uint8)
-        strips = ("least", sheet.least), ("middle", sheet.middle), ("greatest", sheet.greatest)
-        corners = places_of(len(strips), *sheet_size(height, width), columns=1)
-        for number, ((name, picks), corner) in enumerate(zip(strips, corners, strict=True), 1):
-            if not picks:
-                continue
-            path = f"{place}/sheet/{number}_{name}"
-            strip = np.hstack([part for pick in picks for part in (pick.frame, gap)])[:, :-BETWEEN]
-            words = f"{name}: {picks[0].y:.2f} to {picks[-1].y:.2f}"
-            hang(self._rows, path, corner, strip.shape[::-1], words, GREY)
-            self._rows.log(path, rr.Image(strip))
+        corners = places_of(len(sheet), *sheet_size(height, width), columns=1)
+        for number, ((name, picks), corner) in enumerate(
+            zip(sheet.items(), corners, strict=True), 1
+        ):
+            if picks:
+                path = f"{place}/sheet/{number}_{name}"
+                strip = np.hstack([part for pick in picks for part in (pick.frame, gap)])
+                strip = strip[:, :-BETWEEN]
+                words = f"{name}: {picks[0].y:.2f} to {picks[-1].y:.2f}"
+                hang(self._rows, path, corner, strip.shape[::-1], words, GREY)
+                self._rows.log(path, rr.Image(strip))

@@ -15,7 +15,7 @@ from replay.runs.compare import HEAD, Row
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
 from replay.view.layouts import blueprint, lines
-from replay.view.rows import ITERATION, MOST_STREAMS, Rows, label, part, power_of_ten
+from replay.view.rows import ITERATION, MOST_STREAMS, Rows, drawable, part, power_of_ten
 from replay.view.summary import text_table
 
 # Signals that are overlaid where a run has them, with the titles of their panels.
@@ -59,7 +59,7 @@ def build_overlay(
     names, written = [row.name for row in compared], set[str]()
     roots = [f"compare/{part(names, i)}" for i in range(len(names))]
     with recording_to(out, out.stem, out, force=force) as recording:
-        text = label("\n".join(text_table(HEAD, (row.cells() for row in compared))))
+        text = drawable("\n".join(text_table(HEAD, (row.cells() for row in compared))))
         table = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         recording.log("summary", table, static=True)
         for number, (run, row, root) in enumerate(zip(runs, compared, roots, strict=True)):
@@ -110,7 +110,7 @@ def _layout(
     grid = rrb.Grid(*panels(CURVES), grid_columns=2)
     tabs = [rrb.Vertical(table, grid, row_shares=[1, 3], name="Overview")]
     names, shown = outline.names(), outline.streams(MOST_STREAMS)
-    errors = {f"{ERROR}/{part(names, s)}": f"Learning error of {label(names[s])}" for s in shown}
+    errors = {f"{ERROR}/{part(names, s)}": f"Learning error of {drawable(names[s])}" for s in shown}
     if views := panels(errors):
         tabs.append(rrb.Vertical(*views, name="Streams"))
     return blueprint(*tabs, name="Comparison", timeline=ITERATION, length=length, tab=tab)

@@ -23,7 +23,7 @@ from replay.view.layouts import (
     scene,
     tabs_of,
 )
-from replay.view.rows import MOST_STREAMS, Rows, Span, label
+from replay.view.rows import MOST_STREAMS, Rows, Span, drawable
 from replay.view.wall import WALL, bounds, sheet_size
 
 # Modules that have a page each; of more, those that stand on one page.
@@ -217,7 +217,7 @@ class RunLayout:
             width, height = sheet_size(*self._spec.frame_shape)
             left.append(images(f"/modules/{i}/sheet", title, bounds(3, height, width, columns=1)))
         for save in (save for save in self._outline.saved if save.module == i):
-            name += f": {label(self._spec.streams[save.stream])}"
+            name += f": {drawable(self._spec.streams[save.stream])}"
             blocks, saved = self._outline.blocks, save.t + self._outline.tau
             later = blocks.starts[(blocks.streams == save.stream) & (blocks.starts >= saved)]
             ends = {"until it was saved": saved}

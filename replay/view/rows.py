@@ -70,7 +70,7 @@ _DRAWN = (
 
 
 @lru_cache(maxsize=4096)
-def label(text: str) -> str:
+def drawable(text: str) -> str:
     """Return a text without the letters that the viewer cannot draw."""
     kept = (c for c in text if c not in "⟨⟩")
     return "".join(
@@ -80,7 +80,7 @@ def label(text: str) -> str:
 
 def part(names: Sequence[str], index: int) -> str:
     """Return a stream's part of an entity's path: its number from 1, which sorts it, and name."""
-    return str(rr.escape_entity_path_part(f"{index + 1}_{label(names[index])}"))
+    return str(rr.escape_entity_path_part(f"{index + 1}_{drawable(names[index])}"))
 
 
 def power_of_ten(values: FloatArray) -> FloatArray:
@@ -145,7 +145,7 @@ class Rows:
     def event(self, t: int, iteration: int | None, text: str, level: str = "INFO") -> None:
         """Log an event in words."""
         level = "WARN" if level == "WARNING" else level
-        self.log_at("events", t, iteration, rr.TextLog(label(text), level=level))
+        self.log_at("events", t, iteration, rr.TextLog(drawable(text), level=level))
 
     def log_at(self, path: str, t: int, iteration: int | None, value: Any) -> None:
         """Log a value at a frame, and an iteration where the source has any."""
@@ -186,7 +186,7 @@ class Rows:
         style = None
         if path not in self._buffers:
             style = rr.SeriesLines(
-                names=[label(name) for name in names],
+                names=[drawable(name) for name in names],
                 colors=packed_all(rgbs or [pale(i) for i in range(len(names))]),
                 widths=[width] * len(names),
                 aggregation_policy=AGGREGATION,

@@ -23,7 +23,7 @@ from replay.runs.log import Batch, RunHeader
 from replay.runs.run import Outline, rules_of
 from replay.view.lanes import Lanes
 from replay.view.modules import ModulesView, Weights, saved_mark
-from replay.view.rows import WIDTH, Rows, changes, label, part, power_of_ten
+from replay.view.rows import WIDTH, Rows, changes, drawable, part, power_of_ten
 from replay.view.scene import world_of_run
 
 # Signals that are the timelines.
@@ -89,7 +89,10 @@ class RunView:
         self._lanes = Lanes(rows, streams, by_progress=by_progress, piece=piece)
         self.modules = ModulesView(rows, modules, by_progress=by_progress)
         self.world, notes = world_of_run(rows, header, folder, streams, every)
-        curves, weights = Curves(rows, header, streams), Weights(rows, by_progress=by_progress)
+        curves, weights = (
+            SignalCurves(rows, header, streams),
+            Weights(rows, by_progress=by_progress),
+        )
         self._writers: list[Writer] = [curves, Inputs(rows), self._lanes, weights, self.modules]
         if self.world is not None:
             self._writers.append(self.world)
@@ -144,7 +147,7 @@ class Inputs:
             return
         streams = columns["stream"][turns].tolist()
         self._named = streams[-1]
-        labels = [label(self._spec.streams[s]) for s in streams]
+        labels = [drawable(self._spec.streams[s]) for s in streams]
         boxes = rr.Boxes2D.columns(labels=labels, colors=packed_all([colour(s) for s in streams]))
         self._rows.send(WATCHED_NAME, (columns.frames[turns], columns.iterations[turns]), boxes)
 
@@ -161,7 +164,7 @@ class Curve(NamedTuple):
     width: float = WIDTH
 
 
-class Curves:
+class SignalCurves:
     """Writes the signals of a run as curves.
 
     Args:

@@ -31,7 +31,7 @@ from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, RunHeader
 from replay.storage.opening import log_files
-from replay.view.rows import Rows, changes, label, part
+from replay.view.rows import Rows, changes, drawable, part
 from replay.view.wall import WallView
 
 # The entity whose frame is the robot's root frame.
@@ -255,7 +255,7 @@ class SceneView:
         self._rows.log(path, rr.Transform3D(translation=eye.place, quaternion=turn))
         edges, rgbs = pyramid(eye), packed_all([colour(s)] * EDGES)
         self._rows.log(path, rr.LineStrips3D(edges, colors=rgbs, radii=[THIN]))
-        end, names = [np.mean(edges[-1][2:4], axis=0)], [label(gaze.name)]
+        end, names = [np.mean(edges[-1][2:4], axis=0)], [drawable(gaze.name)]
         name = rr.Points3D(end, labels=names, colors=rgbs[:1], radii=[THICK], show_labels=True)
         self._rows.log(f"{path}/name", name)
 

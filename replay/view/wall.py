@@ -13,7 +13,7 @@ from replay.outputs import EACH
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
-from replay.view.rows import Rows, Span, changes, label, part
+from replay.view.rows import Rows, Span, changes, drawable, part
 
 WALL = "wall"
 
@@ -61,7 +61,7 @@ def hang(
     rgbs = packed_all([rgb])
     frame = rr.Boxes2D(mins=[[0, 0]], sizes=[size], colors=rgbs, show_labels=False)
     rows.log(f"{path}/frame", frame)
-    place, texts = [[width / 2, (1 + ROOM / 8) * height]], [label(words)]
+    place, texts = [[width / 2, (1 + ROOM / 8) * height]], [drawable(words)]
     text = rr.Points2D(place, labels=texts, colors=rgbs, radii=[0.0], show_labels=True)
     rows.log(f"{path}/words", text)
 
@@ -123,7 +123,7 @@ class WallView:
 
     def _write_words(self, columns: SignalColumns, s: int) -> None:
         """Write below an image its stream's name, and state or module, where they change."""
-        name, words = label(self._rows.spec.streams[s]), self._words[s]
+        name, words = drawable(self._rows.spec.streams[s]), self._words[s]
         texts: list[tuple[int, str]] = []
         if self._by_progress:
             codes = columns["state"][:, s]

@@ -215,9 +215,9 @@ def _learned(
     """Learn, on request with a live view, until the run ends or a signal stops it."""
     viewer = None
     if live_view:
-        from replay.viewer import watched
+        from replay.viewer import live_window
 
-        viewer = partial(watched, say=printing.status)
+        viewer = partial(live_window, say=printing.status)
     if hasattr(session.source, "stop"):
         session.source.stop = stop  # so that a signal also ends waiting for frames
     session.hashing = progress.hashing
