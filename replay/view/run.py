@@ -89,13 +89,14 @@ class RunView:
         self._lanes = Lanes(rows, streams, by_progress=by_progress, piece=piece)
         self.modules = ModulesView(rows, modules, by_progress=by_progress)
         self.world, notes = world_of_run(rows, header, folder, streams, every)
-        curves, weights = (
+        self._writers: list[Writer] = [
             SignalCurves(rows, header, streams),
+            Inputs(rows),
+            self._lanes,
             Weights(rows, by_progress=by_progress),
-        )
-        self._writers: list[Writer] = [curves, Inputs(rows), self._lanes, weights, self.modules]
-        if self.world is not None:
-            self._writers.append(self.world)
+            self.modules,
+            *([] if self.world is None else [self.world]),
+        ]
         for note in notes:
             rows.event(0, 0, note, "WARN")
 
@@ -202,9 +203,9 @@ class SignalCurves:
 
     def _curves(self, columns: SignalColumns) -> Iterator[Curve]:
         yield from self._signals(columns)
-        yield from self._learning(columns)
         yield from self._of_streams(columns) if self._by_progress else self._decision(columns)
         yield self._attention(columns)
+        yield from self._learning(columns)
 
     def _signals(self, columns: SignalColumns) -> Iterator[Curve]:
         """Yield every signal's values as they are, except R and Q."""
@@ -240,14 +241,14 @@ class SignalCurves:
             values = power_of_ten(columns[name].astype(np.float64).reshape(len(columns), -1))
             names = line_names(SIGNALS[name], 0, outputs)[: values.shape[1]]
             yield Curve(f"abstraction/log_{name}", names, values)
-        for i, rule in enumerate(self._rules):
-            values = power_of_ten(rule.met(columns))
-            yield Curve(f"rules/{rule.signal}", [rule.ratio], values, [pale(i)])
         mean, width = columns["band_mean"], 2 * columns["band_sd"]
         edges = np.concatenate([mean - width, mean + width], axis=2)
         for i in range(edges.shape[1]):
             names, greys = [f"band of module {i + 1}"] * edges.shape[2], [GREY] * edges.shape[2]
             yield Curve(f"gate/band/{i + 1}", names, edges[:, i], greys, width=1.0)
+        for i, rule in enumerate(self._rules):
+            values = power_of_ten(rule.met(columns))
+            yield Curve(f"rules/{rule.signal}", [rule.ratio], values, [pale(i)])
 
     def _decision(self, columns: SignalColumns) -> Iterator[Curve]:
         """Yield reward and value of each shown stream."""

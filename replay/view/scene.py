@@ -164,7 +164,8 @@ class SceneView:
         self._objects = [t for t in scenery.objects if set(t.truth) <= set(self._spec.truth)]
         for thing in self._objects:
             rows.log(f"{SCENE}/{thing.name}", _shape(thing, LIGHT))
-        self._gazes = [scenery.gaze(name) for name in self._spec.streams]
+        gazes = {gaze.name: gaze for gaze in scenery.gazes}
+        self._gazes = [gazes.get(name) for name in self._spec.streams]
         for s, gaze in enumerate(self._gazes):
             if gaze is not None:
                 self._write_pyramid(s, gaze)
@@ -255,7 +256,7 @@ class SceneView:
         self._rows.log(path, rr.Transform3D(translation=eye.place, quaternion=turn))
         edges, rgbs = pyramid(eye), packed_all([colour(s)] * EDGES)
         self._rows.log(path, rr.LineStrips3D(edges, colors=rgbs, radii=[THIN]))
-        end, names = [np.mean(edges[-1][2:4], axis=0)], [drawable(gaze.name)]
+        end, names = [np.mean(edges[-1][2:4], axis=0)], [drawable(self._spec.streams[s])]
         name = rr.Points3D(end, labels=names, colors=rgbs[:1], radii=[THICK], show_labels=True)
         self._rows.log(f"{path}/name", name)
 
