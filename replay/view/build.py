@@ -22,7 +22,6 @@ from cdmisfa.core.untrusted import opened_regular
 from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
 from replay.inputs import About, holds_run, open_to_look
-from replay.logs.source import LoggedSource
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_batches, read_header
 from replay.runs.modules import load_modules
@@ -192,31 +191,24 @@ def _write_recording(
         world = None if scenery is None else SceneView(rows, scenery, every)
         for note in (*source.warnings, *(world.notes if world is not None else ())):
             rows.event(first, None, note, "WARN")
-        _write_frames(rows, source, every, world)
+        step, entities = every if spec.images else 1, view_entities(spec)
+        for t in range(first, first + count, BLOCK):
+            for stream, entity in enumerate(entities):
+                for low, high in source.spans(stream, t, min(t + BLOCK, first + count)):
+                    source.seek(low)
+                    block, frames = source.take(stream, high - low), np.arange(low, high)
+                    shown = frames % step == 0
+                    rows.frames(entity, (frames[shown], None), block.frames[shown])
+                    if spec.truth and stream == 0:
+                        rows.lines("world/truth", spec.truth, (frames, None), block.truth, gap=1)
+                        if world is not None:
+                            world.move(frames, block.truth)
+        rows.flush()
     names = drawable(", ".join(spec.streams))
     properties: Any = {"frames": count, "streams": names, "fps": spec.fps}
     recording.send_property("recording", rr.AnyValues(**properties))
     layout = recording_layout(spec, first + count, has_scene=world is not None, tab=tab)
     recording.send_blueprint(layout)
-
-
-def _write_frames(rows: Rows, source: LoggedSource, every: int, world: SceneView | None) -> None:
-    """Write all frames of a recording, from its first on."""
-    spec, end, entities = rows.spec, source.t + source.frames, view_entities(rows.spec)
-    step = every if spec.images else 1
-    for t in range(source.t, end, BLOCK):
-        for stream, entity in enumerate(entities):
-            for low, high in source.spans(stream, t, min(t + BLOCK, end)):
-                source.seek(low)
-                block = source.take(stream, high - low)
-                frames = np.arange(low, high)
-                shown = frames % step == 0
-                rows.frames(entity, (frames[shown], None), block.frames[shown])
-                if spec.truth and stream == 0:
-                    rows.lines("world/truth", spec.truth, (frames, None), block.truth, gap=1)
-                    if world is not None:
-                        world.move(frames, block.truth)
-    rows.flush()
 
 
 def view_entities(spec: SourceSpec) -> list[str]:

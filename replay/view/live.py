@@ -32,8 +32,6 @@ from replay.view.scene import SceneView
 # Time between two pieces.
 EVERY_SECONDS = 1.5
 
-SUMMARY = "The run is still learning. The view of the finished run has its results."
-
 # Frames from one pose of the scene to the next, and from one logged image to the next.
 EVERY_FRAMES = 10
 
@@ -78,11 +76,10 @@ class LiveView(Sink):
         self._recording.set_sinks(sink)
         self.address = str(sink.uri)
         self._recording.send_recording_name("live")
-        rows, folder = Rows(self._recording, spec), run or Path()
-        rows.log("summary", rr.TextDocument(SUMMARY))
+        self._rows = rows = Rows(self._recording, spec)
+        rows.log("summary", rr.TextDocument("The run is still learning."))
         streams = begun.streams(MOST_STREAMS)
-        self._view = RunView(rows, header, streams, folder, every=EVERY_FRAMES, piece=PIECE)
-        self._rows = rows
+        self._view = RunView(rows, header, streams, run or Path(), every=EVERY_FRAMES, piece=PIECE)
         has_scene = isinstance(self._view.world, SceneView)
         self._recording.send_blueprint(run_layout(begun, has_scene=has_scene))
         self._images = spec.images
