@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.logs.clock import by_time, counts, of_other_rate, overlap, step_of, unlike
+from replay.logs.clock import by_time, counts, overlap
 from replay.logs.stream import LAST_NS, LogStream
 
 START = 1_700_000_000 * NANOSECONDS
@@ -41,17 +41,6 @@ def test_every_frame_shows_the_last_image_at_or_before_it(
         shown = len(set(rows))
         found = counts(len(stream), rows)
         assert (found["repeated"], found["dropped"]) == (len(clock) - shown, len(stream) - shown)
-
-
-def test_a_rate_is_another_from_a_hundredth_on_and_times_from_half_a_step_on() -> None:
-    first = times(*[20_000_000] * 9)
-    assert step_of(first) == 0.02
-    for images, fps, other in ((first, 50.4, 0), (first, 51, 1), (first[:1], 51, 0)):
-        assert of_other_rate(images, fps) == other
-    assert not of_other_rate(times(0, 0, 0), 51)  # they tell no rate
-    assert unlike(first, first + 10_000_000) == ""
-    assert unlike(first, first + 10_000_001) == "images at different times"
-    assert unlike(first, first[1:]) == "10 and 9 images"
 
 
 def test_no_rate_makes_frames_without_end() -> None:

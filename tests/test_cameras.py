@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from pathlib import Path
 
@@ -87,20 +86,3 @@ def test_pictures_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     values = write_pictures(tmp_path / "left", 12)
     frames = external(tmp_path / "left", size=(12, 16), rate=10).take(0, 12).frames
     np.testing.assert_array_equal(frames[:, 0, 0], values)
-
-
-def test_a_run_on_cameras_says_of_what_its_streams_are(cdmisfa: Cdmisfa, logs: Path) -> None:
-    log, rec = logs / "a.mcap", logs / "rec"
-    done = cdmisfa("learn", log, *BOTH, *SMALL, "--seed", "3", *QUICK, "-o", logs / "run")
-    assert done.code == 0, done.err
-    assert "cam_left: 60 images, 0 frames repeated, 0 images dropped" in done.err
-    source = json.loads((logs / "run" / "run.json").read_text())["source"]
-    assert (source["kind"], source["topics"]) == ("foreign", ["/cam_left", "/cam_right"])
-    assert source["size"] == [12, 16]
-    assert "area average" in source["recipe"]
-    assert [len(file["sha256"]) for file in source["files"]] == [64]
-    assert cdmisfa("convert", log, *BOTH, "-o", rec).code == 0
-    assert cdmisfa("learn", rec, *QUICK, "-o", logs / "again").code == 0
-    for run in (logs / "run", logs / "again"):
-        config = json.loads((run / "run.json").read_text())["config"]
-        assert config["scene"] == {"kind": "foreign"}

@@ -23,7 +23,6 @@ from recorder.log.viewlog import ViewLog
 from recorder.mcap.chunks import decompressed
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
-from recorder.recording import record_scene
 from replay.logs.formats.recording import ViewFile
 from tools.fuzz.oracle import tabled_rows
 
@@ -71,15 +70,6 @@ def test_blocks_are_those_of_the_tables(pictures: dict[str, Path], compression: 
         for ours, theirs in zip(fast(view, start, n), plain(view, start, n), strict=True):
             np.testing.assert_array_equal(ours, theirs)
     view.close()
-
-
-def test_vectors_are_those_of_the_tables(tmp_path: Path) -> None:
-    record_scene("oscillatory", tmp_path, frames=FRAMES)
-    for path in sorted(tmp_path.glob("*.mcap")):
-        view = ViewFile(path)
-        for ours, theirs in zip(fast(view, 3, 190), plain(view, 3, 190), strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-        view.close()
 
 
 def chunk_of(messages: list[tuple[int, int, bytes]], between: bytes = b"") -> bytes:

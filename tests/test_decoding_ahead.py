@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -153,21 +150,6 @@ def test_whatever_is_asked_for_next_frames_and_errors_are_the_same(
         for one, other in zip(anyhow(log), expected, strict=True):
             np.testing.assert_array_equal(one, other)
         assert max(held) <= 2 * cores
-
-
-def test_an_interrupt_leaves_no_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ahead, "CORES", 2)
-    before, log = threading.active_count(), write(tmp_path / "log.mcap")
-    with contextlib.closing(external(log, rate=25)) as source:
-        source.take(0, 7)
-        monkeypatch.setattr(Future, "exception", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            source.take(0, 7)
-    assert threading.active_count() == before
-
-
-def interrupted(self: Future[Any]) -> None:
-    raise KeyboardInterrupt
 
 
 def test_large_pictures_are_left_to_one_thread(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import Cdmisfa
 from folders import flip
 
 from cdmisfa.core.config import LearnerConfig
@@ -74,19 +72,6 @@ def test_a_run_is_whole_wherever_it_lies(copy: Path) -> None:
     (note,) = found.notes
     assert note.startswith(f"{copy / 'run.rrd'} is not checked: make it again with cdmisfa view")
     assert check_log(copy / "run.mcap").ok
-
-
-def test_a_view_that_is_missing_comes_back_with_the_command_that_is_named(
-    cdmisfa: Cdmisfa, copy: Path
-) -> None:
-    folder = copy.rename(copy.with_name("a run"))
-    (folder / "run.rrd").unlink()
-    refused = cdmisfa("verify", folder, "--json")
-    (problem,) = refused.json["problems"]
-    command, *words = shlex.split(problem["what"].partition("make it again with ")[2])
-    assert (refused.code, command) == (3, "cdmisfa")
-    assert cdmisfa(*words).code == 0
-    assert cdmisfa("verify", folder).code == 0
 
 
 @pytest.mark.parametrize(

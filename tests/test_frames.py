@@ -7,9 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.core.arrays import as_frames
-from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, quadratic
@@ -85,21 +82,3 @@ def test_the_order_of_frames_in_memory_does_not_matter() -> None:
     expected = abstraction(SMALL).update(frames).tobytes()
     for same in (np.asfortranarray(frames), wide[:, ::2], unaligned, frames.tolist()):
         assert abstraction(SMALL).update(same).tobytes() == expected  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("kind", ["int8", "bool"])
-def test_only_uint8_are_pixels(kind: str) -> None:
-    frames = np.ones((4, SMALL), kind)
-    for call in (as_frames, quadratic, abstraction(SMALL).update):
-        with pytest.raises(UsageError, match=f"frames of {kind} .* given: give uint8 pixels or"):
-            call(frames)  # type: ignore[operator]
-
-
-def test_a_block_of_another_order_in_memory_gives_the_same_bits() -> None:
-    spec = SourceSpec(("a",), (2,), "float64")
-    frames = np.random.default_rng(2).random((100, 2))
-    ys = []
-    for same in (frames, np.asfortranarray(frames)):
-        learner = CuriousLearner(LearnerConfig(), spec, 0)
-        ys.append(learner.step(Block(0, 0, same, np.empty((100, 0)))).y.tobytes())
-    assert ys[0] == ys[1]

@@ -96,20 +96,3 @@ def test_numbers_come_back_as_they_were_exported(cdmisfa: Cdmisfa, tmp_path: Pat
     pq.write_table(pq.read_table(table).slice(0, 50), table)
     with pytest.raises(LogDamagedError, match="LeRobot's layout"):
         external(out, fields=fields)
-
-
-def test_what_is_no_such_dataset_is_one_line(dataset: Path) -> None:
-    with pytest.raises(UsageError, match=f"no topic cam; it has images on: {KEY}"):
-        external(dataset, ["cam"])
-    info = dataset / "meta/info.json"
-    text = info.read_text()
-    info.write_text(text.replace("v3.0", "v2.1"))
-    with pytest.raises(UsageError, match=r"LeRobot dataset v2\.1"):
-        external(dataset)
-    info.write_text(text[:50])
-    with pytest.raises(LogDamagedError, match="describes no LeRobot dataset"):
-        external(dataset)
-    info.write_text(text)
-    next(dataset.glob("videos/*/*/*.mp4")).unlink()
-    with pytest.raises(LogDamagedError, match="no such file"):
-        external(dataset)

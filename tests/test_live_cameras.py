@@ -12,18 +12,17 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 from contracts.sources import same
-from folders import coverage
 from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedReaders, bar
 from waiting import wait_for
 
 from cdmisfa.agents.progress.attention import ProgressConfig
 from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from recorder.cameras.live import LiveSource, Steady
-from recorder.cameras.readers import CameraFrames, Readers
+from recorder.cameras.readers import Readers
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
 from replay.inputs import open_recording
 from replay.integrity.info import describe
@@ -134,13 +133,6 @@ def test_the_clock_has_the_rate_that_is_stated_measured_or_asked_for() -> None:
     assert opened(steady(0, 0, 30), rate=7.5).spec.fps == 7.5
     with pytest.raises(UsageError, match="states no rate: set one with --rate"):
         opened(steady(0, 0, 1), states=None)
-
-
-def test_a_camera_that_shows_nothing_is_named() -> None:
-    readers = ScriptedReaders([*steady(0, 0, 3000), Arrival(99, 1, flat(0))], 2)
-    with pytest.raises(UsageError, match="right shows no image"):
-        LiveSource(readers, ("left", "right"), {})
-    assert readers.closed
 
 
 def test_it_ends_with_the_first_camera_that_ends() -> None:
@@ -295,34 +287,6 @@ def test_a_camera_that_is_lost_is_a_gap_or_the_end(on_loss: Any, why: str, then:
     cameras.close(source)
 
 
-def test_a_camera_that_cannot_be_opened_is_no_loss_but_an_error() -> None:
-    cameras = Cameras(1)
-    cameras.hands[0].give(CdmisfaError("rtsp://nowhere cannot be opened"))
-    with pytest.raises(UsageError, match="rtsp://nowhere cannot be opened"):
-        LiveSource(cameras.readers, ["left"], {})
-
-
-def test_images_of_all_cameras_become_frames_of_the_first_ones_size() -> None:
-    said = list[str]()
-    frames = CameraFrames(["left", "right"], None, "crop", say=said.append)
-    image = np.arange(96 * 128).reshape(96, 128).astype(np.uint8)
-    half = image[::2, ::2]
-    assert frames.frame(1, half) is None  # the size is not known yet
-    assert frames.frame(0, image).shape == (48, 64)
-    np.testing.assert_array_equal(frames.frame(0, half), half)
-    np.testing.assert_array_equal(frames.frame(1, image[24:72]), image[24:72, 32:96])
-    # of another size than its first, it may be smaller
-    assert frames.frame(1, half[:24, :32]).shape == (48, 64)
-    assert said == [
-        "left: 128x96, shown as 64x48",
-        "left: images change from 128x96 to 64x48; each is made a frame of 64x48",
-        "right: 128x48, cropped to 64x48, shown as 64x48",
-        "right: images change from 128x48 to 32x24; each is made a frame of 64x48",
-    ]
-    with pytest.raises(UsageError, match="left: an image of 32x24 is smaller than 64x48"):
-        CameraFrames(["left"], (48, 64), "crop").frame(0, half[:24, :32])
-
-
 def test_a_full_queue_is_emptied_and_says_so() -> None:
     cameras = Cameras(1, queue_bytes=10 * flat(0).nbytes)
     source = cameras.source()
@@ -330,26 +294,6 @@ def test_a_full_queue_is_emptied_and_says_so() -> None:
     wait_for(lambda: source.alignment["left"]["lost"] == 20, seconds=20)
     assert cameras.said == 2 * ["left: discarded 10 images: they came faster than they were used"]
     cameras.close(source)
-
-
-def test_waiting_for_a_camera_can_be_stopped() -> None:
-    cameras = Cameras(1)
-    source = cameras.source()
-    source.stop = lambda: True
-    with pytest.raises(LogExhaustedError, match="stopped while waiting for frame"):
-        source.take_all(50)
-    cameras.close(source)
-
-
-def test_recording_goes_on_until_it_is_stopped(tmp_path: Path) -> None:
-    source = opened([*PAUSED, *steady(1, 0, 300)], 2)
-    recorded = RecordedWhileWatched(source, tmp_path / "rec")
-    seen: list[float] = []
-    record_watched(recorded, stop=lambda: len(seen) == 80, progress=seen.append)
-    assert seen == list(range(1, 81))
-    assert coverage(tmp_path / "rec") == {"left": [(0, 38), (60, 80)], "right": [(0, 80)]}
-    assert [file.frames for file in recorded.files] == [58, 80]
-    assert not list((tmp_path / "rec").glob("*.partial"))
 
 
 def test_a_recording_with_gaps_is_shown_with_its_gaps(tmp_path: Path) -> None:

@@ -30,20 +30,11 @@ from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.video import VideoCamera
-from recorder.cameras.words import is_live, live_names, open_live
+from recorder.cameras.words import live_names, open_live
 from recorder.images.options import InputOptions
 from replay.inputs import open_recording
 
 TEST = "av:lavfi:testsrc=size=160x120:rate=30"
-
-
-def test_which_words_name_live_streams() -> None:
-    live = (
-        "camera:/dev/video0 rtsp://robot/left http://robot:8080/stream.mjpg gym:Pendulum-v1 "
-        "https://robot/a.mjpeg?x=1 tcp://robot:9000 av:clip.mkv foxglove://robot:8765/cam"
-    )
-    others = "http://robot/log.mcap s3://bucket/log.mcap icub av folder/log.mcap"
-    assert [word for word in f"{live} {others}".split() if is_live(word)] == live.split()
 
 
 def test_streams_are_named_after_what_they_are() -> None:
@@ -81,13 +72,6 @@ class TestArrays(ForwardContract):
         return ArraySource({"array": frames, "iterator": (255 - frame for frame in frames)})
 
 
-class TestValues(ForwardContract):
-    ends = True
-
-    def open(self) -> FrameSource:
-        return ArraySource({"values": np.random.default_rng(0).random((60, 3))}, fps=20)
-
-
 def test_a_task_shows_its_observations_and_actions_as_truth() -> None:
     with GymSource(["CartPole-v1"], size=(24, 32)) as source:
         observed = [f"CartPole_v1_{i}" for i in range(4)]
@@ -104,24 +88,6 @@ def test_a_task_shows_its_observations_and_actions_as_truth() -> None:
     np.testing.assert_array_equal((np.diff(block.truth[:, 1]) > 0)[within], pushed[within] == 1)
     assert begins.sum() > 3
     assert np.abs(block.truth[begins][1:, :4]).max() <= 0.05
-
-
-FRAMES = np.zeros((5, 2, 2), np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("streams", "why"),
-    [
-        ({"a": np.zeros((5, 2, 2, 3), np.uint8)}, "a shows uint8 of shape"),
-        ({}, "given, or none"),
-        (FRAMES, r'given, or none: name each, as \{"left": frames\}, with'),
-        ({"a": np.zeros((5, 4)), "b": np.zeros((5, 3))}, "b shows float64"),
-        ({"a": iter([np.zeros(2), np.array([0, np.nan])])}, "a: frame 1, .* no finite number"),
-    ],
-)
-def test_arrays_that_do_not_fit_are_refused(streams: Any, why: str) -> None:
-    with pytest.raises(UsageError, match=why):
-        ArraySource(streams).take(0, 2)
 
 
 def learned_twice(cdmisfa: Cdmisfa, place: Path, *words: str) -> dict[str, Any]:
@@ -173,21 +139,6 @@ def test_a_video_is_recorded_until_it_ends(cdmisfa: Cdmisfa, tmp_path: Path) -> 
         greys = [grey for stretch in shown for grey in stretch]
     assert greys == sorted(greys)  # which are late depends on how busy the machine is
     assert (held[0][0], greys[0], greys[-1]) == (0, 0, 19)
-
-
-@pytest.mark.parametrize(
-    ("word", "shape"), [(TEST, (60, 80)), ("gym:CartPole-v1", (57, 85))], ids=["camera", "task"]
-)
-def test_frames_keep_the_ratio_of_the_sides(word: str, shape: tuple[int, int]) -> None:
-    with open_live([word], InputOptions()) as source:
-        assert source.spec.frame_shape == shape
-    wide = InputOptions(size=(30, 80), fit="pad")
-    with open_live([word], wide) as source:
-        frames = source.take(0, 3).frames
-        assert frames.shape == (3, 30, 80)
-        inner = frames[:, :, 20:60] if word == TEST else frames[:, :, 17:62]
-        assert frames.sum() == inner.sum() > 0
-        assert source.describe()["fit"] == "pad"
 
 
 class Motion(http.server.BaseHTTPRequestHandler):
@@ -284,22 +235,6 @@ def test_images_and_numbers_of_a_running_robot_are_recorded_and_learned_from(
         open_live([f"{robot.address}/words"], InputOptions(fields=("z",)))
 
 
-@pytest.mark.parametrize(
-    ("topic", "why"),
-    [
-        ("/cam/front", "has no topic /cam/front: it has images on /cam/left, /cam/right"),
-        ("", "has not one such topic: .* /cam/left, /cam/right; name one as foxglove"),
-        ("/words", "/words holds .*, which is no image"),
-    ],
-)
-def test_a_topic_that_is_no_image_is_refused(
-    robot: Robot, topic: str, why: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("recorder.cameras.foxglove.TOPIC_SECONDS", 1.0)
-    with pytest.raises(UsageError, match=why):
-        open_live([robot.address + topic], InputOptions())
-
-
 def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
     words, connected = [f"{robot.address}/cam/late"], list[str]()
     threading.Timer(0.5, connected.append, ["now"]).start()
@@ -380,8 +315,3 @@ def test_a_network_camera_shows_what_it_sees_at_its_own_rate() -> None:
     moved = np.diff(bars) % 56
     assert moved.max() < 28  # forward: a picture that is late comes twice, and none goes back
     assert moved.sum() > 10
-
-
-def test_a_network_camera_that_shows_nothing_is_said() -> None:
-    with rtsp_camera(1) as word, pytest.raises(UsageError, match="left ended before an image"):
-        open_live([word], InputOptions())

@@ -11,7 +11,6 @@ from contracts.learners import CONFIG, SinkContract
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.cli.progress import Bar
 from cdmisfa.core.blocks import Block
-from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn_blocks
@@ -37,21 +36,9 @@ class Notes(Sink):
         self.told.append("finished")
 
 
-class Least(Sink):
-    """As little as a sink can be."""
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        return
-
-
 class TestNotes(SinkContract):
     def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
         return Notes()
-
-
-class TestLeast(SinkContract):
-    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
-        return Least()
 
 
 class TestDigest(SinkContract):
@@ -108,36 +95,3 @@ def test_the_end_of_a_recording_ends_the_run_and_is_told() -> None:
     assert (notes.told[:3], t, iteration, level) == ([0, 1, 2], 120, 2, "WARNING")
     assert "the streams end after 130 frames" in why
     assert last == [(120, 2, f"ended: {ENDINGS['log_exhausted']}", "INFO"), "finished"]
-
-
-def test_less_than_a_block_is_not_enough() -> None:
-    source, notes = OscillatorySource(length=39), Notes()
-    with pytest.raises(LogExhaustedError, match="the streams end after 39 frames"):
-        learn_blocks(source, learner_for(source), (notes,))
-    assert notes.told == []
-
-
-def test_asked_to_stop_while_it_waits_for_frames_it_is_interrupted() -> None:
-    source, asked = OscillatorySource(length=50), iter([False, False, True, True])
-    assert learn_blocks(source, learner_for(source), stop=lambda: next(asked)) == "interrupted"
-
-
-def test_a_sink_that_fails_ends_the_run_and_finishes_nothing() -> None:
-    class Full(Least):
-        def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-            raise OSError("the disk is full")
-
-    source, notes = OscillatorySource(), Notes()
-    with pytest.raises(OSError, match="the disk is full"):
-        learn_blocks(source, learner_for(source), (notes, Full()))
-    assert notes.told == [0]
-
-
-def test_a_learner_learns_on_from_where_it_is(tmp_path: Path) -> None:
-    source = OscillatorySource()
-    learner, digest = learner_for(source), Digest()
-    for iterations in (3, 11):
-        learn_blocks(source, learner, (digest,), max_iterations=iterations, max_modules=9)
-    whole, straight = OscillatorySource(), Digest()
-    learn_blocks(whole, learner_for(whole), (straight,), max_iterations=11, max_modules=9)
-    assert digest.hexdigest() == straight.hexdigest()

@@ -11,9 +11,7 @@ from contracts.learners import LearnerContract
 
 from cdmisfa.agents.learners import learner_class
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Learner
-from cdmisfa.experiments.sources import configure
 from cdmisfa.experiments.store import read_rows
 from cdmisfa.experiments.sweep import plan, sweep
 
@@ -58,13 +56,6 @@ def test_a_sweep_uses_it_and_knows_its_code(
     monkeypatch.setattr("inspect.getfile", lambda found: __file__)
     other = plan(["oscillatory"], grid={}, seeds=[0], settings=settings)[0].id
     assert planned[0] == planned[1] != other
-
-
-def test_its_keys_are_those_of_its_configuration() -> None:
-    own = configure("oscillatory", settings=(f"learner.algorithm={OWN}",)).learner
-    assert (own.algorithm, own.tau, own.patience) == (OWN, 30, 50)
-    with pytest.raises(UsageError, match=r"learner\.tua: did you mean learner\.tau\?"):
-        configure("oscillatory", settings=(f"learner.algorithm={OWN}", "learner.tua=3"))
 
 
 @pytest.mark.parametrize(

@@ -60,3 +60,9 @@ def test_readme_has_whole_addresses_where_its_files_are_elsewhere(
     assert [link for link in links if not link.startswith("https://")] == []
     assert (f"]({source}/raw/v" in text, "![" in text) == (source is not None,) * 2
     assert len(text) > 5000
+
+
+def test_pictures_are_those_that_the_code_draws() -> None:
+    drawn = runpy.run_path(str(IMAGES / "draw.py"))
+    names = {path.stem for path in IMAGES.glob("*.png")}
+    assert names == {*drawn["VIEWS"], *drawn["REPORTS"], "scene"}

@@ -14,9 +14,8 @@ from folders import external
 from message_files import write_mcap
 
 from cdmisfa import Module, Recipe, Run, make_frame
-from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import Depth, Fit
-from replay.runs.modules import load_modules, save_modules
+from replay.runs.modules import load_modules
 
 RNG = np.random.default_rng(5)
 
@@ -108,52 +107,9 @@ def test_a_run_and_its_modules_say_the_recipe(cdmisfa: Cdmisfa, tmp_path: Path) 
     assert module.transform([*pictures[:5], *larger]).shape == (10, len(y[0]))
 
 
-@pytest.mark.parametrize(
-    ("recipe", "given", "why"),
-    [
-        (Recipe((8, 16)), np.zeros((4, 7, 20), np.uint8), "14x7 is smaller than 16x8"),
-        (Recipe((8, 16), raw=(20, 40)), np.zeros((4, 40, 20), np.uint8), "20x40 .* 40x20: turn it"),
-        (
-            Recipe((8, 16)),
-            np.full((4, 8, 16), 200.0),
-            "hold 200: scale them to 0 to 1, or give uint8",
-        ),
-        (Recipe((8, 16)), [b"nothing"], "an image cannot be taken: .* broken"),
-        (Recipe((8, 16)), None, "images of object .* given"),
-        (
-            Recipe((3,), fields=("a", "b")),
-            np.zeros((4, 2)),
-            r"float64 of shape \(4, 2\) .* give \(n, 3\).*a, b",
-        ),
-        (Recipe((3,)), [[1.0, np.nan, 2.0]], "frame 0 holds nan at place 1, .* no finite number"),
-    ],
-)
-def test_what_a_module_cannot_take_is_refused_in_a_line(
-    recipe: Recipe, given: Any, why: str
-) -> None:
-    with pytest.raises(UsageError, match=why) as refused:
-        module_of(recipe, recipe.shape).transform(given)
-    assert "\n" not in str(refused.value)
-
-
 def test_numbers_of_any_type_are_taken_and_kept_in_their_range() -> None:
     module = module_of(Recipe((2,), range=(-1.0, 1.0)), (2,))
     given = [[3, -5], [1, 0]]
     np.testing.assert_array_equal(module.transform(np.array(given, float)), module.transform(given))
     np.testing.assert_array_equal(module.transform(given), module.transform([[1.0, -1.0], [1, 0]]))
     assert module.transform(np.zeros((0, 2), int)).shape == (0, 2)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["x", "[]", "{}", '{"shape": 3}', '{"shape": [2], "fit": "no"}', '{"shape": ["a"]}',
-     '{"shape": [2], "raw": [3]}', '{"shape": [2], "range": [1]}',
-     '{"shape": [2], "range": 3}', '{"shape": [2], "fields": 3}'],
-)  # fmt: skip
-def test_a_recipe_that_is_none_is_damage(text: str, tmp_path: Path) -> None:
-    save_modules(tmp_path / "modules.npz", [module_of(Recipe((2,)), (2,))])
-    assert load_modules(tmp_path)[0].recipe == Recipe((2,))
-    arrays = dict(np.load(tmp_path / "modules.npz"))
-    np.savez(tmp_path / "modules.npz", **{**arrays, "module1_recipe": np.array(text)})
-    with pytest.raises(LogDamagedError, match="holds no modules"):
-        load_modules(tmp_path)

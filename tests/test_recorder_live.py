@@ -9,12 +9,11 @@ from contracts.sources import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import build, load_preset
-from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig
 from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.eyes import eye_matrix, grey, perspective
 from recorder.world.icub.motions import Motions
-from recorder.world.scenes import SCENES, open_scene
+from recorder.world.scenes import SCENES
 
 pytest.importorskip("pybullet")
 
@@ -110,17 +109,3 @@ def test_views_are_as_if_all_were_drawn_each_frame(seen):
                 ]
                 differing += int((np.hstack(pair) != seen[view, t]).sum())
     assert differing <= 1
-
-
-@pytest.mark.parametrize(
-    ("scene", "words"),
-    [
-        ({"robot": "iCubNowhere"}, r"scene\.robot is iCubNowhere, .* icub-models has .*V2_5"),
-        ({"robot": "left_hand_mk3"}, r"left_hand_mk3, which cannot be built"),
-        ({"eyes": {"yaw": [80, 0, -45]}}, r"scene\.eyes\.yaw has 80.*-50 to 50"),
-        ({"eyes": {"views": ["../a", "b", "c"]}}, r"scene\.eyes\.views is '\.\./a'"),
-    ],
-)
-def test_a_scene_that_cannot_be_is_named(scene, words):
-    with pytest.raises(UsageError, match=words):
-        open_scene("icub", build(IcubConfig, "scene", scene))

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.motions import CHUNK, Motions, reflect
+from recorder.world.icub.motions import CHUNK, Motions
 
 SCENE = IcubConfig()
 WHOLE = Motions(SCENE, 3).positions(0, 2 * CHUNK + 100)
@@ -47,19 +47,3 @@ def test_object_3_walks_within_its_limits_y_slower_than_x():
     assert 0.0035 < steps[:, 1].std() < 0.0041
     assert steps[:, 0].std() > 10 * steps[:, 1].std()
     assert np.corrcoef(path[1:, 1], path[:-1, 1])[0, 1] > 0.99
-
-
-def test_the_motions_share_no_random_numbers_with_who_spawns_from_the_same_seed():
-    drawn = (WHOLE[:20, 1, 0] + 0.8) / 0.2
-    for child in np.random.SeedSequence(3).spawn(8):
-        numbers = np.random.default_rng(child).random(100)
-        assert np.abs(drawn[:, None] - numbers).min() > 1e-9
-
-
-def test_a_walk_turns_round_at_its_limits():
-    np.testing.assert_allclose(
-        reflect(np.array([0.0, 0.9, 1.1, 2.0, 2.1, -0.1, 3.2]), (0.0, 1.0)),
-        [0.0, 0.9, 0.9, 0.0, 0.1, 0.1, 0.8],
-        atol=1e-12,
-    )
-    np.testing.assert_array_equal(reflect(np.array([5.0, -5.0]), (0.3, 0.3)), [0.3, 0.3])

@@ -14,37 +14,14 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.resume import check_run
 from cdmisfa.experiments.session import run
 from recorder.config import RecordConfig
-from recorder.log.scenery import scenery_of, turned, turns_of
+from recorder.log.scenery import scenery_of, turned
 from recorder.recording import record_scene
 from recorder.world.icub.config import EyesConfig, IcubConfig
-from recorder.world.icub.head import FRAMES_OF_A_LOOK, Roaming, turn, turn_frames, turns
+from recorder.world.icub.head import FRAMES_OF_A_LOOK, Roaming
 from replay.inputs import open_recording
 from replay.runs.run import read_outline
 
 YAW = (45.0, 0.0, -45.0)
-
-
-def test_a_turn_takes_so_many_frames_and_neither_jumps_nor_overshoots():
-    assert [turn_frames(d, 7.5) for d in (0, 45, -90, 46)] == [0, 6, 12, 7]
-    assert turn_frames(90, 0) == 0
-    path = [45.0, *turn(45, -45, 12), -45.0]
-    steps = np.diff(path)
-    assert (steps < 0).all()
-    assert -steps.min() < 2 * 90 / 13  # at least jerk: 15/8 of the mean
-    assert np.abs(np.diff(path, n=2)).max() < 4
-    np.testing.assert_allclose(path, -np.array(path[::-1]))
-
-
-def test_turns_cost_what_lies_between_two_views_and_most_with_one_that_roams():
-    assert turns(YAW, 7.5, roam=False) == ((0, 6, 12), (6, 0, 6), (12, 6, 0))
-    assert turns(YAW, 7.5, roam=True)[3] == (12, 12, 12, 0)
-    assert [row[3] for row in turns(YAW, 7.5, roam=True)] == [12, 12, 12, 0]
-    stated = section_table(IcubConfig(transit=7.5))
-    assert turns_of(stated, [2, 0]) == ((0, 12), (12, 0))
-    assert turns_of(section_table(IcubConfig()), [0, 1, 2]) == ()
-    for broken in (1e-320, "x", float("nan"), float("inf"), -1.0):
-        assert not np.any(turns_of({**stated, "transit": broken}, [0, 1]))
-    assert turn_frames(1e300, 1.0) == 360
 
 
 def test_a_roaming_head_dwells_on_views_and_turns_between_them_the_same_at_every_cut():

@@ -12,8 +12,7 @@ import pytest
 from cdmisfa.core.config import build, load_preset, section_table
 from recorder.config import RecordConfig
 from recorder.world.icub.config import EyesConfig, IcubConfig
-from recorder.world.icub.lens import SAMPLES, Lens, light
-from recorder.world.icub.room import ball_mesh, box_mesh, can_mesh
+from recorder.world.icub.lens import SAMPLES, Lens
 from recorder.world.icub.textures import SIDE, TEXTURES, texture
 
 pytest.importorskip("pybullet")
@@ -80,15 +79,6 @@ def test_a_picture_does_not_depend_on_how_often_its_objects_were_drawn_before():
     seen = seen_in(scene, (2, 4815, 4), (2, 4810, 9), (2, 4815, 4))
     for frames in seen[1:]:
         np.testing.assert_array_equal(seen[0][-1], frames[-1])
-
-
-@pytest.mark.parametrize("name", ["ball", "can", "box"])
-def test_normals_stay_as_they_are_when_normalised_again(name):
-    mesh = {"ball": ball_mesh(0.04), "can": can_mesh(0.03, 0.1), "box": box_mesh([0.1] * 3)}[name]
-    x, y, z = (np.array(mesh.normals, np.float32) ** 2).T
-    for squared in (x + y + z, x + z + y, y + z + x):
-        assert squared.dtype == np.float32
-        assert (squared == 1).all()
 
 
 QUIET = dataclasses.replace(SMALL, noise=0.0)
@@ -172,25 +162,6 @@ def test_blur_and_vignette_by_hand():
     edge = Lens(IcubConfig(blur=True, vignette=0.5)).through(rays_of(200, 1), 0, 0)[0, ..., 0]
     assert edge[0, 0, 0] == edge[-1, 1, -1] == 100
     assert edge[23:25, :, 31:33].min() >= 199
-
-
-def test_light_drifts_for_all_views_alike_and_eyes_adapt_to_it():
-    factors = light(0.2, 0, 6000)
-    assert (factors.min(), factors.max()) == (0.8, 1.2)
-    assert np.abs(np.diff(factors)).max() < 0.001
-    np.testing.assert_array_equal(light(0.2, 2990, 20), factors[2990:3010])
-    at, scene = 700, IcubConfig(drift=0.2)
-    drifting = Lens(scene).through(rays_of(100, 3), at, 0)
-    np.testing.assert_array_equal(drifting[:, 0, 0, 0, 0], np.rint(100 * factors[at : at + 3]))
-    seen = np.concatenate([rays_of(60, 2), rays_of(200, 1)])
-    adapted = Lens(dataclasses.replace(scene, exposure=True)).through(seen, at, 0)
-    assert np.abs(adapted.mean(axis=(1, 2, 3, 4)) - 128).max() < 1
-    drifts = dataclasses.replace(SMALL, drift=0.2)
-    with contextlib.closing(IcubSource(drifts, RecordConfig())) as source:
-        source.seek(at)
-        block = source.take(0, 3)
-    assert source.spec.truth == (*TRUTH, "light")
-    np.testing.assert_array_equal(block.truth[:, -1], factors[at : at + 3])
 
 
 @pytest.mark.parametrize("name", sorted(TEXTURES))

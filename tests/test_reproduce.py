@@ -13,16 +13,13 @@ from conftest import Cdmisfa
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.experiments.documents import versions
-from cdmisfa.experiments.results import mean_interval
 from cdmisfa.experiments.trial import run_trial
 from cdmisfa.studies.paper import icub, nonstationary, oscillatory
-from cdmisfa.studies.paper.experiment import Experiment, Findings, Trial, groups, paper_config
+from cdmisfa.studies.paper.experiment import Experiment, Findings, Trial
 from cdmisfa.studies.paper.oscillatory import Oscillatory
 from cdmisfa.studies.paper.reproduce import reproduce
 from recorder.world.oscillatory import OscillatorySource
-from replay.inputs import open_recording
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_logs" / "icub"
@@ -98,25 +95,6 @@ def test_a_claim_that_fails_exits_4(
     assert done.err.endswith(f"{said}\n")
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_trial_that_breaks_or_is_damaged_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cdmisfa: Cdmisfa
-) -> None:
-    stability(tmp_path)
-    rows = tmp_path / "rows.jsonl"
-    rows.write_text(rows.read_text().replace('"arrays":"UEsDB', '"arrays":"UEsDA'))
-    with pytest.raises(LogDamagedError, match=r"the row of trial \w+ is damaged"):
-        stability(tmp_path)
-
-    def broken(self: Experiment, settings: Any) -> Any:
-        raise UsageError("it broke")
-
-    monkeypatch.setattr(oscillatory.Stability, "run", broken)
-    done = cdmisfa("reproduce", "stability", "--trials", 1, "-o", tmp_path / "other")
-    assert done.code == 1
-    assert "'seed': 28000}: it broke; the others are kept" in done.err
-
-
 def trials_with(midpoints: dict[float, float], spread: float = 0.0) -> list[Trial]:
     """A trial a sigma, epsilon^c and each of ten seeds, which turn one after the other."""
     return [
@@ -153,39 +131,6 @@ def test_the_order_of_table_1_is_judged_where_enough_was_rewarded(
     (table,) = found.tables
     above = [row[2] == "above 0.86" for row in table["rows"]]
     assert above == [midpoint > 0.86 for midpoint in midpoints.values()]
-
-
-def test_intervals_of_epsilon_d_are_by_seeds() -> None:
-    def interval(spread: float) -> tuple[float, float]:
-        (turn,) = (
-            nonstationary._turn(group, 0.86)
-            for (sigma,), group in groups(trials_with({0.0: 0.66}, spread), "value").items()
-        )
-        low, high = mean_interval(turn.of_seeds)
-        assert low <= turn.value <= high
-        return low, high
-
-    low, high = interval(0.0)
-    assert high - low < 1e-9
-    low, high = interval(0.02)
-    answers = trials_with({0.0: 0.66}, 0.02)
-    turns = [
-        nonstationary.point_of_no_return([t for t in answers if t.settings["seed"] == seed])
-        for seed in range(10)
-    ]
-    assert high - low == pytest.approx(np.diff(mean_interval(turns))[0], rel=0.35)
-
-
-@pytest.mark.skipif(not SAMPLE.exists(), reason="the sample recording is not there")
-def test_the_icub_trial_keeps_what_its_figures_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(icub, "HELD_OUT", 400)
-    with open_recording(SAMPLE) as source:
-        row, arrays = icub.learn_curves(source, paper_config("icub"), seed=0)
-        frames = source.frames - 400
-    assert row["iterations"] == frames // 40
-    assert arrays["eta_dot"].shape == (row["iterations"], 1)
-    assert arrays["shown"].shape == (3, 48, 128)
-    assert not row["streams"]
 
 
 def test_a_module_is_judged_by_frames_after_those_it_learned_from() -> None:

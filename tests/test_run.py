@@ -93,31 +93,6 @@ def test_the_seed_decides_and_logging_does_not(tmp_path: Path) -> None:
     assert one.signals_sha256 == two.signals_sha256 != other.signals_sha256
 
 
-def test_the_json_of_a_result_and_the_manifest(tmp_path: Path) -> None:
-    how = {"max_iterations": None, "max_modules": 1, "sections": {"scene": {"kind": "oscillatory"}}}
-    result = run(tmp_path, seed=5, **how)
-    document = json.loads(json.dumps(result.as_json(), allow_nan=False))
-    known = {"schema", "run", "source", "seed", "iterations", "frames", "signals_sha256", "modules"}
-    assert set(document) >= known | {"final_policy", "epsilon"}
-    assert (document["schema"], document["seed"]) == (1, 5)
-    assert document["frames"] == 100 * document["iterations"]
-    (module,) = document["modules"]
-    assert len(module.pop("eta")) == 1
-    assert (module.pop("recipe")["shape"], module.pop("slow")) == ([2], [])
-    assert module == {
-        "index": 1,
-        "stream": "x1",
-        "stream_index": 0,
-        "iteration": document["iterations"] - 1,
-        "policy": [0, 1, 1],
-    }
-    manifest = json.loads((tmp_path / "run.json").read_text())
-    assert (manifest["seed"], manifest["source"]["kind"]) == (5, "oscillatory")
-    assert manifest["config"]["scene"] == {"kind": "oscillatory"}
-    assert build(LearnerConfig, "learner", manifest["config"]["learner"]) == CONFIG
-    assert {"python", "numpy"} <= set(manifest["versions"])
-
-
 @pytest.mark.parametrize("leftover", ["run.mcap", "run.mcap.partial", "notes.txt"])
 def test_a_folder_that_holds_something_is_refused(tmp_path: Path, leftover: str) -> None:
     (tmp_path / leftover).write_text("mine")
@@ -125,17 +100,6 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path, leftover: str)
         run(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [leftover]
     assert (tmp_path / leftover).read_text() == "mine"
-
-
-def test_force_replaces_the_run_and_nothing_else(tmp_path: Path) -> None:
-    run(tmp_path, max_iterations=3)
-    for name in ("run.rrd", "notes.txt"):
-        (tmp_path / name).write_text("before")
-    result = run(tmp_path, max_iterations=5, seed=1, force=True)
-    assert logged(tmp_path).hexdigest() == result.signals_sha256
-    assert json.loads((tmp_path / "run.json").read_text())["seed"] == 1
-    assert not (tmp_path / "run.rrd").exists(), "a view of another run"
-    assert (tmp_path / "notes.txt").read_text() == "before"
 
 
 class Failing(OscillatorySource):

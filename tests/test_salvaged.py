@@ -17,7 +17,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from message_files import START, STEP, every, learned_alike, write_mcap
 from video_packets import COUNT, FOXGLOVE, GROUP, foxglove, video
 
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError
 
 SIZE = (HEIGHT, WIDTH)
 
@@ -113,18 +113,6 @@ def test_a_broken_film_shows_the_same_in_any_order(tmp_path: Path) -> None:
     order = [*range(COUNT), 3, 30, *random.Random(0).sample(range(COUNT), COUNT)]
     for row, frame in zip(order, shown(path, order), strict=True):
         np.testing.assert_array_equal(frame, expected[last.get(row, row)], err_msg=str(row))
-
-
-def test_what_is_not_read_is_no_damage(tmp_path: Path) -> None:
-    pytest.importorskip("av")
-    videos = write_video_messages(tmp_path / "a.mcap", video("h264 with B-frames"))
-    messages = [raw(image, "weird8") for image in pictures(3)]
-    images = write_mcap(tmp_path / "b.mcap", RAW, {"/cam": every(STEP, messages)})
-    for salvage in (False, True):
-        with pytest.raises(UsageError, match=r"/cam at .* waits for later ones \(B-frames\)"):
-            external(videos, salvage=salvage)
-        with pytest.raises(UsageError, match="its pixel format 'weird8' is not read"):
-            external(images, salvage=salvage)
 
 
 def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Path) -> None:

@@ -99,17 +99,6 @@ def test_the_bytes_are_the_documented_ones_however_arrays_lie(seed: int, odd: fl
     assert canonical_bytes(record) == plain_bytes(record)
 
 
-def test_nan_equals_every_nan_but_not_a_number() -> None:
-    """Whether a NaN carries a sign depends on the processor, not on the learner."""
-    record, negative = example(), float(np.copysign(np.nan, -1.0))
-    one, other = (
-        dataclasses.replace(record, eta=np.array([nan, 1.0]), reward=nan)
-        for nan in (float("nan"), negative)
-    )
-    assert canonical_bytes(one) == canonical_bytes(other)
-    assert canonical_bytes(one) != canonical_bytes(dataclasses.replace(one, reward=0.0))
-
-
 def test_the_hash_is_over_all_records_in_order() -> None:
     first, second = example(1), example(2)
     digest, swapped = SignalsHash(), SignalsHash()

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import dataclasses
 import json
 import os
 import signal
 import subprocess
-import sys
 import threading
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +17,16 @@ import psutil
 import pytest
 from camera_files import write_cameras
 from conftest import Cdmisfa
-from engine_tasks import trace
 from waiting import running, started, wait_for
 
 from cdmisfa.cli.commands.trials import parse_grid, parse_seeds
-from cdmisfa.core import processes
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.processes import WorkersError, run_all
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.processes import WorkersError
 from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import store
 from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.session import run
-from cdmisfa.experiments.sources import open_source
 from cdmisfa.experiments.store import ROWS, read_rows
 from cdmisfa.experiments.sweep import UNKEPT, plan, sweep
 from recorder.recording import record_scene
@@ -78,13 +72,6 @@ def test_a_trial_is_named_by_what_it_depends_on(monkeypatch: pytest.MonkeyPatch)
     assert len(others | {number(max_modules=1)}) == 7
 
 
-def test_a_worker_with_other_code_refuses() -> None:
-    (trial,) = plan("oscillatory", grid={}, seeds=[0], max_iterations=5)
-    assert "error" not in store.compute(trial)
-    refused = store.compute(dataclasses.replace(trial, code="0.0.0+another"))
-    assert "not 0.0.0+another" in refused["error"]
-
-
 def test_a_recording_is_named_by_its_bytes_and_swept_as_its_scene_is(tmp_path: Path) -> None:
     for name, frames in (("a", 3000), ("b", 3000), ("c", 300)):
         record_scene("oscillatory", tmp_path / name, frames=frames)
@@ -103,20 +90,6 @@ def test_a_trial_is_a_run(tmp_path: Path) -> None:
     (row,) = read_rows(tmp_path)
     result = run(OscillatorySource(), LearnerConfig(), seed=5, max_iterations=600).as_json()
     assert row["result"] == {key: result[key] for key in row["result"]}
-
-
-def test_cameras_are_swept_with_the_learner_that_learn_takes(tmp_path: Path) -> None:
-    log = tmp_path / "log.mcap"
-    write_cameras(log, {"/left": (100, 20)})
-    source, learned = open_source([log])
-    source.close()
-    (trial,) = plan([log], grid={}, seeds=[0])
-    assert trial.call.args[1] == learned
-    assert learned.learner.algorithm == "progress"
-    (chosen,) = plan([log], grid={"learner.algorithm": ["2.0"]}, seeds=[0])
-    assert chosen.call.args[1].learner.algorithm == "2.0"
-    report = sweep([log], tmp_path / "sweep", seeds=[0], max_iterations=2)
-    assert (report.computed, report.failed) == (1, ())
 
 
 def test_logs_are_swept_as_the_options_say(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
@@ -188,18 +161,6 @@ def test_a_row_that_was_cut_short_is_computed_again_and_a_damaged_one_named(
         list(read_rows(tmp_path))
 
 
-def test_a_folder_takes_one_sweep_at_a_time(tmp_path: Path) -> None:
-    inside: list[str] = []
-
-    def progress(*_: int) -> None:
-        with pytest.raises(UsageError, match="in use") as refused:
-            sweep("oscillatory", tmp_path, seeds=[7], max_iterations=5)
-        inside.append(str(refused.value))
-
-    sweep("oscillatory", tmp_path, seeds=[0], max_iterations=5, progress=progress)
-    assert len(inside) == 1
-
-
 def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
     with started("sweep", "oscillatory", "--seeds", "0:40", "-o", tmp_path) as process:
         wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
@@ -209,20 +170,6 @@ def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
     assert report.skipped == len(before) < 40
     assert report.computed == 40 - len(before)
     assert rows_of(tmp_path).items() >= before.items()
-
-
-@pytest.mark.parametrize("jobs", ["1", "2"])
-def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, jobs: str) -> None:
-    words = ("sweep", "oscillatory", "--seeds", "0:4000", "--jobs", jobs, "-o", tmp_path)
-    with started(*words) as process:
-        wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
-        process.terminate()
-        complaint = process.communicate(timeout=30)[1]
-    assert process.returncode == 143
-    assert complaint.splitlines()[-1] == (
-        f"cdmisfa: interrupted: {tmp_path} keeps the trials that are finished: "
-        "say the same again to go on"
-    )
 
 
 # Workers
@@ -297,49 +244,6 @@ def test_dask_gives_the_same_rows_though_a_worker_is_killed(
     assert rows_of(tmp_path / "dask") == local
 
 
-def test_a_silent_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(processes, "CONNECT_SECONDS", 0.5)
-    with pytest.raises(WorkersError, match=r"127\.0\.0\.1:9"):
-        list(run_all(trace, [("", 0, "")], scheduler="tcp://127.0.0.1:9"))
-
-
-@pytest.mark.parametrize(
-    ("lost", "why"), [("KilledWorker", "every dask worker .* died"), ("", "went away")]
-)
-def test_a_cluster_that_is_lost_ends_the_sweep_in_words(
-    monkeypatch: pytest.MonkeyPatch, lost: str, why: str
-) -> None:
-    distributed = pytest.importorskip("distributed")
-
-    class LostClient:
-        def __init__(self, *_: Any, **__: Any) -> None:
-            self.wait_for_workers = self.close = lambda *_, **__: None
-
-        def get_executor(self, **_: Any) -> Any:
-            return self
-
-        def submit(self, *_: Any) -> Future[Any]:
-            future: Future[Any] = Future()
-            if lost:
-                future.set_exception(distributed.KilledWorker("task", None, 3))
-            else:
-                future.cancel()
-                future.set_running_or_notify_cancel()
-            return future
-
-    monkeypatch.setattr(distributed, "Client", LostClient)
-    tasks = [("", n, "") for n in range(3)]
-    with pytest.raises(WorkersError, match=why):
-        list(run_all(trace, tasks, scheduler="tcp://127.0.0.1:9"))
-
-
-def test_a_scheduler_without_dask_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=r"pip install 'cdmisfa\[dask\]'"):
-        list(run_all(trace, [("", 0, "")], scheduler="tcp://127.0.0.1:9"))
-
-
 # Results
 
 
@@ -384,14 +288,6 @@ def test_results_are_printed_in_every_form(cdmisfa: Cdmisfa, known: Path) -> Non
     document = json.loads(shown("--json"))
     assert document["points"][1]["measures"]["iterations"] == {"mean": 5.0, "sd": None, "n": 1}
     assert "20 ± 10" in shown()
-
-
-def test_a_folder_without_a_sweep_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"sweep\.json: no regular file"):
-        reading.results(tmp_path)
-    (tmp_path / "sweep.json").write_text("{}")
-    with pytest.raises(LogDamagedError, match=r"sweep\.json is damaged"):
-        reading.results(tmp_path)
 
 
 # The command

@@ -72,12 +72,3 @@ def test_trial_is_the_learner_across_a_swap() -> None:
     )
     learner = step_by_step(QUICK, ("zero", "x2", "x3"), 1, trial.iterations, swap)
     assert_equal(trial, *learner)
-
-
-def test_trial_ends_for_the_reason_it_gives() -> None:
-    assert run_trial(QUICK, seed=0, max_iterations=10).ended == "max_iterations"
-    assert run_trial(QUICK, seed=0, max_iterations=0).iterations == 0
-    one = run_trial(QUICK, seed=0, max_modules=1)
-    assert (one.ended, len(one.modules)) == ("max_modules", 1)
-    never = dataclasses.replace(QUICK, delta=1e-12, patience=5)
-    assert run_trial(never, seed=0).ended == "nothing_left"
