@@ -14,8 +14,7 @@ from typing import Any
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import InputOptions
 from recorder.mcap.records import no_log
-from replay.logs.aligning import UnequalError
-from replay.logs.combining import join_parts
+from replay.logs.aligning import UnequalError, join_parts
 from replay.logs.formats import views
 from replay.logs.formats.arrays import array_streams
 from replay.logs.formats.recording import NoRecordingError, ViewFile

@@ -33,51 +33,41 @@ Progress = Callable[[int, int], None]
 class StoredSource(ClockedSource):
     """A source of stored frames: all of them once, or looped, lap after lap.
 
-    A derived class sets `_spec`, `_loop`, `_count`, `gaps` and, with gaps, `_held`.
+    A derived class sets `_spec`, `_loop`, `frames`, `gaps` and, with gaps, `_held`.
 
     Attributes:
+        frames: number of frames of every stream, those of gaps included.
+        first_frame: number of the first frame.
         centre: "episode": frames are shown without the mean of their episode; see `episode`.
         held_out: frames at the end that `take` does not return; see `hold_out`.
         more: a remedy, beside looping, for too few frames.
         to_judge: whether the last frames are held out by default; see `hold_out`.
         recorded: whether it is a recording of ours.
         left_out: a line for each log that could not be read and was left out.
-        copies: a line for each stream that shows the same as a stream of another log.
         notes: a line for each choice that was made by default.
         warnings: a line for each thing that the user should know.
     """
 
+    frames: int
+    first_frame: int = 0
     centre: Centre = "run"
     held_out: int = 0
     more: str = ""
     to_judge: bool = False
     recorded: bool = False
     left_out: tuple[str, ...] = ()
-    copies: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     _loop: bool
-    _first: int = 0
-    _count: int
     _held: Sequence[Sequence[Span]]
     """The frames of the first lap that each stream has."""
     _means: dict[int, tuple[Span, NDArray[Any]]] | None = None
     _identities: Sequence[Identity] | None = None
 
     @property
-    def frames(self) -> int:
-        """Number of frames of every stream, those of gaps included."""
-        return self._count
-
-    @property
-    def first_frame(self) -> int:
-        """Number of the first frame."""
-        return self._first
-
-    @property
     def end(self) -> int:
         """The frame after the last that `take` returns, of the first lap."""
-        return self._first + self._count - self.held_out
+        return self.first_frame + self.frames - self.held_out
 
     def centre_by(self, centre: Centre) -> None:
         """Show every frame as it is, or without the mean of its episode.
@@ -95,10 +85,10 @@ class StoredSource(ClockedSource):
         Raises:
             UsageError: the source loops, or no frame would be left.
         """
-        if self._loop or not 0 <= count < self._count:
-            raise UsageError(f"{self._name()}: no {count} frames of {self._count} can be held out")
+        if self._loop or not 0 <= count < self.frames:
+            raise UsageError(f"{self._name()}: no {count} frames of {self.frames} can be held out")
         self.held_out = count
-        self._spec = replace(self._spec, length=self._count - count)
+        self._spec = replace(self._spec, length=self.frames - count)
 
     def pieces(self, stream: int, start: int, stop: int, n: int) -> Iterator[Block]:
         """Yield the frames [start, stop) of a stream in blocks of n or fewer; the clock stays.
@@ -155,7 +145,7 @@ class StoredSource(ClockedSource):
         """See `spans`."""
         if not self.gaps:
             return [(start, stop)]
-        return in_laps(self._held[stream], self._first, self._count, start, stop)
+        return in_laps(self._held[stream], self.first_frame, self.frames, start, stop)
 
     def episode(self, stream: int, t: int) -> Span:
         """The episode [start, stop) of a frame, in the first lap.
@@ -167,8 +157,8 @@ class StoredSource(ClockedSource):
             t: a frame that the stream has, of any lap.
         """
         if not self.gaps:
-            return self._first, self._first + self._count
-        held, t = self._held[stream], self._first + (t - self._first) % self._count
+            return self.first_frame, self.first_frame + self.frames
+        held, t = self._held[stream], self.first_frame + (t - self.first_frame) % self.frames
         return held[bisect.bisect_right(held, t, key=lambda span: span[0]) - 1]
 
     def seek(self, t: int) -> None:
@@ -178,8 +168,8 @@ class StoredSource(ClockedSource):
             LogExhaustedError: the source ends before frame t.
             ValueError: t is before the first frame.
         """
-        if t < self._first:
-            raise ValueError(f"frame {t} lies before the first, {self._first}")
+        if t < self.first_frame:
+            raise ValueError(f"frame {t} lies before the first, {self.first_frame}")
         if not self._loop and t > self.end:
             raise LogExhaustedError(
                 f"{self._name()}: it ends at frame {self.end}, before frame {t}; begin again at "
@@ -263,9 +253,9 @@ class StoredSource(ClockedSource):
             return block
         shown, at = [], 0
         while at < n:  # an episode ends where a lap does
-            place = (t + at - self._first) % self._count
-            count = min(n - at, self._count - place)
-            mean = self._mean(stream, self._first + place)
+            place = (t + at - self.first_frame) % self.frames
+            count = min(n - at, self.frames - place)
+            mean = self._mean(stream, self.first_frame + place)
             shown.append(centred(block.frames[at : at + count], mean))
             at += count
         frames = shown[0] if len(shown) == 1 else np.concatenate(shown)
@@ -288,7 +278,7 @@ class StoredSource(ClockedSource):
     def _unbroken(self, stream: int, n: int) -> int:
         """The first of the next n frames of a stream that follow one another."""
         # Looping, a stretch that holds them is in the rest of this lap or in the next two.
-        end = self._t + 3 * self._count + n if self._loop else self.end
+        end = self._t + 3 * self.frames + n if self._loop else self.end
         for low, high in self._spans(stream, self._t, end):
             if high - low >= n:
                 return low

@@ -141,7 +141,7 @@ def test_files_may_be_named_in_any_order(vectors: Path) -> None:
 def test_what_does_not_belong_together_is_refused(vectors: Path, pictures: Path) -> None:
     with pytest.raises(UsageError, match="are recordings of their own: name one"):
         open_recording([vectors, pictures])
-    with pytest.raises(UsageError, match=r"x1\.mcap is a copy of .*x1\.mcap: leave one out"):
+    with pytest.raises(LogDamagedError, match="a part is missing or doubled"):
         open_recording([vectors / "x1.mcap", vectors / "x1.mcap"])
     with pytest.raises(UsageError, match="no such"):
         open_recording(vectors / "nothing")

@@ -25,7 +25,6 @@ STATED: dict[str, tuple[str, str, str, Mapping[str, str]]] = {
     "mkv, small clusters": ("mkv", "libx264", "yuv420p", {"cluster_time_limit": "200"}),
     "webm": ("webm", "libvpx-vp9", "yuv420p", {}),
     "avi": ("avi", "mjpeg", "yuvj420p", {}),
-    "wmv": ("wmv", "wmv2", "yuv420p", {}),
 }
 
 
@@ -36,6 +35,7 @@ NOT_STATED: dict[str, tuple[str, str, str, Mapping[str, str]]] = {
         {"movflags": "frag_keyframe+empty_moov+skip_trailer"},
     ),
     "mpeg": ("mpg", "mpeg1video", "yuv420p", {}),
+    "wmv": ("wmv", "wmv2", "yuv420p", {}),
 }
 """Containers that state where they end."""
 

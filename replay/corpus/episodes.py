@@ -145,10 +145,9 @@ class EpisodeSource(StoredSource):
         for episode in alike:
             episode.start, end = end, end + episode.count + PAUSE
         self._starts = [episode.start for episode in alike]
-        self._count = end if self._loop else end - PAUSE
-        length = None if self._loop else self._count
+        self.frames = end if self._loop else end - PAUSE
+        length = None if self._loop else self.frames
         self._spec = replace(one, streams=tuple(names), length=length)
-        self.copies = tuple(_copies(alike))
         order = "by when each begins, then by its path"
         ends = f"{alike[0].name} to {alike[-1].name}" if len(alike) > 1 else alike[0].name
         self.notes = (f"{counted(len(alike), 'episode')}, {order}: {ends}",)
@@ -163,13 +162,13 @@ class EpisodeSource(StoredSource):
 
     def hold_out(self, count: int) -> None:
         """Keep the last episodes from `take` that lie within so many frames, or else these."""
-        first = bisect.bisect_left(self._starts, self._count - count)
+        first = bisect.bisect_left(self._starts, self.frames - count)
         whole = first < len(self._starts)
-        super().hold_out(self._count - self._starts[first] if whole else count)
+        super().hold_out(self.frames - self._starts[first] if whole else count)
 
     def episode(self, stream: int, t: int) -> Span:
         """The log [start, stop) that a frame is of, or the episode of a dataset."""
-        t %= self._count
+        t %= self.frames
         one = self._episodes[bisect.bisect_right(self._starts, t) - 1]
         if one.many:
             spans = one.spans(self._spec.streams[stream])
@@ -213,15 +212,15 @@ class EpisodeSource(StoredSource):
 
     def _spans(self, stream: int, start: int, stop: int) -> Iterable[Span]:
         name = self._spec.streams[stream]
-        lap, at = divmod(start, self._count)
+        lap, at = divmod(start, self.frames)
         number = max(bisect.bisect_right(self._starts, at) - 1, 0)
         while True:
             for i in range(number, len(self._episodes)):
                 episode = self._episodes[i]
-                if lap * self._count + episode.start >= stop:
+                if lap * self.frames + episode.start >= stop:
                     return
                 for low, high in episode.spans(name):
-                    low, high = low + lap * self._count, high + lap * self._count
+                    low, high = low + lap * self.frames, high + lap * self.frames
                     if max(low, start) < min(high, stop):
                         yield max(low, start), min(high, stop)
             if not self._loop:
@@ -229,7 +228,7 @@ class EpisodeSource(StoredSource):
             lap, number = lap + 1, 0
 
     def _block(self, stream: int, t: int, n: int) -> Block:
-        place = t % self._count
+        place = t % self.frames
         number = bisect.bisect_right(self._starts, place) - 1
         self._reading = number, place
         one, source = self._episodes[number], self._log(number)
@@ -304,14 +303,6 @@ class EpisodeSource(StoredSource):
 def _said(spec: SourceSpec) -> str:
     """What the frames of a log are, in words."""
     return f"frames of {'x'.join(map(str, spec.frame_shape))} {spec.dtype} at {spec.fps:g} Hz"
-
-
-def _copies(episodes: Sequence[Episode]) -> Iterator[str]:
-    known: dict[str, str] = {}
-    for one in episodes:
-        other = known.setdefault(one.identity.sampled, one.name)
-        if other != one.name:
-            yield f"{one.name} holds the same as {other}, as a copy does"
 
 
 def _few(lines: Sequence[str]) -> Sequence[str]:

@@ -20,7 +20,6 @@ from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import Problem, Segment
 from replay.integrity.info import count_decoded, kind_of, read_once, report_all, report_on
 from replay.integrity.report import LogReport, State, as_problem, combined, failed
-from replay.logs.formats import table
 from replay.logs.formats import views as recorded
 from replay.logs.formats.mcap_log import decoders_in
 from replay.logs.formats.recording import ViewFile
@@ -328,16 +327,14 @@ def _check_external(path: Path) -> LogReport:
     """Decode every image of a camera log without checksums."""
     try:
         kind = log_format(path)
-        notes = table.notes(path) if kind == "table" else []
-        if kind == "bag":
-            notes = [f"{path}: a ROS bag has no checksums, changed bytes may go unnoticed"]
         channels = channels_of(path, whole=True)
     except LogDamagedError as error:
         return replace(failed(path, error), crc="absent")
     report = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
     if kind == "pictures" and channels[0].encoding == "png":  # PNG has checksums of its own
         report = replace(report, crc="ok" if report.ok else "bad")
-    return replace(report, notes=(*notes, *report.notes))
+    notes = dict.fromkeys(line for channel in channels for line in channel.remarks)
+    return replace(report, notes=tuple(notes | dict.fromkeys(report.notes)))
 
 
 def _check_topics(path: Path, topics: Iterable[str]) -> LogReport:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +15,12 @@ import numpy as np
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import stream_name, stream_names
 from recorder.images.options import Align, InputOptions
 from replay.logs import clock as clocks
 from replay.logs.clock import Clock
-from replay.logs.combining import copies
 from replay.logs.formats.arrays import FPS
-from replay.logs.stream import LogStream
+from replay.logs.stream import LogStream, joined
 
 
 class UnequalError(UsageError):
@@ -54,18 +57,12 @@ def align(
         streams = [_excerpt(stream, options, zero) for stream in streams]
     times = list(map(_times, streams))
     by_index = arrays or (options.align == "index" and len(times) > 1)
-    try:
-        if options.align == "time":
-            _refuse_apart(streams)
-            clock = clocks.by_time(times, fps)
-        else:
-            if not by_index:
-                _refuse_unequal(streams, options, fps, goal)
-            clock = clocks.by_index(times, fps, gaps=not by_index)
-    except UsageError as error:
-        # Streams that do not fit may be copies of one another, of which one was cut.
-        line = next(copies(streams), None)
-        raise error if line is None else type(error)(f"{line}: leave one out") from None
+    if options.align == "time":
+        _refuse_apart(streams)
+        return Aligned(streams, fps, clocks.by_time(times, fps))
+    if not by_index:
+        _refuse_unequal(streams, options, fps, goal)
+    clock = clocks.by_index(times, fps, gaps=not by_index)
     return Aligned(streams, fps, clock)
 
 
@@ -158,3 +155,46 @@ def _refuse_unequal(
                 f"{stream.topic} has {1 / clocks.step_of(own):g} images a second, not {fps:g}: "
                 f"choose images by their times, as with: {command('time')}"
             )
+
+
+def join_parts(streams: Sequence[LogStream]) -> list[LogStream]:
+    """Join logs with one topic of which each begins after another ends; others stay streams."""
+    found: list[LogStream] = []
+    for topic in dict.fromkeys(stream.topic for stream in streams):
+        own = [stream for stream in streams if stream.topic == topic]
+        ordered = sorted(own, key=lambda s: 0 if s.times is None else int(s.times[0]))
+        follow = len(own) > 1 and all(
+            one.times is not None and two.times is not None and one.times[-1] < two.times[0]
+            for one, two in itertools.pairwise(ordered)
+        )
+        found += [joined(ordered)] if follow else own
+    return found if len(found) < len(streams) else list(streams)
+
+
+def names_of(streams: Sequence[LogStream]) -> tuple[str, ...]:
+    """Names of streams by their topics, with the file's and folders' where topics are shared.
+
+    Raises:
+        UsageError: a topic of a log is named twice.
+    """
+    topics = [stream.topic for stream in streams]
+    if len(set(topics)) == len(topics):
+        return stream_names(topics)
+    places = [(stream.path.resolve(), stream.topic) for stream in streams]
+    if len(set(places)) < len(places):
+        place = next(place for place in places if places.count(place) > 1)
+        raise UsageError(f"{place[1]} of {place[0]} is named twice: leave one out")
+    for folders in range(max(len(path.parts) for path, _ in places)):
+        names = [_in_folders(stream, folders) for stream in streams]
+        if len(set(names)) == len(names):
+            break
+    return stream_names(names)
+
+
+def _in_folders(stream: LogStream, folders: int) -> str:
+    """A stream's name with that of its file, and of some of the folders this is in."""
+    path, name = stream.path, stream_name(stream.topic)
+    if name not in (stream_name(path.stem), stream_name(path.resolve().name)):
+        name = f"{path.stem}/{name}"
+    above = Path(os.path.abspath(path)).parts[:-1]
+    return "/".join([*above[max(len(above) - folders, 0) :], name])

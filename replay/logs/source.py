@@ -23,9 +23,8 @@ from recorder.log.scenery import turns_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
 from replay.logs import clock as clocks
-from replay.logs.aligning import align
+from replay.logs.aligning import align, names_of
 from replay.logs.clock import Clock
-from replay.logs.combining import copies, names_of
 from replay.logs.formats.views import SCENE
 from replay.logs.images import Images
 from replay.logs.opening import identity_of
@@ -107,9 +106,9 @@ class LoggedSource(StoredSource):
             aligned = align(self.streams, self._options, self._goal)
             self.streams, self._fps, self._clock = aligned
             clock = aligned.clock
-        self._first = self._t = clock.first
-        self._count = len(clock.rows[0])
-        length = None if self._loop else self._count
+        self.first_frame = self._t = clock.first
+        self.frames = len(clock.rows[0])
+        length = None if self._loop else self.frames
         self.framings: Sequence[Framing | None] = [None] * len(self.streams)
         if self.recorded:
             names = tuple(stream.topic for stream in self.streams)
@@ -129,8 +128,8 @@ class LoggedSource(StoredSource):
         self.gaps = any(clock.gaps) and self._options.gaps == "skip"
         if self.recorded:
             self.gaps = self.streams[0].views[0].facts.gaps
-        end = self._first + self._count
-        self._held = [outside(own, self._first, end) for own in clock.gaps]
+        end = self.first_frame + self.frames
+        self._held = [outside(own, self.first_frame, end) for own in clock.gaps]
         self.pauses = dict(zip(names, clock.gaps, strict=True))
         self.alignment: dict[str, dict[str, int]] = {}
         if self.to_judge:
@@ -138,7 +137,6 @@ class LoggedSource(StoredSource):
             each = zip(names, self.streams, clock.rows, left_out, strict=True)
             for name, stream, rows, gaps in each:
                 self.alignment[name] = clocks.counts(stream.count, rows, gaps)
-            self.copies = tuple(copies(self.streams))
 
     def _recorded_clock(self) -> Clock:
         facts = self.streams[0].views[0].facts
@@ -162,8 +160,8 @@ class LoggedSource(StoredSource):
         rows, parts = self._clock.rows[stream], []
         at = t
         while at < t + n:
-            place = (at - self._first) % self._count
-            stop = min(place + t + n - at, self._count)
+            place = (at - self.first_frame) % self.frames
+            stop = min(place + t + n - at, self.frames)
             parts.append(self._frames(stream, at, rows[place:stop]))
             at += stop - place
         frames, truth = parts[0]
@@ -199,7 +197,7 @@ class LoggedSource(StoredSource):
                 after, start = 0, t + len(rows)
         stop = start + max(len(rows), LIKELY)
         ahead = np.arange(start, stop if self._loop else min(stop, self.end))
-        next_rows = np.asarray(self._clock.rows[after])[(ahead - self._first) % self._count]
+        next_rows = np.asarray(self._clock.rows[after])[(ahead - self.first_frame) % self.frames]
         places = [(stream, int(row)) for row in rows]
         places += [(after, row) for row in next_rows.tolist()]
         shown = {(number, row) for number, (row, _) in self._shown.items()}
@@ -236,7 +234,6 @@ class LoggedSource(StoredSource):
     def _warnings(self) -> Iterator[str]:
         for stream in self.streams:
             yield from stream.warnings
-        yield from self.copies
         clock = self._clock
         if self.recorded:
             ends = {
@@ -248,7 +245,7 @@ class LoggedSource(StoredSource):
                     f"{self._name()}: its views end at different frames; it ends with the "
                     f"shortest, before frame {end}"
                 )
-            if left_out := end - self._first - self._count:
+            if left_out := end - self.first_frame - self.frames:
                 yield (
                     f"{self._name()}: {left_out} frames are missing in a view and left out in all"
                 )
@@ -327,14 +324,14 @@ class LoggedSource(StoredSource):
 
     def described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """See `StoredSource`."""
-        shared: dict[str, Any] = {"frames": self._count, "loop": self._loop}
+        shared: dict[str, Any] = {"frames": self.frames, "loop": self._loop}
         if self.recorded:
             views = [view for stream in self.streams for view in stream.views]
             named = [{"name": view.facts.view, "frames": view.count} for view in views]
             return {
                 "kind": "recording",
                 **self.scene(),
-                "first_frame": self._first,
+                "first_frame": self.first_frame,
                 "views": [{**one, **log} for one, log in zip(named, logs, strict=True)],
                 **shared,
             }

@@ -163,15 +163,13 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
     """Return an array as (n, I) of numbers or (n, height, width[, 3])."""
     array = as_array(given, name)
     array = array[:, None] if array.ndim == 1 else array
-    if array.ndim == 4 and array.shape[3] in (1, 3, 4):
+    if array.ndim == 4 and array.shape[3] in (1, 4):
         array = array[..., 0] if array.shape[3] == 1 else array[..., :3]
-    if array.dtype.kind not in "biuf" or array.ndim not in (2, 3, 4) or not array.size:
-        raise UsageError(f"{name}: an array {array.shape} of {array.dtype}: {_FORMS}")
-    if array.ndim == 4 and array.shape[3] != 3:
-        raise UsageError(
-            f"{name}: an array {array.shape} of {array.dtype}: {_FORMS}; np.moveaxis(x, 1, -1) "
-            "moves colours last"
-        )
+    images = array.ndim == 3 or (array.ndim == 4 and array.shape[3] == 3)
+    if array.dtype.kind not in "biuf" or not (images or array.ndim == 2) or not array.size:
+        hint = "; np.moveaxis(x, 1, -1) moves colours last" if array.ndim == 4 else ""
+        raise UsageError(f"{name}: an array {array.shape} of {array.dtype}: {_FORMS}{hint}")
+    high = 1 if array.dtype.kind == "f" else 255
     if array.dtype.kind == "f":
         finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
         if not finite.all():
@@ -179,11 +177,11 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
                 f"{name}: row {int(np.argmin(finite))}, counted from 0, holds NaN or infinity, as "
                 f"{int((~finite).sum())} of {len(array)} rows do: leave them out or fill them"
             )
-    if array.ndim > 2 and array.dtype not in (np.uint8, np.uint16, np.bool_):
-        low, high, most = array.min(), array.max(), 1 if array.dtype.kind == "f" else 255
-        if low < 0 or high > most:
-            raise UsageError(
-                f"{name}: pictures of {array.dtype} hold {low:g} to {high:g}: scale them to 0 to "
-                f"{most}, or give uint8; other numbers are rows, as x.reshape(len(x), -1)"
-            )
+    scaled = array.dtype in (np.uint8, np.uint16, np.bool_)
+    if images and not scaled and not 0 <= array.min() <= array.max() <= high:
+        raise UsageError(
+            f"{name}: pictures of {array.dtype} hold {array.min():g} to {array.max():g}: scale "
+            f"them to 0 to {high:g}, or give uint8; other numbers are rows, as "
+            "x.reshape(len(x), -1)"
+        )
     return array.astype(array.dtype.newbyteorder("="), copy=False)

@@ -118,8 +118,7 @@ def streams(
                 f"{path}: its messages are not in the order of time; convert it to MCAP"
             )
         fetch = bag.fetcher(topic, times)
-        remark = f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"
-        about = {"program": "rosbags", "remarks": [remark]}
+        about = {"program": "rosbags", "remarks": [_remark(path)]}
         found.append(message_stream(path, topic, kind, options, times, fetch, **about))
     return found
 
@@ -153,8 +152,13 @@ def channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
         own = stamps[name]
         ends = min(own, default=None), max(own, default=None)
         images = decoder_of(kind, InputOptions()) is not None
-        found.append(ChannelFacts(name, kind.encoding, kind.schema, len(own), *ends, images))
+        about = (kind.encoding, kind.schema, len(own), *ends, images)
+        found.append(ChannelFacts(name, *about, remarks=(_remark(path),)))
     return found
+
+
+def _remark(path: Path) -> str:
+    return f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"
 
 
 @contextlib.contextmanager

@@ -35,7 +35,7 @@ def extent_of(path: Path) -> Extent:
         LogDamagedError: the disk does not give it.
     """
     with opened_regular(path) as file:
-        size, head = os.fstat(file.fileno()).st_size, file.read(len(_ASF))
+        size, head = os.fstat(file.fileno()).st_size, file.read(16)
         if head[4:8] in _FIRST_BOXES:
             kinds, extent = _boxes(file, size)
             if kinds & {b"moov", b"moof"}:
@@ -45,7 +45,7 @@ def extent_of(path: Path) -> Extent:
             return _elements(file, size)
         if head.startswith(b"RIFF"):
             return _chunks(file, size)
-        return _objects(file, size) if head == _ASF else Extent(stated=False)
+        return Extent(stated=False)
 
 
 def _ended(what: str, stop: int, size: int) -> Extent:
@@ -163,32 +163,3 @@ def _inner_chunks(file: BinaryIO, at: int, stop: int) -> Iterator[tuple[bytes, i
         name, length = struct.unpack("<4sI", _at(file, at, 8))
         yield name, at, at + 8 + length
         at += 8 + length + length % 2
-
-
-# WMV: the Advanced Systems Format, 3.2
-
-_ASF: Final = bytes.fromhex("3026b2758e66cf11a6d900aa0062ce6c")
-_PROPERTIES: Final = bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")
-_BROADCAST: Final = 1
-_DATA_HEAD: Final = 50
-"""Bytes before the first packet, which all have one length."""
-
-
-def _objects(file: BinaryIO, size: int) -> Extent:
-    header = _at(file, 0, 1 << 16)
-    found = header.find(_PROPERTIES)
-    if found < 0:
-        return Extent(stated=False)
-    (stop,) = struct.unpack_from("<Q", header, found + 40)
-    (flags,) = struct.unpack_from("<I", header, found + 88)
-    if flags & _BROADCAST:
-        return Extent(stated=False)
-    if stop > size:
-        return _ended("what it states of itself", stop, size)
-    (length,) = struct.unpack_from("<I", header, found + 92)
-    at = int.from_bytes(header[16:24], "little") + _DATA_HEAD
-    while length and at + length <= min(size, stop):
-        if not any(_at(file, at, 8)):
-            return _zeros(at)
-        at += length
-    return Extent()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,12 +18,12 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, check_regular, read_json
 from recorder.images.compressed import compressed_image
-from recorder.images.fields import EXACT, bounded
-from recorder.images.options import NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, InputOptions
+from recorder.images.options import RECIPE, VIDEO_RECIPE, InputOptions
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic
+from replay.logs.formats.table import number_stream
 from replay.logs.formats.video import VideoFile
-from replay.logs.stream import ChannelFacts, LogStream, Rows, explained, limited, picked
+from replay.logs.stream import ChannelFacts, LogStream, explained, limited
 
 INFO: Final = "meta/info.json"
 PAUSE: Final = 20
@@ -53,14 +54,11 @@ class Dataset:
             raise UsageError(f"{path}: there is no frame in it")
         self.times = times.astype(np.int64)
 
-    def stream(self, topic: str, what: str, **about: Any) -> LogStream:
-        """Return a stream of all frames."""
+    def notes(self, what: str) -> list[str]:
+        """Return the warning that episodes are joined, if there are several."""
         many = len(self.rows)
         note = f"{self.path}: {what} is of {many} episodes, with pauses between"
-        about["warnings"] = [*about.get("warnings", ()), *([note] if many > 1 else [])]
-        return LogStream(
-            path=self.path, topic=topic, count=len(self.times), times=self.times, **about
-        )
+        return [note] if many > 1 else []
 
 
 def streams(
@@ -83,15 +81,18 @@ def streams(
     for topic in chosen:
         camera = _Camera(path, topic, color=options.color is True)
         opened.callback(camera.close)
-        stream = camera.dataset.stream(
-            topic,
-            topic,
+        stream = LogStream(
+            path=path,
+            topic=topic,
+            count=len(camera.dataset.times),
+            times=camera.dataset.times,
             fetch=camera.fetch,
             decode=camera.decode,
             picture=None if camera.video else bytes,
             held=camera.held,
             program="LeRobot's layout",
             recipe=VIDEO_RECIPE if camera.video else RECIPE,
+            warnings=camera.dataset.notes(topic),
         )
         found.append(stream)
     return found
@@ -193,26 +194,11 @@ def _numbers(path: Path, options: InputOptions) -> LogStream:
     with limited(path, "LeRobot's layout", held=numbers.nbytes):
         starts = dataset.starts
         firsts = np.array([int(row["dataset_from_index"]) for row in dataset.rows]) - starts[:-1]
-        at = np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))
-        frames = bounded(numbers[at], options.range)
-    if not (whole := np.isfinite(frames).all(axis=1)).all():
-        raise UsageError(
-            f"{path}: frame {int(np.argmin(whole))} lacks a number of {what}, or has one that is "
-            "not finite: name others with --field"
-        )
-    rounded = [f"{path}: numbers beyond 2^53 may be rounded, to float64"]
-
-    def read(rows: Rows) -> tuple[FloatArray, FloatArray]:
-        return picked(frames, rows), np.empty((len(rows), 0))
-
-    return dataset.stream(
-        topic,
-        what,
-        read=read,
-        recipe=NUMBERS_RECIPE,
-        fields=names,
-        warnings=rounded if (np.abs(frames) > EXACT).any() else [],
+        frames = numbers[np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))]
+    stream = number_stream(
+        path, topic, {what: frames}, dataset.times, options, lambda row: f"{path}: frame {row}"
     )
+    return replace(stream, fields=names, warnings=[*stream.warnings, *dataset.notes(what)])
 
 
 def is_dataset(path: Path) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,7 @@ from cdmisfa.core.untrusted import check_regular
 from recorder.images.fields import EXACT, Field, bounded, is_path
 from recorder.images.options import NUMBERS_RECIPE, InputOptions
 from replay.logs.formats.messages import check_topics
-from replay.logs.stream import LAST_NS, ChannelFacts, LogStream, Rows, limited, picked
+from replay.logs.stream import LAST_NS, ChannelFacts, LogStream, limited, picked
 
 ENDINGS: Final = (".csv", ".parquet")
 
@@ -53,8 +53,8 @@ def streams(
         LogDamagedError: it is no table, or has words among numbers.
     """
     check_topics(path, path.stem, options.topics)
-    table = _read(path)
-    if path.suffix.lower() == ".csv":
+    table, csv = _read(path), path.suffix.lower() == ".csv"
+    if csv:
         _refuse_words(path, table, options.fields or table.column_names)
     times, time_column = _times(path, table, options.time)
     fields = options.fields or tuple(
@@ -65,71 +65,91 @@ def streams(
         raise UsageError(f"{path}: it has no column of numbers with rows, but {kinds}")
     with limited(path, "PyArrow", remedy="take fewer columns, with --field"):
         columns = [_column(path, table, name) for name in fields]
-    numbers = np.concatenate(columns, axis=1)
+    # A row of a CSV file is named by its line, from 1, of Parquet by its number, from 0.
+    stream = number_stream(
+        path,
+        path.stem,
+        dict(zip(fields, columns, strict=True)),
+        times,
+        options,
+        lambda row: f"{path}: line {row + 2}" if csv else f"{path}: row {row}",
+    )
+    return [stream]
+
+
+def number_stream(
+    path: Path,
+    topic: str,
+    columns: Mapping[str, FloatArray],
+    times: IntArray | None,
+    options: InputOptions,
+    where: Callable[[int], str],
+) -> LogStream:
+    """Return the numbers of a table as a stream, in the order of time.
+
+    Args:
+        path: the log.
+        topic: the name of the stream.
+        columns: of each field its numbers, (n, I); NaN if there is none.
+        times: (n,) nanoseconds, -1 if there is none; None of rows at an even rate.
+        options: the range that numbers are kept in.
+        where: names a row.
+
+    Raises:
+        UsageError: a row cannot be left out, as there are no times, or no row is left.
+    """
+    numbers = np.concatenate(list(columns.values()), axis=1)
     # A missing number is not out of bounds: input.range keeps no row without one.
-    whole = ~np.any([np.isnan(column).all(axis=1) for column in columns], axis=0)
+    whole = ~np.any([np.isnan(column).all(axis=1) for column in columns.values()], axis=0)
     whole &= np.isfinite(numbers).all(axis=1) | (options.range is not None)
     if times is not None:
         whole &= times >= 0
-    first_left_out = _row_name(path, int(np.argmin(whole)))
-    if times is None and not whole.all():
+    first = where(int(np.argmin(whole)))
+    if not whole.any() or (times is None and not whole.all()):
         raise UsageError(
-            f"{path}: {first_left_out} lacks a finite number: name the column of its times with "
-            "--set input.time=COLUMN, so that it can be left out"
+            f"{first} lacks a finite number of {', '.join(columns)}: name the column of times with "
+            "--set input.time=COLUMN, so that such rows can be left out, or fewer with --field"
         )
-    if not whole.any():
-        raise UsageError(f"{path}: there is no row with all of {', '.join(fields)}")
-    rows, warnings = np.flatnonzero(whole), []
-    if left_out := int((~whole).sum()):
-        warnings.append(
+    rows, lines = np.flatnonzero(whole), []
+    if left_out := len(whole) - len(rows):
+        lines.append(
             f"{left_out} of {len(whole)} rows lack a finite number or their time and are left "
-            f"out, the first is {first_left_out}"
+            f"out, the first is {first.removeprefix(f'{path}: ')}"
         )
     if times is not None:
-        times = times[whole]
-        if late := int((times < np.maximum.accumulate(times)).sum()):
-            warnings.append(
-                f"{late} rows are after later ones: taken in the order of {time_column}"
-            )
-        order = np.argsort(times, kind="stable")
-        rows, times = rows[order], times[order]
+        if late := int((times[rows] < np.maximum.accumulate(times[rows])).sum()):
+            lines.append(f"{late} rows are after later ones: they are sorted by their times")
+        rows = rows[np.argsort(times[rows], kind="stable")]
     frames = bounded(numbers, options.range)[rows]
     if (np.abs(frames) > EXACT).any():
-        warnings.append("numbers beyond 2^53 may be rounded, to float64")
-
-    def read(wanted: Rows) -> tuple[FloatArray, FloatArray]:
-        return picked(frames, wanted), np.empty((len(wanted), 0))
-
-    stream = LogStream(
+        lines.append("numbers beyond 2^53 may be rounded, to float64")
+    return LogStream(
         path=path,
-        topic=path.stem,
+        topic=topic,
         count=len(frames),
-        times=times,
-        read=read,
-        where=lambda row: f"{path}: {_row_name(path, int(rows[row]))}",
-        encoding=path.suffix[1:],
+        times=None if times is None else times[rows],
+        read=lambda wanted: (picked(frames, wanted), np.empty((len(wanted), 0))),
+        where=lambda row: where(int(rows[row])),
         recipe=NUMBERS_RECIPE,
-        fields=fields,
-        warnings=[f"{path}: {line}" for line in warnings],
+        fields=tuple(columns),
+        warnings=[f"{path}: {line}" for line in lines],
     )
-    return [stream]
 
 
 def channels(path: Path) -> list[ChannelFacts]:
     """Return the columns of a table; raises as `streams`."""
     table, kind = _read(path), path.suffix[1:]
+    remark = f"{path}: a table has no checksums, changed numbers would go unnoticed"
     return [
-        ChannelFacts(name, kind, str(own.type), len(own) - own.null_count, images=False)
+        ChannelFacts(
+            name,
+            kind,
+            str(own.type),
+            len(own) - own.null_count,
+            images=False,
+            remarks=(remark,),
+        )
         for name, own in zip(table.column_names, table.columns, strict=True)
-    ]
-
-
-def notes(path: Path) -> list[str]:
-    """Return the lines that `verify` prints of a table; raises as `streams`."""
-    table = _read(path)
-    return [
-        f"{path}: {table.num_rows} rows of {table.num_columns} columns can be read; a table has "
-        "no checksums, changed numbers would go unnoticed"
     ]
 
 
@@ -196,11 +216,6 @@ def _refuse_words(path: Path, table: Any, names: Sequence[str]) -> None:
     if mixed:
         with limited(path, "PyArrow", remedy="choose columns of numbers with --field"):
             _read_csv(path, mixed)
-
-
-def _row_name(path: Path, row: int) -> str:
-    """Name a row: the line of a CSV file, from 1; of Parquet the row, from 0."""
-    return f"line {row + 2}" if path.suffix.lower() == ".csv" else f"row {row}"
 
 
 def _is_numeric(column: Any) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import filecmp
 import itertools
 import re
 from collections.abc import Sequence
@@ -116,19 +115,14 @@ def arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]]
 
 def _several(views: Sequence[ViewFile]) -> UsageError | None:
     """The refusal of files that do not belong together; None of different ones in one folder."""
-    copied = ""
-    for one, two in itertools.combinations([view.path for view in views], 2):
-        if one == two or filecmp.cmp(one, two, shallow=False):
-            copied = f"{two} is a copy of {one}: leave one out"
-            break
     folders = list(dict.fromkeys(str(view.path.parent) for view in views))
     if len(folders) < 2:
-        return UsageError(copied) if copied else None
-    refused = copied or f"{folders[0]} and {folders[1]} are recordings of their own"
+        return None
+    refused = f"{folders[0]} and {folders[1]} are recordings of their own: name one of them"
     if not views[0].facts.spec.images:
-        return UsageError(f"{refused}: name one of them")
+        return UsageError(refused)
     return SeveralRecordingsError(
-        f"{refused}: name one of them, or put their streams on one clock with --align index"
+        f"{refused}, or put their streams on one clock with --align index"
     )
 
 
