@@ -24,7 +24,7 @@ from replay.logs.opening import ALL, OpenLogs, image_logs, only_external
 from replay.logs.source import LoggedSource
 from replay.runs.folders import RUN_FILE, is_run
 from replay.storage.location import is_url, location
-from replay.storage.opening import by_number, log_files, no_such, starts_as_log
+from replay.storage.opening import log_files, natural_order, no_such, starts_as_log
 
 About = Callable[[LoggedSource], None]
 """Called with logs that were opened to be shown, to print what they are."""
@@ -266,7 +266,7 @@ def locations(words: Sequence[str | Path]) -> list[Path]:
             found.append(location(word))
             continue
         matched = map(Path, glob.glob(str(word), recursive=True))
-        logs = sorted((p for p in matched if p.suffix not in (".rrd", ".json")), key=by_number)
+        logs = sorted((p for p in matched if p.suffix not in (".rrd", ".json")), key=natural_order)
         if not logs:
             raise UsageError(f"{word}: no file or folder matches")
         found += logs

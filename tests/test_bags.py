@@ -92,15 +92,6 @@ def test_every_image_is_there_in_its_place(make: Callable[[Path], Path], tmp_pat
     source.close()
 
 
-@pytest.mark.parametrize("make", [ros1_bag, ros2_database])
-def test_a_torn_bag_is_one_line(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    path = make(tmp_path)
-    raw = path.read_bytes()
-    path.write_bytes(raw[: len(raw) // 2])
-    with pytest.raises(LogDamagedError, match=r"cameras\.(bag|db3): rosbags cannot read it"):
-        external(path, TOPICS).take(0, COUNT)
-
-
 @pytest.mark.parametrize("value", [5, "text"])
 def test_a_message_that_is_no_bytes_is_damage(tmp_path: Path, value: object) -> None:
     path = ros2_database(tmp_path)

@@ -5,15 +5,10 @@ from __future__ import annotations
 import io
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import PACKED
-from conftest import Cdmisfa
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from message_files import every, write_mcap
 from PIL import Image
 
 from recorder.images.compressed import compressed_image
@@ -121,62 +116,3 @@ def test_what_cameras_leave_around_the_end_is_no_damage(
 def test_small_pictures_are_whole(kind: str, side: int) -> None:
     flat = packed(np.full((side, side, 3), 7, np.uint8), **{**PNG, **JPEG}[kind])
     assert compressed_image(flat).shape == (side, side)
-
-
-def in_folder(folder: Path, pictures: list[bytes], ending: str) -> tuple[Path, str]:
-    (folder / "log").mkdir()
-    for number, data in enumerate(pictures):
-        (folder / "log" / f"{number}.{ending}").write_bytes(data)
-    return folder / "log", f"3.{ending}"
-
-
-def in_log(folder: Path, pictures: list[bytes], ending: str) -> tuple[Path, str]:
-    messages = [CompressedImage(data=p, format=ending).SerializeToString() for p in pictures]
-    path = write_mcap(folder / "log.mcap", PACKED, {"/cam": every(10**8, messages)})
-    return path, "/cam at 1000000000300000000 ns"
-
-
-@pytest.mark.parametrize("written", [in_folder, in_log])
-@pytest.mark.parametrize(("ending", "format"), [("png", "PNG"), ("jpg", "JPEG")])
-def test_commands_name_the_damaged_picture(
-    tmp_path: Path, cdmisfa: Cdmisfa, written: Any, ending: str, format: str
-) -> None:
-    random = np.random.default_rng(3)
-    pictures = [packed(scene(random), format=format) for _ in range(6)]
-    pictures[3] = end_of_zeros(pictures[3], random)
-    path, where = written(tmp_path, pictures, ending)
-    words = (path, "-o", tmp_path / "out", "--size", "8x8", "--rate", "10")
-    failed = cdmisfa("convert", *words)
-    assert failed.code == 3
-    assert where in failed.err.splitlines()[-1]
-    checked = cdmisfa("verify", path, "--json")
-    assert checked.code == 3
-    assert [where in problem["where"] for problem in checked.json["problems"]] == [True]
-    assert cdmisfa("convert", *words, "--force", "--salvage").code == 0
-
-
-@pytest.mark.parametrize(
-    ("ending", "damage", "state", "crc"),
-    [
-        ("png", None, "whole", "ok"),
-        ("png", end_of_zeros, "damaged", "bad"),
-        ("jpg", None, "unchecked", "absent"),
-        ("jpg", end_of_zeros, "unchecked", "absent"),
-    ],
-)
-def test_info_and_verify_judge_a_folder_alike(
-    tmp_path: Path, cdmisfa: Cdmisfa, ending: str, damage: Damage | None, state: str, crc: str
-) -> None:
-    """Of pictures without checksums `info` says that it has not looked."""
-    random = np.random.default_rng(4)
-    pictures = [packed(scene(random), format={"png": "PNG", "jpg": "JPEG"}[ending])] * 6
-    if damage:
-        pictures[3] = damage(pictures[3], random)
-    path, where = in_folder(tmp_path, pictures, ending)
-    info, verify = cdmisfa("info", path, "--json"), cdmisfa("verify", path, "--json")
-    assert (info.json["state"], info.json["crc"]) == (state, crc)
-    assert [where in p["where"] for p in info.json["problems"]] == [True] * (state == "damaged")
-    assert verify.json["state"] == ("damaged" if damage else "whole")
-    assert verify.json["files"][0]["crc"] == crc
-    if state != "unchecked":
-        assert info.code == verify.code

@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, pictures, write_cameras, write_images
-from conftest import Cdmisfa
-from folders import contents, external
-from waiting import started, wait_for
+from camera_files import HEIGHT, WIDTH, pictures, write_images
+from folders import external
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 
 SIZE = (HEIGHT, WIDTH)
-BOTH = ("--topic", "/left", "--topic", "/right", "--size", f"{WIDTH}x{HEIGHT}")
 
 
 def write_part(path: Path, rows: range, topics: tuple[str, ...] = ("/left", "/right")) -> None:
@@ -81,24 +78,3 @@ def test_a_part_that_was_cut_before_its_first_message_is_left_out_and_said(
         os.truncate(part, 42)
     with pytest.raises(LogDamagedError, match="there is no message before"):
         external(parts[0].parent, ["/right"], size=SIZE)
-
-
-def test_a_killed_conversion_is_resumed(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    write_cameras(tmp_path / "a.mcap", {"/left": (6000, 20), "/right": (6000, 20)})
-    words = ("convert", tmp_path / "a.mcap", *BOTH, "-o")
-    assert cdmisfa(*words, tmp_path / "whole").code == 0
-    folder = tmp_path / "rec"
-    partial = folder / "left.mcap.partial"
-    with started(*words, folder) as process:
-        wait_for(lambda: partial.exists() and partial.stat().st_size >= 20_000, 60, process)
-        process.kill()
-        process.communicate(timeout=60)
-    assert not (folder / "left.mcap").exists()
-    refused = cdmisfa(*words, folder)
-    assert (refused.code, "--resume" in refused.err) == (2, True)
-    other = cdmisfa(*words, folder, "--resume", "--rate", "25", "--align", "time")
-    assert (other.code, "cannot be continued" in other.err) == (2, True), other.err
-    for _ in range(2):
-        done = cdmisfa(*words, folder, "--resume")
-        assert done.code == 0, done.err
-        assert contents(folder) == contents(tmp_path / "whole")

@@ -18,8 +18,8 @@ from folders import contents, coverage, external
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError
-from recorder.images.framing import FRAME_PIXELS, default_size, fitted
-from recorder.images.options import Align, Fit
+from recorder.images.framing import FRAME_PIXELS, default_size
+from recorder.images.options import Align
 from recorder.recording import RecordingStoppedError, record, recorded
 from replay.inputs import open_recording
 from replay.logs.clock import intersection
@@ -242,23 +242,6 @@ def test_a_dataset_has_an_episode_between_gaps(cdmisfa: Cdmisfa, tmp_path: Path)
 def _frames(source: Any, stream: int, low: int, high: int) -> np.ndarray:
     source.seek(low)
     return np.asarray(source.take(stream, high - low).frames)
-
-
-IMAGE = np.arange(24 * 32, dtype=np.uint32).reshape(24, 32).astype(np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("fit", "expected"),
-    [
-        ("crop", IMAGE[6:18]),
-        ("stretch", (IMAGE[::2].astype(float) + IMAGE[1::2]) / 2),
-        ("pad", np.pad(IMAGE[::2, ::2] / 4 + IMAGE[1::2, 1::2] / 4 + IMAGE[::2, 1::2] / 4
-                       + IMAGE[1::2, ::2] / 4, ((0, 0), (8, 8)))),
-    ],
-)  # fmt: skip
-def test_other_ratios_are_cut_stretched_or_padded(fit: Fit, expected: np.ndarray) -> None:
-    frame = fitted(IMAGE, (12, 32), fit)
-    assert abs(frame.astype(float) - expected).max() <= 1
 
 
 @pytest.mark.parametrize(

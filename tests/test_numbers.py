@@ -215,24 +215,6 @@ def test_the_rows_of_a_table_are_frames_at_their_times(
         assert (source.spec.fps, source.take(0, 3).frames.tolist()) == (10, [[0], [1], [2]])
 
 
-def test_rows_without_a_number_are_left_out_and_a_pause_is_a_gap(tmp_path: Path) -> None:
-    stamps, numbers = (np.arange(COUNT) / 50).tolist(), angles()[:, 0].tolist()
-    numbers[3] = stamps[5] = None
-    numbers[40:60] = [None] * 20
-    shuffled = np.random.default_rng(0).permutation(COUNT)
-    columns = {"s": [stamps[i] for i in shuffled], "a": [numbers[i] for i in shuffled]}
-    path = write_table(tmp_path / "t.csv", columns)
-    with external(path, time="s", align="time") as source:
-        assert source.gaps
-        assert source.pauses == {"t": [(40, 60)]}
-        assert source.spans(0, 0, COUNT) == [(0, 40), (60, COUNT)]
-        assert "22 of 90 rows lack a finite number or their time" in source.warnings[0]
-        shown = source.take(0, 7).frames[:, 0]
-        assert (shown == angles()[[0, 1, 2, 2, 4, 4, 6], 0]).all()
-    with pytest.raises(UsageError, match="line 9 lacks a finite number: name"):
-        external(path, fields=["a"], rate=10)
-
-
 def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
     path = write_table(tmp_path / "t.parquet", {"state": angles().tolist(), "n": range(COUNT)})
     with external(path, fields=["state[1:3]", "n"], rate=5) as source:

@@ -46,22 +46,6 @@ def test_the_signals_are_those_of_the_files(
     assert cdmisfa("check", tmp_path / "run").code == 0
 
 
-def test_a_run_is_viewed_exported_and_compared(
-    cdmisfa: Cdmisfa, web: WebServer, oscillatory_run: Path, tmp_path: Path
-) -> None:
-    web.files["/runs/a/run.mcap"] = (oscillatory_run / "run.mcap").read_bytes()
-    url = web.url("/runs/a/run.mcap")
-    refused = cdmisfa("learn", url)
-    assert (refused.code, f"{url} is a run, not a recording" in refused.err) == (2, True)
-    assert cdmisfa("view", url, "--save", tmp_path / "a.rrd").code == 0
-    for source, out in ((url, "far.csv"), (oscillatory_run, "near.csv")):
-        assert cdmisfa("export", source, "-o", tmp_path / out).code == 0
-    assert (tmp_path / "far.csv").read_bytes() == (tmp_path / "near.csv").read_bytes()
-    same = cdmisfa("compare", oscillatory_run, url, "--json")
-    assert [row["run"] for row in same.json["runs"]] == [oscillatory_run.name, "a"]
-    assert "-o F.html" in cdmisfa("report", url).err
-
-
 def test_damage_is_found_and_named_by_its_url(
     cdmisfa: Cdmisfa, web: WebServer, oscillatory_recording: Path, tmp_path: Path
 ) -> None:

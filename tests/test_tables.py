@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Cdmisfa
 from folders import external
 from message_files import write_table
 
@@ -123,48 +122,9 @@ def test_an_empty_column_and_rows_out_of_order_are_said(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(("name", "place"), [("t.csv", "line 5"), ("t.parquet", "row 3")])
-def test_what_is_missing_is_left_out_and_is_not_the_end_of_a_range(
-    tmp_path: Path, name: str, place: str
-) -> None:
-    values = [0, 1, 2, None, 4, np.inf, *range(6, ROWS)]
-    path = write_table(tmp_path / name, {"t": np.arange(ROWS) / 10, "a": values})
-    kept, said = taken(path, range=(1.0, 8.0), gaps="hold", align="index")
-    assert [a for (a,) in kept] == [1, 1, 2, 4, 1, 6, 7, 8, 8, 8, 8]
-    assert said[0].endswith(f"left out, the first is {place}")
-    with pytest.raises(UsageError, match=f"{place} lacks a finite number: name"):
-        taken(path, time=None, rate=5, range=(1.0, 8.0))
-
-
 def test_distances_in_a_list_that_were_not_measured_are_the_end_of_a_range(tmp_path: Path) -> None:
     lists = [[1.0, None], [np.nan, 2.0], None, [3.0, np.inf]]
     path = write_table(tmp_path / "t.parquet", {"t": np.arange(4) / 10, "r": lists})
     kept, said = taken(path, fields=["r"], range=(0.5, 9.0), align="index")
     assert kept == [[1, 0.5], [0.5, 2], [3, 0.5]]
     assert said[0].endswith("left out, the first is row 2")
-
-
-def test_commands_take_tables_and_say_what_was_left_out(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    rows = [f"{i / 50},{'' if i == 7 else i}" for i in range(60) if i not in (20, 21)]
-    path = tmp_path / "t.csv"
-    path.write_text("\n".join(["t,a", *rows]) + "\n")
-    for words in (
-        ["learn", path, "--set", "learner.tau=10", "--max-iterations", 1],
-        ["convert", path, "-o", tmp_path / "rec"],
-        ["export", path, "--to", "lerobot", "-o", tmp_path / "set"],
-        ["view", path, "--set", "input.range=-3,3", "--save", tmp_path / "v.rrd"],
-    ):
-        done = cdmisfa(*words, "--set", "input.time=t")
-        assert done.code == 0, done.err
-        if "input.range=-3,3" not in words:
-            assert f"warning: {path}: 1 of 58 rows lack a finite number" in done.err, words[0]
-            assert done.err.count("(3 missing): 1.2 s of it become 1.14 s of frames") == 1
-        assert "H.264" not in done.err
-    checked = cdmisfa("verify", path)
-    assert checked.code == 0
-    assert "58 rows of 2 columns can be read; a table has no checksums" in checked.out
-    refused = cdmisfa(
-        "export", path, "--set", "input.time=t", "--to", "npz", "-o", tmp_path / "a.npz"
-    )
-    assert refused.code == 2
-    assert "npz holds the signals of one run: name a run" in refused.err

@@ -19,7 +19,7 @@ from replay.logs.opening import log_format
 from replay.logs.source import LoggedSource
 from replay.storage.identity import Identity
 from replay.storage.location import location
-from replay.storage.opening import by_number
+from replay.storage.opening import natural_order
 from replay.stored import Span
 
 STREAM: Final = "stream"
@@ -252,7 +252,7 @@ def _way(log: Log) -> str:
 
 def _by_numbers(name: str) -> list[Any]:
     """Sort key that puts 9/log before 10/log."""
-    return [by_number(Path(part)) for part in Path(name).parts]
+    return [natural_order(Path(part)) for part in Path(name).parts]
 
 
 def _named_by_file(log: Log) -> bool:

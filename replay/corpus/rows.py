@@ -21,7 +21,7 @@ from replay.integrity.info import describe_log, describe_reader
 from replay.integrity.report import ChannelInfo, LogReport, failed_state
 from replay.logs.clock import missing
 from replay.logs.opening import identity_of, image_topics, only_external, open_stream
-from replay.storage.identity import Identity, LogIdentity
+from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import is_url, location
 
 VERSION: Final = 2
@@ -177,7 +177,7 @@ def _described(place: Path, deep: bool) -> tuple[LogReport, str, list[dict[str, 
         topics = [c.topic for c in info.channels if deep and c.encoding != "numpy"]
     else:
         with LogReader(place, salvage=True, check="chunks") as reader:
-            sha256 = _hash_of(LogIdentity(reader))
+            sha256 = _hash_of(McapIdentity(reader))
             info = describe_reader(reader, decode=False)
         if deep:
             info = describe_log(place, decode=True)

@@ -131,8 +131,8 @@ def _refuse_unequal(
 
     times = list(map(_times, streams))
     begins, ends = clocks.overlap(times)
-    for stream, own in zip(streams[1:], times[1:], strict=True):
-        if not (reason := clocks.unlike(times[0], own)):
+    for stream, stamps in zip(streams[1:], times[1:], strict=True):
+        if not (reason := clocks.unlike(times[0], stamps)):
             continue
         two = f"{streams[0].topic} and {stream.topic}"
         if begins < ends:
@@ -149,26 +149,26 @@ def _refuse_unequal(
             f"{two} have no time in common: take the i-th image of each together, as with: "
             f"{command('index')}"
         )
-    for stream, own in zip(streams, times, strict=True):
-        if clocks.of_other_rate(own, fps):
+    for stream, stamps in zip(streams, times, strict=True):
+        if clocks.of_other_rate(stamps, fps):
             raise UnequalError(
-                f"{stream.topic} has {1 / clocks.step_of(own):g} images a second, not {fps:g}: "
+                f"{stream.topic} has {1 / clocks.step_of(stamps):g} images a second, not {fps:g}: "
                 f"choose images by their times, as with: {command('time')}"
             )
 
 
 def join_parts(streams: Sequence[LogStream]) -> list[LogStream]:
     """Join logs with one topic of which each begins after another ends; others stay streams."""
-    found: list[LogStream] = []
+    result: list[LogStream] = []
     for topic in dict.fromkeys(stream.topic for stream in streams):
-        own = [stream for stream in streams if stream.topic == topic]
-        ordered = sorted(own, key=lambda s: 0 if s.times is None else int(s.times[0]))
-        follow = len(own) > 1 and all(
+        alike = [stream for stream in streams if stream.topic == topic]
+        ordered = sorted(alike, key=lambda s: 0 if s.times is None else int(s.times[0]))
+        follow = len(alike) > 1 and all(
             one.times is not None and two.times is not None and one.times[-1] < two.times[0]
             for one, two in itertools.pairwise(ordered)
         )
-        found += [joined(ordered)] if follow else own
-    return found if len(found) < len(streams) else list(streams)
+        result += [joined(ordered)] if follow else alike
+    return result if len(result) < len(streams) else list(streams)
 
 
 def names_of(streams: Sequence[LogStream]) -> tuple[str, ...]:
@@ -187,8 +187,8 @@ def names_of(streams: Sequence[LogStream]) -> tuple[str, ...]:
     for folders in range(max(len(path.parts) for path, _ in places)):
         names = [_in_folders(stream, folders) for stream in streams]
         if len(set(names)) == len(names):
-            break
-    return stream_names(names)
+            return stream_names(names)
+    return stream_names([f"{i + 1}/{topic}" for i, topic in enumerate(topics)])
 
 
 def _in_folders(stream: LogStream, folders: int) -> str:

@@ -63,13 +63,13 @@ def by_time(streams: Sequence[IntArray], fps: float) -> Clock:
     rows = [np.searchsorted(times, clock, side="right") - 1 for times in streams]
     gaps: list[list[Span]] = []
     for times in streams:
-        step, found = step_of(times) * NANOSECONDS, list[Span]()
+        step, spans = step_of(times) * NANOSECONDS, list[Span]()
         for i in pauses(times):
             begins = int(np.searchsorted(clock, int(times[i - 1]) + int(step / 2), side="right"))
             ends = int(np.searchsorted(clock, times[i], side="left"))
             if begins < ends:
-                found.append((begins, ends))
-        gaps.append(found)
+                spans.append((begins, ends))
+        gaps.append(spans)
     return Clock(start, rows, gaps)
 
 
@@ -92,12 +92,12 @@ def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> Clock:
     for i in begins:
         ticks[i] = max(round(int(first[i] - first[i - 1]) * fps / NANOSECONDS), 2)
     frame = np.cumsum(ticks) - ticks[0]
-    found = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
+    spans = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
     if frame[-1] > MAX_FRAMES:
-        said = f"it has {gaps_in_words(found, fps)}, {frame[-1] + 1} frames in all"
-        raise UsageError(f"{said}: choose a part without, with --start or --end")
+        line = f"it has {gaps_in_words(spans, fps)}, {frame[-1] + 1} frames in all"
+        raise UsageError(f"{line}: choose a part without, with --start or --end")
     rows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
-    return Clock(int(first[0]), [rows] * len(streams), [found] * len(streams))
+    return Clock(int(first[0]), [rows] * len(streams), [spans] * len(streams))
 
 
 def by_number(streams: Sequence[Sequence[Span]], start_ns: int, first: int, *, gaps: bool) -> Clock:
@@ -112,45 +112,45 @@ def by_number(streams: Sequence[Sequence[Span]], start_ns: int, first: int, *, g
     Raises:
         LogDamagedError: no frame is in every stream.
     """
-    streams = [merged(held) for held in streams]
+    streams = [merged(covered) for covered in streams]
     common = streams[0]
     if gaps:
-        common = [(first, max((high for held in streams for _, high in held), default=first))]
+        common = [(first, max((high for covered in streams for _, high in covered), default=first))]
     else:
-        for held in streams[1:]:
-            common = intersection(common, held)
+        for covered in streams[1:]:
+            common = intersection(common, covered)
     common = merged(span for span in common if span[0] < span[1])
     if not common:
         raise LogDamagedError("no frame is there, whole, in every view")
     begins, end = common[0][0], common[-1][1]
     parts = [np.arange(low, high) for low, high in common] if len(common) > 1 else []
     rows: Rows = np.concatenate(parts) if parts else range(begins, end)
-    absent = [outside(held, begins, end) if gaps else [] for held in streams]
+    absent = [outside(covered, begins, end) if gaps else [] for covered in streams]
     return Clock(start_ns, [rows] * len(streams), absent, begins)
 
 
 def merged(spans: Iterable[Span]) -> list[Span]:
-    """Ranges in their order, with those that touch merged."""
-    found: list[Span] = []
+    """Merge ranges that touch, given in their order."""
+    result: list[Span] = []
     for start, stop in spans:
-        touches = found and found[-1][1] == start
-        found.append((found.pop()[0], stop) if touches else (start, stop))
-    return found
+        touches = result and result[-1][1] == start
+        result.append((result.pop()[0], stop) if touches else (start, stop))
+    return result
 
 
 def intersection(one: Sequence[Span], two: Sequence[Span]) -> list[Span]:
     """The frames in both of two sorted lists of ranges [start, stop)."""
-    found: list[Span] = []
+    result: list[Span] = []
     i = j = 0
     while i < len(one) and j < len(two):
         low, high = max(one[i][0], two[j][0]), min(one[i][1], two[j][1])
         if low < high:
-            found.append((low, high))
+            result.append((low, high))
         if one[i][1] < two[j][1]:
             i += 1
         else:
             j += 1
-    return found
+    return result
 
 
 def overlap(streams: Sequence[IntArray]) -> tuple[int, int]:
@@ -209,8 +209,8 @@ def retimed(times: IntArray, rows: Rows, fps: float) -> str:
         rows: which of them each frame shows, each at least once.
         fps: frames a second.
     """
-    shown = np.asarray(rows)
-    frame = np.concatenate([[0], np.flatnonzero(shown[1:] != shown[:-1]) + 1])
+    row_of = np.asarray(rows)
+    frame = np.concatenate([[0], np.flatnonzero(row_of[1:] != row_of[:-1]) + 1])
     since = (times - times[0]) / NANOSECONDS
     lacks = _lacks(times)
     lacks[pauses(times) - 1] = 0
@@ -230,11 +230,15 @@ def counts(count: int, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
         rows: which of them each frame shows.
         gaps: frames that are not counted.
     """
-    shown = len(rows)
+    visible = len(rows)
     if not isinstance(rows, range):
-        shown = int(np.count_nonzero(rows[1:] != rows[:-1])) + 1
-    held = sum(stop - start for start, stop in gaps)
-    return {"messages": count, "repeated": len(rows) - held - shown, "dropped": count - shown}
+        visible = int(np.count_nonzero(rows[1:] != rows[:-1])) + 1
+    in_gaps = sum(stop - start for start, stop in gaps)
+    return {
+        "messages": count,
+        "repeated": len(rows) - in_gaps - visible,
+        "dropped": count - visible,
+    }
 
 
 def gaps_in_words(gaps: Sequence[Span], fps: float) -> str:

@@ -21,7 +21,7 @@ _CELLS = 8
 _BRIGHTNESS: Final = np.array((0.299, 0.587, 0.114))[:, None, None]
 """Of red, green and blue, as grey frames show them."""
 
-_TOLD: Final = 2.0
+_MOST_RATIO: Final = 2.0
 """Change of red or blue over that of brightness, up to which grey shows it as well; a red ball on
 black comes to that."""
 
@@ -57,9 +57,9 @@ def shows_hue(source: StoredSource) -> bool:
 def hue_varies(frames: NDArray[Any]) -> bool:
     """Whether hue varies where brightness does not, and lasts, as noise does not.
 
-    In each of 8 x 8 cells hue is red and blue less brightness, without what brightness in the same
-    cell tells of it, at most `_TOLD` times itself. Of that, as of brightness, the covariance of
-    frames that follow one another is taken, summed over the cells.
+    In each of 8 x 8 cells hue is red and blue less brightness, without what brightness in the
+    same cell tells of it, at most `_MOST_RATIO` times itself. Of that, as of brightness, the
+    covariance of frames that follow one another is taken, summed over the cells.
 
     Args:
         frames: (n, height, 3 width) uint8, each in red, green and blue beside one another.
@@ -71,7 +71,7 @@ def hue_varies(frames: NDArray[Any]) -> bool:
     grey = (_BRIGHTNESS * cells).sum(axis=0)
     hue = cells[[0, 2]] - grey
     along = (hue * grey).sum(axis=1) / np.maximum((grey * grey).sum(axis=0), 1e-9)
-    hue -= along.clip(-_TOLD, _TOLD)[:, None] * grey
+    hue -= along.clip(-_MOST_RATIO, _MOST_RATIO)[:, None] * grey
     lasting = _lasting(hue) / len(grey.T)
     varies = max(
         _SHARE * _lasting(grey) / len(grey.T),

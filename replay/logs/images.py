@@ -14,7 +14,7 @@ from recorder.images.compressed import AT_ONCE, compressed_image
 from recorder.images.pixels import Shown, UnknownPixels
 from replay.logs.stream import BROKEN, LogStream
 
-SALVAGE: Final = "learn and convert pass over what is broken with --salvage"
+SALVAGE: Final = "learn and convert replace broken images with --salvage"
 
 CORES: Final = thread_count()
 """Images that are decoded at once."""
@@ -26,8 +26,7 @@ Place = tuple[int, int]
 class DecodingAhead:
     """Images of streams that threads decode; with one thread there are none.
 
-    No more than two a thread are held, those of which nothing is known until they are asked for
-    among them.
+    No more than two a thread are held, images that no thread can decode among them.
 
     Args:
         streams: the streams.
@@ -37,35 +36,35 @@ class DecodingAhead:
     def __init__(self, streams: Sequence[LogStream], *, color: bool) -> None:
         self._streams, self._color = streams, color
         self._threads = ThreadPoolExecutor(CORES)
-        self._begun: dict[Place, Future[ByteArray] | None] = {}
+        self._pending: dict[Place, Future[ByteArray] | None] = {}
         self._coming: Iterator[Place] = iter(())
 
     def expect(self, places: Iterable[Place]) -> None:
         """Announce the rows that are asked for next, in this order; others are forgotten."""
         wanted = dict.fromkeys(places if CORES > 1 else ())
-        for place in self._begun.keys() - wanted:
+        for place in self._pending.keys() - wanted:
             self._forget(place)
-        self._coming = iter([place for place in wanted if place not in self._begun])
+        self._coming = iter([place for place in wanted if place not in self._pending])
         self._begin()
 
     def pop(self, place: Place) -> ByteArray | None:
         """Return an image; None if no thread has decoded it, or the caller shall see the error."""
-        coming = self._begun.pop(place, None)
+        coming = self._pending.pop(place, None)
         self._begin()
         return None if coming is None or coming.exception() is not None else coming.result()
 
     def close(self) -> None:
-        """Decode no more, and wait for what is being decoded; harmless when called twice."""
-        for place in [*self._begun]:
+        """Decode no more, and wait for running threads; harmless when called twice."""
+        for place in [*self._pending]:
             self._forget(place)
         self._threads.shutdown()
 
     def _begin(self) -> None:
-        for place in itertools.islice(self._coming, max(2 * CORES - len(self._begun), 0)):
-            self._begun[place] = self._decode(*place)
+        for place in itertools.islice(self._coming, max(2 * CORES - len(self._pending), 0)):
+            self._pending[place] = self._decode(*place)
 
     def _decode(self, number: int, row: int) -> Future[ByteArray] | None:
-        """Fetch a row in this thread, and let another decode it; None of what is no JPEG or PNG."""
+        """Fetch a row in this thread, and let another decode it; None for other images."""
         stream = self._streams[number]
         if stream.picture is None:
             return None
@@ -78,7 +77,7 @@ class DecodingAhead:
         return self._threads.submit(compressed_image, data, color=self._color, most=AT_ONCE)
 
     def _forget(self, place: Place) -> None:
-        if (coming := self._begun.pop(place)) is not None:
+        if (coming := self._pending.pop(place)) is not None:
             coming.cancel()
 
 

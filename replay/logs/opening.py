@@ -15,7 +15,7 @@ from recorder.mcap.reader import LogReader
 from replay.logs.formats import arrays, bag, images, lerobot, mcap_log, table, video
 from replay.logs.formats.messages import NoTopicError, fits_topic
 from replay.logs.stream import ChannelFacts, LogStream
-from replay.storage.identity import Identity, LogIdentity
+from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import location
 from replay.storage.opening import log_files
 
@@ -79,10 +79,10 @@ def only_external(path: Path) -> bool:
 
 def image_logs(paths: Sequence[str | Path]) -> list[Path]:
     """Return the logs that paths mean: a folder of MCAP files is each, a rosbag2 is one log."""
-    found: list[Path] = []
+    logs: list[Path] = []
     for path in map(location, paths):
-        found += log_files(path) if log_format(path) == "mcap" else [path]
-    return found
+        logs += log_files(path) if log_format(path) == "mcap" else [path]
+    return logs
 
 
 class OpenLogs:
@@ -109,7 +109,7 @@ class OpenLogs:
 
         Args:
             files: the logs.
-            options: the topics, and what is taken of them.
+            options: the topics, and whether images or fields are read.
             opened: closes the logs.
             salvage: leave out what is damaged, of several logs also one that cannot be read.
 
@@ -124,9 +124,9 @@ class OpenLogs:
         broken: dict[Path, LogDamagedError] = {}
         refused: list[NoTopicError] = []
         for i, file in enumerate(files):
-            own = replace(options, topics=topics[i : i + 1]) if in_turn else options
+            chosen = replace(options, topics=topics[i : i + 1]) if in_turn else options
             try:
-                found = FORMATS[log_format(file)](file, own, opened, salvage=salvage)
+                streams = FORMATS[log_format(file)](file, chosen, opened, salvage=salvage)
             except NoTopicError as error:
                 if in_turn or len(files) == 1 or not topics:
                     raise
@@ -137,8 +137,8 @@ class OpenLogs:
                     raise
                 broken[file] = error
                 continue
-            self.streams += found
-            self.logs.append((file, found[0].reader))
+            self.streams += streams
+            self.logs.append((file, streams[0].reader))
         self.left_out = [f"{error}: this log is left out" for error in broken.values()]
         if not self.streams:
             raise refused[0] if refused else next(iter(broken.values()))
@@ -172,11 +172,11 @@ def identity_of(path: Path, reader: LogReader | None = None) -> Identity:
         reader: of an MCAP file.
     """
     if reader is not None:
-        return LogIdentity(reader)
+        return McapIdentity(reader)
     if not path.is_dir():
         return Identity(path)
-    found = path.rglob("*") if lerobot.is_dataset(path) else path.iterdir()
-    return Identity(path, (file for file in found if file.is_file()))
+    members = path.rglob("*") if lerobot.is_dataset(path) else path.iterdir()
+    return Identity(path, (file for file in members if file.is_file()))
 
 
 def image_topics(path: Path) -> list[str]:

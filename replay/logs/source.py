@@ -29,7 +29,7 @@ from replay.logs.formats.views import SCENE
 from replay.logs.images import Images
 from replay.logs.opening import identity_of
 from replay.logs.stream import BROKEN, LogStream, Rows
-from replay.storage.identity import Identity, LogIdentity
+from replay.storage.identity import Identity, McapIdentity
 from replay.stored import Span, StoredSource, outside
 
 LIKELY: Final = 32
@@ -320,7 +320,7 @@ class LoggedSource(StoredSource):
     def _logs(self) -> Sequence[Identity]:
         if not self.recorded:
             return [identity_of(*log) for log in self._log_list]
-        return [LogIdentity(view.reader) for stream in self.streams for view in stream.views]
+        return [McapIdentity(view.reader) for stream in self.streams for view in stream.views]
 
     def described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """See `StoredSource`."""

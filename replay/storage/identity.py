@@ -114,7 +114,7 @@ class Identity:
         return [(state.st_size, state.st_mtime_ns) for state in states]
 
 
-class LogIdentity(Identity):
+class McapIdentity(Identity):
     """Identity of an MCAP file; its sample has all bytes from its data end record on."""
 
     def __init__(self, reader: LogReader) -> None:

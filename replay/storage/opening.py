@@ -29,13 +29,13 @@ def log_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
         if path.is_dir():
             whole = sorted(path.glob("*.mcap"))
             cut = sorted(path.glob(f"*.mcap{PARTIAL}"))
-            found = whole + [p for p in cut if p.with_suffix("") not in whole]
-            if not found:
+            logs = whole + [p for p in cut if p.with_suffix("") not in whole]
+            if not logs:
                 raise UsageError(
                     f"{path}: no log in this folder; {KINDS}; record or learn first, or name each "
                     "video, bag, table or folder of pictures in it, or cdmisfa index all of them"
                 )
-            files += found
+            files += logs
         elif path.exists():
             files.append(path)
         else:
@@ -73,7 +73,7 @@ def starts_as_log(path: Path) -> bool:
         return file.read(len(MAGIC)) == MAGIC
 
 
-def by_number(path: Path) -> list[tuple[int, str]]:
+def natural_order(path: Path) -> list[tuple[int, str]]:
     """Return a sort key that puts 9.png before 10.png."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(p) if p.isdecimal() else -1, p) for p in parts]

@@ -49,12 +49,12 @@ def streams(
         UsageError: no such array, or one that holds no frames.
         LogDamagedError: the file holds something else.
     """
-    held = load_numbers(path)
-    chosen = [name for name in held if not options.topics or fits_topic(name, options.topics)]
+    arrays = load_numbers(path)
+    chosen = [name for name in arrays if not options.topics or fits_topic(name, options.topics)]
     if not chosen:
-        raise NoTopicError(f"{path}: it has the arrays {', '.join(held)}: name of these")
+        raise NoTopicError(f"{path}: it has the arrays {', '.join(arrays)}: name of these")
     try:
-        return array_streams({name: held[name] for name in chosen}, options, path)
+        return array_streams({name: arrays[name] for name in chosen}, options, path)
     except UsageError as error:
         raise type(error)(f"{path}: {error}") from None
 
@@ -76,7 +76,7 @@ def array_streams(
     """
     if not arrays:
         raise UsageError("no array given: name one at least")
-    found = []
+    opened_streams = []
     for name, given in arrays.items():
         array = _checked(str(name), given)
         stream = LogStream(
@@ -89,8 +89,8 @@ def array_streams(
             recipe=RECIPE,
             digest=None if path else partial(array_hash, str(name), array),
         )
-        found.append(stream)
-    return found
+        opened_streams.append(stream)
+    return opened_streams
 
 
 def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
@@ -123,13 +123,13 @@ def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
 
 def channels(path: Path) -> list[ChannelFacts]:
     """Return the arrays of a file; raises as `load_numbers`."""
-    found = []
+    facts = []
     for name, array in load_numbers(path).items():
         shape = "x".join(map(str, array.shape[1:]))
         rows = len(array) if array.ndim else 1
         kind = f"{array.dtype} {shape}".rstrip()
-        found.append(ChannelFacts(name, "numpy", kind, rows, images=False))
-    return found
+        facts.append(ChannelFacts(name, "numpy", kind, rows, images=False))
+    return facts
 
 
 def array_hash(name: str, array: NDArray[Any]) -> dict[str, Any]:

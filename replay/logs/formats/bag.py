@@ -42,15 +42,15 @@ class Bag(NamedTuple):
 
     def kinds(self) -> dict[str, MessageKind]:
         """Return the kind of each topic's messages; in ROS 1 each publisher is a connection."""
-        found = {}
+        kinds_by_topic = {}
         for connection in (c for reader in self.readers for c in reader.connections):
             definition = str(connection.msgdef.data).encode()
             name, idl = str(connection.msgtype), connection.msgdef.format.name == "IDL"
             kind = MessageKind(name, "cdr", definition, "ros2idl" if idl else "ros2msg")
             if self.ros1:
                 kind = MessageKind(name.replace("/msg/", "/"), "ros1", definition, "ros1msg")
-            found[str(connection.topic)] = kind
-        return found
+            kinds_by_topic[str(connection.topic)] = kind
+        return kinds_by_topic
 
     def messages(
         self, topics: Sequence[str], start: int | None = None
@@ -108,7 +108,7 @@ def streams(
     """
     with open_bag(path) as bag:
         kinds = [(topic, kind, topic) for topic, kind in bag.kinds().items()]
-    found = []
+    opened_streams = []
     for topic, kind, _ in choose_topics(path, kinds, options):
         bag = opened.enter_context(open_bag(path))  # readers hold one chunk: of one topic
         with limited(path, "rosbags"):
@@ -119,8 +119,8 @@ def streams(
             )
         fetch = bag.fetcher(topic, times)
         about = {"program": "rosbags", "remarks": [_remark(path)]}
-        found.append(message_stream(path, topic, kind, options, times, fetch, **about))
-    return found
+        opened_streams.append(message_stream(path, topic, kind, options, times, fetch, **about))
+    return opened_streams
 
 
 def channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
@@ -147,14 +147,14 @@ def channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
                 messages = bag.messages if whole else bag.stamps
                 for name, stamp, *_ in messages(list(kinds)):
                     stamps[name].append(stamp)
-    found = []
+    facts = []
     for name, kind in kinds.items():
-        own = stamps[name]
-        ends = min(own, default=None), max(own, default=None)
+        times = stamps[name]
+        ends = min(times, default=None), max(times, default=None)
         images = decoder_of(kind, InputOptions()) is not None
-        about = (kind.encoding, kind.schema, len(own), *ends, images)
-        found.append(ChannelFacts(name, *about, remarks=(_remark(path),)))
-    return found
+        about = (kind.encoding, kind.schema, len(times), *ends, images)
+        facts.append(ChannelFacts(name, *about, remarks=(_remark(path),)))
+    return facts
 
 
 def _remark(path: Path) -> str:

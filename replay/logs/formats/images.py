@@ -16,7 +16,7 @@ from recorder.images.pixels import MalformedImage
 from recorder.mcap.records import Problem
 from replay.logs.formats.messages import check_topics
 from replay.logs.stream import LogStream
-from replay.storage.opening import by_number
+from replay.storage.opening import natural_order
 
 ENDINGS: Final = (".jpeg", ".jpg", ".png")
 
@@ -59,7 +59,7 @@ def image_files(path: Path) -> list[Path]:
     files = [file for file in path.iterdir() if file.suffix.lower() in ENDINGS]
     for file in files:
         check_regular(file, MAX_IMAGE)
-    return sorted(files, key=by_number)
+    return sorted(files, key=natural_order)
 
 
 def broken_images(files: Sequence[Path], most: int) -> list[Problem] | None:
@@ -77,11 +77,11 @@ def broken_images(files: Sequence[Path], most: int) -> list[Problem] | None:
     """
     if sum(file.stat().st_size for file in files) > most:
         return None
-    found = []
+    problems = []
     for file in files:
         try:
             if file.suffix.lower() != ".png" or not check_png(read_regular(file, MAX_IMAGE)):
                 return None
         except MalformedImage as error:
-            found.append(Problem(str(file), str(error)))
-    return found
+            problems.append(Problem(str(file), str(error)))
+    return problems

@@ -77,7 +77,7 @@ def streams(
     if not chosen or (not options.topics and len(chosen) > 1):
         wrong = f"no topic {', '.join(options.topics)}" if options.topics else "name one --topic"
         raise NoTopicError(f"{path}: {wrong}; it has images on: {', '.join(cameras) or 'none'}")
-    found = []
+    opened_streams = []
     for topic in chosen:
         camera = _Camera(path, topic, color=options.color is True)
         opened.callback(camera.close)
@@ -94,8 +94,8 @@ def streams(
             recipe=VIDEO_RECIPE if camera.video else RECIPE,
             warnings=camera.dataset.notes(topic),
         )
-        found.append(stream)
-    return found
+        opened_streams.append(stream)
+    return opened_streams
 
 
 class _Camera:
@@ -209,12 +209,12 @@ def is_dataset(path: Path) -> bool:
 def channels(path: Path) -> list[ChannelFacts]:
     """Return the features of a dataset, one value a frame."""
     info = _info(path)
-    found = []
+    facts = []
     for name, feature in info["features"].items():
         kind, shape = feature.get("dtype"), "x".join(map(str, feature.get("shape", ())))
         frames = int(info["total_frames"])
-        found.append(ChannelFacts(name, str(kind), shape, frames, images=kind in _IMAGES))
-    return found
+        facts.append(ChannelFacts(name, str(kind), shape, frames, images=kind in _IMAGES))
+    return facts
 
 
 def features(path: Path) -> tuple[list[str], list[str]]:
@@ -230,7 +230,7 @@ def _columns(file: Path, names: Sequence[str]) -> FloatArray:
     import pyarrow.parquet as pq
 
     check_regular(file)
-    found = []
+    columns = []
     with limited(file, "PyArrow", remedy="take fewer, with --field"):
         table = pq.ParquetFile(file).read(columns=list(names), use_threads=False)
         for name in names:
@@ -238,8 +238,8 @@ def _columns(file: Path, names: Sequence[str]) -> FloatArray:
             while pa.types.is_nested(column.type):
                 column = column.flatten()
             flat = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
-            found.append(flat.reshape(table.num_rows, -1))
-        return np.concatenate(found, axis=1)
+            columns.append(flat.reshape(table.num_rows, -1))
+        return np.concatenate(columns, axis=1)
 
 
 def _info(path: Path) -> Any:

@@ -18,7 +18,7 @@ from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
 from replay.logs.formats.messages import choose_topics, message_stream
 from replay.logs.stream import LogStream, NothingLoggedError
-from replay.storage.opening import by_number
+from replay.storage.opening import natural_order
 
 
 def streams(
@@ -34,7 +34,7 @@ def streams(
     """
     readers: list[LogReader] = []
     empty: list[NothingLoggedError] = []
-    for file in sorted(path.glob("*.mcap"), key=by_number) if path.is_dir() else [path]:
+    for file in sorted(path.glob("*.mcap"), key=natural_order) if path.is_dir() else [path]:
         reader = opened.enter_context(LogReader(file, salvage=salvage))
         try:
             refuse_empty(reader)
@@ -44,14 +44,14 @@ def streams(
     if not readers:
         raise empty[0]
     channels = [
-        (channel.topic, kind_of(reader, channel), (reader, channel.id))
+        (channel.topic, message_kind(reader, channel), (reader, channel.id))
         for reader in readers
         for channel in reader.channels.values()
     ]
     expected: dict[LogReader, Sequence[Segment]] = {}
-    found = []
-    for topic, kind, own in choose_topics(path, channels, options):
-        messages, parts = Messages(own, expected), len({reader for reader, _ in own})
+    opened_streams = []
+    for topic, kind, members in choose_topics(path, channels, options):
+        messages, parts = Messages(members, expected), len({reader for reader, _ in members})
         joined = [f"{path}: {topic} is joined from {parts} logs, by time"] if parts > 1 else []
         left_out = [f"{error}: left out" for error in empty]
         stream = message_stream(
@@ -65,8 +65,8 @@ def streams(
             reader=None if path.is_dir() else readers[0],
             warnings=[*joined, *left_out, *(w for reader in readers for w in reader.warnings)],
         )
-        found.append(stream)
-    return found
+        opened_streams.append(stream)
+    return opened_streams
 
 
 class Messages:
@@ -147,9 +147,9 @@ def _by_pass(
 ) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
     """Yield the chunks with messages of channels, and their log times, read and checked."""
     for segment, table in reader.tables():
-        own = _rows_of(table, channels)
-        if len(own):
-            yield segment, table.log_time[own]
+        rows = _rows_of(table, channels)
+        if len(rows):
+            yield segment, table.log_time[rows]
 
 
 def _by_index(
@@ -160,28 +160,28 @@ def _by_index(
     segments = [s for s in reader.segments if not numbers.isdisjoint(s.channel_counts() or ())]
     reader.expect(segments, indexes=True)
     for segment in segments:
-        own = [pairs for _, pairs in reader.index(segment, numbers)]
-        pairs = own[0] if len(own) == 1 else np.concatenate(own)
+        indexes = [pairs for _, pairs in reader.index(segment, numbers)]
+        pairs = indexes[0] if len(indexes) == 1 else np.concatenate(indexes)
         yield segment, pairs[pairs[:, 1].argsort(kind="stable"), 0]
 
 
 def refuse_empty(reader: LogReader) -> None:
     """Refuse a log that was cut before its first message."""
-    there = reader.channels and any(segment.size for segment in reader.segments)
-    if not reader.complete and not there:
+    has_messages = reader.channels and any(segment.size for segment in reader.segments)
+    if not reader.complete and not has_messages:
         raise NothingLoggedError(f"{reader.path}: {reader.missing}: there is no message before")
 
 
 def topics_in(reader: LogReader) -> list[str]:
     """Return the topics of a log with images."""
     channels = reader.channels.values()
-    found = (c.topic for c in channels if decoder_of(kind_of(reader, c), InputOptions()))
-    return list(dict.fromkeys(found))
+    topics = (c.topic for c in channels if decoder_of(message_kind(reader, c), InputOptions()))
+    return list(dict.fromkeys(topics))
 
 
 def decoders_in(reader: LogReader) -> dict[int, Decoder]:
     """Return the decoder of each channel of images."""
-    channels = [(c.topic, kind_of(reader, c), c.id) for c in reader.channels.values()]
+    channels = [(c.topic, message_kind(reader, c), c.id) for c in reader.channels.values()]
     topics, found = topics_in(reader), dict[int, Decoder]()
     options = InputOptions(topics=tuple(topics))
     for _, kind, numbers in choose_topics(reader.path, channels, options) if topics else ():
@@ -191,7 +191,7 @@ def decoders_in(reader: LogReader) -> dict[int, Decoder]:
     return found
 
 
-def kind_of(reader: LogReader, channel: Channel) -> MessageKind:
+def message_kind(reader: LogReader, channel: Channel) -> MessageKind:
     """Return the kind of a channel's messages."""
     schema = reader.schemas.get(channel.schema_id)
     if schema is None:

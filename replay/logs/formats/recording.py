@@ -130,17 +130,17 @@ class ViewFile:
             rows.add(segment)
         self._find_layouts()
         for rows in self._channels:
-            if rows.segments and rows.segments[-1] is segment:
-                number = len(rows.segments) - 1
-                if self.reader.table(segment) is not None:
-                    rows.read(number, 0, rows.starts[-1] - rows.starts[-2], None)
+            in_chunk = rows.segments and rows.segments[-1] is segment
+            if in_chunk and rows.layout is not None and self.reader.table(segment) is not None:
+                number, count = len(rows.segments) - 1, rows.starts[-1] - rows.starts[-2]
+                rows.read(number, 0, count, None)
 
     def finish(self) -> None:
         """Set `ranges`, after the last chunk."""
-        found: list[list[Span]] = [
+        covered: list[list[Span]] = [
             [(one.start, one.stop) for one in rows.ranges] for rows in self._channels
         ]
-        self.ranges = found[0] if len(found) == 1 else intersection(*found)
+        self.ranges = covered[0] if len(covered) == 1 else intersection(*covered)
 
     def close(self) -> None:
         """Close the file."""
@@ -150,13 +150,12 @@ class ViewFile:
         channels = [c for c in self.reader.channels.values() if c.topic == topic]
         if not channels and self.reader.missing:
             raise LogDamagedError(f"{self.path}: {self.reader.missing}: there is no message before")
-        if len(channels) != 1:
+        known = [self.reader.schemas.get(c.schema_id) for c in channels]
+        protobuf = [c.message_encoding == "protobuf" for c in channels]
+        if protobuf != [True] or known[0] is None or known[0].name != schema:
             raise LogDamagedError(
-                f"{self.path}: {len(channels)} channels on {topic}, a recording has one"
+                f"{self.path}: {topic} is not one channel of {schema} in protobuf"
             )
-        known = self.reader.schemas.get(channels[0].schema_id)
-        if known is None or known.name != schema or channels[0].message_encoding != "protobuf":
-            raise LogDamagedError(f"{self.path}: {topic} does not hold {schema} in protobuf")
         return _ChannelRows(what, self.reader, channels[0], self.facts)
 
     def _find_layouts(self) -> None:
@@ -214,11 +213,10 @@ class _ChannelRows:
         self.segments: list[Segment] = []
         self.starts = [0]
         self.layout: Any = None
-        self._least, self._what = 0, what
-        self.places, self.width = list[int](), 0
+        self._what, self.places, self.width = what, list[int](), 0
         self._reader, self._channel, self._facts = reader, channel, facts
         self._may_lack = reader.salvage or facts.gaps
-        self._unconfirmed: set[int] = set()
+        self._trusted, self._confirmed = False, set[int]()
 
     def set_layout(self, least: int, marks: dict[int, int], places: list[int], width: int) -> None:
         """Set where a message holds its values, counted from its end.
@@ -229,7 +227,7 @@ class _ChannelRows:
             places: (R,) distance of each value.
             width: bytes of a value.
         """
-        self._least, self.places, self.width = least, places, width
+        self.places, self.width = places, width
         self.layout = kernel_layout(least, list(marks), list(marks.values()), places, width)
 
     def extend(self) -> None:
@@ -239,17 +237,15 @@ class _ChannelRows:
             LogDamagedError: a log time that is no frame's, a frame twice or out of order, and
                 without `salvage` a frame that is missing, unless the file says that it has gaps.
         """
-        trusted = self._reader.by_index and not self._may_lack
+        self._trusted = self._reader.by_index and not self._may_lack
         for segment in self._reader.segments:
-            if trusted:
+            if self._trusted:  # its log times are compared with the counts when it is read
                 self._count_messages(segment)
             else:
                 self.add(segment)
-        if trusted:
-            # The log times of each chunk are compared with the summary's count when it is read.
-            self._unconfirmed.update(range(len(self.segments)))
-            first, count = self._facts.first_frame, self.starts[-1]
-            self.ranges = [_RowRange(first, first + count, 0)] if count else []
+        if self._trusted and (count := self.starts[-1]):
+            first = self._facts.first_frame
+            self.ranges = [_RowRange(first, first + count, 0)]
 
     def add(self, segment: Segment) -> None:
         """Number the messages of the next chunk; raises as `extend`."""
@@ -262,9 +258,7 @@ class _ChannelRows:
         """Return the message of a frame."""
         number, low, _ = next(self.pieces(frame, 1))
         table = self._table(number)
-        own = np.flatnonzero(table.channel == self._channel.id)
-        self._check_count(number, len(own))
-        return table.payload(int(own[low]))
+        return table.payload(int(np.flatnonzero(table.channel == self._channel.id)[low]))
 
     def pieces(self, frame: int, count: int) -> Iterator[tuple[int, int, int]]:
         """Yield where the messages of `count` frames of one range are, from a frame on.
@@ -293,16 +287,9 @@ class _ChannelRows:
             LogDamagedError: the chunk is damaged, or one is laid out otherwise than others.
         """
         table, channel, rows = self._table(number), self._channel.id, (low, low + n)
-        if self.layout is None:
-            found: int | None = int(np.count_nonzero(table.channel == channel))
-        else:
-            found = gather(table.data, table.records, channel, rows, self.layout, out)
-        if found is None:
-            sizes = table.size[table.channel == channel][low : low + n]
-            wrong = "shorter than" if (sizes < self._least).any() else "laid out unlike"
+        if gather(table.data, table.records, channel, rows, self.layout, out) is None:
             where = f"{self._reader.path}: {self.segments[number].name}"
-            raise LogDamagedError(f"{where}: {self._what} is {wrong} the others")
-        self._check_count(number, found)
+            raise LogDamagedError(f"{where}: {self._what} is laid out unlike the others")
 
     def _count_messages(self, segment: Segment) -> bool:
         """Count the channel's messages in the next chunk of the file; whether it has any."""
@@ -326,7 +313,7 @@ class _ChannelRows:
         wrong = np.flatnonzero(~exact | (steps < 1 if self._may_lack else steps != 1))
         if len(wrong):
             at = int(wrong[0])
-            remedy = "cdmisfa verify lists what is missing, cdmisfa learn --salvage leaves it out"
+            remedy = "cdmisfa verify lists missing frames, cdmisfa learn --salvage leaves them out"
             if self._reader.salvage:
                 remedy = "save what can be read with cdmisfa recover, and learn from that"
             raise LogDamagedError(
@@ -349,36 +336,30 @@ class _ChannelRows:
         if not segment.indexes:
             table = self._table(number)
             times: NDArray[np.uint64] = table.log_time[table.channel == channel]
-            self._check_count(number, len(times))
             return times
         try:
-            pairs = [own[:, 0] for c, own in self._reader.index(segment) if c == channel]
+            pairs = [index[:, 0] for c, index in self._reader.index(segment) if c == channel]
         except MalformedRecord as error:
             raise LogDamagedError(f"{self._reader.path}: {error}") from None
         return np.concatenate(pairs)
 
     def _table(self, number: int) -> MessageTable:
         """A chunk's messages; a LogDamagedError if it is damaged or has other frames."""
-        segment = self.segments[number]
+        segment, path = self.segments[number], self._reader.path
         table = self._reader.table(segment)
         if table is None:
-            raise LogDamagedError(f"{self._reader.path}: {segment.name} is damaged")
-        if number in self._unconfirmed:
-            times = table.log_time[table.channel == self._channel.id]
-            self._check_count(number, len(times))
-            (row, stop), first = self.starts[number : number + 2], self._facts.first_frame
-            if (times != self._facts.times(np.arange(first + row, first + stop))).any():
-                # Raises an error that names the frame.
-                self._number(times, row, [_RowRange(first, first + row, 0)] if row else [])
-            self._unconfirmed.remove(number)
-        return table
-
-    def _check_count(self, number: int, found: int) -> None:
-        """Compare how many messages of the channel a chunk holds with what its index says."""
-        stated = self.starts[number + 1] - self.starts[number]
-        if found != stated:
-            path, name = self._reader.path, self.segments[number].name
+            raise LogDamagedError(f"{path}: {segment.name} is damaged")
+        if number in self._confirmed:
+            return table
+        times = table.log_time[table.channel == self._channel.id]
+        (row, stop), first = self.starts[number : number + 2], self._facts.first_frame
+        if len(times) != stop - row:
             raise LogDamagedError(
-                f"{path}: {name} holds {found} messages of {self._channel.topic!r}, its index "
-                f"says {stated}; run cdmisfa recover"
+                f"{path}: {segment.name} holds {len(times)} messages of {self._channel.topic!r}, "
+                f"its index says {stop - row}; run cdmisfa recover"
             )
+        expected = self._facts.times(np.arange(first + row, first + stop))
+        if self._trusted and (times != expected).any():  # raises an error that names the frame
+            self._number(times, row, [_RowRange(first, first + row, 0)] if row else [])
+        self._confirmed.add(number)
+        return table

@@ -144,12 +144,12 @@ def channels(path: Path) -> list[ChannelFacts]:
         ChannelFacts(
             name,
             kind,
-            str(own.type),
-            len(own) - own.null_count,
+            str(column.type),
+            len(column) - column.null_count,
             images=False,
             remarks=(remark,),
         )
-        for name, own in zip(table.column_names, table.columns, strict=True)
+        for name, column in zip(table.column_names, table.columns, strict=True)
     ]
 
 
@@ -240,15 +240,15 @@ def _column(path: Path, table: Any, name: str) -> FloatArray:
         return _floats(table[name])[:, None]
     try:
         values = table[first].to_pylist()
-        found = [None if value is None else field.numbers({first: value}) for value in values]
+        rows = [None if value is None else field.numbers({first: value}) for value in values]
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
-    sizes = {len(own) for own in found if own is not None}
+    sizes = {len(row) for row in rows if row is not None}
     if len(sizes) != 1:
         counts = " or ".join(map(str, sorted(sizes))) or "no"
         raise UsageError(f"{path}: {name} holds {counts} numbers in a row: choose a part of it")
     (size,) = sizes
-    return np.array([[np.nan] * size if own is None else own for own in found], np.float64)
+    return np.array([[np.nan] * size if row is None else row for row in rows], np.float64)
 
 
 def _floats(column: Any) -> FloatArray:

@@ -111,10 +111,10 @@ class VideoFile:
 
     def _open(self) -> None:
         """Find the times of all frames, without decoding one."""
-        found = self._container.streams.video
-        if not found or found[0].codec_context is None:
+        videos = self._container.streams.video
+        if not videos or videos[0].codec_context is None:
             raise LogDamagedError(f"{self.path}: there is no video in it")
-        self._stream = stream = found[0]
+        self._stream = stream = videos[0]
         stream.thread_type = "NONE"
         context = stream.codec_context
         context.thread_count = 1
@@ -156,22 +156,22 @@ class VideoFile:
     def image(self, row: int) -> ByteArray:
         """Decode a frame; a `MalformedRecord` if it is broken, and FFmpeg's own errors."""
         stamp = int(self.stamps[row])
-        found, at, self._next = None, self._next, _NOWHERE
+        frame, at, self._next = None, self._next, _NOWHERE
         if at <= row < at + _FORWARD:
             with contextlib.suppress(self._av.FFmpegError):  # of a frame that this does not need
-                found = self._forward(stamp)
-        if found is None:
+                frame = self._forward(stamp)
+        if frame is None:
             try:
-                found = self._from(stamp, stamp)
+                frame = self._from(stamp, stamp)
             except self._av.FFmpegError:
                 if not self._unsure:
                     raise
-        if found is None and self._unsure:
-            found = self._from(_BEGIN, stamp)
-        if found is None:
+        if frame is None and self._unsure:
+            frame = self._from(_BEGIN, stamp)
+        if frame is None:
             raise MalformedRecord("the video is broken, no frame can be decoded")
         self._next = row + 1
-        return self._shown(found)
+        return self._shown(frame)
 
     def _decoded(self) -> Iterator[Any]:
         for packet in self._container.demux(self._stream):
@@ -186,8 +186,8 @@ class VideoFile:
 
     def _forward(self, stamp: int) -> Any:
         """Decode on to a frame; None if it is broken or not there."""
-        found = next((f for f in self._frames if f.pts is None or f.pts >= stamp), None)
-        return None if found is None or found.pts != stamp or found.is_corrupt else found
+        frame = next((f for f in self._frames if f.pts is None or f.pts >= stamp), None)
+        return None if frame is None or frame.pts != stamp or frame.is_corrupt else frame
 
     def close(self) -> None:
         """Close the file; harmless when called twice."""
