@@ -14,7 +14,7 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.modules import Module
-from replay.runs.modules import SlowFeatures, load_modules, save_modules
+from replay.runs.modules import load_modules, save_modules
 
 EASY = {"delta": 1.0, "eta_dot_window": 3, "min_variance": 0.0, "warm_up": 0, "tau": 20}
 """Saves what it has after a few blocks."""
@@ -48,7 +48,6 @@ def test_a_module_transforms_as_the_learner_did(dtype: str, expansion: str, tmp_
         np.testing.assert_array_equal(same.transform(frames), y)
         np.testing.assert_array_equal(same.transform(frames.reshape(20, -1)), y)
         assert same.frame_shape == (2, 3)
-    np.testing.assert_array_equal(SlowFeatures(loaded).transform(frames), loaded.transform(frames))
     assert (loaded.expansion, loaded.scale) == (module.expansion, module.scale)
     assert type(loaded.expansion) is str
 
@@ -61,11 +60,10 @@ def with_width(width: int, **values: Any) -> Module:
 @pytest.mark.parametrize("shape", [(5, 3, 2), (5, 2, 3, 1), (5, 1, 6), (5, 2), (5,), (2, 3)])
 def test_frames_have_the_shape_that_the_module_learned_from(shape: tuple[int, ...]) -> None:
     module = with_width(6, expansion="none", frame_shape=(2, 3))
-    for given in (module, SlowFeatures(module)):
-        with pytest.raises(UsageError, match=r"given: give uint8 pixels .* \(n, 2, 3\)"):
-            given.transform(np.zeros(shape))
-        assert given.transform(np.zeros((5, 6))).shape == (5, 1)  # as rows
-        assert given.transform(np.zeros((0, 2, 3))).shape == (0, 1)
+    with pytest.raises(UsageError, match=r"given: give uint8 pixels .* \(n, 2, 3\)"):
+        module.transform(np.zeros(shape))
+    assert module.transform(np.zeros((5, 6))).shape == (5, 1)  # as rows
+    assert module.transform(np.zeros((0, 2, 3))).shape == (0, 1)
 
 
 def test_the_expansion_decides_the_width_and_only_pixels_and_values_are_taken() -> None:

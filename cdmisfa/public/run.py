@@ -20,7 +20,6 @@ from cdmisfa.experiments.resume import Recomputation
 from cdmisfa.public.recording import Recording, as_words
 from cdmisfa.public.shown import attended_image, view
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
-from replay.runs.modules import SlowFeatures
 from replay.runs.run import read_outline
 
 SCALARS = tuple(signal.name for signal in SIGNALS.values() if not signal.dims)
@@ -116,11 +115,6 @@ class Run(Shown, replay.runs.run.Run):
     def path(self) -> Path:
         """Its folder."""
         return self.log.parent
-
-    @property
-    def features(self) -> tuple[SlowFeatures, ...]:
-        """Its modules as fitted transformers of scikit-learn, in order."""
-        return tuple(map(SlowFeatures, self.modules))
 
     @property
     def config(self) -> Mapping[str, Any]:

@@ -16,7 +16,7 @@ from cdmisfa.core.signals import NO_STATE, SIGNALS, BlockSignals, Signal
 
 @dataclass(frozen=True, slots=True)
 class SignalColumns:
-    """Consecutive records of the same shapes: of each signal by its name the (n, *dims) values."""
+    """Consecutive records of the same shapes: (n, *dims) values of each signal by its name."""
 
     values: Mapping[str, NDArray[Any]]
 
@@ -42,16 +42,16 @@ class SignalColumns:
         return int(self.values["y"].shape[1])
 
     def rows(self, start: int, stop: int) -> SignalColumns:
-        """The records [start, stop) of these."""
+        """Return the records [start, stop)."""
         return SignalColumns({name: value[start:stop] for name, value in self.values.items()})
 
     def records(self) -> Iterator[BlockSignals]:
-        """The records one by one."""
+        """Yield the records one by one."""
         values = (self.values[name] for name in SIGNALS)
         yield from map(BlockSignals, *(v.tolist() if v.ndim == 1 else v for v in values))
 
     def times(self, per_frame: bool = False) -> tuple[IntArray, IntArray]:
-        """Frames and iterations of the rows: one per record, or one per frame of it."""
+        """Return frames and iterations of the rows: one per record, or one per frame of it."""
         if not per_frame:
             return self.frames, self.iterations
         every = (self.frames[:, None] + np.arange(self.tau)).reshape(-1)
@@ -66,8 +66,8 @@ class Blocks:
 
     Attributes:
         starts: (n,) first frame of each block.
-        iterations: (n,) its iteration.
-        streams: (n,) the stream that was watched.
+        iterations: (n,) iteration of each block.
+        streams: (n,) attended stream.
     """
 
     starts: IntArray
@@ -75,51 +75,51 @@ class Blocks:
     streams: IntArray
 
     def places(self, frames: IntArray) -> IntArray:
-        """Index of the last block here that had begun at each frame, (n,) both."""
+        """Return the index of the last block that began at or before each frame, (n,) both."""
         return np.maximum(np.searchsorted(self.starts, frames, side="right") - 1, 0)
 
     def iteration(self, frames: IntArray) -> IntArray:
-        """The last iteration that had begun at each frame, (n,) both; 0 before the first."""
+        """Return the last iteration that began at or before each frame; 0 before the first."""
         if not len(self.starts):
             return np.zeros(len(frames), dtype=np.int64)
         return self.iterations[self.places(frames)]
 
     def last(self) -> Blocks:
-        """The last one of these."""
+        """Return the last block."""
         return Blocks(self.starts[-1:], self.iterations[-1:], self.streams[-1:])
 
     @classmethod
     def of(cls, columns: SignalColumns) -> Blocks:
-        """Those of records, as copies: the records need not be kept for them."""
-        kept = (columns.frames, columns.iterations, columns["stream"])
-        return cls(*(np.array(part, dtype=np.int64) for part in kept))
+        """Return copies of the blocks of records, which can then be freed."""
+        parts = (columns.frames, columns.iterations, columns["stream"])
+        return cls(*(np.array(part, dtype=np.int64) for part in parts))
 
     @classmethod
     def concatenated(cls, parts: Sequence[Blocks]) -> Blocks:
-        """Several, one after the other."""
-        none = np.empty(0, dtype=np.int64)
-        every = ((p.starts, p.iterations, p.streams) for p in parts)
-        return cls(*(np.concatenate(part) for part in zip((none,) * 3, *every, strict=True)))
+        """Return the blocks of several parts, in order."""
+        empty = np.empty(0, dtype=np.int64)
+        names = ("starts", "iterations", "streams")
+        return cls(*(np.concatenate([empty, *(getattr(p, n) for p in parts)]) for n in names))
 
 
 def has_values(name: str, values: NDArray[Any]) -> bool:
-    """Whether a signal's values are not all missing."""
+    """Return whether any of a signal's values is present."""
     if values.dtype.kind == "f":
         return not bool(np.isnan(values).all())
     return values.size > 0 and (name != "state" or bool((values != NO_STATE).any()))
 
 
 def whole_signals(pieces: Iterable[SignalColumns], names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Some signals of all records, (n, *dims) each; NaN for modules that were not there yet."""
-    found: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+    """Return some signals of all records, (n, *dims) each; NaN for modules not yet learned."""
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
     for piece in pieces:
-        for name, parts in found.items():
-            parts.append(piece[name])
-    return {name: _concatenated(SIGNALS[name], found.pop(name)) for name in names}
+        for name in names:
+            parts[name].append(piece[name])
+    return {name: _concatenated(SIGNALS[name], parts.pop(name)) for name in names}
 
 
 def padded(signal: Signal, values: NDArray[Any], modules: int) -> NDArray[Any]:
-    """(n, *dims) values with NaN for modules that were not there yet."""
+    """Return (n, *dims) values, padded with NaN for modules not yet learned."""
     if not signal.dims.startswith("M") or values.shape[1] == modules:
         return values
     whole = np.full((len(values), modules, *values.shape[2:]), np.nan)
@@ -128,15 +128,19 @@ def padded(signal: Signal, values: NDArray[Any], modules: int) -> NDArray[Any]:
 
 
 def columns_of_records(records: Sequence[BlockSignals]) -> Iterator[SignalColumns]:
-    """Records as arrays, a new piece wherever a shape changes."""
+    """Yield records as arrays, a new piece wherever a shape changes."""
     for _, group in groupby(records, key=shapes_of):
         same = list(group)
-        values = ((s, [getattr(r, s.name) for r in same]) for s in SIGNALS.values())
-        yield SignalColumns({s.name: np.array(found, dtype=s.dtype) for s, found in values})
+        yield SignalColumns(
+            {
+                name: np.array([getattr(r, name) for r in same], s.dtype)
+                for name, s in SIGNALS.items()
+            }
+        )
 
 
 def shapes_of(signals: BlockSignals) -> tuple[tuple[int, ...], ...]:
-    """The shape of each signal of a record that is an array, in the record's order."""
+    """Return the shapes of a record's arrays, in the record's order."""
     return tuple([getattr(signals, name).shape for name in _ARRAYS])
 
 

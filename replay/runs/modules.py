@@ -1,7 +1,4 @@
-"""The frozen modules of a run: modules.npz as plain arrays, and scikit-learn style transformers.
-
-Importing them needs neither the learner nor scikit-learn.
-"""
+"""The frozen modules of a run, stored as plain arrays in modules.npz."""
 
 from __future__ import annotations
 
@@ -9,12 +6,11 @@ import dataclasses
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NoReturn, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.modules import Module
 from recorder.images.framing import Recipe
@@ -92,98 +88,3 @@ def _modules(stored: Mapping[str, NDArray[Any]]) -> Iterator[Module]:
 
 def _key(index: int, name: str) -> str:
     return f"module{index}_{name}"
-
-
-class SlowFeatures:
-    """Transformer that computes the slow features of frames with a frozen module.
-
-    It is fitted already. In a pipeline that is fitted as a whole, put it into scikit-learn's
-    `FrozenEstimator`.
-
-    Args:
-        module: the frozen module.
-
-    Example:
-        >>> rest = [np.zeros(1)] * 3 + [np.zeros(1, np.int64)]
-        >>> module = Module(1, "x1", 0, 9, np.eye(1, 2), np.zeros(2), *rest, scale=1.0)
-        >>> SlowFeatures(module).transform([[3.0, 4.0], [5.0, 6.0]]).ravel().tolist()
-        [3.0, 5.0]
-    """
-
-    def __init__(self, module: Module) -> None:
-        self.module = module
-
-    @classmethod
-    def load(cls, path: str | Path) -> tuple[Self, ...]:
-        """Return a transformer for each module of modules.npz, or of a run's folder, in order.
-
-        Raises:
-            UsageError: there is no such file.
-            LogDamagedError: the file holds something else.
-        """
-        return tuple(cls(module) for module in load_modules(Path(path)))
-
-    def __repr__(self) -> str:
-        return f"SlowFeatures({self.module!r})"
-
-    def _repr_html_(self) -> str:
-        return self.module._repr_html_()
-
-    @property
-    def components_(self) -> FloatArray:
-        """(J, I) weights, a row an output."""
-        return self.module.phi
-
-    @property
-    def mean_(self) -> FloatArray:
-        """(I,) mean of the input, after scaling and expansion."""
-        return self.module.mean
-
-    def transform(self, X: Any) -> FloatArray:
-        """Return the outputs of the module on frames, y = phi (x - mean).
-
-        Args:
-            X: (n, *frame_shape) frames of the shape that the module learned from, or these as
-                rows (n, I). uint8 values are divided by 255 if it learned from pixels. Frames are
-                expanded as they were for the learner.
-
-        Returns:
-            (n, J).
-
-        Raises:
-            UsageError: the shape or type is not that of the module's frames.
-        """
-        return self.module.transform(X)
-
-    def fit(self, X: Any = None, y: Any = None) -> NoReturn:
-        """Refuse: a frozen module does not learn.
-
-        Raises:
-            UsageError: always.
-        """
-        raise UsageError(
-            "a frozen module is not fitted again: learn a new one with cdmisfa learn, or put this "
-            "one into sklearn.frozen.FrozenEstimator to keep it as it is in a pipeline"
-        )
-
-    def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Return the parameters, as scikit-learn's estimators do."""
-        return {"module": self.module}
-
-    def set_params(self, **params: Any) -> Self:
-        """Set the module, as scikit-learn's estimators set their parameters."""
-        self.module = params.get("module", self.module)
-        return self
-
-    def __sklearn_is_fitted__(self) -> bool:
-        return True
-
-    def __sklearn_tags__(self) -> Any:
-        from sklearn.utils import Tags, TargetTags, TransformerTags
-
-        return Tags(
-            estimator_type=None,
-            target_tags=TargetTags(required=False),
-            transformer_tags=TransformerTags(),
-            requires_fit=False,
-        )
