@@ -137,48 +137,6 @@ def test_columns_that_stand_still_within_a_block_are_learned_like_the_others(
     np.testing.assert_allclose(state.gram, state.v @ state.v.T, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("pixels", "still"), [(False, False), (True, True)])
-def test_gram_kernel_is_as_near_to_long_double_as_two_direct_orders_are(pixels, still):
-    """The two: sums over the inputs from the first to the last, and from the last to the first.
-
-    Which of them is nearest is chance; the geometric mean over some first weights is not.
-    """
-    config, n, size = config_of(8, 2), 800, 400
-    frames = mostly_still_frames(n, size, [40] * (n // 40)) if still else latent_frames(n, size)
-    if pixels:
-        frames = freeze(np.round(frames * 255) / 255)
-    orders = [
-        lambda v, x: np.cumsum(v * x, axis=-1)[..., -1],
-        lambda v, x: np.cumsum((v * x)[..., ::-1], axis=-1)[..., -1],
-    ]
-    ratios = []
-    for seed in range(4):
-        start = new_state(np.random.default_rng(seed), size, config)
-        exact, first, second = (
-            PlainIncSFA(start, config, dtype, dot)
-            for dtype, dot in zip((np.longdouble, float, float), (np.dot, *orders), strict=True)
-        )
-        xi = np.array([[plain.learn(x) for x in frames] for plain in (exact, first, second)])
-        block, xi_block = learn_in(GRAM, config, frames, [40] * (n // 40), seed=seed)
-
-        def errors(learned, own_xi, xi=xi[0], exact=exact):
-            weights = (getattr(learned, name) - getattr(exact, name) for name in ("v", "phi"))
-            change = np.nanmedian(np.abs(own_xi - xi) / xi)
-            return np.array([*(np.abs(error).max() for error in weights), change])
-
-        worst = np.maximum(errors(first, xi[1]), errors(second, xi[2]))
-        ratios.append(errors(block, xi_block) / worst)
-    assert (np.exp(np.log(ratios).mean(axis=0)) <= 1).all()
-
-
-def test_error_of_the_carried_gram_matrix_does_not_grow():
-    config = config_of(7, 1)
-    frames = latent_frames(4000, 256)
-    state, _ = learn_in(GRAM, config, frames, [40] * 100)
-    lengths = state.d[:, None] * state.d
-    assert np.abs((state.gram - state.v @ state.v.T) / lengths).max() < 1e-12
-
-
 @pytest.mark.parametrize("kernel", [STRICT, GRAM])
 def test_pixels_are_learned_like_their_255ths(kernel):
     config = config_of(5, 1)
@@ -232,30 +190,6 @@ def test_a_component_at_rest_wakes_when_the_input_varies_along_it():
     assert np.abs(state.z_prev[1]) > 0
 
 
-@pytest.mark.parametrize("kernel", [STRICT, GRAM])
-def test_a_saved_state_goes_on_with_the_same_bits(kernel):
-    config = config_of(4, 1)
-    frames = latent_frames(2400, 210)
-    a, xi = learn_in(kernel, config, frames, [40] * 60)
-    half, _ = learn_in(kernel, config, frames[:1200], [40] * 30)
-    copy = new_state(np.random.default_rng(9), 210, config)
-    for source, target in zip(half, copy, strict=True):
-        target[...] = source
-    parts = [learn(kernel, config, copy, frames[k : k + 40]) for k in range(1200, 2400, 40)]
-    rest = np.concatenate(parts)
-    assert rest.tobytes() == xi[1200:].tobytes()
-    assert all(x.tobytes() == y.tobytes() for x, y in zip(a, copy, strict=True))
-
-
-def test_strict_bits_do_not_depend_on_how_frames_are_cut():
-    config = config_of(5, 1)
-    frames = latent_frames(300, 5)
-    a, xi_a = learn_in(STRICT, config, frames, [300])
-    b, xi_b = learn_in(STRICT, config, frames, [1, 99, 7, 193])
-    assert xi_a.tobytes() == xi_b.tobytes()
-    assert a.phi.tobytes() == b.phi.tobytes()
-
-
 @pytest.mark.parametrize("pixels", [False, True])
 @pytest.mark.parametrize(("rows", "size", "n"), [(4, 1300, 9), (7, 1024, 67), (3, 544, 5)])
 def test_outputs_of_a_row_do_not_depend_on_the_rows_beside_it(rows, size, n, pixels):
@@ -274,21 +208,6 @@ def test_outputs_of_a_row_do_not_depend_on_the_rows_beside_it(rows, size, n, pix
             assert project(*some).tobytes() == stacked[first:stop, row : row + 2].tobytes()
     assert project(phi[:0], offset[:0], frames).shape == (n, 0)
     assert project(phi, offset, frames[:0]).shape == (0, rows)
-
-
-def test_pixels_are_projected_as_their_values_are():
-    rng = np.random.default_rng(1)
-    phi, offset = rng.standard_normal((5, 700)), rng.standard_normal(5)
-    pixels = rng.integers(0, 256, (70, 700), dtype=np.uint8)
-    values = pixels * PIXEL
-    assert project(phi, offset, pixels).tobytes() == project(phi, offset, values).tobytes()
-
-
-@pytest.mark.parametrize("size", [0, 1, 5, 8, 300])
-def test_the_mean_output_is_what_phi_gives_out_on_the_mean(size):
-    rng = np.random.default_rng(2)
-    phi, mean = rng.standard_normal((6, size)), rng.standard_normal(size)
-    np.testing.assert_allclose(kernels.mean_output(phi, mean), phi @ mean, rtol=0, atol=1e-13)
 
 
 odd = st.sampled_from([0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 5e-324, 1e-310, 1e308])
@@ -334,3 +253,20 @@ def test_arrays_of_another_shape_or_order_are_refused():
     for wrong in (state.w[:, ::-1], state.w[:, :3], state.w.astype(np.float32), [[1.0] * 4]):
         with pytest.raises(UsageError, match=r"^w "):
             kernels.incsfa(state._replace(w=wrong), 0.1, 10)
+
+
+def test_error_of_the_carried_gram_matrix_does_not_grow():
+    config = config_of(7, 1)
+    frames = latent_frames(4000, 256)
+    state, _ = learn_in(GRAM, config, frames, [40] * 100)
+    lengths = state.d[:, None] * state.d
+    assert np.abs((state.gram - state.v @ state.v.T) / lengths).max() < 1e-12
+
+
+def test_strict_bits_do_not_depend_on_how_frames_are_cut():
+    config = config_of(5, 1)
+    frames = latent_frames(300, 5)
+    a, xi_a = learn_in(STRICT, config, frames, [300])
+    b, xi_b = learn_in(STRICT, config, frames, [1, 99, 7, 193])
+    assert xi_a.tobytes() == xi_b.tobytes()
+    assert a.phi.tobytes() == b.phi.tobytes()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.signals import SignalsHash
-from cdmisfa.experiments.trial import run_trial
 from recorder.world.oscillatory import OscillatorySource
 
 EXACT = {"stream", "module", "novel", "known_by", "saved", "novel_blocks", "explored", "action"}
@@ -259,15 +257,6 @@ def test_a_learner_with_a_damaged_memory_refuses_to_go_on() -> None:
         learner.repeat(x, x, np.zeros((4, 3)))
 
 
-def test_a_policy_of_other_numbers_stays() -> None:
-    known = KernelAgent(LearnerConfig(tau=5, warm_up=0, epsilon_start=1e-6), 40)
-    known.agent.policy[:] = 2**63 - 1
-    for k in range(3):
-        told = known.think(0.5 / (k + 1), NOVEL, (0.5, 0.9, 0.9), np.zeros((5, 1)))
-        assert np.isfinite(known.values()).all()
-        assert told["next_stream"] < 40
-
-
 def test_what_does_not_fit_is_refused() -> None:
     source = OscillatorySource()
     learner = CuriousLearner(LearnerConfig(), source.spec, 0)
@@ -279,10 +268,3 @@ def test_what_does_not_fit_is_refused() -> None:
         kernels.think(known.struct, np.zeros(4), np.zeros((5, 1)), 0, np.zeros(3))
     with pytest.raises(UsageError, match=r"y given as \(5, 2\)"):
         kernels.think(known.struct, np.zeros(5), np.zeros((5, 2)), 0, np.zeros(3))
-
-
-def test_swaps_and_ends_return_at_once() -> None:
-    config = dataclasses.replace(LearnerConfig(), epsilon_decay=0.5, patience=5, delta=1e-12)
-    result = run_trial(config, seed=0)
-    assert result.ended == "nothing_left"
-    assert result.epsilon < 1e-3

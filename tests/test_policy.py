@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_agent import STAY, KernelAgent
-from reference.agent import value_sum
 
 from cdmisfa.agents.agent import NOVEL
 from cdmisfa.core.config import LearnerConfig
@@ -75,18 +74,6 @@ def test_q_is_the_dense_solution_and_the_policy_is_optimal(
     np.testing.assert_allclose(Q, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
     slack = 1e-9 * np.abs(expected).max()
     assert (expected[np.arange(n), policy] >= expected.max(axis=1) - slack).all()
-
-
-@settings(deadline=None)
-@given(problems())
-def test_the_sum_of_values_is_the_dense_one(
-    problem: tuple[np.ndarray, np.ndarray, int, float, np.ndarray],
-) -> None:
-    stay, switch, _, gamma, policy = problem
-    r = np.stack([stay, switch / (len(stay) - 1)], axis=1)
-    V = dense_values(r, policy, gamma)
-    got = value_sum(stay, switch, policy, gamma)
-    assert got == pytest.approx(V.sum(), rel=1e-9, abs=1e-9 * np.abs(V).sum())
 
 
 def lstd_q(

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.features.recursive import PIECE, RecursiveFeature
+from cdmisfa.features.recursive import RecursiveFeature
 from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import ffi, lib
 
@@ -60,15 +60,6 @@ def test_equals_batch_sfa_over_an_infinite_window(
     assert y.var(axis=0) == pytest.approx(1.0, rel=1e-6)
 
 
-def test_pixels_count_as_the_values_they_stand_for() -> None:
-    values = mixture(1, 2000, 3, 30)
-    pixels = np.round(255 * (values - values.min()) / np.ptp(values)).astype(np.uint8)
-    a = learned(pixels, [500, 1201], components=8)
-    b = learned(pixels / 255.0, [500, 1201], components=8)
-    assert direction_cosine(a.phi[0], b.phi[0]) == pytest.approx(1.0, abs=1e-9)
-    assert a.slowness == pytest.approx(b.slowness, rel=1e-9)
-
-
 @given(seed=st.integers(0, 10**6), cuts=st.lists(st.integers(1, 999), max_size=8, unique=True))
 @settings(max_examples=25)
 def test_it_does_not_matter_how_frames_of_few_directions_are_cut(
@@ -79,15 +70,6 @@ def test_it_does_not_matter_how_frames_of_few_directions_are_cut(
     pieces = learned(frames, sorted(cuts), components=4)
     assert abs(direction_cosine(whole.phi[0], pieces.phi[0])) > 1 - 1e-9
     assert pieces.state.spectrum == pytest.approx(whole.state.spectrum, rel=1e-6)
-
-
-def test_a_long_call_is_its_pieces() -> None:
-    frames = np.random.default_rng(2).integers(0, 256, (3 * PIECE + 5, 50), dtype=np.uint8)
-    a, b = RecursiveFeature(50, 8), RecursiveFeature(50, 8)
-    changes = a.update(frames)
-    each = [b.update(frames[i : i + PIECE]) for i in range(0, len(frames), PIECE)]
-    np.testing.assert_array_equal(changes, np.concatenate(each))
-    np.testing.assert_array_equal(a.phi, b.phi)
 
 
 def test_differences_over_a_gap_do_not_count() -> None:
@@ -157,17 +139,6 @@ def test_what_lies_outside_of_the_directions_kept_counts_as_its_last_frames_show
     assert whole.variance == pytest.approx(y.var(), rel=0.2)
 
 
-def test_change_is_free_of_scale_and_falls() -> None:
-    frames = mixture(7, 4000, 4, 15)
-    a, b = RecursiveFeature(15, 6), RecursiveFeature(15, 6)
-    first = [a.update(frames[i : i + 40])[-1] for i in range(0, 4000, 40)]
-    second = [b.update(1e-3 * frames[i : i + 40])[-1] for i in range(0, 4000, 40)]
-    assert np.isnan(first[0])
-    assert first[1:] == pytest.approx(second[1:], abs=1e-6)
-    assert np.mean(first[1:6]) > 5 * np.mean(first[-20:])
-    assert max(first[1:]) <= np.sqrt(2)
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda sfa: pickle.loads(pickle.dumps(sfa))])
 def test_a_copy_learns_on_its_own(copied: Callable[[RecursiveFeature], RecursiveFeature]) -> None:
     frames = np.random.default_rng(3).integers(0, 256, (400, 60), dtype=np.uint8)
@@ -177,24 +148,6 @@ def test_a_copy_learns_on_its_own(copied: Callable[[RecursiveFeature], Recursive
     np.testing.assert_array_equal(sfa.phi, phi)
     sfa.update(frames[200:])
     np.testing.assert_array_equal(sfa.phi, other.phi)
-
-
-def test_frames_are_neither_changed_nor_kept() -> None:
-    frames = mixture(8, 100, 3, 10)
-    before, sfa = frames.copy(), RecursiveFeature(10, 4)
-    sfa.update(frames)
-    phi = sfa.phi
-    np.testing.assert_array_equal(frames, before)
-    frames[:] = 7.0
-    np.testing.assert_array_equal(sfa.phi, phi)
-
-
-@pytest.mark.parametrize(
-    "frames", [np.zeros((5, 9)), np.zeros((5, 10), bool), np.zeros((5, 10), np.int8), np.zeros(10)]
-)
-def test_what_are_no_frames_is_refused(frames: NDArray[Any]) -> None:
-    with pytest.raises(UsageError, match="frames of"):
-        RecursiveFeature(10, 4).update(frames)
 
 
 @pytest.mark.parametrize("options", [(0, 4), (10, 0), (10, 4, 5), (10, 4, 1, 0)])

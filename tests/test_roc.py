@@ -38,29 +38,6 @@ def test_repeated_outputs_become_centres_and_their_errors_vanish() -> None:
     assert not counts[1].any()
 
 
-def test_a_near_centre_moves_by_one_over_its_count() -> None:
-    centres, counts = node()
-    roc.cluster(centres, counts, 0, block(1.0), 0.3, 1e12)
-    assert roc.cluster(centres, counts, 0, block(1.2), 0.3, 1e12) == pytest.approx(0.2)
-    np.testing.assert_allclose(centres[0, 0], 1.1)
-
-
-def test_a_far_output_takes_the_place_of_the_weakest_centre() -> None:
-    centres, counts = node(places=2)
-    for value in (1.0, 1.0, -1.0, 9.0):
-        roc.cluster(centres, counts, 0, block(value), 0.3, 100.0)
-    assert sorted(centres[0, :, 0, 0].tolist()) == [1.0, 9.0]
-
-
-def test_centres_that_are_not_seen_are_forgotten() -> None:
-    centres, counts = node()
-    roc.cluster(centres, counts, 1, block(1.0), 0.3, 10.0)
-    for _ in range(8):
-        roc.cluster(centres, counts, 0, block(2.0), 0.3, 10.0)
-    assert not counts[1].any()
-    assert counts[0].max() > 1
-
-
 def test_a_block_is_known_to_the_first_module_that_is_near_under_its_label() -> None:
     centres, counts = node()
     roc.cluster(centres, counts, 0, block(1.0), 0.3, 40.0)

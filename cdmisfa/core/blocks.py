@@ -18,11 +18,9 @@ from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.shown import Shown
 
+# The only type whose values are pixels, and the value of one step of a pixel.
 UINT8 = np.dtype(np.uint8)
-"""The only type whose values are pixels."""
-
 PIXEL = 1.0 / 255.0
-"""What one step of a uint8 pixel counts."""
 
 
 @dataclass(frozen=True, slots=True)

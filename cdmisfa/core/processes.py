@@ -1,4 +1,4 @@
-"""Where work is computed: in this process, in others of this machine, or on a dask cluster."""
+"""Computation in this process, in others of this machine, or on a dask cluster."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+# Has a worker call a function with arguments.
 Submit = Callable[..., Future[Any]]
-"""Has a worker call a function with arguments."""
 
+# How long a scheduler and its first worker may take to answer.
 CONNECT_SECONDS = 15
-"""How long a scheduler and its first worker may take to answer."""
 
+# Tasks that a cluster has at a time: more than it has workers, few enough to hand out soon.
 IN_CLUSTER = 1000
-"""Tasks that a cluster has at a time: more than it has workers, few enough to hand out soon."""
 
+# Environment of local workers: the processes are the parallelism.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-"""Environment of local workers: the processes are the parallelism."""
 
 
 def thread_count() -> int:
-    """Threads that this process may use at once: as many as processors, or OMP_NUM_THREADS says."""
-    said = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    return int(said) if said.isdecimal() and 0 < int(said) < 1000 else os.cpu_count() or 1
+    """Return the number of threads that this process may use: OMP_NUM_THREADS, or processors."""
+    setting = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return int(setting) if setting.isdecimal() and 0 < int(setting) < 1000 else os.cpu_count() or 1
 
 
 class WorkersError(CdmisfaError):
@@ -119,8 +119,8 @@ def workers(jobs: int) -> Iterator[Submit]:
             yield submit
         except BrokenProcessPool as error:
             raise WorkersError(
-                "a worker process was killed, by somebody or for lack of memory: say the same "
-                "again, what is finished is kept"
+                "a worker process was killed, by somebody or for lack of memory: repeat the "
+                "command, what is finished is kept"
             ) from error
         finally:
             pool.shutdown(kill_workers=True)
@@ -192,7 +192,7 @@ def _read(path: str) -> Any:
 
 @contextlib.contextmanager
 def _dask_workers(scheduler: str) -> Iterator[Submit]:
-    """Connect to a dask cluster, which has other workers try what one died of.
+    """Connect to a dask cluster, whose other workers try a task again when one died of it.
 
     joblib's own backend for dask (1.6) waits for ever for a task that every worker died of.
     """
@@ -202,31 +202,22 @@ def _dask_workers(scheduler: str) -> Iterator[Submit]:
         raise UsageError(
             "--scheduler needs a package that is not installed: pip install 'cdmisfa[dask]'"
         ) from error
-    # Else it logs a traceback of every lost connection; what matters is raised.
+    # Else it logs a traceback of every lost connection; the errors that matter are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    try:
-        distributed.comm.resolve_address(scheduler)  # else a traceback after half a minute
-        client = distributed.Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise WorkersError(
-            f"no dask scheduler answers at {scheduler}: {one_line(error)}"
-        ) from error
-    with contextlib.closing(client):
+    with contextlib.ExitStack() as stack:
         try:
+            distributed.comm.resolve_address(scheduler)  # else a traceback after half a minute
+            client = distributed.Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
+            stack.enter_context(contextlib.closing(client))
             client.wait_for_workers(1, timeout=CONNECT_SECONDS)
-        except TimeoutError as error:
+        except (OSError, TimeoutError, ValueError) as error:
             raise WorkersError(
-                f"the dask scheduler at {scheduler} has no workers: start some with "
-                f"dask worker {scheduler}"
+                f"no dask scheduler with workers answers at {scheduler}: {one_line(error)}"
             ) from error
         try:
             yield client.get_executor(pure=False).submit
-        except distributed.KilledWorker as error:
+        except (distributed.KilledWorker, CancelledError) as error:
             raise WorkersError(
-                "every dask worker that tried a task died: their logs say why; what is finished "
-                "is kept"
-            ) from error
-        except CancelledError as error:
-            raise WorkersError(
-                "the scheduler went away: start it and say the same again, what is finished is kept"
+                f"the dask cluster lost its workers or its scheduler ({one_line(error)}): what is "
+                "finished is kept, their logs say why"
             ) from error

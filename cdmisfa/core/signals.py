@@ -27,20 +27,16 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 
 Show = Literal["line", "lane", "heat", "text", "hidden"]
 
+# Names of the codes of actions and policies, and of those of a stream's state.
 ACTIONS = ("stay", "switch")
-"""Names of the codes of actions and policies."""
-
 STATES = ("learning", "learned", "known", "given_up")
-"""Names of the codes of a stream's state."""
 
+# Code of a stream's state where the learner has none.
 NO_STATE = -1
-"""Code of a stream's state where the learner has none."""
 
+# To be raised whenever a field of `BlockSignals` is added, dropped or changes its meaning. Runs of
+# another version are refused.
 SCHEMA_VERSION = 4
-"""Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning.
-
-Runs of another version are refused.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +65,7 @@ class Signal:
     about: str
 
 
+# The element type of a field, by its annotation.
 _DTYPES: Mapping[str, str] = {
     "int": "int64",
     "float": "float64",
@@ -76,7 +73,6 @@ _DTYPES: Mapping[str, str] = {
     "IntArray": "int64",
     "FloatArray": "float64",
 }
-"""The element type of a field, by its annotation."""
 
 
 def _signal(
@@ -222,22 +218,18 @@ class BlockSignals:
     )
 
 
+# With more streams than this the signal R is not kept as a dense tensor.
 DENSE_STREAMS = 64
-"""With more streams than this the signal R is not kept as a dense tensor."""
 
 
-def signal_table() -> tuple[Signal, ...]:
-    """The description of every signal, in the record's order."""
-    table = []
-    for field in dataclasses.fields(BlockSignals):
-        dtype = _DTYPES[str(field.type)]
-        show = field.metadata["show"] or ("line" if dtype == "float64" else "lane")
-        told = {**field.metadata, "show": show}
-        table.append(Signal(name=field.name, dtype=dtype, **told))
-    return tuple(table)
+def _described(field: dataclasses.Field[Any]) -> Signal:
+    dtype = _DTYPES[str(field.type)]
+    show = field.metadata["show"] or ("line" if dtype == "float64" else "lane")
+    return Signal(name=field.name, dtype=dtype, **{**field.metadata, "show": show})
 
 
-SIGNALS: Mapping[str, Signal] = {s.name: s for s in signal_table()}
+# The description of every signal, in the record's order.
+SIGNALS: Mapping[str, Signal] = {f.name: _described(f) for f in dataclasses.fields(BlockSignals)}
 
 
 def values(signals: BlockSignals) -> Iterator[tuple[Signal, NDArray[Any]]]:
@@ -284,8 +276,8 @@ _SCALARS = [s for s in SIGNALS.values() if not s.dims]
 _ARRAYS = [s for s in SIGNALS.values() if s.dims]
 _NUMBERS_OF = attrgetter(*(s.name for s in _SCALARS))
 _ARRAYS_OF = attrgetter(*(s.name for s in _ARRAYS))
+# Made by this name, the type is numpy's own object, and comparing it costs nothing.
 _ARRAY_TYPES = [np.dtype("<" + np.dtype(s.dtype).str[1:]) for s in _ARRAYS]
-"""Made by this name, the type is numpy's own object, and comparing it costs nothing."""
 
 
 class _Layout(NamedTuple):
