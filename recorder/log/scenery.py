@@ -1,4 +1,4 @@
-"""What stands where in the iCub scene, as recordings and runs state its configuration.
+"""Return where everything is in the iCub scene, from the configuration that recordings state.
 
 The robot's root frame is x to the back, y to the right, z up, in metres; the paper's y, which the
 ground truth has, goes to the left. A camera's frame is x to the right, y down, z along its gaze.
@@ -29,32 +29,29 @@ from recorder.world.icub.head import (
 )
 from recorder.world.icub.room import painted
 
-KIND = "icub"
-"""The scene that is described here."""
+KIND = "icub"  # name of the scene
 
+# The view of a head that roams, and the column of truth with its yaw to the left.
 ROAMING = ROAM, YAW
-"""The view of a head that roams, and the truth's name of how far that is turned to the left."""
 
-Quaternion = tuple[float, float, float, float]
-"""A turn as (x, y, z, w)."""
-
+Quaternion = tuple[float, float, float, float]  # (x, y, z, w)
 Place = tuple[float, float, float]
 
+# From a camera's frame to that of a head that looks straight on: its z goes to -x.
 _GAZE: Quaternion = (-0.5, -0.5, 0.5, 0.5)
-"""From a camera's frame to that of a head that looks straight on: its z goes to -x."""
 
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """Something on the table, or the table.
+    """An object on the table, or the table.
 
     Attributes:
-        name: what it is.
+        name: of the object.
         shape: "box", "cylinder" or "sphere".
         size: its extent along x, y and z.
         colour: red, green and blue, 0 to 1.
-        place: its centre; x and y of an object are where the truth says.
-        truth: names of the truth's columns that say so; none of what stands still.
+        place: its centre; x and y of an object that moves are in the truth.
+        truth: columns of truth with x and y; none if it does not move.
     """
 
     name: str
@@ -65,14 +62,14 @@ class Thing:
     truth: tuple[str, ...] = ()
 
     def places(self, names: Sequence[str], truth: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 3) where its centre is at frames with this (n, D) truth, whose columns have names."""
+        """Return its centre, (n, 3), at frames with this (n, D) truth, whose columns have names."""
         x, y = (truth[:, list(names).index(name)] for name in self.truth)
         return np.stack([x, -y, np.full(len(truth), self.place[2])], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
 class Eye:
-    """A camera: where it is, and how it maps what is in front of it.
+    """A camera: its pose, and how it maps the world.
 
     Attributes:
         place: of its centre.
@@ -90,7 +87,7 @@ class Eye:
 
 @dataclass(frozen=True, slots=True)
 class Gaze:
-    """A view: how the head is turned for it, and its eyes.
+    """A view: the turn of the head, and its eyes.
 
     Attributes:
         name: of the view.
@@ -113,13 +110,13 @@ class Gaze:
 
 @dataclass(frozen=True, slots=True)
 class Scenery:
-    """A robot and what is in front of it.
+    """The robot and the objects in front of it.
 
     Attributes:
         robot: a model of the icub-models package.
         gazes: one for each view.
-        table: which stands still.
-        objects: which move.
+        table: does not move.
+        objects: move.
         eyes: their measures, keys `scene.eyes.*`.
         transit: degrees that the head turns in a frame; 0 where it jumps.
         arms: angles of the arms' joints, degrees, where they do not hang.
@@ -134,28 +131,25 @@ class Scenery:
     arms: Mapping[str, float] = field(default_factory=dict)
 
     def gaze(self, view: str) -> Gaze | None:
-        """The gaze of a view, None where there is no such view."""
+        """Return the gaze of a view, None if there is no such view."""
         return next((gaze for gaze in self.gazes if gaze.name == view), None)
 
     def turned(self, gaze: Gaze, yaw: float) -> Gaze:
-        """A gaze with the head turned otherwise, degrees to the left."""
+        """Return a gaze with another yaw of the head, degrees to the left."""
         return _gaze(gaze.name, yaw, self.eyes, gaze.head.position)
 
     def way(self, before: Gaze, after: Gaze) -> list[Gaze]:
-        """Where the head looks at the frames that are lost as it turns from one to the other."""
+        """Return the gazes at the frames that are lost while the head turns."""
         frames = turn_frames(after.yaw - before.yaw, self.transit)
         return [self.turned(after, yaw) for yaw in turn(before.yaw, after.yaw, frames)]
 
 
 def scenery_of(config: Mapping[str, Any], neck: Place | None = None) -> Scenery | None:
-    """What a scene's configuration (`scene.*`) says.
+    """Return the scenery of a scene's configuration (`scene.*`), None for another scene.
 
     Args:
         config: the table, as `as_table` gives it.
         neck: origin of the neck yaw joint; by default that of iCub v2.5.
-
-    Returns:
-        None of another scene.
 
     Raises:
         LogDamagedError: it is one of the iCub scene, and keys are missing or make no sense.
@@ -172,37 +166,31 @@ def scenery_of(config: Mapping[str, Any], neck: Place | None = None) -> Scenery 
         x, y = ((near + far) / 2).tolist()
         length, width = (far - near).tolist()
         red, green, blue = (float(part) for part in _paint(config, "table") or table["colour"])
+        size, place = (length, width, thickness), (x, y, top - thickness / 2)
+        arms = {s + joint: a for joint, a in ARMS.items() for s in ("l_", "r_")}
         return Scenery(
             robot=str(config["robot"]),
             gazes=gazes,
-            table=Thing(
-                *("table", "box", (length, width, thickness), (red, green, blue)),
-                place=(x, y, top - thickness / 2),
-            ),
+            table=Thing("table", "box", size, (red, green, blue), place),
             objects=_objects(config, top),
             eyes=eyes,
             transit=float(config.get("transit", 0.0)),
-            arms={s + joint: a for joint, a in ARMS.items() for s in ("l_", "r_")}
-            if config.get("arms")
-            else {},
+            arms=arms if config.get("arms") else {},
         )
     except (KeyError, TypeError, ValueError) as error:
         raise LogDamagedError(f"the configuration of the scene is broken ({error})") from error
 
 
 def turns_of(config: Mapping[str, Any], streams: Sequence[int]) -> tuple[tuple[int, ...], ...]:
-    """Frames that are lost between each two streams as the head turns, [from][to].
+    """Return the frames that are lost between each two streams as the head turns, [from][to].
 
     Args:
-        config: of the scene, as a recording states it.
+        config: of the scene, as a recording states it; its head may jump, or it may have none.
         streams: their places among the scene's.
-
-    Returns:
-        None of a scene whose head jumps, or has none.
     """
-    if not config.get("transit"):
-        return ()
     try:
+        if not config.get("transit"):
+            return ()
         yaw, transit = config["eyes"]["yaw"], float(config["transit"])
         table = turns(yaw, transit, roam=bool(config.get("roam")))
         return tuple(tuple(table[a][b] for b in streams) for a in streams)
@@ -211,28 +199,25 @@ def turns_of(config: Mapping[str, Any], streams: Sequence[int]) -> tuple[tuple[i
 
 
 def _paint(config: Mapping[str, Any], name: str) -> tuple[float, float, float] | None:
-    """The colour of a thing where it is painted."""
+    """Return the colour of a thing if it is painted."""
     return painted(name) if config.get("texture") else None
 
 
 def _objects(config: Mapping[str, Any], top: float) -> tuple[Thing, ...]:
-    """The box, the cylinder and the ball, which stand on the table."""
+    """Return the box, the cylinder and the ball on the table."""
     box, cylinder, ball = (config[f"object{i}"] for i in (1, 2, 3))
-    edge, across, high = 2 * box["half_size"], 2 * cylinder["radius"], cylinder["height"]
-    round_ = 2 * ball["radius"]
-    found = (
+    edge, across, diameter = 2 * box["half_size"], 2 * cylinder["radius"], 2 * ball["radius"]
+    shapes = (
         ("box", "box", (edge, edge, edge), box),
-        ("cylinder", "cylinder", (across, across, high), cylinder),
-        ("ball", "sphere", (round_, round_, round_), ball),
+        ("cylinder", "cylinder", (across, across, cylinder["height"]), cylinder),
+        ("ball", "sphere", (diameter, diameter, diameter), ball),
     )
-    return tuple(
-        Thing(
-            *(name, shape, size, _paint(config, name) or (float(table["grey"]),) * 3),
-            place=(sum(table["x"]) / 2, -sum(table["y"]) / 2, top + size[2] / 2),
-            truth=(f"object{i}_x", f"object{i}_y"),
-        )
-        for i, (name, shape, size, table) in enumerate(found, 1)
-    )
+    things = []
+    for i, (name, shape, size, table) in enumerate(shapes, 1):
+        colour = _paint(config, name) or (float(table["grey"]),) * 3
+        place = sum(table["x"]) / 2, -sum(table["y"]) / 2, top + size[2] / 2
+        things.append(Thing(name, shape, size, colour, place, (f"object{i}_x", f"object{i}_y")))
+    return tuple(things)
 
 
 def _gaze(name: str, yaw: float, eyes: Mapping[str, Any], neck: Place) -> Gaze:
@@ -254,7 +239,7 @@ def _gaze(name: str, yaw: float, eyes: Mapping[str, Any], neck: Place) -> Gaze:
 
 
 def times(first: Quaternion, second: Quaternion) -> Quaternion:
-    """Product of two quaternions: turn by the second, then by the first."""
+    """Return the product of two quaternions: turn by the second, then by the first."""
     (a, b, c, w), (x, y, z, v) = first, second
     return (
         w * x + a * v + b * z - c * y,
@@ -265,7 +250,7 @@ def times(first: Quaternion, second: Quaternion) -> Quaternion:
 
 
 def inverse(turn: Quaternion) -> Quaternion:
-    """Inverse of a unit quaternion."""
+    """Return the inverse of a unit quaternion."""
     x, y, z, w = turn
     return -x, -y, -z, w
 

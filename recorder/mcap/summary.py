@@ -1,6 +1,6 @@
-"""The summary at a log's end: what it counts, and where it says that everything is.
+"""Read the summary at a log's end: its counts and its index.
 
-It is believed only where it accounts for every message it counts, and only for logs of which
+It is believed only if it accounts for every message it counts, and only for logs of which
 not every byte is read; every chunk is compared with it when it is read.
 """
 
@@ -33,12 +33,12 @@ from recorder.mcap.records import (
 )
 from recorder.mcap.store import Store
 
-FOOTER_BYTES: Final = RECORD_HEADER.size + 20
-_BEFORE_PLACES: Final = 36
-"""Bytes of a chunk index before the places of its message indexes."""
+_FOOTER: Final = struct.Struct("<BQQQI")
 _LENGTH: Final = struct.Struct("<I")
+# Bytes of a chunk index before the places of its message indexes.
+_BEFORE_PLACES: Final = 36
+# Bytes of a chunk before its records, without the name of its compression.
 _FIXED: Final = CHUNK_HEADER.size + 12
-"""Bytes of a chunk before its records, without the name of its compression."""
 _INDEXES: Final = (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 
 
@@ -62,18 +62,18 @@ class Summary:
     indexes: dict[int, list[bytes]] = field(default_factory=lambda: {o: [] for o in _INDEXES})
 
     def sound_chunks(self) -> list[Segment]:
-        """The chunks of which it says everything but their CRC, in file order."""
-        found = []
+        """Return the chunks that it states, all but their CRC, in file order."""
+        chunks = []
         for content in self.indexes[Opcode.CHUNK_INDEX] if self.read else ():
             with contextlib.suppress(MalformedRecord):
-                found.append(_segment(content))
-        return sorted(filter(None, found), key=lambda segment: segment.offset)
+                chunks.append(_segment(content))
+        return sorted(filter(None, chunks), key=lambda segment: segment.offset)
 
     def chunks(self, known: set[int]) -> list[Segment] | None:
-        """The chunks in file order, where it defines the `known` channels.
+        """Return the chunks in file order, None if it does not account for every message.
 
-        Returns:
-            None where it does not account for every message.
+        Args:
+            known: the channels that it defines.
 
         Raises:
             MalformedRecord: a broken index.
@@ -81,21 +81,21 @@ class Summary:
         stated = self.statistics
         if stated is None or not self.read:
             return None
-        all_of = [_segment(content) for content in self.indexes[Opcode.CHUNK_INDEX]]
-        found = sorted(filter(None, all_of), key=lambda segment: segment.offset)
-        starts = [*(segment.offset for segment in found), self.begin]
-        stops = [len(MAGIC), *(segment.stop for segment in found)]
+        segments = [_segment(content) for content in self.indexes[Opcode.CHUNK_INDEX]]
+        chunks = sorted(filter(None, segments), key=lambda segment: segment.offset)
+        starts = [*(segment.offset for segment in chunks), self.begin]
+        stops = [len(MAGIC), *(segment.stop for segment in chunks)]
         if any(map(operator.gt, stops, starts)):
             raise MalformedRecord("its chunk index names chunks that overlap")
-        counts = [segment.channel_counts() or {} for segment in found]
+        counts = [segment.channel_counts() or {} for segment in chunks]
         accounted = (
-            len(found) == len(all_of) == stated.chunk_count
+            len(chunks) == len(segments) == stated.chunk_count
             and len(self.indexes[Opcode.METADATA_INDEX]) == stated.metadata_count
             and len(self.indexes[Opcode.ATTACHMENT_INDEX]) == stated.attachment_count
             and sum(sum(c.values()) for c in counts) == stated.message_count
             and all(c.keys() <= known for c in counts)
         )
-        return found if accounted else None
+        return chunks if accounted else None
 
     def contradictions(self, segments: Sequence[Segment]) -> Iterator[str]:
         """Yield where it names other chunks than those of a walk, or other numbers of messages."""
@@ -108,19 +108,19 @@ class Summary:
             yield f"it states {stated} messages, there are {present}"
 
     def ranges(self, opcode: int) -> list[tuple[int, int]]:
-        """The bytes [start, stop) of the file where it says that attachments or metadata are.
+        """Return the bytes [start, stop) of the file of its attachments or metadata records.
 
         Raises:
             MalformedRecord: they are not within the data.
         """
-        found = []
+        spans = []
         for content in self.indexes[opcode]:
             fields = Fields(content, "an index")
             start, size = fields.read8(), fields.read8()
             if size < RECORD_HEADER.size or start + size > self.begin:
                 raise MalformedRecord("an index points outside the data")
-            found.append((start, start + size))
-        return found
+            spans.append((start, start + size))
+        return spans
 
 
 def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summary | None:
@@ -129,11 +129,12 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
     Returns:
         The summary as far as it can be read, or None where the file has no end.
     """
-    footer_at = file.size - len(MAGIC) - FOOTER_BYTES
+    footer_at = file.size - len(MAGIC) - _FOOTER.size
     if footer_at < len(MAGIC) or file.read(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
         return None
-    footer = file.read(footer_at, FOOTER_BYTES)
-    opcode, length, start, offsets, crc = struct.unpack("<BQQQI", footer)
+    footer = file.read(footer_at, _FOOTER.size)
+    opcode, length, start, offsets, crc = _FOOTER.unpack(footer)
+    # Some writers leave the place of the summary, or of its offsets, at 0 where they wrote none.
     if opcode != Opcode.FOOTER or length != 20:
         refuse("footer", "it is no footer record")
         return None
@@ -182,7 +183,11 @@ def _take_records(data: bytes, summary: Summary, definitions: Definitions) -> No
 
 
 def _segment(content: bytes) -> Segment | None:
-    """The chunk of a chunk index, or None where only the chunk tells what it holds."""
+    """Return the chunk of a chunk index, None if it does not state the chunk's messages.
+
+    The message indexes of a chunk follow it without gaps: from their places follow their sizes, and
+    so the number of messages of each channel, without reading the file there.
+    """
     try:
         (mapped,) = _LENGTH.unpack_from(content, _BEFORE_PLACES - 4)
         (name,) = _LENGTH.unpack_from(content, _BEFORE_PLACES + mapped + 8)
@@ -224,5 +229,5 @@ def _segment(content: bytes) -> Segment | None:
 
 @functools.lru_cache(8)
 def _layout(parts: int, name: int) -> struct.Struct:
-    """A chunk index: times, place, length, message indexes, compression, both sizes."""
+    """Return the layout of a chunk index: times, place, length, indexes, compression, sizes."""
     return struct.Struct(f"<QQQQI{'HQ' * parts}QI{name}sQQ")
