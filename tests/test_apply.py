@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import numpy as np
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
-from applied_data import SIZE, TAU, camera, learned, make_run
-from camera_files import pictures, write_images
+from applied_data import SIZE, TAU, camera, make_run
+from camera_files import pictures
 from conftest import Cdmisfa
 from folders import external
 from mcap.reader import make_reader
@@ -20,11 +19,9 @@ from view_data import View, scalars
 from waiting import started
 
 from cdmisfa import Run
-from cdmisfa.experiments.apply import Application, Totals
+from cdmisfa.experiments.apply import Application
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
-from replay.export.applied import Applied
-from replay.runs.modules import save_modules
 
 
 @pytest.fixture
@@ -126,38 +123,6 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
                 np.testing.assert_array_equal(getattr(one, name), getattr(each[0], name))
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "why"),
-    [
-        ("apply RUN oscillatory", 2, r"frames of \(2,\), and the modules learned from \(6, 8\)"),
-        ("apply RUN small.mcap", 2, "4x3 is smaller than 8x6: choose larger images$"),
-        ("apply RUN empty.mcap", 3, "empty.mcap"),
-        ("apply RUN a.mcap empty.mcap -o out.csv", 2, "a file each"),
-        ("apply EMPTY a.mcap", 2, "has no modules: learn longer"),
-        ("apply RUN a.mcap -o there.csv", 2, "there.csv exists"),
-        ("apply RUN a.mcap -o v.xlsx", 2, "v.xlsx: name a file with .parquet, .csv, .mcap, .rrd,"),
-    ],
-)
-def test_what_cannot_be_applied_is_refused_in_a_line(
-    words: str, code: int, why: str, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    camera(tmp_path / "a.mcap", 30)
-    tiny = [(20 * i, image[:4, :4]) for i, image in enumerate(pictures(30))]
-    write_images(tmp_path / "small.mcap", {"/cam": tiny})
-    (tmp_path / "empty.mcap").write_bytes(b"")
-    (tmp_path / "there.csv").write_text("mine")
-    if "EMPTY" in words:
-        save_modules(run / "modules.npz", [])
-    named = {"RUN": run, "EMPTY": run}
-    args = [named.get(word, tmp_path / word if "." in word else word) for word in words.split()[1:]]
-    done = cdmisfa("apply", *args)
-    assert done.code == code, done.err
-    assert re.search(why, done.err), done.err
-    assert len(done.err.splitlines()) == 1
-    assert (tmp_path / "there.csv").read_text() == "mine"
-    assert not list(tmp_path.glob("v.*"))
-
-
 LIVE = "av:lavfi:testsrc=size=160x120:rate=30"
 
 
@@ -190,12 +155,3 @@ def test_a_reader_that_goes_away_ends_it(run: Path) -> None:
         command.stdout.close()
         assert command.wait(30) == 1
         assert "Traceback" not in command.stderr.read()
-
-
-def test_a_module_that_is_not_alive_knows_nothing() -> None:
-    source = ArraySource({"a": np.zeros((TAU, *SIZE), np.uint8)})
-    totals = Totals(source.spec, [learned(1), learned(2), learned(3)])
-    (block,) = source.take_all(TAU)
-    y, novelty = np.zeros((TAU, 9)), np.array([0.5, 0.5, 2.0])
-    totals.add(Applied(block, y, np.full(9, 0.1), np.array([True, False, True]), novelty))
-    assert [row["known"] for row in totals.rows()] == [1.0, 0.0, 0.0]

@@ -17,9 +17,7 @@ from folders import flip
 from mcap.reader import make_reader
 from waiting import started, wait_for
 
-from cdmisfa import Run
 from cdmisfa.cli.commands import doctor
-from cdmisfa.core.names import counted
 from cdmisfa.kernels import WIDE
 
 SHORT = ("--max-iterations", "5", "--json")
@@ -36,23 +34,6 @@ def assert_one_line(outcome: Outcome, code: int, *words: str) -> None:
 
 
 class TestJson:
-    def test_record(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-        folder = tmp_path / "r"
-        document = cdmisfa("record", "oscillatory", "-o", folder, "--frames", 60, "--json").json
-        assert (document["schema"], document["recording"], document["frames"]) == (
-            1,
-            str(folder),
-            60,
-        )
-        assert [view["name"] for view in document["views"]] == ["x1", "x2", "x3"]
-        for view in document["views"]:
-            assert view["frames"] == 60
-            assert Path(view["file"]).stat().st_size == view["bytes"]
-            assert len(view["sha256"]) == 64
-        words = ("record", "oscillatory", "-o", tmp_path / "one", "--frames", 60, "--view", "x2")
-        assert [view["name"] for view in cdmisfa(*words, "--json").json["views"]] == ["x2"]
-        assert [file.name for file in (tmp_path / "one").iterdir()] == ["x2.mcap"]
-
     @pytest.mark.parametrize("which", ["oscillatory_recording", "oscillatory_run"])
     def test_info(self, cdmisfa: Cdmisfa, which: str, request: pytest.FixtureRequest) -> None:
         path = request.getfixturevalue(which)
@@ -64,16 +45,6 @@ class TestJson:
         for channel in document["channels"]:
             keys = {"topic", "encoding", "schema", "messages", "start_ns", "end_ns"}
             assert keys <= set(channel)
-
-    def test_one_is_no_plural(
-        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
-    ) -> None:
-        words = ("learn", oscillatory_recording, "--max-iterations", 1, "--no-rerun")
-        ended = "ended after 1 iteration"
-        assert f"{ended}: " in cdmisfa(*words, "-o", tmp_path / "run").out
-        assert f"{ended} of 100 frames: " in cdmisfa("info", tmp_path / "run").out
-        assert "** in 1 iteration (100 frames of 3 streams)" in Run(tmp_path / "run").summary()
-        assert [counted(n, "frame", ",") for n in (0, 1000)] == ["0 frames", "1,000 frames"]
 
     def test_info_in_words(
         self,
@@ -125,21 +96,6 @@ class TestJson:
         assert f"({1 - stored / whole:.0%} saved)" in said
         assert re.search(r"/view/x1 +2000 +50 +0.000 +39.980", said)
 
-    def test_verify(self, cdmisfa: Cdmisfa, oscillatory_recording: Path) -> None:
-        done = cdmisfa("verify", oscillatory_recording, "--json")
-        assert done.code == 0
-        assert done.json == {**done.json, "schema": 1, "ok": True, "problems": []}
-
-    def test_verify_takes_one_view_for_itself(
-        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
-    ) -> None:
-        alone = tmp_path / "x2.mcap"
-        alone.write_bytes((oscillatory_recording / "x2.mcap").read_bytes())
-        assert cdmisfa("verify", alone).code == 0
-        done = cdmisfa("verify", tmp_path)
-        assert done.code == 3
-        assert "'x1' of the recording has no file" in done.out
-
     def test_doctor(self, cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch) -> None:
         find = doctor.find_spec
         monkeypatch.setattr(doctor, "find_spec", lambda n: None if n == "s3fs" else find(n))
@@ -175,18 +131,6 @@ class TestRuns:
         assert config["learner"]["nu"] == 0.02
         assert config["learner"]["sigma"] == 0.0009
         assert config["scene"].keys() == {"kind", "seed", "streams"}
-
-    @pytest.mark.parametrize("form", ["parquet", "npz", "csv"])
-    def test_export(
-        self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, form: str
-    ) -> None:
-        file = tmp_path / f"signals.{form}"
-        done = cdmisfa("export", oscillatory_run, "-o", file, "--json")
-        document = done.json
-        assert ("leaves out y and y_frozen" in done.err) is (form == "csv")
-        assert (document["file"], document["rows"]) == (str(file), 15)
-        assert file.stat().st_size > 0
-        assert_one_line(cdmisfa("export", oscillatory_run, "-o", file), 2, "--force")
 
     @pytest.mark.parametrize(
         ("algorithm", "blocks", "said"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import click
 import pytest
@@ -14,7 +13,6 @@ from conftest import Cdmisfa
 from cdmisfa.cli import options
 from cdmisfa.cli.app import COMMANDS, cli
 from cdmisfa.cli.commands.learn import learn_command
-from cdmisfa.core.errors import UsageError
 from recorder.images.options import OPTIONS, InputConfig, InputOptions
 
 
@@ -82,27 +80,6 @@ def test_the_words_of_settings_are_read_as_these_settings() -> None:
     command.main(chosen.words(), standalone_mode=False)
     command.main([], standalone_mode=False)
     assert parsed == [chosen, InputOptions()]
-
-
-@pytest.mark.parametrize(
-    ("chosen", "why"),
-    [
-        ({"rate": float("nan")}, "--rate is nan: it must be a number"),
-        ({"rate": -5.0}, "--rate is -5.0"),
-        ({"rate": []}, r"--rate is \[\]"),
-        ({"size": (0, 4)}, r"--size is \(0, 4\): it must be in \[1, inf\)"),
-        ({"start": float("inf")}, "--start is inf"),
-        ({"end": "late"}, "--end is 'late'"),
-        ({"range": (5, -5)}, r"input.range is \(5.0, -5.0\)"),
-        ({"holdout": 0.95}, r"input.holdout is 0.95: it must be in \[0, 0.9\]"),
-        ({"color": "red"}, "--color is 'red'"),
-    ],
-)
-def test_settings_of_a_log_or_a_caller_are_checked_like_typed_ones(
-    chosen: dict[str, Any], why: str
-) -> None:
-    with pytest.raises(UsageError, match=f"^({why})"):
-        InputOptions(**chosen)
 
 
 def test_a_shell_completes_commands_options_choices_and_files(

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import psutil
 import pytest
-from camera_files import write_cameras
 from conftest import Cdmisfa
-from folders import contents, external
+from folders import contents
 from waiting import started, wait_for
 
-from recorder.recording import RecordingStoppedError, record, record_scene
+from recorder.recording import RecordingStoppedError, record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 
 
@@ -101,17 +100,3 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
         assert cdmisfa(*unknown).code == 2
     nothing = cdmisfa("record", "--resume", "-o", tmp_path / "new")
     assert (nothing.code, "name the SCENE" in nothing.err) == (2, True)
-
-
-def test_a_conversion_is_resumed_by_convert(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    log, folder = tmp_path / "a.mcap", tmp_path / "rec"
-    write_cameras(log, {"/left": (200, 20)})
-    with pytest.raises(RecordingStoppedError):
-        record(external([log], size=(12, 16)), folder, stop=lambda: True)
-    for scene in ((), ("oscillatory",)):
-        refused = cdmisfa("record", *scene, "--resume", "-o", folder)
-        remedy = f"resume a conversion with cdmisfa convert SOURCE -o {folder} --resume"
-        line = f"cdmisfa: {folder} is of no scene: {remedy}\n"
-        assert (refused.code, refused.err) == (2, line)
-    done = cdmisfa("convert", log, "-o", folder, "--resume", "--size", "16x12")
-    assert done.code == 0, done.err

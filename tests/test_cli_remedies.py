@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa
-from waiting import python
 
 ROOT = Path(__file__).parents[1]
 
@@ -44,16 +43,6 @@ def test_demo_without_the_simulator_records_oscillatory_streams(
     assert followed == [(f"x{n}", f"sin({5 - n} theta + c)") for n in (1, 2, 3)]
     assert min(module["correlation"] for module in done.json["modules"]) > 0.99
     assert Path(done.json["report"]).parent == tmp_path / "runs" / "demo-oscillatory"
-
-
-def test_another_package_of_the_name_of_ours_is_named(tmp_path: Path) -> None:
-    other = tmp_path / "replay" / "__init__.py"
-    other.parent.mkdir()
-    other.touch()
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import cdmisfa"
-    done = python("-c", code, cwd=tmp_path)
-    said = f"replay is not cdmisfa's: {other}; give cdmisfa an environment of its own"
-    assert done.stderr.splitlines()[-1] == f"ImportError: {said}"
 
 
 def test_the_citation_names_this_version() -> None:

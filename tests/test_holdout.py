@@ -166,15 +166,3 @@ def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -
             else:
                 with pytest.raises(LogDamagedError, match=r"110\.png.*--salvage"):
                     judged(source, [replace(learned, expansion="none")], components=2)
-
-
-def test_the_leading_components_of_many_directions_are_those_of_frames_in_memory() -> None:
-    rng, t = np.random.default_rng(8), np.arange(3000)
-    strong = np.stack([np.sin(t / period) for period in (90, 31, 12, 5)], axis=1) * (4, 5, 6, 7)
-    x = strong @ rng.normal(0, 1, (4, 200)) + rng.normal(0, 1, (3000, 200))
-    centred = x - x.mean(axis=0)
-    within = np.linalg.svd(centred, full_matrices=False)[2][:4].T
-    exact = slowness(centred @ within @ batch_sfa(centred @ within, 2).T)
-    phi, mean, _ = batch_outputs(in_pieces(x, 256), len(x), components=4, outputs=2)
-    (found,) = following_slowness(in_pieces(x, 256), [(phi, mean)])
-    np.testing.assert_allclose(found, exact, rtol=1e-3)

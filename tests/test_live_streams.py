@@ -248,16 +248,9 @@ def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
 REFUSED = {
     "learn av:nothing.mkv": "av:nothing.mkv cannot be opened",
     "record rtsp://me:secret@127.0.0.1:9/x -o x": "rtsp://127.0.0.1:9/x cannot",
-    "record foxglove://127.0.0.1:9/x -o x": "does not answer",
     "record gym:Nothing-v0 -o x": "gym:Nothing-v0 cannot be made",
-    "record camera:/dev/video99 -o x": "/dev/video99: there is no such device",
-    f"learn {TEST} --field k": "shows images: --field is for messages",
-    f"learn {TEST} --set input.range=0.3,5": "shows images: input.range is for messages of foxglove://",
-    f"learn {TEST} --loop": "live streams cannot go back",
     f"learn {TEST} --resume -o run": "learn from a recording of them",
-    f"record {TEST} -o x --resume": "leave out --resume",
     f"convert {TEST} -o x": "is a live stream: cdmisfa record",
-    "record icub --size 32x24 -o x": "icub is a scene: --size is for logs and cameras",
 }
 
 

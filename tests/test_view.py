@@ -10,7 +10,6 @@ from run_data import DELTA, IMAGE, VECTOR, module_of, run_of, write_run
 from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
@@ -113,19 +112,6 @@ def test_eyes_get_threshold_band_weights_and_events(shown):
     np.testing.assert_allclose(advantage, [1000 * (s.Q[1, 0] - s.Q[1, 1]) for s in records])
 
 
-def test_the_share_of_the_recent_blocks_is_there(tmp_path, monkeypatch):
-    monkeypatch.setattr("replay.view.run.RECENT", 5)
-    monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", 4)
-    records = write_run(tmp_path / "run.mcap", VECTOR, ITERATIONS)
-    build_view(tmp_path, tmp_path / "run.rrd")
-    found = scalars(View(tmp_path / "run.rrd").rows["/decision/attention"])
-    streams = np.array([s.stream for s in records])
-    for k in range(len(records)):
-        recent = streams[max(0, k - 4) : k + 1]
-        share = np.bincount(recent, minlength=len(VECTOR.streams)) / len(recent)
-        np.testing.assert_allclose(found[k], share)
-
-
 def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
     written = write_run(tmp_path / "run.mcap", VECTOR, ITERATIONS)
     text = summary_text(read_outline(tmp_path), "run", ["ended: nothing was left"])
@@ -157,12 +143,3 @@ def test_an_empty_run_has_a_view_too(tmp_path):
     write_run(tmp_path / "run.mcap", VECTOR, 0)
     build_view(tmp_path, tmp_path / "empty.rrd")
     assert "/signals/y" not in View(tmp_path / "empty.rrd").rows
-
-
-def test_an_existing_view_is_kept(tmp_path):
-    write_run(tmp_path / "run.mcap", VECTOR, 2)
-    (tmp_path / "run.rrd").write_bytes(b"mine")
-    with pytest.raises(UsageError, match="--force"):
-        build_view(tmp_path, tmp_path / "run.rrd", force=False)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]
-    assert (tmp_path / "run.rrd").read_bytes() == b"mine"

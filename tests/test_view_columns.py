@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from run_data import IMAGE, VECTOR, run_of, write_run
 
-from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.codec import (
     MATRIX_DEFINITION,
@@ -88,15 +85,6 @@ def test_one_pass_reads_records_in_batches_and_the_frames_asked_for(tmp_path, mo
     some = read_batches(log, read_header(log), every=30)
     times = [t for s in some for frames, _ in s.watched for t in frames.tolist()]
     assert times == list(range(0, ITERATIONS * 40, 30 if spec is IMAGE else 1))
-
-
-def test_a_record_about_another_stream_is_damage(tmp_path):
-    spec = dataclasses.replace(VECTOR, streams=("x1", "x2"))
-    path = tmp_path / "run.mcap"
-    write_run(path, VECTOR, 5)
-    header = dataclasses.replace(read_header(path), spec=spec)
-    with pytest.raises(LogDamagedError, match="other streams"):
-        list(read_batches(path, header))
 
 
 def test_an_outline_sums_the_records_up(tmp_path):

@@ -106,13 +106,3 @@ def test_few_modules_have_a_page_each_and_many_stand_on_pages(tmp_path):
         assert layout.root_container.active_tab == tabs.index(modules)
     with pytest.raises(UsageError, match=r"no tab 'nowhere': there are Overview, .*Modules"):
         run_layout(outline, tab="nowhere")
-
-
-def test_the_picture_has_the_name_of_its_stream(built):
-    view, records, _ = built
-    rows = view.rows["/world/watched/name"]
-    labels = [text for (text,) in rows["Boxes2D:labels"]]
-    named, stream = dict(zip(rows["frame"], labels, strict=True)), None
-    for record in records:
-        stream = named.get(record.t, stream)
-        assert stream == IMAGE.streams[record.stream]

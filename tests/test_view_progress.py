@@ -20,7 +20,6 @@ from view_data import View, scalars
 
 from replay.runs.run import read_outline
 from replay.view.build import build_view
-from replay.view.summary import summary_text
 
 ITERATIONS = 30
 TAU = 40
@@ -112,22 +111,3 @@ def test_no_view_of_any_learner_is_empty(
     words = ["learn", oscillatory_recording, "--loop", "--algorithm", algorithm, "-o", run]
     assert cdmisfa(*words, "--max-iterations", 60).code == 0
     assert check_no_view_is_empty(run) > 25
-
-
-def test_the_summary_says_what_became_of_each_stream(shown):
-    _, folder, _ = shown
-    first, second, third = read_outline(folder).names()
-    events = [
-        f"stream {first} is learned by module 1 after 9 blocks, slowness 0.0500",
-        f"stream {second} is known by module 1 (of {first}) after 4 blocks, slowness 0.0600",
-        f"stream {third} is given up after 3 blocks: it is constant",
-        f"looking once more at what was given up: {third}",
-        f"stream {second} is known by module 2 (of {first}) after 8 blocks, slowness 0.0400",
-        "ended: nothing was left",
-    ]
-    text = summary_text(read_outline(folder), "run", events)
-    assert "1 learning, 1 learned, 1 known" in text
-    assert f"- **{first}**: learned by module 1 after 9 blocks, slowness 0.0500" in text
-    assert f"- **{second}**: known by module 2 (of {first}) after 8 blocks" in text
-    assert f"- **{third}**: being learned" in text
-    assert "It ended: nothing was left." in text

@@ -81,17 +81,6 @@ def test_objects_stand_where_the_world_knew_them_and_the_head_looks_at_what_is_w
     assert View(tmp_path / "run.rrd").titles().count("World") == 1
 
 
-def test_without_the_robots_models_there_is_the_rest_and_a_line_that_says_so(tmp_path, monkeypatch):
-    without_models(monkeypatch)
-    write_run(tmp_path / "run.mcap", SCENE, 3, source=LIVE)
-    build_view(tmp_path, tmp_path / "run.rrd")
-    rows = View(tmp_path / "run.rrd").rows
-    said = [text for (text,) in rows["/events"]["TextLog:text"]]
-    assert "the robot's body is not shown: `pip install icub-models` for it" in said
-    assert "/scene/box" in rows
-    assert "/scene/neck" not in rows
-
-
 def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
     records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
     saves = [record for record in records if record.saved]
