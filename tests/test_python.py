@@ -158,7 +158,7 @@ def test_a_run_gives_what_its_log_holds(tmp_path: Path) -> None:
     assert again.events[-1].text.startswith("ended: ")
     (module,) = again.modules
     shown = module.transform(again.frames(0, 3))
-    assert np.array_equal(again.features[0].transform(again.frames(0, 3)), shown)
+    assert np.array_equal(again.modules[0].transform(again.frames(0, 3)), shown)
     assert "1 module learned" in again.summary()
     for part in ((3, 3), (-1, 2), (0, 10**6)):
         with pytest.raises(ValueError, match="has no iterations"):
