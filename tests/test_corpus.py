@@ -18,8 +18,7 @@ from conftest import Cdmisfa
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.corpus import index as indexing
-from replay.corpus import rows as looking
-from replay.corpus.finding import INDEX, found_logs
+from replay.corpus.finding import INDEX, find_logs
 from replay.corpus.index import index_logs, read_index
 from replay.corpus.rows import SCHEMA
 
@@ -134,18 +133,18 @@ class TestUpToDate:
         self, corpus: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         index_logs([corpus])
-        before = (corpus / INDEX).stat()
+        before = (corpus / INDEX).stat().st_mtime_ns
         assert index_logs([corpus]).read == 0
-        assert (corpus / INDEX).stat() == before  # not even written
+        assert (corpus / INDEX).stat().st_mtime_ns == before  # not even written
         shutil.copytree(corpus / "night" / "one", corpus / "night" / "two")
         os.utime(corpus / "robot.mcap", ns=(1, 1))
         (corpus / "text.mcap").unlink()
         opened: list[str] = []
-        look = looking.look
+        read_rows = indexing.read_rows
         monkeypatch.setattr(
             indexing,
-            "look",
-            lambda tasks, **how: opened.extend(t.path for t in tasks) or look(tasks, **how),
+            "read_rows",
+            lambda logs, deep: opened.extend(log.path for log in logs) or read_rows(logs, deep),
         )
         made = index_logs([corpus])
         assert opened == [*(f"night/two/x{i}.mcap" for i in (1, 2, 3)), "robot.mcap"]
@@ -157,9 +156,9 @@ class TestBadInput:
         (corpus / "night" / "up").symlink_to(corpus)
         (corpus / "self").symlink_to(corpus / "self")
         (corpus / "lost.mcap").symlink_to("nowhere")
-        names = [Path(log.file).name for log in found_logs([corpus])]
+        names = [Path(log.file).name for log in find_logs([corpus])]
         assert len(names) == 11
-        assert [log.problem for log in found_logs([corpus]) if log.file.endswith("lost.mcap")] == [
+        assert [log.problem for log in find_logs([corpus]) if log.file.endswith("lost.mcap")] == [
             "it cannot be read: No such file or directory"
         ]
 

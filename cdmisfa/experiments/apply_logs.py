@@ -253,7 +253,7 @@ def _find_logs(
     """Index the logs that words name; return their names and entries in the order of names."""
     indices = [Path(word).resolve() for word in words if is_index(Path(word))]
     if others := [word for word in words if not is_index(Path(word))]:
-        index_logs(others, index, jobs=where.get("jobs", 1), told=indexing)
+        index_logs(others, index, jobs=where.get("jobs", 1), progress=indexing)
         indices.append(index)
     found: dict[str, IndexedLog] = {}
     for path in indices:

@@ -18,7 +18,7 @@ from recorder.images.options import InputConfig, InputOptions
 from recorder.world.scenes import SCENES, open_scene
 
 if TYPE_CHECKING:
-    from replay.corpus.logs import Told
+    from replay.corpus.episodes import Progress
     from replay.stored import StoredSource
 
 # The learner of streams that are no scene of ours, nor recorded from one.
@@ -253,7 +253,7 @@ def open_logs(
     salvage: bool = False,
     inputs: InputOptions | None = None,
     episodes: bool = False,
-    told: Told = lambda done, total: None,
+    told: Progress = lambda done, total: None,
     goal: tuple[str, str] = ("learn", "RUN"),
 ) -> SeekableSource:
     """Open a recording, external logs, or many of both as episodes.

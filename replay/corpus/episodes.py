@@ -1,42 +1,45 @@
-"""Many logs as one source: each is an episode, and between two of them is a gap."""
+"""Many logs as one source: each is an episode, and there is a gap between two of them."""
 
 from __future__ import annotations
 
 import bisect
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from cdmisfa.core.blocks import Block, SourceSpec
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.names import counted
 from recorder.images.options import InputOptions
+from replay.corpus.index import logs_of_corpus
 from replay.corpus.logs import (
     Episode,
-    Found,
     Log,
-    Told,
-    find_episodes,
-    kind_of,
-    logs_of_corpus,
+    are_alike,
+    by_numbers,
+    episode_of,
+    names_of,
     sampled,
 )
 from replay.inputs import open_log
-from replay.logs.clock import UNEVEN
 from replay.logs.formats.lerobot import PAUSE
 from replay.logs.source import LoggedSource
 from replay.storage.identity import Identity
 from replay.stored import Span, StoredSource
 
-SAID: Final = 5
-"""Lines of a kind, as of logs that are left out, that are said."""
+MOST_LINES: Final = 5
+"""Number of warnings of a kind, as of logs that are left out, that are printed."""
 
-MOST: Final = 20_000
-"""Episodes of one source: so many are listed in the files of a run."""
+MOST_EPISODES: Final = 20_000
+"""Episodes of one source, which the files of a run list."""
 
 _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "time", "stamp")
-"""What logs state of how images became frames, the same of all."""
+"""What the description of a source states of how images became frames, the same for all logs."""
+
+Progress = Callable[[float, float | None], None]
+"""Called with the number of logs that were opened, and of all logs."""
 
 
 def open_episodes(
@@ -48,13 +51,13 @@ def open_episodes(
     """Open the logs of an index, or each path by itself, as episodes.
 
     Args:
-        words: what was named.
-        paths: what the words stand for, where each is an episode whatever it is.
+        words: the words of the command line.
+        paths: the paths that the words name, if each is an episode.
         inputs: see `EpisodeSource`.
-        how: see there.
+        how: see `EpisodeSource`.
 
     Returns:
-        None where the words name no index and no paths are given.
+        None if the words name no index and no paths are given.
 
     Raises:
         UsageError: an index holds no logs, or as for `EpisodeSource`.
@@ -65,15 +68,15 @@ def open_episodes(
 
 
 class EpisodeSource(StoredSource):
-    """Logs one after the other, by when each begins and then by their paths.
+    """Logs one after the other, ordered by their start times and then by their paths.
 
-    Streams of the same name are one. What lies between two logs is a gap, `PAUSE` frames of the
-    clock, and so is all of a log to a stream that it lacks. One log is open at a time.
+    Streams of the same name are one. Between two logs is a gap of `PAUSE` frames, and a log that
+    lacks a stream is a gap in it. One log is open at a time.
 
     Attributes:
         left_out: a line for each log that cannot be read, or not to its end.
-        framings: for each stream how an image becomes a frame, None where that is not said.
-        changes: for each stream the first line that says how its images changed.
+        framings: for each stream how an image becomes a frame, or None.
+        changes: for each stream the first line that states how its images changed.
         turns: see `turn_to`.
     """
 
@@ -87,70 +90,86 @@ class EpisodeSource(StoredSource):
         *,
         loop: bool = False,
         salvage: bool = False,
-        told: Told = lambda done, total: None,
+        told: Progress = lambda done, total: None,
     ) -> None:
-        """Open every log once, for its frames and what identifies it.
+        """Open every log once, for its frames and its identity.
 
         Args:
-            logs: what is opened as one, each.
-            inputs: how images of others become frames.
+            logs: the files of each log.
+            inputs: how images of external logs become frames.
             loop: begin again at the end.
-            salvage: pass over what is damaged of a log; else what follows in it is left out.
-            told: how many of the logs were opened.
+            salvage: skip damaged parts of a log; else the rest of the log is left out.
+            told: called with the number of opened logs, and of all.
 
         Raises:
-            UsageError: none of them shows frames.
-            LogDamagedError: nor can any be read.
+            UsageError: none of them has frames.
+            LogDamagedError: none can be read.
         """
         if inputs is not None and inputs.color == "auto":
-            raise UsageError("--color auto looks at one log: say --color or not, for all episodes")
-        if len(logs) > MOST:
-            raise UsageError(
-                f"{len(logs):,} logs are more episodes than one run lists, {MOST:,}: index fewer"
-            )
+            raise UsageError("--color auto is for a single log: choose on or off for episodes")
+        if len(logs) > MOST_EPISODES:
+            raise UsageError(f"{len(logs):,} logs: a run has at most {MOST_EPISODES:,} episodes")
         self._inputs, self._loop, self._salvage = inputs, loop, salvage
         self._open_now: tuple[int, LoggedSource] | None = None
         self._reading = 0, 0
         self._lost: list[str] = []
         self.changes: dict[str, str] = {}
-        self._set_clock(find_episodes(logs, self._opened, told))
+        episodes: list[Episode] = []
+        errors: list[CdmisfaError] = []
+        warnings: list[str] = []
+        self._folder, names = names_of(logs)
+        order = sorted(zip(names, logs, strict=True), key=lambda named: by_numbers(named[0]))
+        for done, (name, log) in enumerate(order, 1):
+            try:
+                with contextlib.closing(self._open(log)) as source:
+                    episodes.append(episode_of(log, name, source, self._open))
+                    warnings.extend(source.warnings)
+            except CdmisfaError as error:
+                errors.append(error)
+            told(done, len(logs))
+        if not episodes:
+            raise errors[0]
+        episodes.sort(key=lambda episode: episode.spec.start_ns)
+        damaged, unfit = list[str](), list[str]()
+        for reason in errors:
+            lines = damaged if isinstance(reason, LogDamagedError) else unfit
+            lines.append(f"{reason}: this log is left out")
+        unfit += self._set_clock(episodes)
+        self.left_out = tuple(damaged)
+        self.warnings = tuple(line for lines in (damaged, unfit, warnings) for line in _few(lines))
 
-    def _set_clock(self, found: Found) -> None:
-        """Put the logs that show what the first one does on one clock."""
-        first = found.episodes[0]
-        one, kind = first.spec, found.kinds[kind_of(first.spec)]
-        alike: list[Episode] = []
-        others: list[str] = []
-        for episode in found.episodes:
-            said = [_said(spec) for spec in (episode.spec, one)]
-            if kind_of(episode.spec) == kind_of(one) and (
-                abs(episode.spec.fps / one.fps - 1) <= UNEVEN
-            ):
-                alike.append(episode)
-            else:
-                others.append(
-                    f"{episode.name} has {said[0]}, {first.name}, the first, {said[1]}: it is left "
-                    "out; --size and --rate make logs alike"
-                )
-        self._episodes, self._kind, self._folder = alike, kind, found.folder
-        self.left_out = tuple(found.damaged)
-        lines = found.damaged, [*found.unfit, *others], found.warnings
-        self.warnings = tuple(line for some in lines for line in _few(some))
-        names = dict.fromkeys(stream for episode in alike for stream in episode.spec.streams)
-        about = [kind.streams[name] for name in names]
-        self.framings = [framing for framing, _, _ in about]
-        self._fields, self._pixels = [own for _, own, _ in about], [own for _, _, own in about]
-        self.turns = kind.turns if len(kind.turns) == len(names) else ()
+    def _set_clock(self, episodes: Sequence[Episode]) -> Iterator[str]:
+        """Put the logs with frames like those of the first one on one clock.
+
+        Yields:
+            A line for each other log.
+        """
+        first = episodes[0]
+        alike = [episode for episode in episodes if are_alike(episode.spec, first.spec)]
+        streams: dict[str, tuple[Any, list[str], str]] = {}
         end = 0
         for episode in alike:
+            streams = {**episode.streams, **streams}
             episode.start, end = end, end + episode.count + PAUSE
+        self._episodes = alike
         self._starts = [episode.start for episode in alike]
         self.frames = end if self._loop else end - PAUSE
+        names = tuple(dict.fromkeys(name for episode in alike for name in episode.spec.streams))
         length = None if self._loop else self.frames
-        self._spec = replace(one, streams=tuple(names), length=length)
+        self._spec = replace(first.spec, streams=names, length=length)
+        self.framings = [streams[name][0] for name in names]
+        self._fields = [streams[name][1] for name in names]
+        self._pixels = [streams[name][2] for name in names]
+        self.turns = first.turns if len(first.turns) == len(names) else ()
+        ends = f"{first.name} to {alike[-1].name}" if len(alike) > 1 else first.name
         order = "by when each begins, then by its path"
-        ends = f"{alike[0].name} to {alike[-1].name}" if len(alike) > 1 else alike[0].name
         self.notes = (f"{counted(len(alike), 'episode')}, {order}: {ends}",)
+        for episode in episodes:
+            if not are_alike(episode.spec, first.spec):
+                yield (
+                    f"{episode.name} has {_described(episode.spec)}, {first.name}, the first, "
+                    f"{_described(first.spec)}: it is left out; --size and --rate make logs alike"
+                )
 
     def pixels(self, stream: int) -> str:
         """See `LoggedSource`."""
@@ -237,25 +256,25 @@ class EpisodeSource(StoredSource):
         return replace(block, stream=stream, t=t)
 
     def _log(self, number: int) -> LoggedSource:
-        """A log, open, and no other one.
+        """Return a log, opened, after closing any other one.
 
         Raises:
-            LogDamagedError: it cannot be opened any more, or shows something else.
+            LogDamagedError: it cannot be opened any more, or has changed.
         """
         if self._open_now is None or self._open_now[0] != number:
             self.close()
-            one = self._episodes[number]
+            episode = self._episodes[number]
             try:
-                source = self._opened(one.log)
+                source = self._open(episode.log)
             except UsageError as error:
                 raise LogDamagedError(str(error)) from None
-            if sampled(source) != one.identity.sampled:
+            if sampled(source) != episode.identity.sampled:
                 source.close()
-                raise LogDamagedError(f"{one.name}: it was changed since it was first opened")
+                raise LogDamagedError(f"{episode.name}: it has changed since it was first opened")
             self._open_now = number, source
         return self._open_now[1]
 
-    def _opened(self, log: Log) -> LoggedSource:
+    def _open(self, log: Log) -> LoggedSource:
         return open_log(log, self._inputs, salvage=self._salvage)
 
     def _leave_out(self, error: LogDamagedError) -> None:
@@ -271,24 +290,21 @@ class EpisodeSource(StoredSource):
         return [episode.identity for episode in self._episodes]
 
     def scene(self) -> Mapping[str, str]:
-        """What was recorded, where that is one thing."""
-        one = self._kind.scenes
-        return {"scene": next(iter(one))} if len(one) == 1 and one != {""} else {}
+        """Return the scene that was recorded, if it is the same in all logs."""
+        scenes = {episode.scene for episode in self._episodes}
+        return {"scene": scenes.pop()} if len(scenes) == 1 and scenes != {""} else {}
 
     def described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-        """The logs in their order with the frames [start, stop) of each."""
+        """Return the description of the source: its logs with the frames [start, stop) of each."""
         files = [
-            {
-                "file": episode.name,
-                "frames": [episode.start, episode.start + episode.count],
-                **log,
-            }
+            {"file": episode.name, "frames": [episode.start, episode.start + episode.count], **log}
             for episode, log in zip(self._episodes, logs, strict=True)
         ]
+        stated = self._episodes[0].stated
         return {
             "kind": "episodes",
             **self.scene(),
-            **{key: self._kind.stated[key] for key in _STATED if key in self._kind.stated},
+            **{key: stated[key] for key in _STATED if key in stated},
             **({"fields": self._fields} if any(self._fields) else {}),
             "rate": self._spec.fps,
             "files": files,
@@ -300,12 +316,12 @@ class EpisodeSource(StoredSource):
         return self._folder or str(self._episodes[0].log[0])
 
 
-def _said(spec: SourceSpec) -> str:
-    """What the frames of a log are, in words."""
+def _described(spec: SourceSpec) -> str:
+    """Return what the frames of a log are, in words."""
     return f"frames of {'x'.join(map(str, spec.frame_shape))} {spec.dtype} at {spec.fps:g} Hz"
 
 
 def _few(lines: Sequence[str]) -> Sequence[str]:
-    """The first lines, and how many more there are."""
-    more = len(lines) - SAID
-    return [*lines[:SAID], *([f"and {more} more, alike"] if more > 0 else [])]
+    """Return the first lines, and how many more there are."""
+    more = len(lines) - MOST_LINES
+    return [*lines[:MOST_LINES], *([f"and {more} more, alike"] if more > 0 else [])]

@@ -1,7 +1,4 @@
-"""Find the logs that words name and all logs below folders: names, sizes, when they changed.
-
-No log is opened for this, and no more is asked of the file system than what a folder lists.
-"""
+"""Find all logs below folders by listing them, without opening any."""
 
 from __future__ import annotations
 
@@ -19,22 +16,21 @@ from replay.runs.folders import RUN_FILE
 from replay.storage.location import is_url
 
 INDEX: Final = "corpus.parquet"
-"""Name of the index of a folder, in it."""
+"""Name of the index file in the folder that it indexes."""
 
 _LOGS: Final = frozenset((".mcap", *ENDINGS))
 _RUN: Final = frozenset((RUN_FILE, RUN_FILE + PARTIAL))
 
 
-class Found(NamedTuple):
-    """A log, a file or a folder that is one.
+class ListedLog(NamedTuple):
+    """A log: a file, or a folder that is opened as one.
 
     Attributes:
-        file: its name, as it is opened; of a name that is not UTF-8 as it can be written.
-        bytes: of it.
-        changed: what differs when it was written again: the time of its last change in
-            nanoseconds; "" of a URL, and where it cannot be opened.
-        problem: why it cannot be opened.
-        path: what it is called in an index; "" before it is in one.
+        file: path or URL; a name that is not UTF-8 is escaped.
+        bytes: size.
+        changed: time of the last change in nanoseconds; "" for a URL, or if it cannot be read.
+        problem: why it cannot be opened, or "".
+        path: its name in an index, or "".
     """
 
     file: str
@@ -44,24 +40,22 @@ class Found(NamedTuple):
     path: str = ""
 
 
-def found_logs(words: Sequence[str | Path]) -> Iterator[Found]:
-    """The logs that words name, in the order of names within each folder.
-
-    A folder is listed once, by whichever links lead there.
+def find_logs(words: Sequence[str | Path]) -> Iterator[ListedLog]:
+    """Yield the logs that words name, and all logs below folders; each folder is listed once.
 
     Raises:
         UsageError: a word names nothing.
     """
-    seen: set[tuple[int, int]] = set()
+    listed: set[tuple[int, int]] = set()
     for word in words:
         if is_url(word):
-            yield Found(str(word))
+            yield ListedLog(str(word))
             continue
         for place in locations([word]):
             if place.is_dir():
-                yield from _below(str(place), seen)
+                yield from _below(str(place), listed)
             else:
-                yield _file(place)
+                yield _log_file(str(place))
 
 
 def may_be_corpus(words: Sequence[str | Path]) -> bool:
@@ -73,55 +67,49 @@ def may_be_corpus(words: Sequence[str | Path]) -> bool:
     return os.path.isfile(place / INDEX) or (place.suffix == ".parquet" and place.is_file())
 
 
-def state_of_log(place: Path) -> tuple[int, str]:
-    """Bytes of a log on this machine and when it changed, as `Found` has them.
+def size_and_time(place: Path) -> tuple[int, str]:
+    """Return size and time of change of a log on this machine, as `ListedLog` has them.
 
     Raises:
-        OSError: it is not there.
+        OSError: it does not exist.
     """
-    if place.is_dir():
-        return _state_of_folder(place)
-    state = os.stat(place)
-    return state.st_size, str(state.st_mtime_ns)
+    files = [path for path in place.rglob("*") if path.is_file()] if place.is_dir() else [place]
+    states = [os.stat(file) for file in files]
+    changed = max((state.st_mtime_ns for state in states), default=0)
+    return sum(state.st_size for state in states), str(changed)
 
 
-def _file(place: Path) -> Found:
-    try:
-        return _named(str(place), *state_of_log(place))
-    except OSError as error:
-        return _named(str(place), problem=_why(error))
-
-
-def _below(root: str, seen: set[tuple[int, int]]) -> Iterator[Found]:
-    """The logs of a folder and of those in it, down to the last."""
-    folders = [root]
-    while folders:
-        folder = folders.pop()
-        try:
-            state = os.stat(folder)
-            if (state.st_dev, state.st_ino) in seen:
-                continue
-            seen.add((state.st_dev, state.st_ino))
-            with os.scandir(folder) as listed:
-                entries = sorted(listed, key=lambda entry: entry.name)
-        except OSError as error:
-            yield _named(folder, problem=_why(error))
+def _below(root: str, listed: set[tuple[int, int]]) -> Iterator[ListedLog]:
+    """Yield the logs in a folder and all folders below it; links in a circle end."""
+    errors: list[OSError] = []
+    for folder, folders, files in os.walk(root, followlinks=True, onerror=errors.append):
+        state = os.stat(folder)
+        names = {*folders, *files}
+        format = _format_of_folder(folder, names)
+        if format in ("bag", "dataset", "pictures"):
+            yield _log_file(folder)
+        if (state.st_dev, state.st_ino) in listed or format in ("bag", "dataset"):
+            folders.clear()
             continue
-        names = {entry.name for entry in entries}
-        kind = _kind_of(folder, names)
-        if kind in ("bag", "dataset", "pictures"):
-            yield _file(Path(folder))
-        if kind in ("bag", "dataset"):
-            continue
+        listed.add((state.st_dev, state.st_ino))
+        folders.sort()
         run = names & _RUN
-        folders += [] if run else [e.path for e in reversed(entries) if _is_folder(e)]
-        yield from _files_of([e for e in entries if e.name in run] if run else entries, names)
+        if run:
+            folders.clear()  # a run keeps no further logs below it
+        for name in sorted(run or files):
+            whole = name.removesuffix(PARTIAL)
+            partial = name.endswith(f".mcap{PARTIAL}") and whole not in names
+            ending = os.path.splitext(name)[1].lower()
+            if name != INDEX and (partial or ending in _LOGS):
+                yield _log_file(os.path.join(folder, name))
+    for error in errors:
+        yield ListedLog(_escaped(error.filename), problem=f"it cannot be read: {error.strerror}")
 
 
-def _kind_of(folder: str, names: set[str]) -> str:
-    """The format of the log that a folder is; "mcap" or "split" where its files are logs."""
-    hints = any(os.path.splitext(name)[1].lower() in IMAGE_ENDINGS for name in names)
-    if not (hints or names & {"metadata.yaml", "meta"}) or names & _RUN:
+def _format_of_folder(folder: str, names: set[str]) -> str:
+    """Return the format of a folder that is one log; "mcap" for a folder of logs."""
+    images = any(os.path.splitext(name)[1].lower() in IMAGE_ENDINGS for name in names)
+    if names & _RUN or not (images or names & {"metadata.yaml", "meta"}):
         return "mcap"
     try:
         return log_format(Path(folder))
@@ -129,45 +117,14 @@ def _kind_of(folder: str, names: set[str]) -> str:
         return "mcap"
 
 
-def _files_of(entries: Sequence[os.DirEntry[str]], names: set[str]) -> Iterator[Found]:
-    """The logs among what a folder lists; a partial one where the whole one is not there."""
-    for entry in entries:
-        whole = entry.name.removesuffix(f".mcap{PARTIAL}")
-        partial = whole != entry.name and f"{whole}.mcap" not in names
-        ending = os.path.splitext(entry.name)[1].lower()
-        if entry.name == INDEX or not (partial or ending in _LOGS) or _is_folder(entry):
-            continue
-        try:
-            state = entry.stat()
-            yield _named(entry.path, state.st_size, str(state.st_mtime_ns))
-        except FileNotFoundError as error:
-            if entry.is_symlink():
-                yield _named(entry.path, problem=_why(error))
-        except OSError as error:
-            yield _named(entry.path, problem=_why(error))
-
-
-def _state_of_folder(folder: Path) -> tuple[int, str]:
-    states = [path.stat() for path in folder.rglob("*") if path.is_file()]
-    last = max((state.st_mtime_ns for state in states), default=0)
-    return sum(state.st_size for state in states), str(last)
-
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
+def _log_file(name: str) -> ListedLog:
+    if (escaped := _escaped(name)) != name:
+        return ListedLog(escaped, problem="its name is not UTF-8: give it another")
     try:
-        return entry.is_dir()
-    except OSError:  # a link that leads to itself
-        return False
+        return ListedLog(name, *size_and_time(Path(name)))
+    except OSError as error:
+        return ListedLog(name, problem=f"it cannot be read: {error.strerror}")
 
 
-def _named(name: str, size: int = 0, changed: str = "", problem: str = "") -> Found:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        name = os.fsencode(name).decode(errors="backslashreplace")
-        problem = "its name is not UTF-8: give it another"
-    return Found(name, size, changed, problem)
-
-
-def _why(error: OSError) -> str:
-    return f"it cannot be read: {error.strerror or error}"
+def _escaped(name: str) -> str:
+    return os.fsencode(name).decode(errors="backslashreplace")

@@ -1,11 +1,11 @@
-"""The index of many logs: what is new or changed is read, the rest is kept, by a join."""
+"""The index of many logs: a Parquet file with a row for each stream, updated by what changed."""
 
 from __future__ import annotations
 
 import functools
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -16,53 +16,44 @@ import pyarrow.parquet as pq
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_line
-from cdmisfa.core.processes import WorkersError, run_all
+from cdmisfa.core.processes import run_all
 from cdmisfa.core.untrusted import check_regular, parse_json
 from recorder.log.files import atomic_write, held, make_folder, refuse_unless
-from replay.corpus.finding import INDEX, Found, found_logs
-from replay.corpus.rows import MARK, SCHEMA, VERSION, Answer, look
+from replay.corpus.finding import INDEX, ListedLog, find_logs, may_be_corpus
+from replay.corpus.rows import MARK, SCHEMA, VERSION, read_rows
 from replay.storage.location import is_url, location
 from replay.storage.opening import no_such
 
 BATCH: Final = 32
-"""Logs that a process looks at in one go."""
+"""Logs that a process reads at a time."""
 
-MOST_NAMED: Final = 20
+MOST_PROBLEMS: Final = 20
 """Logs with a problem that `index` prints, so that they fit on a screen."""
 
 SAVED_EVERY: Final = 5000
-"""Logs after which what is known is written, so that a kill costs no more than these."""
+"""Logs after which the index is written, so that a kill loses no more than these."""
 
-_SAME: Final = (
-    "scene",
-    "seed",
-    "config_sha256",
-    "start_ns",
-    "fps",
-    "frame_shape",
-    "dtype",
-    "truth",
-)
-"""What the views of a recording state alike."""
+_SHARED: Final = ("scene", "seed", "config_sha256", "start_ns", "fps", "frame_shape", "dtype",
+                  "truth")  # fmt: skip
+"""What all views of one recording state alike."""
 
 
 @dataclass(slots=True)
 class Indexed:
-    """What became of an index.
+    """The outcome of indexing.
 
     Attributes:
-        index: its file.
-        logs: how many it has now.
-        streams: how many rows.
-        read: logs that were looked at, as they were new or had changed.
-        kept: logs that were as before.
-        gone: logs that it had and that are not there any more, and those that went meanwhile.
-        broken: logs with a problem.
-        kinds: for each kind of log how many there are, their files, streams, bytes and seconds; a
-            recording is one log, however many files it has.
-        problems: `path` and `problem` of the first `MOST_NAMED` of those with one.
-        anew: why nothing was kept of an index that was there; "" where something may be.
-        stopped: it was stopped before all logs were looked at; the rest is for the next time.
+        index: the file.
+        logs: number of logs in it.
+        streams: number of rows.
+        read: number of logs that were new or changed, and were read now.
+        kept: number of unchanged logs.
+        gone: paths of logs that no longer exist.
+        broken: number of logs with a problem.
+        kinds: logs, files, streams, bytes and seconds of each kind of log; a recording is one log.
+        problems: `path` and `problem` of the first `MOST_PROBLEMS` logs that have one.
+        replaced: why an earlier index was replaced, or "".
+        stopped: whether it was stopped before all logs were read.
     """
 
     index: Path
@@ -74,70 +65,22 @@ class Indexed:
     broken: int = 0
     kinds: list[dict[str, Any]] = field(default_factory=list)
     problems: list[dict[str, Any]] = field(default_factory=list)
-    anew: str = ""
+    replaced: str = ""
     stopped: bool = False
 
 
 class IndexedLog(NamedTuple):
-    """What is opened as one: a recording by its files, or a log of others.
+    """What is opened as one log: the files of a recording, or an external log.
 
     Attributes:
-        name: as the index has it, relative to its folder.
-        files: as they are opened.
-        states: bytes of each, and what differs when it was written again, as `Found` has them.
+        name: path relative to the index.
+        files: paths or URLs.
+        states: size and time of change of each file.
     """
 
     name: str
     files: list[str]
     states: list[tuple[int, str]]
-
-
-def indexed_logs(index: Path) -> list[IndexedLog]:
-    """The logs of an index but runs, in the order of their first files.
-
-    Files of recordings that lie in one folder and are not all views of one are a log each.
-
-    Raises:
-        UsageError: it is no index, or one of another version.
-        LogDamagedError: it is damaged.
-    """
-    table = read_index(index)
-    table = table.filter(pc.equal(table["number"], 0))
-    views = table.filter(pc.equal(table["kind"], "recording")).select(["log", "configuration"])
-    stated: dict[str, list[str | None]] = {}
-    for row in views.to_pylist():
-        stated.setdefault(row["log"], []).append(row["configuration"])
-    try:
-        recordings = {name for name, each in stated.items() if _of_one(each)}
-    except (ValueError, AttributeError) as error:
-        raise _damaged(index, error) from error
-    found: dict[str, IndexedLog] = {}
-    for row in table.select(["log", "path", "kind", "bytes", "changed"]).to_pylist():
-        if row["kind"] != "run":
-            path = row["path"]
-            name = row["log"] if row["log"] in recordings else path
-            log = found.setdefault(name, IndexedLog(name, [], []))
-            log.files.append(path if "://" in path else str(index.parent / path))
-            log.states.append((row["bytes"], row["changed"]))
-    return list(found.values())
-
-
-def _of_one(stated: Sequence[str | None]) -> bool:
-    """Whether files are views of one recording, by what each states as JSON."""
-    if len(stated) == 1 or None in stated:
-        return True
-    facts = [parse_json(text or "") for text in stated]
-    views = {str((one.get("view"), one.get("first_frame"))) for one in facts}
-    same = {str([one.get(name) for name in _SAME]) for one in facts}
-    return len(views) == len(facts) and len(same) == 1
-
-
-def is_index(path: Path) -> bool:
-    """Whether a file is an index."""
-    try:
-        return path.suffix == ".parquet" and path.is_file() and _version(path) > 0
-    except CdmisfaError:
-        return False
 
 
 def index_logs(
@@ -146,115 +89,186 @@ def index_logs(
     *,
     deep: bool = False,
     jobs: int = 1,
-    told: Callable[[float, float | None], None] = lambda done, total: None,
+    progress: Callable[[float, float | None], None] = lambda done, total: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Indexed:
-    """Make the index of logs, or bring the one that is there up to date.
+    """Write the index of logs, or update an existing one.
 
-    What has the size and the time of change that the index knows is not opened. An index that is
-    interrupted, or for which the disk has no room, is as it was, or has what was read so far.
+    A log with the size and the time of change that the index has is not opened. An index that is
+    interrupted keeps what was read so far.
 
     Args:
         words: folders, patterns, files and URLs.
-        out: the index; by default corpus.parquet in the folder that is the one word.
-        deep: decode every log, for its checksums, gaps and shapes.
-        jobs: processes; what is found does not depend on them.
-        told: how many of the logs that are to be read were.
-        stop: asked now and then; true ends it with what was read.
+        out: the index; by default corpus.parquet in the folder that is the only word.
+        deep: decode every log, for checksums, gaps and shapes.
+        jobs: number of processes; the result does not depend on it.
+        progress: called with the number of logs that were read, and of all to read.
+        stop: called after each batch; true ends the work.
 
     Raises:
-        UsageError: a word names nothing, another process indexes there, or what is there is no
-            index.
+        UsageError: a word names nothing, another process writes the index, or the file exists and
+            is no index.
         LogDamagedError: the index is damaged.
         LogWriteError: it cannot be written.
     """
-    index = _place_of(words, out)
+    index = _index_of(words, out)
     make_folder(index.parent)
     with held(index.parent):
-        made = Indexed(index)
-        there = _there(words, index.parent)
-        old = _known(index, made)
-        known = _states(old, deep)
-        logs = [log for path, log in sorted(there.items()) if known.get(path) != log[1:3]]
-        made.gone = [path for path in pc.unique(old["path"]).to_pylist() if path not in there]
-        made.kept = len(there) - len(logs)
-        old = old.filter(pc.is_in(old["path"], pa.array(there, pa.string())))
-        looked: list[str] = []
-        rows: dict[int, pa.Table] = {}
-        saved = 0
+        indexed = Indexed(index)
+        logs = _logs_by_path(words, index.parent)
+        table = SCHEMA.empty_table()
+        if index.exists():
+            if (version := _version(index)) == VERSION:
+                table = read_index(index)
+            else:
+                indexed.replaced = f"{index} has version {version}: it is replaced"
+        known = _known_states(table, deep)
+        to_read = [log for path, log in sorted(logs.items()) if known.get(path) != log[1:3]]
+        indexed.gone = [path for path in pc.unique(table["path"]).to_pylist() if path not in logs]
+        indexed.kept = len(logs) - len(to_read)
+        table = table.filter(pc.is_in(table["path"], pa.array(logs, pa.string()))).cast(SCHEMA)
+        new: list[pa.Table] = []
         try:
-            for at, some, answer in _looked(logs, deep, jobs):
-                rows[at] = answer.rows
-                made.gone += answer.gone
-                looked += (log.path for log in some)
-                told(len(looked), len(logs))
-                if stop() and len(looked) < len(logs):
-                    made.stopped = True
+            for batch, (rows, gone) in _read(to_read, deep, jobs):
+                table = table.filter(pc.invert(pc.is_in(table["path"], pa.array(batch))))
+                new.append(rows)
+                indexed.gone += gone
+                indexed.read += len(batch)
+                progress(indexed.read, len(to_read))
+                if stop() and indexed.read < len(to_read):
+                    indexed.stopped = True
                     break
-                if len(looked) - saved >= SAVED_EVERY:
-                    saved = len(looked)
-                    _write(old, looked, rows, index)
-        except WorkersError:
-            _write(old, looked, rows, index)
-            raise
-        made.read = len(looked)
-        table = old
-        if looked or made.gone or not index.exists() or made.anew:
-            table = _write(old, looked, rows, index)
-    made.streams, made.logs = table.num_rows, len(pc.unique(table["path"]))
+                if indexed.read % SAVED_EVERY < len(batch):
+                    _write([table, *new], index)
+        finally:
+            if indexed.read or indexed.gone or not index.exists() or indexed.replaced:
+                table = _write([table, *new], index)
+    _summarize(indexed, table)
+    return indexed
+
+
+def _summarize(indexed: Indexed, table: pa.Table) -> None:
+    """Count what an index has: its logs, those with a problem, and how much of each kind."""
     first = pc.equal(table["number"], 0)
     broken = table.filter(pc.and_(first, pc.is_valid(table["problem"])))
-    made.broken = len(broken)
-    made.problems = broken.slice(0, MOST_NAMED).select(["path", "problem"]).to_pylist()
-    made.kinds = _kinds(table, first)
-    return made
-
-
-def _kinds(table: pa.Table, first: pa.ChunkedArray) -> list[dict[str, Any]]:
-    """Return for each kind of log how much there is, as `Indexed.kinds` has it.
-
-    Args:
-        table: rows of streams.
-        first: whether each is the first of its file, whose size it states.
-    """
-    of_log = ("log", "topic", "start_ns", "end_ns")
-    columns = {name: table[name] for name in of_log}
-    columns["kind"] = pc.cast(table["kind"], pa.string())
-    columns["files"] = pc.cast(first, pa.int64())
-    columns["bytes"] = pc.if_else(first, table["bytes"], 0)
-    logs = pa.table(columns).group_by("log", use_threads=False).aggregate(
+    indexed.streams, indexed.logs = table.num_rows, len(pc.unique(table["path"]))
+    indexed.broken = len(broken)
+    indexed.problems = broken.slice(0, MOST_PROBLEMS).select(["path", "problem"]).to_pylist()
+    streams = pa.table(
+        {
+            **{name: table[name] for name in ("log", "topic", "start_ns", "end_ns")},
+            "kind": pc.fill_null(pc.cast(table["kind"], pa.string()), "not read"),
+            "files": pc.cast(first, pa.int64()),
+            "bytes": pc.if_else(first, table["bytes"], 0),
+        }
+    )
+    logs = streams.group_by("log", use_threads=False).aggregate(
         [("kind", "first"), ("files", "sum"), ("topic", "count"), ("bytes", "sum"),
          ("start_ns", "min"), ("end_ns", "max")]
     )  # fmt: skip
-    found: dict[str, dict[str, Any]] = {}
-    for log in logs.to_pylist():
-        kind = log["kind_first"] or "not read"
-        none = {"kind": kind, "logs": 0, "files": 0, "streams": 0, "bytes": 0, "seconds": 0.0}
-        own = found.setdefault(kind, none)
-        own["logs"] += 1
-        own["files"] += log["files_sum"]
-        own["streams"] += log["topic_count"]
-        own["bytes"] += log["bytes_sum"] or 0
-        if log["start_ns_min"] is not None and log["end_ns_max"] is not None:
-            own["seconds"] += (log["end_ns_max"] - log["start_ns_min"]) / NANOSECONDS
-    return [found[kind] for kind in sorted(found)]
+    seconds = pc.divide(
+        pc.cast(pc.subtract(logs["end_ns_max"], logs["start_ns_min"]), pa.float64()), NANOSECONDS
+    )
+    logs = logs.append_column("seconds", pc.fill_null(seconds, 0.0))
+    columns = ("log", "files_sum", "topic_count", "bytes_sum", "seconds")
+    kinds = logs.group_by("kind_first", use_threads=False).aggregate(
+        [("log", "count"), *((name, "sum") for name in columns[1:])]
+    )
+    indexed.kinds = [
+        dict(zip(("kind", "logs", "files", "streams", "bytes", "seconds"), values, strict=True))
+        for values in sorted(
+            zip(
+                kinds["kind_first"].to_pylist(),
+                kinds["log_count"].to_pylist(),
+                *(kinds[f"{name}_sum"].to_pylist() for name in columns[1:]),
+                strict=True,
+            )
+        )
+    ]
 
 
-def read_index(path: Path) -> pa.Table:
-    """The rows of an index.
+def indexed_logs(index: Path) -> list[IndexedLog]:
+    """Return the recordings and external logs of an index, ordered by their first files.
+
+    The files of recordings in one folder are one log if they are views of one recording.
 
     Raises:
         UsageError: it is no index, or one of another version.
         LogDamagedError: it is damaged.
     """
-    version = _version(path)
-    if version != VERSION:
-        raise UsageError(
-            f"{path} is an index of version {version}, this program has {VERSION}: make it again "
-            "with cdmisfa index"
-        )
+    table = read_index(index)
+    table = table.filter(pc.equal(table["number"], 0))
+    views = table.filter(pc.equal(table["kind"], "recording")).select(["log", "configuration"])
+    configurations: dict[str, list[str | None]] = {}
+    for row in views.to_pylist():
+        configurations.setdefault(row["log"], []).append(row["configuration"])
     try:
-        with pq.ParquetFile(path) as file:  # `read_table` imports pandas, where that is there
+        recordings = {name for name, texts in configurations.items() if _are_views_of_one(texts)}
+    except (ValueError, AttributeError) as error:
+        raise _damaged(index, error) from error
+    logs: dict[str, IndexedLog] = {}
+    for row in table.select(["log", "path", "kind", "bytes", "changed"]).to_pylist():
+        if row["kind"] != "run":
+            path = row["path"]
+            name = row["log"] if row["log"] in recordings else path
+            log = logs.setdefault(name, IndexedLog(name, [], []))
+            log.files.append(path if "://" in path else str(index.parent / path))
+            log.states.append((row["bytes"], row["changed"]))
+    return list(logs.values())
+
+
+def _are_views_of_one(configurations: Sequence[str | None]) -> bool:
+    if len(configurations) == 1 or None in configurations:
+        return True
+    facts = [parse_json(text or "") for text in configurations]
+    views = {str((fact.get("view"), fact.get("first_frame"))) for fact in facts}
+    shared = {str([fact.get(name) for name in _SHARED]) for fact in facts}
+    return len(views) == len(facts) and len(shared) == 1
+
+
+def logs_of_corpus(words: Sequence[str | Path]) -> list[list[Path]] | None:
+    """Return the files of each log of an index; None if the words name no index of many logs.
+
+    Args:
+        words: an index, or a folder that has one.
+
+    Raises:
+        UsageError: the index holds no log, or has another version.
+        LogDamagedError: it is damaged.
+    """
+    if not may_be_corpus(words):
+        return None
+    place = Path(words[0])
+    index = place / INDEX if place.is_dir() else place
+    if not place.is_dir() and not is_index(index):
+        return None  # it is a table
+    logs = indexed_logs(index)
+    if place.is_dir() and [log.name for log in logs] == [os.curdir]:
+        return None  # the folder is a single recording
+    if not logs:
+        raise UsageError(f"{index} holds no log to learn from: index a folder of logs")
+    return [[location(file) for file in log.files] for log in logs]
+
+
+def is_index(path: Path) -> bool:
+    """Return whether a file is an index."""
+    try:
+        return path.suffix == ".parquet" and path.is_file() and _version(path) > 0
+    except CdmisfaError:
+        return False
+
+
+def read_index(path: Path) -> pa.Table:
+    """Return the rows of an index.
+
+    Raises:
+        UsageError: it is no index, or one of another version.
+        LogDamagedError: it is damaged.
+    """
+    if (version := _version(path)) != VERSION:
+        raise UsageError(f"{path} has version {version}, not {VERSION}: run cdmisfa index again")
+    try:
+        with pq.ParquetFile(path) as file:  # `read_table` would import pandas if installed
             return file.read()
     except (pa.ArrowException, OSError) as error:
         raise _damaged(path, error) from error
@@ -262,28 +276,23 @@ def read_index(path: Path) -> pa.Table:
 
 def _version(path: Path) -> int:
     check_regular(path)
-    try:
-        stated = (pq.read_schema(path).metadata or {}).get(MARK, b"")
-    except (pa.ArrowException, OSError) as error:
-        if path.suffix != ".parquet":  # a log, say, which nobody should remove
-            raise _no_index(path) from error
-        raise _damaged(path, error) from error
-    if not stated.isdigit():
-        raise _no_index(path)
-    return int(stated)
-
-
-def _no_index(path: Path) -> UsageError:
-    return UsageError(f"{path} is no index of logs: name another file, or the folder of an index")
+    version = b""
+    if path.suffix == ".parquet":  # else it is a log, which nobody should remove
+        try:
+            version = (pq.read_schema(path).metadata or {}).get(MARK, b"")
+        except (pa.ArrowException, OSError) as error:
+            raise _damaged(path, error) from error
+    if not version.isdigit():
+        raise UsageError(f"{path} is no index of logs: name another file")
+    return int(version)
 
 
 def _damaged(path: Path, error: Exception) -> LogDamagedError:
-    said = one_line(error)[:200]
-    return LogDamagedError(f"{path} is damaged ({said}): remove it, and index again")
+    return LogDamagedError(f"{path} is damaged ({one_line(error)}): remove it, and index again")
 
 
-def _place_of(words: Sequence[str | Path], out: Path | None) -> Path:
-    """Where the index of some logs is."""
+def _index_of(words: Sequence[str | Path], out: Path | None) -> Path:
+    """Return the path of the index of some logs."""
     if out is not None:
         refuse_unless(out, "an index is a Parquet file", ".parquet")
         return out
@@ -291,63 +300,47 @@ def _place_of(words: Sequence[str | Path], out: Path | None) -> Path:
         place = location(words[0])
         if place.is_dir():
             return place / INDEX
-        if not (place.exists() or any(letter in str(place) for letter in "*?[")):
+        if not place.exists() and not set("*?[") & set(str(place)):
             raise no_such(place)
-    named = " ".join(map(str, words))
-    raise UsageError(f"{named}: no folder, which would hold its index: say where, with -o")
+    raise UsageError(f"{' '.join(map(str, words))}: name the index with -o F.parquet")
 
 
-def _there(words: Sequence[str | Path], folder: Path) -> dict[str, Found]:
-    """Return the logs that are there by their paths, which are relative to the index's folder."""
+def _logs_by_path(words: Sequence[str | Path], folder: Path) -> dict[str, ListedLog]:
+    """Return the logs by their paths, relative to the folder of the index."""
     below = os.path.join(folder, "")
-    found: dict[str, Found] = {}
-    for log in found_logs(words):
+    logs: dict[str, ListedLog] = {}
+    for log in find_logs(words):
         path = log.file.removeprefix(below)
-        if len(path) == len(log.file) and "://" not in path:
+        if path == log.file and "://" not in path:
             path = os.path.relpath(path, folder)
-        found[path] = log._replace(path=path)
-    return found
+        logs[path] = log._replace(path=path)
+    return logs
 
 
-def _known(index: Path, made: Indexed) -> pa.Table:
-    """What an index has; nothing where there is none, or one of another version."""
-    if not index.exists():
-        return SCHEMA.empty_table()
-    if (version := _version(index)) != VERSION:
-        made.anew = f"{index} was an index of version {version}: it is made anew"
-        return SCHEMA.empty_table()
-    return read_index(index)
-
-
-def _states(old: pa.Table, deep: bool) -> dict[str, tuple[int, str]]:
-    """Return size and time of change by path of what an index knows, with `deep` of it decoded."""
-    known = old.filter(pc.and_(pc.not_equal(old["changed"], ""), pc.or_(old["deep"], not deep)))
+def _known_states(table: pa.Table, deep: bool) -> dict[str, tuple[int, str]]:
+    """Return size and time of change of the logs in an index; with `deep`, of decoded logs."""
+    known = table.filter(
+        pc.and_(pc.not_equal(table["changed"], ""), pc.or_(table["deep"], not deep))
+    )
     columns = (known[name].to_pylist() for name in ("path", "bytes", "changed"))
     return {path: (size, changed) for path, size, changed in zip(*columns, strict=True)}
 
 
-def _looked(
-    logs: Sequence[Found], deep: bool, jobs: int
-) -> Iterator[tuple[int, Sequence[Found], Answer]]:
-    """Read logs, as many at a time as one process takes.
-
-    Yields:
-        The number of some logs that follow one another, the logs, and their rows.
-    """
+def _read(
+    logs: Sequence[ListedLog], deep: bool, jobs: int
+) -> Iterator[tuple[list[str], tuple[pa.Table, list[str]]]]:
+    """Yield the paths of a batch of logs, with their rows and the paths of logs that are gone."""
     batches = [logs[at : at + BATCH] for at in range(0, len(logs), BATCH)]
-    work = functools.partial(look, deep=deep)
-    for number, answer in run_all(work, batches, jobs=min(jobs, math.ceil(len(batches) / 4))):
-        yield number, batches[number], answer
+    work = functools.partial(read_rows, deep=deep)
+    for number, result in run_all(work, batches, jobs=min(jobs, math.ceil(len(batches) / 4))):
+        yield [log.path for log in batches[number]], result
 
 
-def _write(
-    old: pa.Table, looked: Sequence[str], rows: Mapping[int, pa.Table], index: Path
-) -> pa.Table:
-    """Write what is known by now, in the order of paths: of what was not looked at, as before."""
-    kept = old.filter(pc.invert(pc.is_in(old["path"], pa.array(looked, pa.string()))))
-    tables = [kept.cast(SCHEMA), *(rows[at] for at in sorted(rows))]
+def _write(tables: Sequence[pa.Table], index: Path) -> pa.Table:
+    """Write rows in the order of paths, and return them."""
     table = pa.concat_tables(tables).unify_dictionaries().combine_chunks()
-    table = table.take(pc.sort_indices(table["path"])).replace_schema_metadata(SCHEMA.metadata)
+    order = pc.sort_indices(table, [("path", "ascending"), ("number", "ascending")])
+    table = table.take(order).replace_schema_metadata(SCHEMA.metadata)
     with atomic_write(index) as partial:
         pq.write_table(table, partial, compression="zstd")
     return table

@@ -126,7 +126,7 @@ def _logs(source: Sequence[str]) -> list[list[str]]:
     """
     from recorder.cameras.words import is_live
     from recorder.world.scenes import SCENES
-    from replay.corpus.logs import logs_of_corpus
+    from replay.corpus.index import logs_of_corpus
     from replay.inputs import locations
 
     if any(map(is_live, source)):

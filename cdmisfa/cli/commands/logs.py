@@ -299,11 +299,11 @@ def index_command(
             out,
             deep=deep,
             jobs=jobs or os.cpu_count() or 1,
-            told=shown.update,
+            progress=shown.update,
             stop=stop,
         )
-    if indexed.anew:
-        printing.warning(indexed.anew)
+    if indexed.replaced:
+        printing.warning(indexed.replaced)
     if as_json:
         printing.document(
             index=indexed.index,
