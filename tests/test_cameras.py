@@ -39,8 +39,7 @@ REFUSED = {
     ),
     "view t.csv uneven.mcap --set input.time=s --save v": "these show 1 number and images",
     "view apart.mcap --save v.rrd": (
-        "apart.mcap: /early ends before /late begins, they have no time in common: "
-        "take each by itself, with --topic"
+        "the streams have no time in common: take each by itself, with --topic"
     ),
     "learn joints.mcap": NO_IMAGES,
     "view joints.mcap --save v.rrd": "it holds no images",

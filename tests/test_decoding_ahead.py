@@ -87,9 +87,9 @@ def test_few_pictures_are_held_and_each_is_decoded_once(
     begin = ahead.DecodingAhead._begin
 
     def counted(self: ahead.DecodingAhead) -> None:
-        before = len(self._begun)
+        before = len(self._pending)
         begin(self)
-        waiting.extend(range(before + 1, len(self._begun) + 1))
+        waiting.extend(range(before + 1, len(self._pending) + 1))
 
     monkeypatch.setattr(ahead.DecodingAhead, "_begin", counted)
     frames, _, _ = shown(write(tmp_path / "log.mcap"))
@@ -139,7 +139,7 @@ def test_whatever_is_asked_for_next_frames_and_errors_are_the_same(
     monkeypatch.setattr(
         ahead.DecodingAhead,
         "pop",
-        lambda self, place: (held.append(len(self._begun)), pop(self, place))[1],
+        lambda self, place: (held.append(len(self._pending)), pop(self, place))[1],
     )
     monkeypatch.setattr(ahead, "CORES", 1)
     expected = anyhow(log)

@@ -70,7 +70,7 @@ def test_what_is_not_finite_is_left_out_by_its_name_or_kept_in_a_range(
     kept, said = taken(path, range=(-3.0, 5.0))
     assert [a for (a,) in kept] == [-3, -3, -2, -3, *range(6), 5, 5]
     assert said == ()
-    with pytest.raises(UsageError, match=f"{place} lacks a finite number: name"):
+    with pytest.raises(UsageError, match=f"{place} lacks a finite number of t, a: name"):
         taken(path, time=None, rate=5)
 
 
@@ -118,7 +118,7 @@ def test_an_empty_column_and_rows_out_of_order_are_said(tmp_path: Path) -> None:
     assert [b for (b,) in frames] == [i for i in range(ROWS) if i != 9]
     assert [line.partition("t.csv: ")[2] for line in said[:2]] == [
         "1 of 12 rows lack a finite number or their time and are left out, the first is line 11",
-        "3 rows are after later ones: taken in the order of t",
+        "3 rows are after later ones: they are sorted by their times",
     ]
 
 

@@ -58,7 +58,6 @@ def align(
     times = list(map(_times, streams))
     by_index = arrays or (options.align == "index" and len(times) > 1)
     if options.align == "time":
-        _refuse_apart(streams)
         return Aligned(streams, fps, clocks.by_time(times, fps))
     if not by_index:
         _refuse_unequal(streams, options, fps, goal)
@@ -106,17 +105,6 @@ def _excerpt(stream: LogStream, options: InputOptions, zero: int) -> LogStream:
     return stream.part(np.arange(low, high), times[low:high])
 
 
-def _refuse_apart(streams: Sequence[LogStream]) -> None:
-    """Refuse streams to be aligned by time that have no time in common."""
-    ends = min(streams, key=lambda stream: int(_times(stream)[-1]))
-    begins = max(streams, key=lambda stream: int(_times(stream)[0]))
-    if _times(ends)[-1] < _times(begins)[0]:
-        raise UsageError(
-            f"{ends.path}: {ends.topic} ends before {begins.topic} begins, they have no time in "
-            "common: take each by itself, with --topic"
-        )
-
-
 def _refuse_unequal(
     streams: Sequence[LogStream], options: InputOptions, fps: float, goal: tuple[str, str]
 ) -> None:
@@ -138,12 +126,6 @@ def _refuse_unequal(
         if begins < ends:
             raise UnequalError(
                 f"{two} have {reason}: put them on one clock, as with: {command('time')}"
-            )
-        if any(len(clocks.pauses(each)) for each in times):
-            raise UnequalError(
-                f"{two} have no time in common, and gaps, across which --align index takes images "
-                "for neighbours: take each by itself, with --topic, or a part without with "
-                "--start and --end"
             )
         raise UnequalError(
             f"{two} have no time in common: take the i-th image of each together, as with: "

@@ -50,9 +50,11 @@ def by_time(streams: Sequence[IntArray], fps: float) -> Clock:
     """Show in each frame the last row at or before its time, while every stream has rows.
 
     Raises:
-        UsageError: the rate makes more frames than anybody can want.
+        UsageError: there is no such time, or the rate makes more frames than anybody can want.
     """
     start, stop = overlap(streams)
+    if stop < start:
+        raise UsageError("the streams have no time in common: take each by itself, with --topic")
     ticks = (stop - start) * fps / NANOSECONDS + 1
     if ticks > MAX_FRAMES:
         raise UsageError(

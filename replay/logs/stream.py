@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.clock import times_of
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.options import RECIPE
 from recorder.images.pixels import MalformedImage, Shown
@@ -99,11 +99,14 @@ class LogStream:
     views: Sequence[Any] = ()
 
     def __post_init__(self) -> None:
-        """Check the times, which must lie between 1970 and the end of any clock.
+        """Check that there are rows, at times between 1970 and the end of any clock.
 
         Raises:
+            UsageError: there are no rows.
             LogDamagedError: a time lies elsewhere.
         """
+        if not self.count:
+            raise UsageError(f"{self.path}: there is no message or frame on {self.topic}")
         if self.times is not None:
             check_times(f"{self.path}: {self.topic}", self.times)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -22,7 +21,6 @@ from cdmisfa.core.untrusted import open_regular
 MAX_BYTES: Final = 192 * 1024 * 1024
 """Largest file of arrays that is read."""
 
-_END = struct.Struct("<4s4H2LH")
 _PLAIN = re.compile(r"[<|][bifuU]\d{1,6}")
 NOT_ARRAYS: Final = (
     *(MemoryError, OverflowError, RecursionError, SyntaxError, TokenError, zlib.error),
@@ -46,11 +44,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         size = os.fstat(file.fileno()).st_size
         try:
             with np.load(file, allow_pickle=False) as stored:
-                members = stored.zip.infolist()
-                if sum(member.file_size for member in members) > size:
+                if sum(member.file_size for member in stored.zip.infolist()) > size:
                     raise ValueError("its arrays overlap, or are compressed")
-                if len(members) != _stated_members(stored.zip):
-                    raise ValueError("its directory is cut")
                 arrays = {name: stored[name] for name in stored.files}
         except NOT_ARRAYS as error:
             raise ValueError(one_line(error)) from error
@@ -97,11 +92,3 @@ def _plain_type(kind: Any) -> np.dtype[Any]:
     if not all(_PLAIN.fullmatch(field[1]) for field in fields):
         raise ValueError(f"{str(kind)[:40]!r} is no plain type")
     return np.dtype(kind if isinstance(kind, str) else fields)
-
-
-def _stated_members(archive: zipfile.ZipFile) -> int:
-    """How many members the last record of a zip file without a comment states."""
-    if archive.fp is None or archive.comment:
-        raise ValueError("it has a comment")
-    archive.fp.seek(-_END.size, os.SEEK_END)
-    return int(_END.unpack(archive.fp.read(_END.size))[4])

@@ -40,8 +40,6 @@ def log_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
             files.append(path)
         else:
             raise no_such(path)
-    if not files:
-        raise UsageError("no log was named")
     return files
 
 
@@ -53,8 +51,6 @@ def no_such(path: Path, words: Iterable[str] = (), remedy: str = "") -> UsageErr
         words: what else may have been meant.
         remedy: what is said where nothing is near.
     """
-    if path.is_symlink():
-        return UsageError(f"{path} is a link to {path.readlink()}, which is not there")
     beside = [path.parent / p.name for p in path.parent.iterdir()] if path.parent.is_dir() else ()
     known = {str(name).lower(): name for name in (*beside, *words)}
     nearest = difflib.get_close_matches(str(path).lower(), known, n=1, cutoff=0.7)

@@ -50,8 +50,6 @@ class Dataset:
             self.starts = np.concatenate([[0], np.cumsum(lengths)])
             ticks = np.arange(self.starts[-1]) + np.repeat(np.arange(len(lengths)) * PAUSE, lengths)
             times = np.round(ticks * (NANOSECONDS / float(self.info["fps"])))
-        if not len(times):
-            raise UsageError(f"{path}: there is no frame in it")
         self.times = times.astype(np.int64)
 
     def notes(self, what: str) -> list[str]:

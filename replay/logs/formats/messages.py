@@ -124,11 +124,9 @@ def message_stream(
         about: further attributes of the stream.
 
     Raises:
-        UsageError: there is no message.
+        UsageError: there is no message, or no header if `options.stamp` asks for it.
         LogDamagedError: a message cannot be read.
     """
-    if not len(times):
-        raise UsageError(f"{path}: there is no message on {topic}")
     decode = decoder_of(kind, options)
     assert decode is not None
     names = kind.schema, kind.encoding
@@ -158,20 +156,16 @@ def by_stamps(stream: LogStream) -> LogStream:
         UsageError: the messages state no times.
         LogDamagedError: a message cannot be read.
     """
-    if stream.stamp is None:
-        raise UsageError(
-            f"{stream.path}: {stream.topic} has no messages with a header: leave out "
-            "input.stamp=header"
-        )
-    stamps = np.empty(stream.count, np.int64)
+    stamps = np.zeros(stream.count, np.int64)
+    stamp = stream.stamp or (lambda stored: 0)
     for row in range(stream.count):
         try:
-            stamps[row] = stream.taken(row, stream.stamp)
+            stamps[row] = stream.taken(row, stamp)
         except (MalformedRecord, MalformedImage) as error:
             raise LogDamagedError(f"{stream.name_of(row)}: {error}") from None
-    if len(stamps) > 1 and stamps.min() == stamps.max():
+    if stream.stamp is None or (len(stamps) > 1 and stamps.min() == stamps.max()):
         raise UsageError(
-            f"{stream.path}: the headers on {stream.topic} all say {stamps[0]} ns: leave out "
+            f"{stream.path}: no headers on {stream.topic} state times: leave out "
             "--set input.stamp=header"
         )
     order = np.argsort(stamps, kind="stable")

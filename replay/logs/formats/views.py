@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import HeadPose
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.log.messages import POSE_TOPIC
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import PARTIAL
@@ -87,16 +87,13 @@ def arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]]
         by_view.setdefault((view.facts.stream_index, view.facts.view), []).append(view)
     indexes, names = zip(*by_view, strict=True)
     if len(set(indexes)) < len(indexes) or len(set(names)) < len(names):
-        wrong = f"{views[0].path}: its files are not of one recording: two claim the same stream"
-        raise _several(views) or LogDamagedError(wrong)
+        raise _unfit(views, views[0], "its files are not of one recording: two are one stream")
     first = views[0]
     for view in views[1:]:
         differ = [k for k in _SAME if getattr(first.facts, k) != getattr(view.facts, k)]
         if differ:
-            wrong = (
-                f"{view.path}: not of the same recording as {first.path.name}: {differ[0]} differs"
-            )
-            raise _several(views) or LogDamagedError(wrong)
+            what = f"not of the same recording as {first.path.name}: {differ[0]} differs"
+            raise _unfit(views, view, what)
     arranged = []
     for stream in sorted(by_view):
         parts = sorted(by_view[stream], key=lambda view: view.facts.first_frame)
@@ -104,20 +101,17 @@ def arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]]
             end = one.ranges[-1][1] if one.ranges else one.facts.first_frame
             begins = two.facts.first_frame
             if end > begins or (end < begins and not salvage):
-                wrong = (
-                    f"{two.path}: begins at frame {begins}, {one.path.name} ends before {end}: a "
-                    "part is missing or doubled"
-                )
-                raise _several(views) or LogDamagedError(wrong)
+                what = f"begins at frame {begins}, {one.path.name} ends before {end}"
+                raise _unfit(views, two, f"{what}: a part is missing or doubled")
         arranged.append(parts)
     return arranged
 
 
-def _several(views: Sequence[ViewFile]) -> UsageError | None:
-    """The refusal of files that do not belong together; None of different ones in one folder."""
+def _unfit(views: Sequence[ViewFile], view: ViewFile, what: str) -> CdmisfaError:
+    """The error about a file that does not belong to others; of several folders their names."""
     folders = list(dict.fromkeys(str(view.path.parent) for view in views))
     if len(folders) < 2:
-        return None
+        return LogDamagedError(f"{view.path}: {what}")
     refused = f"{folders[0]} and {folders[1]} are recordings of their own: name one of them"
     if not views[0].facts.spec.images:
         return UsageError(refused)
