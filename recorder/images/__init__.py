@@ -1,1 +1,1 @@
-"""Images in messages and files of others: decoded, made gray and small."""
+"""Images and numbers of external logs and cameras: decoded, and turned into frames."""

@@ -58,7 +58,7 @@ Align = Literal["index", "time"]
 """How streams that differ are put on one clock: the i-th images, or the last ones at each time."""
 
 OnLoss = Literal["reconnect", "wait", "end"]
-"""What is done about a live stream that stalls or goes away."""
+"""Reaction to a live stream that stalls or goes away."""
 
 
 @dataclass(frozen=True, slots=True)
