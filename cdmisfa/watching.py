@@ -80,8 +80,8 @@ class WatchEnv(Env):
         entry = learner_class(algorithm)
         preset = getattr(entry, "preset", None)
         base = load_preset(preset)["learner"] if preset else {}
-        told = ({"algorithm": algorithm}, settings)
-        self._config = build(entry.configuration, "learner", base, *told)
+        layers = base, {"algorithm": algorithm}, settings
+        self._config = build(entry.configuration, "learner", *layers)
         self._source, self._start, self._observe = source, source.t, observe
         self._most = max_iterations
         spec = source.spec
@@ -112,10 +112,10 @@ class WatchEnv(Env):
             Zeros, and `info`.
         """
         super().reset(seed=seed)
-        own = int(self.np_random.integers(2**31)) if seed is None else seed
+        seed = int(self.np_random.integers(2**31)) if seed is None else seed
         if isinstance(self._source, SeekableSource):
             self._source.seek(self._start)
-        self.learner = open_learner(self._config, self._source.spec, own)
+        self.learner = open_learner(self._config, self._source.spec, seed)
         self.signals, self._seen, self._ended = None, np.zeros_like(self._seen), False
         self._watched = self.learner.stream
         return self._seen.copy(), {"stream": self._watched}

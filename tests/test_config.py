@@ -174,7 +174,7 @@ def test_the_defaults_and_the_papers_constants() -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"nu = 1\n", "nu stands outside a .section"),
+        (b"nu = 1\n", "nu is outside of any .section"),
         (b"[learner\n", "no preset, which is TOML"),
         (b"\xff\xfe", "no preset, which is TOML"),
         (b"[learner]\nnu = " + b"[\n" * 2000 + b"]\n" * 2000, "recursion"),

@@ -1,1 +1,1 @@
-"""Where to look, and when to save what was learned."""
+"""Learners: they choose a stream, learn slow features of it, and save modules."""

@@ -1,4 +1,4 @@
-"""The curiosity-driven agent: what it remembers, its rules, and its gate of frozen modules."""
+"""The curiosity-driven agent: its memory, its rules, and its gate of frozen modules."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
                 f"learner.algorithm 1.0 takes at most {DENSE_STREAMS} streams, not {n_streams}"
             )
     clusters = (n_streams, config.roc_centres) if tabular else (0, 0)
-    others: dict[str, Any] = {
+    arrays: dict[str, Any] = {
         "memory": np.zeros(1, MEMORY),
         "y_frames": np.zeros(1, np.int64),
         "stay_sum": np.zeros(n_streams),
@@ -119,14 +119,14 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
         "centres": np.zeros((*clusters, config.tau, config.outputs)),
         "counts": np.zeros(clusters),
     }
-    agent = Agent(**{n: others.get(n, np.zeros(config.outputs)) for n in Agent._fields})
+    agent = Agent(**{n: arrays.get(n, np.zeros(config.outputs)) for n in Agent._fields})
     agent.memory["last_stream"], agent.memory["stream"] = -1, first_stream
     begin_abstraction(agent, config.epsilon_start)
     return agent
 
 
 def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
-    """Forget everything that belongs to the abstraction before; all statistics start anew."""
+    """Forget everything that belongs to the abstraction before; all statistics start again."""
     for array in agent[1:]:
         array[...] = 0
     for array in (agent.eta, agent.eta_dot, agent.eta_inst):
@@ -141,12 +141,12 @@ def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
     m["epsilon"] = epsilon_start
 
 
-def as_struct(agent: Agent, told: SimpleNamespace, out: NDArray[np.void]) -> kernels.Struct:
+def as_struct(agent: Agent, rules: SimpleNamespace, out: NDArray[np.void]) -> kernels.Struct:
     """An agent as the kernels take it: its arrays, its rules, and where its outcome goes.
 
     Args:
         agent: changed in place.
-        told: its rules.
+        rules: see `rules`.
         out: (1,) of `OUTCOME`, written.
     """
     sizes = {
@@ -156,8 +156,8 @@ def as_struct(agent: Agent, told: SimpleNamespace, out: NDArray[np.void]) -> ker
         "tensor": len(agent.dense),
         "places": agent.counts.shape[1],
     }
-    rules = kernels.Struct("rules", vars(told), {})
-    arrays = {"rules": rules.pointer, "out": kernels.records("outcome", out)}
+    numbers = kernels.Struct("rules", vars(rules), {})
+    arrays = {"rules": numbers.pointer, "out": kernels.records("outcome", out)}
     arrays["memory"] = kernels.records("memory", agent.memory)
     for name, array in zip(agent._fields[1:], agent[1:], strict=True):
         arrays[name] = kernels.pointer(name, array, array.shape, array.dtype)

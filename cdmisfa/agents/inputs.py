@@ -1,6 +1,6 @@
 """Blocks in, signals out: what all learners of this package share.
 
-`count_inputs` and `rows_of` check what a learner takes in; `signals_of_block` makes the record of
+`count_inputs` and `rows_of` check the input of a learner; `signals_of_block` makes the record of
 an iteration for learners that have only some of the signals.
 """
 

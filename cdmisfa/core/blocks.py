@@ -95,7 +95,7 @@ class SourceSpec:
         return nearest_frames(times, self.fps, self.start_ns)
 
     def facts(self) -> dict[str, Any]:
-        """What is told of a source in a notebook, by names."""
+        """Return facts for a notebook, by names."""
         return {
             "streams": ", ".join(self.streams),
             "frames": "without end" if self.length is None else self.length,

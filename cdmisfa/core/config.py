@@ -72,8 +72,8 @@ def key(
         unstated: `section_table` leaves the default out, so that recordings of scenes without the
             key keep their bytes.
     """
-    told = {"low": low, "high": high, "above": above, "rising": rising, "unstated": unstated}
-    return dataclasses.field(default=default, metadata=told)
+    rule = {"low": low, "high": high, "above": above, "rising": rising, "unstated": unstated}
+    return dataclasses.field(default=default, metadata=rule)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ class LearnerConfig(Section):
         gate_window: w_g, window of the band in which a module's slowness lies (blocks).
         warm_up: novel blocks of a new abstraction before rewards begin.
         min_variance: v_min, least recent variance of an output that may be saved.
-        novel_share: least share, of late, of novel blocks of the stream before, for a save.
+        novel_share: least recent share of novel blocks of the stream before, for a save.
         patience: iterations without exploration after which a run gives up.
         alpha: α, 1.0 only: rate of the tabular reward.
         roc_centres: 1.0 only: cluster centres for each stream.
@@ -223,7 +223,7 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
         document = copy.deepcopy(_parsed(data.decode("utf-8").replace("\r\n", "\n")))
         for section, table in document.items():
             if not isinstance(table, dict):
-                raise ValueError(f"{shown(section)} stands outside a [section]")
+                raise ValueError(f"{shown(section)} is outside of any [section]")
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{name}: no preset, which is TOML: {error}") from None
     return document
@@ -298,8 +298,8 @@ def convert_value(value: Any, hint: Any, key: str) -> Any:
     try:
         return _converted(value, hint)
     except (ValueError, TypeError, KeyError, OverflowError):
-        shown_value = _SHORT.repr(value)
-        raise UsageError(f"{key} is {shown_value}: it must be {_words_of(hint)}") from None
+        text = _SHORT.repr(value)
+        raise UsageError(f"{key} is {text}: it must be {_words_of(hint)}") from None
 
 
 def _converted(value: Any, hint: Any) -> Any:

@@ -51,12 +51,12 @@ class NotReproducedError(CdmisfaError):
 
 def are_for(options: Sequence[str], what: str) -> str:
     """The text "--a and --b are for WHAT", for an error."""
-    *others, last = options
-    return f"{', '.join(others)} and {last} are for {what}" if others else f"{last} is for {what}"
+    *before, last = options
+    return f"{', '.join(before)} and {last} are for {what}" if before else f"{last} is for {what}"
 
 
 def one_line(error: BaseException) -> str:
-    """What an error of others says, short and in one line."""
+    """Return the message of a library's error, short and in one line."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
@@ -88,7 +88,7 @@ def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
     Args:
         name: as it was written.
         known: the names there are.
-        prefix: what stands before each of them.
+        prefix: text before each of them.
     """
     names = list(known)
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.5)

@@ -1,7 +1,7 @@
-"""The interfaces of learners and of sinks, which take what a run computes.
+"""The interfaces of learners and of sinks, which take the results of a run.
 
 `cdmisfa.experiments.loop.learn_blocks` brings a source, a learner and sinks together, and
-knows no more of them than is said here.
+uses these members alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class LearnerState:
 
     Attributes:
         arrays: the learner's memory, by name.
-        modules: what was learned so far.
+        modules: the saved modules.
         policy_rng: state of the policy's random generator, as its `bit_generator.state`.
     """
 
@@ -69,7 +69,7 @@ class Learner(Protocol):
 
     @property
     def modules(self) -> Sequence[Module]:
-        """What it learned so far."""
+        """The modules saved so far."""
 
     @property
     def events(self) -> Sequence[str]:
@@ -77,7 +77,7 @@ class Learner(Protocol):
 
     @property
     def phi(self) -> NDArray[np.float64]:
-        """Weights of what it is learning now, (J, I), a copy."""
+        """Weights of the abstraction being learned, (J, I), a copy."""
 
     @property
     def over(self) -> str:
@@ -85,7 +85,7 @@ class Learner(Protocol):
 
     @property
     def max_modules(self) -> int | None:
-        """Modules after which a run ends where nothing else is said; None: when it is over."""
+        """Modules after which a run ends by default; None: when it is over."""
 
     def step(self, block: Block) -> BlockSignals:
         """One iteration: look at tau frames, learn, and decide what to watch next.
@@ -126,15 +126,15 @@ def arithmetic_of(learner: Learner) -> int:
 class Sink(Protocol):
     """Takes the iterations and events of a run, in order: a log, a view, a hash, a progress bar.
 
-    A class that derives from it needs `block`, and of the others what it has a use for.
+    A class that derives from it needs `block`, and may define the others.
     """
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """An iteration is over.
 
         Args:
-            block: what was watched.
-            signals: what came of it.
+            block: the watched block.
+            signals: of the iteration.
             learner: as it is now; not to be changed.
         """
 
@@ -154,17 +154,17 @@ class Sink(Protocol):
         return
 
 
-def overwrite(own: Mapping[str, NDArray[Any]], stored: Mapping[str, NDArray[Any]]) -> None:
-    """Write what was stored into a learner's arrays of the same names, all of them or none.
+def overwrite(current: Mapping[str, NDArray[Any]], stored: Mapping[str, NDArray[Any]]) -> None:
+    """Write stored arrays into a learner's arrays of the same names, all of them or none.
 
     Raises:
         ValueError: an array is missing or of another shape or type.
     """
-    for name, array in own.items():
-        found = stored.get(name)
-        if found is None or found.shape != array.shape or found.dtype != array.dtype:
+    for name, array in current.items():
+        new = stored.get(name)
+        if new is None or new.shape != array.shape or new.dtype != array.dtype:
             raise ValueError(f"{name} is missing or of another shape or type")
-    for name, array in own.items():
+    for name, array in current.items():
         array[...] = stored[name]
 
 

@@ -41,7 +41,7 @@ SCHEMA_VERSION = 4
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """What a field of `BlockSignals` is.
+    """The description of a field of `BlockSignals`.
 
     Attributes:
         name: the field's name.
@@ -84,9 +84,9 @@ def _signal(
     equation: str = "",
     show: Show | None = None,
 ) -> Any:
-    """A field; floats are shown as lines and others as lanes, where nothing else is said."""
-    told = {"symbol": symbol, "about": about, "dims": dims, "unit": unit, "equation": equation}
-    return dataclasses.field(metadata={**told, "show": show})
+    """A field; floats are shown as lines and others as lanes, by default."""
+    facts = {"symbol": symbol, "about": about, "dims": dims, "unit": unit, "equation": equation}
+    return dataclasses.field(metadata={**facts, "show": show})
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +256,7 @@ class SignalsHash:
         self.count += 1
 
     def hexdigest(self) -> str:
-        """The hash of what was taken in so far."""
+        """Return the hash of all records so far."""
         return self._hash.hexdigest()
 
 

@@ -3,7 +3,7 @@
 Kept are the largest principal components of the frames and the covariance of the differences
 of consecutive frames along them, each over an exponential window. The slow features are the
 directions of least derivative among the whitened components: a small eigenvalue problem, solved
-anew for every block. Outputs have unit variance, whatever the units of the frames.
+again for every block. Outputs have unit variance, whatever the units of the frames.
 
 It is computed, and its sources are named, in `cdmisfa/kernels/recursive.c`.
 """
@@ -140,7 +140,7 @@ class RecursiveFeature:
 
     @property
     def slowness(self) -> float:
-        """Slowness of the slowest output on what was learned from, NaN where there is none."""
+        """Slowness of the slowest output on the frames it learned from, NaN without any."""
         return float(self.state.spectrum[0])
 
     @property

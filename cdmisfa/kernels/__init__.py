@@ -47,7 +47,7 @@ def expect(name: str, given: object, wanted: object) -> None:
     """Refuse an argument that C could not use.
 
     Raises:
-        UsageError: what is given is not what C needs.
+        UsageError: the argument differs.
     """
     if given != wanted:
         raise UsageError(f"{name} given as {given}: give {wanted}")
@@ -108,7 +108,7 @@ def frames_of(frames: Any, size: int | None = None) -> Struct:
 
 
 def check(code: int, what: str) -> None:
-    """Raise what a kernel's return code says.
+    """Raise the error of a kernel's return code.
 
     Raises:
         MemoryError: there was not enough.

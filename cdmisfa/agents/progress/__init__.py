@@ -1,1 +1,1 @@
-"""Learn from any camera: one candidate a stream, and attention to what is being learned."""
+"""Learn from any camera: one candidate a stream, and attention to undecided streams."""

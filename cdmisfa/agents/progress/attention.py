@@ -1,4 +1,4 @@
-"""What the progress learner can be told, and the rules that choose the next stream.
+"""The configuration of the progress learner, and the rules that choose the next stream.
 
 The keys are `learner.*` of `learner.algorithm = "progress"`; `learner.attention` names the rule.
 """
@@ -24,7 +24,7 @@ RECENT = 2 * HALF
 
 @dataclass(frozen=True, slots=True)
 class ProgressConfig(Section):
-    """Everything the progress learner can be told; the defaults are those of `cameras`.
+    """Configuration of the progress learner; the defaults are those of the preset `cameras`.
 
     No value depends on the units, the contrast or the noise of a camera.
 
@@ -45,7 +45,7 @@ class ProgressConfig(Section):
         agreement: most that tested and fitted slowness may differ, |ln| of their ratio.
         slow: tested slowness over the stream's typical one, below which something in it is slow.
         even: the same, above which nothing is.
-        looks: how often a stream is tried before it is given up for good.
+        looks: how often a stream is tried before it is rejected finally.
         watch: blocks to watch on when every stream is decided, in case one changes.
     """
 
@@ -70,7 +70,7 @@ class ProgressConfig(Section):
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What a rule decides by.
+    """The input of a rule.
 
     Attributes:
         stream: the stream that was watched last.
@@ -107,7 +107,7 @@ Rule = Callable[[Situation], tuple[int, bool]]
 def relative_progress(errors: FloatArray) -> float:
     """Return the fall of the learning error over the last blocks, larger where nearly done.
 
-    That is (max(0, before - now) / before + .001) / now, with before and now the means of the
+    That is (max(0, before - now) / before + 0.001) / now, with before and now the means of the
     learning error over the last but one and the last 8 blocks.
 
     Equation: P3
@@ -148,8 +148,8 @@ def _while_novel(s: Situation) -> tuple[int, bool]:
     decided = np.flatnonzero(~s.learning)
     if not s.learning.any() or (s.draws[0] < s.explore and len(decided)):
         return s.drawn(decided), True
-    begun = np.where(s.learning, s.visits, -1)
-    return int(np.argmax(np.where(s.changed, begun + s.visits.sum(), begun))), False
+    visits = np.where(s.learning, s.visits, -1)
+    return int(np.argmax(np.where(s.changed, visits + s.visits.sum(), visits))), False
 
 
 RULES: Mapping[str, Rule] = {

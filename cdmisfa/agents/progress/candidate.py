@@ -148,7 +148,7 @@ class Candidate:
 
     @property
     def fitted(self) -> float:
-        """Slowness of the slowest output on what was learned from; NaN where there is none."""
+        """Slowness of the slowest output on the frames it learned from; NaN where there is none."""
         return self.sfa.slowness
 
     @property
@@ -191,7 +191,7 @@ class Candidate:
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Everything that changes in it, by name; no copies."""
-        own = {
+        arrays = {
             "counters": np.array([self.blocks, self.tests, self._reference_age], dtype=np.int64),
             "measures": np.array([self.change, self.regret]),
             "errors": self.errors,
@@ -201,7 +201,7 @@ class Candidate:
             "reference": self._reference,
         }
         sfa = zip(RecursiveState._fields, self.sfa.state, strict=True)
-        return own | {f"sfa.{name}": array for name, array in sfa}
+        return arrays | {f"sfa.{name}": array for name, array in sfa}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Go to where another of the same sizes was.
@@ -209,14 +209,14 @@ class Candidate:
         Raises:
             ValueError: an array is missing or of another shape or type.
         """
-        own = self.arrays
-        overwrite(own, arrays)
-        self.blocks, self.tests, self._reference_age = own["counters"].tolist()
-        self.change, self.regret = own["measures"].tolist()
+        current = self.arrays
+        overwrite(current, arrays)
+        self.blocks, self.tests, self._reference_age = current["counters"].tolist()
+        self.change, self.regret = current["measures"].tolist()
 
 
 class Candidates(dict[int, Candidate]):
-    """Those that are held, by their streams.
+    """The candidates in memory, by their streams.
 
     Args:
         new: makes one.
@@ -231,8 +231,8 @@ class Candidates(dict[int, Candidate]):
         self._new = new
         self.most = max(2, min(HELD, MEMORY // size))
 
-    def begun(self, stream: int, learning: NDArray[np.bool_], last: NDArray[Any]) -> Candidate:
-        """The candidate of a stream, for which another may have to go.
+    def opened(self, stream: int, learning: NDArray[np.bool_], last: NDArray[Any]) -> Candidate:
+        """Return the candidate of a stream, for which another may have to go.
 
         Args:
             stream: which.
@@ -249,13 +249,13 @@ class Candidates(dict[int, Candidate]):
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Everything that changes in them, by name, a copy."""
-        held = sorted(self)
+        streams = sorted(self)
         arrays = {
             f"candidate.{stream}.{name}": array.copy()
-            for stream in held
+            for stream in streams
             for name, array in self[stream].arrays.items()
         }
-        return arrays | {"held": np.array(held, dtype=np.int64)}
+        return arrays | {"held": np.array(streams, dtype=np.int64)}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Hold the candidates that are stored in these arrays, among others.

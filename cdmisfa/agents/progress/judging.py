@@ -131,11 +131,11 @@ def slow_outputs(candidate: Candidate, config: ProgressConfig) -> NDArray[np.int
 
 
 def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
-    """Whether a candidate has become a module: slow on new frames too, alive, and settled.
+    """Return whether a candidate has become a module: slow on new frames too, alive, and settled.
 
-    The change that counts as settled grows with the tests: the firmer an output stands, the
-    sooner it is a module. An output that goes on turning among directions that are equally slow
-    is settled when nothing is gained by it.
+    The change that counts as settled grows with the tests: an output that
+    hardly changes is a module sooner. An output that keeps turning among directions that are
+    equally slow is settled when nothing is gained by it.
     """
     windows = candidate.tests / candidate.test_window
     if windows < 1.0:
@@ -159,7 +159,7 @@ def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
 
 
 def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
-    """Why a candidate is given up, or "" where it is not."""
+    """Return why a candidate is rejected, or "" where it is not."""
     if not candidate.alive:
         return CONSTANT if candidate.blocks >= EARLY * candidate.test_window else ""
     if (
@@ -176,7 +176,7 @@ def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
 
 
 def stale(candidate: Candidate, config: ProgressConfig) -> bool:
-    """Whether what a candidate found is settled but seen no more: it was a single event."""
+    """Return whether a candidate's feature is settled but seen no more: a single event."""
     return (
         candidate.tests >= FULL * candidate.test_window
         and candidate.change < config.settled
@@ -185,7 +185,7 @@ def stale(candidate: Candidate, config: ProgressConfig) -> bool:
 
 
 def promising(candidate: Candidate, config: ProgressConfig) -> bool:
-    """Whether a stream that was given up is worth learning after all."""
+    """Return whether a rejected stream is worth learning after all."""
     return (
         candidate.alive
         and candidate.tests >= EARLY * candidate.test_window
@@ -197,9 +197,9 @@ def promising(candidate: Candidate, config: ProgressConfig) -> bool:
 def known_by(
     candidate: Candidate, modules: list[Module], own: int, frames: NDArray[Any]
 ) -> int | None:
-    """Return the index of the module that gives what a candidate found, the stream's own first.
+    """Return the index of the module that gives a candidate's feature, the stream's own first.
 
-    Such a module is as slow on the stream as what is learned must be, and the streams look alike
+    Such a module is as slow on the stream as a new module must be, and the streams look alike
     in the mean: a smooth weighting follows many a thing, also in other worlds.
 
     Args:
@@ -214,7 +214,7 @@ def known_by(
         variance, eta, rho = candidate.sfa.compare(modules[index].phi[0], frames)
         if low < variance < high and rho > SAME and eta <= AS_SLOW * candidate.fitted:
             return index
-    if own in near and _still_there(candidate, modules[own], frames):
+    if own in near and _shows_module(candidate, modules[own], frames):
         return own
     return None
 
@@ -232,7 +232,7 @@ def _alike(module: Module, candidate: Candidate) -> bool:
     return bool(flat or shared > MEAN_CORRELATION * math.sqrt(one * other))
 
 
-def _still_there(candidate: Candidate, module: Module, frames: NDArray[Any]) -> bool:
+def _shows_module(candidate: Candidate, module: Module, frames: NDArray[Any]) -> bool:
     """Return whether a stream shows what its own module encodes, if less and differently."""
     like = candidate.sfa.compare(module.phi[0], frames)
     if like.rho > SAME:

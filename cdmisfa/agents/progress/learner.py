@@ -1,8 +1,8 @@
 """`ProgressLearner`: every slow feature of any streams, with one candidate a stream.
 
-A candidate is tested on each block before it learns from it. What is slow on frames not yet
-learned from, and settled, becomes a module; what a module gives already is known; what is no
-slower than anything else in its stream is given up. The learner stays with a stream until that is
+Each candidate is tested on a block before it learns from it. A feature that is slow on frames not
+yet learned from, and settled, becomes a module; a stream whose feature a module gives already is
+known; a stream in which nothing is slow is rejected. The learner stays with a stream until that is
 decided, and it is over when no stream is being learned.
 """
 
@@ -50,16 +50,16 @@ COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle
 
 
 class ProgressLearner:
-    """One candidate a stream, attention to what is not decided yet, and an end of its own.
+    """A learner with one candidate a stream, attention to undecided streams, and an end.
 
     Args:
-        config: what it is told.
+        config: its configuration.
         spec: the source it learns from.
-        seed: where its random generator starts.
+        seed: seed of its random generator.
 
     Attributes:
-        modules: what it learned so far.
-        events: what the last iteration brought, one line each.
+        modules: the saved modules.
+        events: what happened in the last iteration, one line each.
         rule: chooses the next stream; that of the configuration unless another is assigned.
     """
 
@@ -116,8 +116,10 @@ class ProgressLearner:
     @property
     def phi(self) -> FloatArray:
         """Weights of the candidate of the stream to watch next, (J, I), a copy."""
-        held = self._candidates.get(self.stream)
-        return np.zeros((self._n_outputs, self._n_inputs)) if held is None else held.sfa.phi
+        candidate = self._candidates.get(self.stream)
+        if candidate is None:
+            return np.zeros((self._n_outputs, self._n_inputs))
+        return candidate.sfa.phi
 
     @property
     def over(self) -> str:
@@ -137,7 +139,7 @@ class ProgressLearner:
     def state(self) -> LearnerState:
         """The learner's state, a copy."""
         arrays = self._candidates.arrays
-        arrays |= {name: array.copy() for name, array in self._own.items()}
+        arrays |= {name: array.copy() for name, array in self._tables.items()}
         return LearnerState(arrays, tuple(self.modules), self._rng.bit_generator.state)
 
     def restore(self, state: LearnerState) -> None:
@@ -146,7 +148,7 @@ class ProgressLearner:
         Raises:
             ValueError: an array is missing or of another shape or type.
         """
-        overwrite(self._own, state.arrays)
+        overwrite(self._tables, state.arrays)
         self._candidates.restore(state.arrays)
         self.modules = list(state.modules)
         self._freeze()
@@ -159,34 +161,33 @@ class ProgressLearner:
             block: tau frames of the stream the learner asked for.
 
         Raises:
-            UsageError: it is no block.
             ValueError: the block is of another stream, length, frame shape or type.
             CdmisfaError: it holds a value that is no finite number.
         """
         frames = expand(self._expansion, rows_of(block, self.spec, self.stream, self.tau))
         stream, count = block.stream, len(self.modules)
-        own, counts = self._streams[stream], self._counts[0]
-        novel = int(own["state"]) == LEARNING
-        candidate = self._candidates.begun(stream, self._learning, self._streams["last"])
+        row, counts = self._streams[stream], self._counts[0]
+        novel = int(row["state"]) == LEARNING
+        candidate = self._candidates.opened(stream, self._learning, self._streams["last"])
         y_frozen = kernels.outputs(self._phi, self._offset, frames)
         error = candidate.error
-        candidate.learn(frames, gap=int(own["next"]) != block.t)
-        own["next"], own["last"] = block.t + len(block), counts["iteration"]
-        own["visits"] += 1
+        candidate.learn(frames, gap=int(row["next"]) != block.t)
+        row["next"], row["last"] = block.t + len(block), counts["iteration"]
+        row["visits"] += 1
         counts["iteration"] += 1
-        if int(own["module"]) >= 0:
+        if int(row["module"]) >= 0:
             judging.take_output(
-                own, y_frozen[:, int(own["module"]) * self._n_outputs], self._watched
+                row, y_frozen[:, int(row["module"]) * self._n_outputs], self._watched
             )
         self.events = self._judge(stream, candidate, frames) + self._look_again()
         counts["idle"] = 0 if self._learning.any() else counts["idle"] + 1
-        interesting, explored = self._choose(self._rng.random(2))
+        interests, explored = self._choose(self._rng.random(2))
         tested, gained = candidate.tested, error - candidate.error
         frozen = y_frozen.reshape(len(block), count, self._n_outputs).transpose(1, 0, 2)
         shape = (count, self._n_outputs)
-        said: dict[str, Any] = {
+        signals: dict[str, Any] = {
             "novel": novel and candidate.alive,
-            "known_by": int(own["module"]) + 1 if candidate.alive else -1,
+            "known_by": int(row["module"]) + 1 if candidate.alive else -1,
             "saved": len(self.modules) > count,
             "novel_blocks": candidate.blocks,
             "y": candidate.y,
@@ -207,18 +208,18 @@ class ProgressLearner:
             "tested": float(tested[0]),
             "fitted": candidate.fitted,
             "learning_error": candidate.error,
-            "interest": interesting,
+            "interest": interests,
             "state": self._streams["state"].copy(),
             "typical": candidate.typical,
             "regret": candidate.regret,
         }
         if candidate.tests:
-            said["variance"] = candidate.variance
+            signals["variance"] = candidate.variance
         sizes = {"outputs": len(tested), "modules": count}
-        return signals_of_block(block, self.spec, self.iteration - 1, **sizes, **said)
+        return signals_of_block(block, self.spec, self.iteration - 1, **sizes, **signals)
 
     def summary(self) -> dict[str, Any]:
-        """What became of each stream, as JSON values."""
+        """Return the outcome of each stream, as JSON values."""
         return {
             "final_policy": self._policy.tolist(),
             "epsilon": self.config.explore,
@@ -228,7 +229,7 @@ class ProgressLearner:
         }
 
     @property
-    def _own(self) -> dict[str, NDArray[Any]]:
+    def _tables(self) -> dict[str, NDArray[Any]]:
         """Everything that changes in it but for its candidates, by name; no copies."""
         return {"streams": self._streams, "counts": self._counts}
 
@@ -247,9 +248,9 @@ class ProgressLearner:
         return Candidate(self._n_inputs, c.components, c.outputs, c.window, self._window)
 
     def _judge(self, stream: int, candidate: Candidate, frames: NDArray[Any]) -> tuple[str, ...]:
-        """Decide what the stream has come to; the lines that say so."""
-        own = self._streams[stream]
-        state, module = int(own["state"]), int(own["module"])
+        """Decide on a stream, and return the events."""
+        row = self._streams[stream]
+        state, module = int(row["state"]), int(row["module"])
         if judging.mastered(candidate, self.config):
             del self._candidates[stream]
             return self._settle(stream, candidate, frames)
@@ -257,23 +258,23 @@ class ProgressLearner:
             why = judging.hopeless(candidate, self.config)
             if not why and judging.stale(candidate, self.config):
                 del self._candidates[stream]
-                if own["visits"] - own["decided"] < PATIENCE * self._window:
-                    return self._say(stream, "is begun anew: what was slow in it has come to rest")
+                if row["visits"] - row["decided"] < PATIENCE * self._window:
+                    return self._event(stream, "starts again: its slow feature came to rest")
                 why = NO_PROGRESS
             if why == NO_PROGRESS and module >= 0:  # it gives what can be found there
                 return self._settle(stream, candidate, frames, module)
             if why:
-                decide(own, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
-                return self._say(stream, f"is given up after {own['decided']} blocks: {why}")
+                decide(row, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
+                return self._event(stream, f"is given up after {row['decided']} blocks: {why}")
         elif state == GIVEN_UP:
-            if REASONS[int(own["why"])] != NO_PROGRESS and judging.promising(
+            if REASONS[int(row["why"])] != NO_PROGRESS and judging.promising(
                 candidate, self.config
             ):
                 self._learn_again(stream, -1)
-                return self._say(stream, "is learned after all: something in it is slow")
-        elif judging.differs(own, self._watched):
+                return self._event(stream, "is learned after all: something in it is slow")
+        elif judging.differs(row, self._watched):
             self._learn_again(stream, module)
-            return self._say(stream, f"no longer fits module {module + 1}")
+            return self._event(stream, f"no longer fits module {module + 1}")
         if state != LEARNING and candidate.blocks >= PATIENCE * self._window:
             del self._candidates[stream]
         return ()
@@ -282,8 +283,8 @@ class ProgressLearner:
         self, stream: int, candidate: Candidate, frames: NDArray[Any], index: int | None = None
     ) -> tuple[str, ...]:
         """Decide by which module a stream is learned or known; a new one where none gives it."""
-        own = self._streams[stream]
-        state, before = int(own["state"]), int(own["module"])
+        row = self._streams[stream]
+        state, before = int(row["state"]), int(row["module"])
         if index is None:
             index = judging.known_by(candidate, self.modules, before, frames)
         new = index is None
@@ -293,31 +294,31 @@ class ProgressLearner:
             index = len(self.modules) - 1
         module = self.modules[index]
         given = candidate.sfa.compare(module.phi[0], frames)
-        judging.begin_watching(own, given.variance, given.slowness)
+        judging.begin_watching(row, given.variance, given.slowness)
         if index == before and state != LEARNING:
             return ()
         eta = float(candidate.tested[0]) if new else given.slowness
         learned = module.stream_index == stream
-        decide(own, LEARNED if learned else KNOWN, index, eta)
+        decide(row, LEARNED if learned else KNOWN, index, eta)
         if index == before:
-            return self._say(stream, f"still shows what module {index + 1} gives")
+            return self._event(stream, f"still shows what module {index + 1} gives")
         by = "learned by" if learned else f"known by {module.stream}'s"
         what = f"{'has changed and is' if before >= 0 else 'is'} {by} module {index + 1}"
-        said = f"{what} after {own['decided']} blocks, slowness {eta:.4f}"
+        text = f"{what} after {row['decided']} blocks, slowness {eta:.4f}"
         if new and self._n_outputs > 1:
-            said += f", {int(module.slow.sum())} of {self._n_outputs} outputs slow"
-        return self._say(stream, said)
+            text += f", {int(module.slow.sum())} of {self._n_outputs} outputs slow"
+        return self._event(stream, text)
 
     def _learn_again(self, stream: int, module: int) -> None:
-        """Begin a candidate anew for a stream that had been decided."""
+        """Begin another candidate for a stream that had been decided."""
         self._candidates.pop(stream, None)
         decide(self._streams[stream], LEARNING, module, math.nan)
 
-    def _say(self, stream: int, what: str) -> tuple[str, ...]:
-        return (f"stream {self.spec.streams[stream]} {what}",)
+    def _event(self, stream: int, text: str) -> tuple[str, ...]:
+        return (f"stream {self.spec.streams[stream]} {text}",)
 
     def _look_again(self) -> tuple[str, ...]:
-        """Begin what was given up once more, before all is over; the lines that say so."""
+        """Begin rejected streams again before all is over, and return the events."""
         streams = self._streams
         if self._learning.any():
             return ()
@@ -326,7 +327,7 @@ class ProgressLearner:
             streams["looks"][stream] += 1
             self._learn_again(stream, -1)
         names = ", ".join(self.spec.streams[s] for s in np.flatnonzero(again))
-        return (f"looking once more at what was given up: {names}",) if names else ()
+        return (f"looking again at rejected streams: {names}",) if names else ()
 
     def _module(self, stream: int, candidate: Candidate) -> Module:
         return Module(
@@ -353,12 +354,12 @@ class ProgressLearner:
         self._offset = np.array(offsets).reshape(-1)
 
     def _choose(self, draws: FloatArray) -> tuple[FloatArray, bool]:
-        """Choose the next stream; what each promises, and whether one was drawn at random."""
+        """Choose the next stream; return the interest of each, and whether one was drawn."""
         counts, learning = self._counts[0], self._learning
-        held = np.zeros(len(learning), dtype=bool)
-        held[list(self._candidates)] = True
-        if (learning & held).sum() >= self._candidates.most:
-            learning &= held
+        candidates = np.zeros(len(learning), dtype=bool)
+        candidates[list(self._candidates)] = True
+        if (learning & candidates).sum() >= self._candidates.most:
+            learning &= candidates
         errors = {s: c.recent_errors(RECENT) for s, c in self._candidates.items()}
         situation = Situation(
             stream=self.stream,
