@@ -37,7 +37,7 @@ class AppendOnlyFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Begin the file anew.
+        """Begin an empty file.
 
         Raises:
             UsageError: another process writes it.

@@ -1,1 +1,1 @@
-"""The MCAP file: read with no trust in what it says, and written."""
+"""Read and write MCAP files, without trust in what a file states."""

@@ -145,22 +145,8 @@ def walked_table(
         elif opcode <= max(Opcode) and not cut:
             raise MalformedRecord(f"it holds a {Opcode(opcode).name} record")
     if place < len(data) and not cut:
-        raise MalformedRecord(_no_record(data, place))
+        raise MalformedRecord(f"its byte {place} begins no record that ends within it")
     return MessageTable(data, messages), definitions, times
-
-
-def _no_record(data: ByteArray, at: int) -> str:
-    """Return why the bytes at a place of a chunk are no record."""
-    left = len(data) - at
-    if left < RECORD_HEADER.size:
-        return f"{left} bytes at its end are no record"
-    opcode, length = RECORD_HEADER.unpack_from(data.data, at)
-    over = length + RECORD_HEADER.size - left
-    if opcode == 0:
-        return f"no record at {at} (opcode 0)"
-    if over > 0:
-        return f"a record at {at} runs {over} bytes over its end"
-    return "a message is shorter than its own header"
 
 
 UNUSED: Final = "(the index is not used)"

@@ -128,9 +128,7 @@ class IndexPart:
     @classmethod
     def of_record(cls, content: int, length: int, head: bytes) -> IndexPart:
         """Parse the head of a message index record, whose content is at a place in the file."""
-        if len(head) < cls.HEAD.size:
-            raise MalformedRecord("a message index is cut short")
-        channel, size = cls.HEAD.unpack(head)
+        channel, size = cls.HEAD.unpack(head.ljust(cls.HEAD.size, b"\0"))
         if size + cls.HEAD.size > length or size % 16:
             raise MalformedRecord("a message index lies about its length")
         return cls(channel, content + cls.HEAD.size, size // 16)

@@ -163,9 +163,8 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
 def _take_records(data: bytes, summary: Summary, definitions: Definitions) -> None:
     at = 0
     while at < len(data):
-        if len(data) - at < RECORD_HEADER.size:
-            raise MalformedRecord(f"no record at byte {summary.begin + at}")
-        opcode, length = RECORD_HEADER.unpack_from(data, at)
+        head = data[at : at + RECORD_HEADER.size].ljust(RECORD_HEADER.size, b"\0")
+        opcode, length = RECORD_HEADER.unpack(head)
         content = data[at + RECORD_HEADER.size : at + RECORD_HEADER.size + length]
         if opcode == 0 or len(content) < length:
             raise MalformedRecord(f"no record at byte {summary.begin + at}")
@@ -192,14 +191,12 @@ def _segment(content: bytes) -> Segment | None:
         (mapped,) = _LENGTH.unpack_from(content, _BEFORE_PLACES - 4)
         (name,) = _LENGTH.unpack_from(content, _BEFORE_PLACES + mapped + 8)
         if mapped % 10 or mapped > 10 * 2**16 or name > len(content):
-            raise MalformedRecord("a chunk index is cut short")
+            raise ValueError("lengths that no chunk index has")
         fields = _layout(mapped // 10, name).unpack_from(content)
         start, end, offset, length, _, *places, index_size, _, raw, stored, size = fields
         compression = raw.decode()
-    except struct.error:
-        raise MalformedRecord("a chunk index is cut short") from None
-    except UnicodeDecodeError:
-        raise MalformedRecord("a chunk index holds a text that is not UTF-8") from None
+    except (struct.error, ValueError):
+        raise MalformedRecord("a chunk index is broken") from None
     data, after = offset + _FIXED + name, offset + length
     if length != data - offset + stored:
         raise MalformedRecord("a chunk index lies about its chunk's length")

@@ -285,10 +285,8 @@ class LogStructure:
             if self._limit is not None and content + length != self._limit:
                 raise MalformedRecord("the data section does not end where the summary starts")
             self.data_crc = crc
-        elif opcode <= max(Opcode):
-            raise MalformedRecord(f"a {Opcode(opcode).name} record among the data")
-        elif self.salvage and opcode < _PRIVATE:
-            raise MalformedRecord(f"no record of the format (opcode {opcode})")
+        elif opcode <= max(Opcode) or (self.salvage and opcode < _PRIVATE):
+            raise MalformedRecord(f"a record of opcode {opcode} among the data")
 
     def _definition(self, content: int, length: int) -> bytes:
         """Read a record that is kept in memory."""
@@ -304,10 +302,8 @@ class LogStructure:
 
     def _loose_message(self, content: int, length: int) -> None:
         """Add a message outside chunks to the messages before it."""
-        if length < _LOOSE.size + 8:
-            raise MalformedRecord("a message is shorter than its own header")
-        if length > MAX_CHUNK:
-            raise MalformedRecord(f"a message of {length} bytes, above the limit of {MAX_CHUNK}")
+        if not _LOOSE.size + 8 <= length <= MAX_CHUNK:
+            raise MalformedRecord(f"a message of {length} bytes: it has 22 to {MAX_CHUNK}")
         number, _, time = _LOOSE.unpack(self.file.peek(content, _LOOSE.size))
         end = content + length
         if self._loose is not None and end - self._loose.offset > LOOSE_BYTES:
