@@ -215,8 +215,7 @@ def test_what_is_finished_is_kept_when_it_is_stopped(run: Path, logs: Path, tmp_
         complaint = process.communicate(timeout=30)[1]
     assert process.returncode == 143
     assert complaint.splitlines()[-1] == (
-        f"cdmisfa: interrupted: {out} keeps the outputs that are finished: "
-        "say the same again to go on"
+        f"cdmisfa: interrupted: {out} keeps what is finished: run the same command to continue"
     )
     done = len(files(out))
     assert pq.read_table(out).num_rows == 90 * done

@@ -39,24 +39,19 @@ def test_a_signal_that_changes_nothing_any_more_is_no_failure(
     assert not list((tmp_path / "out").glob("*.partial"))
 
 
-def test_an_interrupt_says_what_is_missing_of_a_run(
-    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: Any
+@pytest.mark.parametrize(
+    "last", ["replay.view.build.build_view", "cdmisfa.experiments.run_folder.save_modules"]
+)
+def test_an_interrupted_run_is_resumed(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: Any, last: str
 ) -> None:
     out = tmp_path / "out"
-    words = (*LEARN, "-o", out)
-    done = _signalled(cdmisfa, words, "replay.view.build.build_view", 2, monkeypatch)
-    assert done.code == 130
-    missing, _, remedy = done.err.splitlines()[-1].partition("make it again with cdmisfa ")
-    assert missing == f"cdmisfa: interrupted: all of {out} is there but its view: "
-    assert cdmisfa(*remedy.split()).code == 0
-    assert cdmisfa("verify", out).code == 0
-
-    words = (*LEARN, "-o", out, "--force", "--no-rerun")
-    done = _signalled(cdmisfa, words, "cdmisfa.experiments.run_folder.save_modules", 2, monkeypatch)
+    done = _signalled(cdmisfa, (*LEARN, "-o", out), last, 2, monkeypatch)
     assert done.code == 130
     said = f"cdmisfa: interrupted: {out} is not finished: go on with --resume"
     assert done.err.splitlines()[-1] == said
-    assert cdmisfa("learn", "-o", out, "--resume", "--no-rerun").code == 0
+    assert cdmisfa("learn", "-o", out, "--resume").code == 0
+    assert (out / "run.rrd").is_file()
     assert cdmisfa("verify", out).code == 0
 
 

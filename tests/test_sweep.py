@@ -318,6 +318,6 @@ def test_grids_and_seeds_are_read_as_written() -> None:
     for text in ("", "3:3", "-1", "a", "0:99999999999"):
         with pytest.raises(click.UsageError, match="--seeds"):
             parse_seeds(text)
-    for words in (("learner.sigma",), ("=1",), ("a.b=",), ("a.b=1", "a.b=2")):
+    for words in (("learner.sigma",), ("=1",), ("a.b=",)):
         with pytest.raises(click.UsageError, match="--grid"):
             parse_grid(words)

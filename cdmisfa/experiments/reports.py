@@ -9,7 +9,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.resume import Recomputation
 from cdmisfa.experiments.run_folder import command_again
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
-from replay.runs.folders import REPORT_FILE, is_run, run_log, runs_in
+from replay.runs.folders import REPORT_FILE, run_log, runs_in
 
 
 def write_report(
@@ -34,34 +34,26 @@ def write_report(
         LogWriteError: the file cannot be written.
     """
     paths = [Path(word) for word in words]
-    runs = [path for path in paths if _is_run(path)]
     if out is None:
-        if len(paths) != 1 or not runs:
+        if len(paths) != 1 or runs_in(paths[0]):
             raise UsageError("name the file of the report: -o report.html")
         out, force = run_log(paths[0]).parent / REPORT_FILE, True
     refuse_unless(out, "a report is an HTML page", ".html", ".htm")
     refuse_taken(out, force=force)
-    page = _page(paths, runs)
+    page = _page(paths)
     with atomic_write(out) as partial:
         partial.write_text(page, encoding="utf-8")
     return out
 
 
-def _page(paths: list[Path], runs: list[Path]) -> str:
+def _page(paths: list[Path]) -> str:
     from replay.report.page import report_of_run, report_of_runs
 
-    if len(paths) == 1 and runs:
-        return report_of_run(paths[0], _reproducible(paths[0]), command_again(paths[0]))
-    if len(paths) == 1 and (found := runs_in(paths[0])):
+    if len(paths) > 1:
+        return report_of_runs(paths, f"{len(paths)} runs compared")
+    if found := runs_in(paths[0]):
         return report_of_runs(found, f"{paths[0].resolve().name}: {len(found)} runs")
-    return report_of_runs(paths, f"{len(paths)} runs compared")
-
-
-def _is_run(path: Path) -> bool:
-    try:
-        return path.exists() and is_run(path)
-    except CdmisfaError:
-        return path.is_dir() and (path / "run.json").is_file()
+    return report_of_run(paths[0], _reproducible(paths[0]), command_again(paths[0]))
 
 
 def _reproducible(run: Path) -> str:

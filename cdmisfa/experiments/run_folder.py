@@ -246,7 +246,6 @@ def opened_log(
     *,
     force: bool,
     resumed: bool,
-    view: bool,
 ) -> Iterator[RunWriter]:
     """Open the log of a run, which is to be finished in the context, and lock its folder.
 
@@ -259,7 +258,6 @@ def opened_log(
         manifest: see `RunWriter`.
         force: replace the contents of the folder.
         resumed: whether the run is resumed; its earlier log is moved to `SET_ASIDE`.
-        view: whether the run will have a view.
 
     Raises:
         UsageError: the folder is not empty, in use or holds a recording.
@@ -289,23 +287,13 @@ def opened_log(
         try:
             yield log
         except BaseException as error:
-            missing = _missing_part(folder, source, view=view)
             log.abandon()
             if isinstance(error, KeyboardInterrupt):
-                raise KeyboardInterrupt(missing) from None
+                how = "cameras cannot go back: start another"
+                if isinstance(source, SeekableSource):
+                    how = "go on with --resume"
+                raise KeyboardInterrupt(f"{folder} is not finished: {how}") from None
             raise
-
-
-def _missing_part(run: Path, source: FrameSource, *, view: bool) -> str:
-    """Return which part of a run an interrupt left out, and how to make it."""
-    from replay.integrity.verify import view_again
-
-    if (run / RUN_FILE).is_file():
-        but = "" if not view or (run / VIEW_FILE).is_file() else " but its view: "
-        return f"all of {run} is there{but and but + view_again(run)}"
-    if isinstance(source, SeekableSource):
-        return f"{run} is not finished: go on with --resume"
-    return f"{run} is not finished, and cameras cannot go back: cdmisfa info {run}"
 
 
 def write_results(

@@ -270,7 +270,6 @@ class Session:
                         self.manifest,
                         force=self._force,
                         resumed=self._resumed,
-                        view=rerun,
                     )
                 )
                 state = Keyframes(log, self.source, self.learner, self._versions, keyframes)

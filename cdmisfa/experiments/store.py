@@ -179,32 +179,27 @@ def run_trials(
         failed = sum(rows[t.id]["status"] == FAILED for t in trials if t.id not in left)
         computed = run_all(compute, missing, jobs=jobs, scheduler=scheduler)
         for finished, (index, result) in enumerate(computed, start=skipped + 1):
-            row = _row(missing[index], result)
+            trial, broke = missing[index], "error" in result
+            row = {
+                "id": trial.id,
+                "status": FAILED if broke else DONE,
+                "point": dict(trial.point),
+                "seed": trial.seed,
+                "code": trial.code,
+                "run": str(trial.log) if trial.log is not None and not broke else None,
+                **(result if broke else {"result": result}),
+            }
             data = memoryview(json.dumps(row, separators=(",", ":")).encode() + b"\n")
             with writing(path):
                 while data:
                     data = data[file.write(data) :]
             rows[row["id"]] = row
-            failed += row["status"] == FAILED
-            done += row["status"] == DONE
+            failed, done = failed + broke, done + (not broke)
             progress(finished, failed, len(trials))
         with writing(path):
             os.fsync(file.fileno())
     failures = tuple(rows[t.id] for t in trials if rows[t.id]["status"] == FAILED)
     return SweepReport(folder, len(trials), skipped, done, failures)
-
-
-def _row(trial: Trial, result: Mapping[str, Any]) -> Row:
-    failed = "error" in result
-    return {
-        "id": trial.id,
-        "status": FAILED if failed else DONE,
-        "point": dict(trial.point),
-        "seed": trial.seed,
-        "code": trial.code,
-        "run": str(trial.log) if trial.log is not None and not failed else None,
-        **(result if failed else {"result": result}),
-    }
 
 
 def read_rows(folder: Path) -> Iterator[Row]:
