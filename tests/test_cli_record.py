@@ -48,7 +48,9 @@ def test_a_terminal_that_is_closed_ends_it_like_a_signal(tmp_path: Path, jobs: i
         os.execv(sys.executable, [sys.executable, "-m", "cdmisfa", *words, "--jobs", str(jobs)])
     recorder = psutil.Process(pid)
     try:
-        wait_for(lambda: sum(p.stat().st_size for p in folder.glob("*.partial")) >= 1 << 17, 60)
+        wait_for(
+            lambda: sum(p.stat().st_size for p in folder.glob("*.mcap.partial")) >= 1 << 17, 60
+        )
         os.close(terminal)
         assert recorder.wait(60) == 129
     finally:

@@ -19,7 +19,6 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.cli import run
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState
-from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.resume import Recomputation, check_run
 from cdmisfa.experiments.session import Session
 from cdmisfa.experiments.sources import open_source
@@ -235,16 +234,7 @@ def test_at_prints_all_of_the_memory(place: Path, cdmisfa: Cdmisfa) -> None:
         if not array.dtype.names:
             printed = np.array(found["arrays"][name], float).reshape(array.shape)
             assert np.array_equal(printed, array, equal_nan=True), name
-    done = cdmisfa("at", run, 50)
-    policy = ", ".join(
-        f"{name} {ACTIONS[action]}"
-        for name, action in zip(learner.spec.streams, found["final_policy"], strict=True)
-    )
-    assert (done.code, f"policy: {policy}" in done.out.splitlines()) == (0, True)
-    assert f"memory: {len(found['arrays'])} arrays, " in done.out
-    said = cdmisfa("at", place / "progress-live", 50).out.splitlines()
-    state = cdmisfa("at", place / "progress-live", 50, "--json").json["streams"]
-    assert [line.partition(":")[0] for line in said[2:-1]] == [one["stream"] for one in state]
+    assert f"memory: {len(found['arrays'])} arrays, " in cdmisfa("at", run, 50).out
 
 
 def test_a_fork_goes_on_as_told(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -> None:

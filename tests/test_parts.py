@@ -12,7 +12,6 @@ from waiting import running, wait_for
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
-from recorder.config import parse_split
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 from replay.inputs import open_recording
@@ -88,9 +87,3 @@ def test_a_lost_part_is_not_written_over(parts: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"x2-002\.mcap is there, but not frame 150 of x2"):
         record_scene("oscillatory", folder, frames=FRAMES, split=SPLIT, resume=True)
     assert contents(folder) == before
-
-
-def test_durations_are_read() -> None:
-    assert [parse_split(text) for text in ("90s", "10min", "0.5h")] == [90, 600, 1800]
-    with pytest.raises(UsageError, match="--split is '512MB': give a duration as"):
-        parse_split("512MB")

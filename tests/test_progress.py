@@ -14,14 +14,12 @@ from hypothesis import strategies as st
 from moving_pictures import MovingPictures
 
 from cdmisfa import Run
-from cdmisfa.agents.learners import LEARNERS, open_learner
 from cdmisfa.agents.progress import candidate as held
 from cdmisfa.agents.progress.attention import (
     RECENT,
     RULES,
     ProgressConfig,
     Situation,
-    relative_progress,
 )
 from cdmisfa.agents.progress.candidate import WHITE_NOISE, Candidate, learning_error
 from cdmisfa.agents.progress.judging import (
@@ -31,18 +29,14 @@ from cdmisfa.agents.progress.judging import (
     promising,
 )
 from cdmisfa.agents.progress.learner import ProgressLearner
-from cdmisfa.core.blocks import Block, SourceSpec, freeze
-from cdmisfa.core.errors import UsageError
-from cdmisfa.core.learning import Learner
+from cdmisfa.core.blocks import Block, freeze
 from cdmisfa.core.signals import canonical_bytes
 from cdmisfa.experiments.loop import learn_blocks
 from cdmisfa.experiments.session import run
-from cdmisfa.experiments.sources import configure
 from recorder.recording import record
 from replay.inputs import open_recording
 
 CONFIG = ProgressConfig(components=8)
-NO_TRUTH = np.zeros((40, 0))
 
 
 def learned_from(source: MovingPictures, seed: int = 0, **settings: Any) -> ProgressLearner:
@@ -163,27 +157,6 @@ def test_candidates_are_held_for_so_many_streams_only(monkeypatch: pytest.Monkey
     assert [m.stream for m in learner.modules] == ["swing"]
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("attention=progres", "learner.attention is 'progres': it must be one of novel, progress"),
-        ("outputs=17", r"learner.outputs is 17: it must be in \[1, 16\]"),
-        ("tau=2", r"learner.tau is 2: it must be in \[3, 100000\]"),
-        ("nu=.1", "unknown key learner.nu: there are algorithm, tau"),
-    ],
-)
-def test_wrong_settings_are_named(setting: str, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        configure("icub", settings=("learner.algorithm=progress", f"learner.{setting}"))
-
-
-def test_the_preset_is_the_defaults() -> None:
-    chosen = configure("icub", settings=("learner.algorithm=progress",))
-    assert chosen.learner == ProgressConfig()
-    assert isinstance(open_learner(chosen.learner, SourceSpec(("a",), (9,), "float64"), 0), Learner)
-    assert LEARNERS["progress"].preset == "cameras"
-
-
 def test_a_candidate_tests_before_it_learns() -> None:
     rng = np.random.default_rng(0)
     noise, swing = Candidate(192, 8, 1, 8000, 20), Candidate(192, 8, 1, 8000, 20)
@@ -237,12 +210,6 @@ def test_a_test_is_of_weights_that_have_not_learned_from_its_frames() -> None:
     ]
     variances = [candidate.variance, candidate.tested**2]
     assert variances[1] * (2 * np.pi) ** 2 * variances[0] == pytest.approx(np.mean(steps, axis=0))
-
-
-def test_progress_is_the_relative_fall_of_the_error() -> None:
-    assert relative_progress(np.r_[np.full(8, 2.0), np.full(8, 1.0)]) == pytest.approx(0.501)
-    assert relative_progress(np.full(RECENT, 0.5)) == pytest.approx(0.002)
-    assert relative_progress(np.zeros(0)) > relative_progress(np.ones(3)) > 100
 
 
 @given(

@@ -16,9 +16,8 @@ from waiting import running, started, wait_for
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.config import RecordConfig
-from recorder.log.files import RECORDING, held, partial_path
+from recorder.log.files import RECORDING, partial_path
 from recorder.log.manifest import RecordingStart, read_start, store_start
-from recorder.log.messages import RECORDING_METADATA
 from recorder.log.resume import frames_held
 from recorder.recording import RecordingStoppedError, record_scene
 from recorder.world.icub.config import IcubConfig
@@ -82,27 +81,6 @@ def test_every_view_of_every_frame_is_there_and_equals_live(icub):
     live.close()
 
 
-def test_a_file_says_what_it_is(icub):
-    with (icub / "center.mcap").open("rb") as file:
-        reader = make_reader(file)
-        values = next(m.metadata for m in reader.iter_metadata() if m.name == RECORDING_METADATA)
-        config = json.loads(next(a.data for a in reader.iter_attachments()))
-    expected = {
-        "scene": "icub",
-        "view": "center",
-        "stream_index": "1",
-        "streams": "left,center,right",
-        "frame_shape": "48x128",
-        "dtype": "uint8",
-        "fps": "50.0",
-        "seed": "3",
-    }
-    assert expected.items() <= values.items()
-    assert {"version_pybullet", "version_icub-models", "version_cdmisfa"} <= values.keys()
-    assert config["scene"]["seed"] == 3
-    assert config["record"]["fps"] == 50.0
-
-
 @pytest.mark.parametrize("kind", ["icub", "oscillatory"])
 def test_bytes_do_not_depend_on_jobs(kind, request, tmp_path):
     whole = request.getfixturevalue(kind)
@@ -128,14 +106,6 @@ def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
     assert contents(folder) == before
     record_scene("oscillatory", folder, frames=3000, views=["x2"], force=True)
     assert contents(folder) == {**before, "x2.mcap": (oscillatory / "x2.mcap").read_bytes()}
-
-
-def test_a_folder_in_use_is_refused(tmp_path):
-    folder = tmp_path / "a"
-    folder.mkdir()
-    with held(folder), pytest.raises(UsageError, match="in use by another process"):
-        record_scene("oscillatory", folder, frames=20)
-    assert contents(folder) == {}
 
 
 RECORD = """
@@ -375,9 +345,3 @@ def test_a_recording_stores_what_its_unfinished_views_shall_be(tmp_path: Path) -
 def test_what_makes_no_sense_in_it_is_passed_over(tmp_path: Path, noted: str) -> None:
     (tmp_path / RECORDING).write_text(noted)
     assert read_start(tmp_path) == RecordingStart()
-
-
-def test_a_folder_that_is_a_file_is_named(tmp_path: Path) -> None:
-    (tmp_path / "nowhere").write_text("a file")
-    with pytest.raises(UsageError, match="nowhere is a file: name a folder"):
-        store_start(tmp_path / "nowhere", ["a"], RecordingStart("", None, {"a": 1}))

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import UsageError
 from cdmisfa.features.recursive import RecursiveFeature
 from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import ffi, lib
@@ -148,12 +147,6 @@ def test_a_copy_learns_on_its_own(copied: Callable[[RecursiveFeature], Recursive
     np.testing.assert_array_equal(sfa.phi, phi)
     sfa.update(frames[200:])
     np.testing.assert_array_equal(sfa.phi, other.phi)
-
-
-@pytest.mark.parametrize("options", [(0, 4), (10, 0), (10, 4, 5), (10, 4, 1, 0)])
-def test_sizes_that_make_no_sense_are_refused(options: tuple[int, ...]) -> None:
-    with pytest.raises(UsageError, match="at least 1"):
-        RecursiveFeature(*options)
 
 
 @given(n=st.integers(0, 40), seed=st.integers(0, 10**6), kind=st.integers(0, 4))

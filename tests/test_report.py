@@ -20,6 +20,7 @@ from cdmisfa.experiments.reports import write_report
 from cdmisfa.experiments.run_folder import command_again
 from replay.report import measurements
 from replay.report.data import RunData
+from replay.report.drawing import Axis, Plot
 from replay.report.measurements import attempts, measurements_of
 from replay.report.page import MOST_BYTES
 from replay.runs.modules import save_modules
@@ -200,24 +201,6 @@ def test_several_runs_and_a_folder_of_them(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     assert done.json["bytes"] == (tmp_path / "folder.html").stat().st_size
 
 
-def test_an_error_of_the_command_is_one_line(
-    cdmisfa: Cdmisfa, tmp_path: Path, run: Path, oscillatory_recording: Path
-) -> None:
-    page, new = tmp_path / "r.html", tmp_path / "x.html"
-    page.write_text("mine")
-    for words, message in (
-        ((run, oscillatory_recording, "-o", new), "holds no run.mcap"),
-        ((run, run), "name the file of the report"),
-        ((run, "-o", page), "exists"),
-        ((run, "-o", tmp_path / "r.pdf"), "a report is an HTML page, name it r.html"),
-        ((tmp_path / "nothing", "-o", new), "nothing"),
-    ):
-        done = cdmisfa("report", *words)
-        assert (done.code, done.err.count("\n")) == (2, 1), done.err
-        assert message in done.err
-    assert page.read_text() == "mine"
-
-
 def test_learning_does_not_fail_with_its_report(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -250,3 +233,20 @@ def test_memory_does_not_grow_with_the_run(tmp_path: Path) -> None:
     assert np.all(np.array(rows) <= [50, 2000, 96])
     assert max(map(len, data.last.values())) == 200
     assert len(module.recent[0]) == 80
+
+
+def test_a_curve_keeps_its_extremes_and_its_gaps() -> None:
+    t = np.arange(50_000, dtype=float)
+    values = np.sin(t / 40)
+    values[777], values[30_000] = 9.0, -9.0
+    values[20_000:21_000] = np.nan
+    values[21_001] = np.nan  # one value alone
+    plot = Plot("a curve", Axis(0, 50_000, 1000), Axis(-9, 9, 90, upward=True))
+    plot.curve("plain", t, values)
+    (path,) = plot.shapes
+    points = [tuple(map(float, p.split())) for p in re.findall(r"[\d.]+ [\d.]+", path)]
+    assert len(points) < 2200
+    assert {0.0, 90.0} <= {y for _, y in points}
+    assert (path.count("M"), path.count("h0")) == (3, 1)
+    assert not [x for x, _ in points if 400.5 < x < 419.5]
+    assert np.all(np.diff([x for x, _ in points]) >= 0)
