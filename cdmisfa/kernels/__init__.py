@@ -59,10 +59,12 @@ def pointer(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] 
     Raises:
         UsageError: it is of another type or shape, does not lie in C order, or is read-only.
     """
-    given: object = type(array)
-    if given is np.ndarray:
-        given = str(array.dtype), array.shape, "C" if array.flags.carray else "other order"
-    expect(name, given, (str(dtype), shape, "C"))
+    fits = type(array) is np.ndarray and array.dtype == dtype and array.shape == shape
+    if not (fits and array.flags.carray):  # names of types take longer than small blocks
+        given: object = type(array)
+        if given is np.ndarray:
+            given = str(array.dtype), array.shape, "C" if array.flags.carray else "other order"
+        expect(name, given, (str(dtype), shape, "C"))
     return _buffer(_POINTERS[dtype], array, True)
 
 
