@@ -6,7 +6,6 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,6 @@ from cdmisfa.core.untrusted import printable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-    from rich.progress import Task
 
     from cdmisfa.cli.interrupts import Stop
     from cdmisfa.core.blocks import Block, SourceSpec
@@ -58,15 +56,11 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
     if Stderr.quiet or not sys.stderr.isatty():
         yield Bar()
         return
+    from rich import progress as rich_progress
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
     from rich.text import Text
 
-    class Figures(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            return Text(figures(task, unit), no_wrap=True, overflow="ellipsis")
-
-    class ProgressWithNote(Progress):
+    class ProgressWithNote(rich_progress.Progress):
         note = ""
 
         def get_renderables(self) -> Iterator[RenderableType]:
@@ -74,24 +68,30 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
             if self.note:
                 yield Text(f"  {self.note}", no_wrap=True, overflow="ellipsis")
 
-    columns = TextColumn("{task.description}"), BarColumn(bar_width=16), Figures()
-    progress = ProgressWithNote(*columns, console=Console(stderr=True), transient=True)
+    progress = ProgressWithNote(
+        rich_progress.TextColumn("{task.description}"),
+        rich_progress.BarColumn(bar_width=16),
+        rich_progress.MofNCompleteColumn(),
+        rich_progress.TextColumn("{task.fields[unit]}"),
+        rich_progress.TimeRemainingColumn(elapsed_when_finished=True),
+        console=Console(stderr=True),
+        transient=True,
+    )
 
     class TerminalBar(Bar):
         def update(self, done: float, total: float | None = None, note: str = "") -> None:
             progress.note = printable(note)
             progress.update(task, completed=done, total=total)
 
-        def restart(self, title: str, new_unit: str) -> None:
-            nonlocal unit
-            unit, progress.note = new_unit, ""
-            progress.reset(task, description=title, total=None)
+        def restart(self, title: str, unit: str) -> None:
+            progress.note = ""
+            progress.reset(task, description=title, total=None, unit=unit)
 
         def say(self, line: str) -> None:
             progress.console.print(printable(line), markup=False, highlight=False, emoji=False)
 
     with progress:
-        task = progress.add_task(title, total=None)
+        task = progress.add_task(title, total=None, unit=unit)
         yield TerminalBar()
 
 
@@ -105,21 +105,6 @@ def resumable_bar(out: Path, title: str, unit: str) -> Iterator[Bar]:
         raise KeyboardInterrupt(
             f"{out} keeps what is finished: run the same command to continue"
         ) from None
-
-
-def figures(task: Task, unit: str) -> str:
-    """Return how much of a task is done, how fast, and the time left, or else the time taken."""
-    done = f"{task.completed:,.0f}"
-    if task.total is not None:
-        done += f" of {task.total:,.0f}"
-    parts = [f"{done} {unit}"]
-    if (speed := task.finished_speed or task.speed) is not None:
-        parts.append(f"{speed:,.0f} a second")
-    if (left := task.time_remaining) is not None:
-        parts.append(f"{timedelta(seconds=round(left))} left")
-    elif task.elapsed is not None:
-        parts.append(f"{timedelta(seconds=round(task.elapsed))}")
-    return ", ".join(parts)
 
 
 class RunProgress(Sink):

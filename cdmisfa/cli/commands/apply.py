@@ -12,7 +12,7 @@ import click
 from cdmisfa.cli import options, printing
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.progress import bar, resumable_bar
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import counted
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def apply_command(
     With a folder as -o, SOURCE may be a folder with many logs, or an index of them. All files are
     one table. The same command continues where it was stopped, and skips what is done.
 
-    If a log cannot be read, the others are still processed; the exit code is then 3, or 2.
+    With a folder as -o, logs that cannot be read are skipped; the exit code is then 3, or 2.
     """
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_taken
@@ -160,31 +160,17 @@ def _apply_to_each(
     code = 0
     with stoppable() as stop:
         for words in logs:
-            row: dict[str, Any] = {"log": " ".join(words), "out": out and str(out)}
-            try:
-                with contextlib.closing(
-                    application.open(words, inputs, loop=loop, salvage=salvage, say=printing.status)
-                ) as source:
-                    totals = _apply(application, source, out, frames, stop, as_lines)
-            except CdmisfaError as error:
-                if len(logs) == 1:
-                    raise
-                printing.warning(str(error))
-                code = max(code, error.exit_code)
-                rows.append(row | {"out": None, "frames": 0, "error": str(error), "modules": []})
-                continue
-            damaged = totals.damaged
-            if damaged is not None:
-                printing.status(f"{damaged}: outputs up to the damage are kept")
-                code = max(code, damaged.exit_code)
-            rows.append(
-                row
-                | {
-                    "frames": totals.frames,
-                    "error": damaged and str(damaged),
-                    "modules": totals.rows(),
-                }
+            opened = application.open(
+                words, inputs, loop=loop, salvage=salvage, say=printing.status
             )
+            with contextlib.closing(opened) as source:
+                totals = _apply(application, source, out, frames, stop, as_lines)
+            error = None if totals.damaged is None else str(totals.damaged)
+            if totals.damaged is not None:
+                printing.status(f"{error}: outputs up to the damage are kept")
+                code = totals.damaged.exit_code
+            row = {"log": " ".join(words), "out": out and str(out), "frames": totals.frames}
+            rows.append({**row, "error": error, "modules": totals.rows()})
             if stop():
                 break
     if as_json and not as_lines:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 
 MOST_STREAMS = 8
 """Number of streams of a run that `info` names."""
-
-MOST_GONE = 5
-"""Number of removed logs that `index` names."""
 
 
 @click.command("info")
@@ -95,20 +92,14 @@ def _print_run(info: LogReport, run: RunInfo) -> None:
 
 def _length(info: LogReport, start: int, end: int) -> str:
     """Return the number of messages of a log, its duration, and its first and last time."""
+    import numpy as np
+
     seconds = (end - start) / 1e9
-    duration = f"{seconds:.3f} s"
-    if seconds >= 60:
-        duration += f" ({timedelta(seconds=round(seconds))})"
     encodings = {channel.encoding for channel in info.channels}
     shared = f"{encodings.pop()} " if len(encodings) == 1 else ""
+    first, last = (f"{np.datetime64(ns // 10**6, 'ms')}Z".replace("T", " ") for ns in (start, end))
     messages = counted(info.messages, f"{shared}message")
-    return f"{messages}, {duration}, from {_utc(start)} to {_utc(end)}"
-
-
-def _utc(ns: int) -> str:
-    """Return a log time as date and time of day, to the millisecond."""
-    seconds, rest = divmod(ns, 10**9)
-    return f"{datetime.fromtimestamp(seconds, tz=UTC):%Y-%m-%d %H:%M:%S}.{rest // 10**6:03}Z"
+    return f"{messages}, {seconds:.3f} s, from {first} to {last}"
 
 
 def _storage(size: SizeInfo, library: str) -> Iterator[str]:
@@ -305,18 +296,9 @@ def index_command(
     if indexed.replaced:
         printing.warning(indexed.replaced)
     if as_json:
-        printing.document(
-            index=indexed.index,
-            logs=indexed.logs,
-            streams=indexed.streams,
-            read=indexed.read,
-            kept=indexed.kept,
-            gone=indexed.gone,
-            broken=indexed.broken,
-            kinds=indexed.kinds,
-            problems=indexed.problems,
-            complete=not indexed.stopped,
-        )
+        values = dataclasses.asdict(indexed)
+        del values["replaced"], values["stopped"]
+        printing.document(**values, complete=not indexed.stopped)
     else:
         _print_index(indexed)
     if indexed.stopped:
@@ -334,10 +316,6 @@ def _print_index(indexed: Indexed) -> None:
         f"{indexed.read} read, {indexed.kept} unchanged, {len(indexed.gone)} gone, "
         f"{indexed.broken} with a problem"
     )
-    for path in indexed.gone[:MOST_GONE]:
-        printing.line(f"gone: {path}")
-    if (more := len(indexed.gone) - MOST_GONE) > 0:
-        printing.line(f"gone: {more} more")
     if indexed.kinds:
         head = "kind", "logs", "files", "streams", "length", "size"
         counts = [[row[name] for name in head[:4]] for row in indexed.kinds]
