@@ -11,7 +11,7 @@ import numpy as np
 from cdmisfa.core.arrays import FloatArray
 
 # Last frames of an output that are fitted.
-KEPT = 20_000
+FITTED = 20_000
 
 # Correlation by which a function must be followed better than a simpler one.
 BETTER = 0.03
@@ -48,10 +48,10 @@ def fits(names: Sequence[str], truth: FloatArray, y: FloatArray) -> list[Fit]:
 
     Args:
         names: of the columns of truth.
-        truth: (n, D) ground truth; the last `KEPT` frames count.
+        truth: (n, D) ground truth; the last `FITTED` frames count.
         y: (n,) the output.
     """
-    truth, y = truth[-KEPT:], y[-KEPT:]
+    truth, y = truth[-FITTED:], y[-FITTED:]
     turn = 2 * np.pi
     tried = []
     for column, name in enumerate(names if len(truth) else ()):

@@ -168,7 +168,7 @@ def served(view: Path, port: int = 0) -> Iterator[tuple[Program, str]]:
 def live_window(data: str, say: Callable[[str], None]) -> Iterator[None]:
     """Show a live view in a window, or where there is no display at a page.
 
-    The window stays open afterwards, and keeps what it shows.
+    The window stays open afterwards, with its last view.
 
     Args:
         data: address of the live view.
@@ -186,7 +186,7 @@ def live_window(data: str, say: Callable[[str], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _page(port: int, data: str, *words: str) -> Iterator[tuple[Program, str]]:
-    """Serve the viewer's page, which shows what is at an address."""
+    """Serve the viewer's page, which shows the data at an address."""
     port = free_port(port)
 
     def answers() -> bool:
@@ -237,9 +237,9 @@ def frame_at(path: Path, at: str) -> int:
     if at.isdecimal():
         return int(at)
     if path.suffix != ".rrd" and holds_run(path):
-        if found := ITERATION.fullmatch(at.strip()):
+        if match := ITERATION.fullmatch(at.strip()):
             for columns in read_columns(path):
-                for frame in columns.frames[columns.iterations == int(found[1])]:
+                for frame in columns.frames[columns.iterations == int(match[1])]:
                     return int(frame)
         words = re.compile(rf"\b{re.escape(at.strip())}\b", re.IGNORECASE)
         for batch in read_batches(path, topics=(EVENT_TOPIC,)):

@@ -20,7 +20,7 @@ from replay.view.rows import MOST_STREAMS, Rows, drawable, part
 if TYPE_CHECKING:
     from replay.export.applied import Applied, AppliedSink
 
-# Frames from one image that is shown to the next; values are all shown.
+# Frames from one image that is drawn to the next; values are all drawn.
 EVERY = 10
 
 
@@ -48,18 +48,18 @@ class ViewSink:
         stream = part(self._spec.streams, s)
         frames = np.arange(block.t, block.t + len(block))
         self._end = max(self._end, block.t + len(block))
-        shown = frames % (EVERY if self._spec.images else 1) == 0
-        at = frames[shown], None
-        self._rows.frames(view_entities(self._spec)[s], at, block.frames[shown])
+        drawn = frames % (EVERY if self._spec.images else 1) == 0
+        at = frames[drawn], None
+        self._rows.frames(view_entities(self._spec)[s], at, block.frames[drawn])
         first, names = (frames[:1], None), [f"module {m.index}" for m, _ in self._modules]
-        slowness = applied.slowness[[own.start for _, own in self._modules]]
+        slowness = applied.slowness[[columns.start for _, columns in self._modules]]
         slowness = np.where(np.isfinite(slowness), slowness, np.nan)
         self._rows.lines(f"slowness/{stream}", names, first, slowness[None])
         self._rows.lines(f"novelty/{stream}", names, first, applied.novelty[None])
-        for module, own in self._modules:
+        for module, columns in self._modules:
             outputs = [f"y{j}" for j in range(1, len(module.phi) + 1)]
             path = f"outputs/{stream}/{module.index}"
-            self._rows.lines(path, outputs, (frames, None), applied.y[:, own], gap=1)
+            self._rows.lines(path, outputs, (frames, None), applied.y[:, columns], gap=1)
 
     def close(self) -> None:
         """Write what waits, and the layout of the view."""

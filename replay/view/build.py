@@ -58,7 +58,7 @@ def build_view(
     Args:
         path: a run's folder or its run.mcap, a recording, or a camera log.
         out: the file.
-        every: frames from one image that is shown to the next, of those that were kept.
+        every: frames from one image that is shown to the next, of those in the log.
         force: replace an existing file.
         tab: name of the tab that is open; by default the first.
         beside: more camera logs, or files of the recording.
@@ -118,7 +118,7 @@ def recording_to(
     Args:
         out: the file.
         name: what the viewer calls the recording.
-        source: what it is made from: Rerun merges recordings of the same name and source.
+        source: log that it is made from: Rerun merges recordings of the same name and source.
         force: replace an existing file.
 
     Raises:
@@ -197,8 +197,8 @@ def _write_recording(
                 for low, high in source.spans(stream, t, min(t + BLOCK, first + count)):
                     source.seek(low)
                     block, frames = source.take(stream, high - low), np.arange(low, high)
-                    shown = frames % step == 0
-                    rows.frames(entity, (frames[shown], None), block.frames[shown])
+                    drawn = frames % step == 0
+                    rows.frames(entity, (frames[drawn], None), block.frames[drawn])
                     if spec.truth and stream == 0:
                         rows.lines("world/truth", spec.truth, (frames, None), block.truth, gap=1)
                         if world is not None:
@@ -233,8 +233,8 @@ def recording_layout(
         *(lines(name, [f"/{entity}"], end) for entity, name in places)
     )
     if spec.images:
-        shown = [images(f"/{entity}", name) for entity, name in places]
-        views = rrb.Grid(*shown, grid_columns=min(len(shown), 3))
+        views_of = [images(f"/{entity}", name) for entity, name in places]
+        views = rrb.Grid(*views_of, grid_columns=min(len(views_of), 3))
     if has_scene:
         column = rrb.Vertical(*(images(f"/{entity}", name) for entity, name in places))
         tabs.append(rrb.Horizontal(scene(), column, column_shares=[5, 2], name="World"))

@@ -1,4 +1,4 @@
-"""Lanes: labelled bars of colour that say what was the case when.
+"""Lanes: labelled bars of colour, one for each state of a run.
 
 A lane's label is its entity, and the viewer sorts lanes by the alphabet, which decides their names.
 A state that changes with many blocks has two lanes: `/attends` holds every change, and
@@ -44,14 +44,14 @@ class Lanes:
 
     Args:
         rows: of the recording.
-        shown: the streams that get a lane of their own: of the policy, or of the stream's state.
+        selected: the streams that get a lane of their own: of the policy, or of the stream's state.
         by_progress: the run is one of the progress learner, which has no gate.
         piece: blocks for which lanes of most blocks have one state; by default a run has `PIECES`,
             which are written at its end.
     """
 
     def __init__(
-        self, rows: Rows, shown: Sequence[int], *, by_progress: bool, piece: int | None = None
+        self, rows: Rows, selected: Sequence[int], *, by_progress: bool, piece: int | None = None
     ) -> None:
         streams, count = rows.spec.streams, len(rows.spec.streams)
         names, (stay, switch) = [drawable(name) for name in streams], ACTIONS
@@ -66,7 +66,7 @@ class Lanes:
         attended = {s: (name, colour(s)) for s, name in enumerate(names)}
         lane("attends", lambda c: c["stream"], attended.__getitem__, "switches")
         if by_progress:
-            for s in shown:
+            for s in selected:
                 lane(f"state/{part(streams, s)}", partial(self._states, s), _state)
             return
         done = {s: (f"{stay} on {name}", colour(s)) for s, name in enumerate(names)}
@@ -76,7 +76,7 @@ class Lanes:
         lane("novelty", _verdicts, _verdict, "both")
         lane("does", lambda c: c["stream"] + count * c["action"], done.__getitem__)
         lane("explores", lambda c: c["explored"], explored.__getitem__)
-        for s in shown:
+        for s in selected:
             planned = {0: (stay, colour(s)), 1: (switch, palette.GREY)}
             codes = partial(lambda s, c: c["policy"][:, s], s)
             lane(f"policy/{part(streams, s)}", codes, planned.__getitem__)
@@ -115,7 +115,7 @@ class Lane:
         path: the entity.
         states: of the codes.
         piece: blocks that have one state, that of most of them; see `Lanes`.
-        mixed: name of the state of blocks most of which have none.
+        mixed: name of the state of blocks that have no state in common.
     """
 
     def __init__(

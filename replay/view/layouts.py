@@ -41,12 +41,12 @@ class Panel:
 
     Attributes:
         title: with the number of the module as {i}, and facts of the run, see `RunLayout`.
-        entities: what it shows; curves that the run does not have are left out, and the panel
+        entities: that it draws; curves that the run does not have are left out, and the panel
             where the first of them is.
         kind: curves, or lanes; of all of the run, or of the last frames or blocks; or of the time
             cursor the last frame of each stream, the input, the weights, or the summary.
         height: of all but lanes, which have what they need.
-        beside: it stands on the right of the one before.
+        beside: it is on the right of the one before.
         lanes: how many there are; `per_stream` besides one for each stream.
         low: least value of the axis.
         high: greatest value of the axis.
@@ -146,7 +146,7 @@ def lines(
 
     Args:
         name: the title.
-        entities: what is drawn.
+        entities: that are drawn.
         end: of the time axis, which has room for a legend beyond; 0: it grows with the values.
         start: of the time axis.
         near: only this many frames up to the time cursor are drawn.
@@ -186,15 +186,15 @@ def lanes(
 def _axis(
     start: int, end: int, boundary: Callable[..., Any] = rr.TimeRangeBoundary.absolute
 ) -> rrb.archetypes.TimeAxis:
-    shown = rr.TimeRange(start=boundary(seq=start), end=boundary(seq=end))
-    return rrb.archetypes.TimeAxis(view_range=shown)
+    visible = rr.TimeRange(start=boundary(seq=start), end=boundary(seq=end))
+    return rrb.archetypes.TimeAxis(view_range=visible)
 
 
 def images(origin: str, name: str, bounds: tuple[Span, Span] | None = None) -> rrb.View:
-    """Return an image, or images of which those within some ranges of x and y are in view."""
+    """Return an image, or those of several images that lie within some ranges of x and y."""
     across, down = bounds or (None, None)
-    shown = rrb.VisualBounds2D(x_range=across, y_range=down) if across and down else None
-    return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=shown)
+    visible = rrb.VisualBounds2D(x_range=across, y_range=down) if across and down else None
+    return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=visible)
 
 
 def scene() -> rrb.View:

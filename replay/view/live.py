@@ -67,7 +67,7 @@ class LiveView(Sink):
     ) -> None:
         header = RunHeader(spec, manifest)
         modules = min(len(spec.streams), MOST_MODULES)  # as many as there may come
-        begun = replace(Tally(header).outline(), tau=tau, outputs=outputs, modules=modules)
+        empty = replace(Tally(header).outline(), tau=tau, outputs=outputs, modules=modules)
         self._recording = rr.RecordingStream(APPLICATION, recording_id=f"live-{os.getpid()}")
         self._recording.set_log_time_enabled(False)
         with socket.create_server(("127.0.0.1", 0)) as free:
@@ -78,10 +78,10 @@ class LiveView(Sink):
         self._recording.send_recording_name("live")
         self._rows = rows = Rows(self._recording, spec)
         rows.log("summary", rr.TextDocument("The run is still learning."))
-        streams = begun.streams(MOST_STREAMS)
+        streams = empty.streams(MOST_STREAMS)
         self._view = RunView(rows, header, streams, run or Path(), every=EVERY_FRAMES, piece=PIECE)
         has_scene = isinstance(self._view.world, SceneView)
-        self._recording.send_blueprint(run_layout(begun, has_scene=has_scene))
+        self._recording.send_blueprint(run_layout(empty, has_scene=has_scene))
         self._images = spec.images
         self._next = time.monotonic() + EVERY_SECONDS
         self._clear()
@@ -145,7 +145,7 @@ class LiveView(Sink):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Write the rest and stop serving; a viewer keeps what it has."""
+        """Write the rest and stop serving; a viewer keeps its data."""
         self.flush()
         self._recording.flush()
         self._recording.disconnect()

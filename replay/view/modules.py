@@ -28,13 +28,13 @@ from replay.view.wall import BETWEEN, hang, places_of, sheet_size
 
 PHI = "abstraction/phi"
 
-# Modules whose output is shown over the quantity that it follows: the first.
+# Modules whose output is drawn over the quantity that it follows: the first.
 FOLLOWED = 6
 
-# Last frames of a run for which it is shown.
+# Last frames of a run for which it is drawn.
 FOLLOWED_FRAMES = 1_000_000
 
-# Blocks before the save whose output is shown: earlier ones are of an abstraction that changes.
+# Blocks before the save whose output is drawn: earlier ones are of an abstraction that changes.
 LAST_BLOCKS = 40
 
 # Width of the line that is followed, behind the output.
@@ -108,17 +108,17 @@ class Weights:
             owners = owners if self._by_progress else watched
             rows = (columns.frames, columns.iterations, watched, owners)
             for t, iteration, s, owner in zip(*(row.tolist() for row in rows), strict=True):
-                phi, shown = logged.get(t), None
+                phi, visible = logged.get(t), None
                 if self._by_progress and s != self._stream and self._phi:
-                    shown = self._phi.get(s, 0 * next(iter(self._phi.values())))
+                    visible = self._phi.get(s, 0 * next(iter(self._phi.values())))
                 self._stream = s
                 if phi is not None:
                     if not self._phi:
                         hang_weights(self._rows, PHI, _numbers(phi))
                     self._phi[owner] = phi
-                    shown = phi if owner == s else shown
-                if shown is not None:
-                    write_weights(self._rows, PHI, t, iteration, shown)
+                    visible = phi if owner == s else visible
+                if visible is not None:
+                    write_weights(self._rows, PHI, t, iteration, visible)
 
 
 class ModulesView:
@@ -137,15 +137,15 @@ class ModulesView:
         self._by_progress = by_progress
         self._rows, self._notes, self.sheets = rows, list[str](), set[int]()
         known = [m for m in modules if m.stream_index < len(rows.spec.streams)]
-        self._own = {module.index: OwnStream(module, rows.spec) for module in known}
+        self._known = {module.index: OwnStream(module, rows.spec) for module in known}
         self._stream_of: dict[int, int] = {}
         self._tau = 0
         self._truth: list[Frames] = []
-        numbers = sorted(self._own)[:FOLLOWED] if rows.spec.truth else []
+        numbers = sorted(self._known)[:FOLLOWED] if rows.spec.truth else []
         self._first: dict[int, list[tuple[int, FloatArray]]] = {n: [] for n in numbers}
 
     def take(self, batch: Batch) -> None:
-        """Write what a log holds of some iterations."""
+        """Write the messages of some iterations."""
         weights = dict(batch.phi)
         if self._first:
             self._truth += batch.truth
@@ -153,19 +153,21 @@ class ModulesView:
             self._tau = columns.tau
             self._saved(columns, weights)
             self._keep_first(columns)
+            frozen = columns["y_frozen"]
             for number, stream in self._stream_of.items():
-                own = columns["stream"] == stream
-                if number not in self._own and number <= columns["y_frozen"].shape[1] and own.any():
-                    frames, iterations = columns.times(per_frame=True)
-                    of = np.repeat(own, columns.tau)
-                    y = columns["y_frozen"][own, number - 1]
-                    self._output(number, frames[of], iterations[of], y.reshape(of.sum(), -1))
-        for number, module in list(self._own.items()):
+                watched = columns["stream"] == stream
+                is_unknown = number not in self._known and number <= frozen.shape[1]
+                if is_unknown and watched.any():
+                    of = np.repeat(watched, columns.tau)
+                    frames, iterations = (times[of] for times in columns.times(per_frame=True))
+                    y = frozen[watched, number - 1].reshape(len(frames), -1)
+                    self._output(number, frames, iterations, y)
+        for number, module in list(self._known.items()):
             try:
                 for t, _, y in module.take(batch):
                     self._output(number, t, batch.blocks.iteration(t), y)
             except UsageError as error:
-                del self._own[number]
+                del self._known[number]
                 self._first.pop(number, None)
                 self._notes.append(f"module {number} says nothing of these frames: {error}")
 
@@ -176,8 +178,8 @@ class ModulesView:
             Which modules have no output on the run's frames, and why.
         """
         saved = {save.module: save.t for save in outline.saved}
-        for number, own in self._own.items():
-            module, place = own.module, f"modules/{number}"
+        for number, stream in self._known.items():
+            module, place = stream.module, f"modules/{number}"
             slow = module.slow.astype(bool).tolist()
             labels = [
                 f"{j} {'slow' if is_slow else 'not slow'}" for j, is_slow in enumerate(slow, 1)
@@ -187,9 +189,9 @@ class ModulesView:
             hang_weights(self._rows, f"{place}/weights", labels, rgbs)
             at = saved.get(number, outline.end), module.iteration
             write_weights(self._rows, f"{place}/weights", *at, module.phi)
-            if self._rows.spec.images and own.count:
+            if self._rows.spec.images and stream.count:
                 self.sheets.add(number)
-                self._write_sheet(place, own.sheet())
+                self._write_sheet(place, stream.sheet())
         return self._notes
 
     def _saved(self, columns: SignalColumns, weights: dict[int, FloatArray]) -> None:
@@ -200,20 +202,20 @@ class ModulesView:
             self._stream_of[number], place = stream, f"modules/{number}"
             self._rows.log(f"{place}/saved", saved_mark())
             self._rows.log_at(f"{place}/saved", t + columns.tau, iteration, rr.Scalars([0.0]))
-            if number not in self._own and t in weights:
+            if number not in self._known and t in weights:
                 hang_weights(self._rows, f"{place}/weights", _numbers(weights[t]))
                 write_weights(self._rows, f"{place}/weights", t, iteration, weights[t])
 
     def _output(self, number: int, t: IntArray, iterations: IntArray, y: FloatArray) -> None:
         """Draw the (n, J) outputs of a module at n frames; only slow ones where any is slow."""
-        module = self._own[number].module if number in self._own else None
+        module = self._known[number].module if number in self._known else None
         stream = self._stream_of[number] if module is None else module.stream_index
         slow = np.zeros(0) if module is None else module.slow
-        shown = np.flatnonzero(slow) if slow.any() else np.arange(y.shape[1])
-        names = [f"output {j + 1}" for j in shown.tolist()]
-        rgbs: list[Colour] = [colour(stream), *(faint(colour(stream)) for _ in shown[1:])]
+        visible = np.flatnonzero(slow) if slow.any() else np.arange(y.shape[1])
+        names = [f"output {j + 1}" for j in visible.tolist()]
+        rgbs: list[Colour] = [colour(stream), *(faint(colour(stream)) for _ in visible[1:])]
         path = f"modules/{number}/output"
-        self._rows.lines(path, names, (t, iterations), y[:, shown], rgbs, gap=self._tau)
+        self._rows.lines(path, names, (t, iterations), y[:, visible], rgbs, gap=self._tau)
 
     def _keep_first(self, columns: SignalColumns) -> None:
         """Keep first outputs in blocks of their own streams, of learning ones the last blocks."""
@@ -221,10 +223,10 @@ class ModulesView:
         for number, blocks in self._first.items():
             is_saved = number <= frozen.shape[1]
             y = frozen[:, number - 1] if is_saved else columns["y"]
-            own = columns["stream"] == self._own[number].module.stream_index
-            own &= is_saved | self._by_progress | (columns["module"] == number)
-            own &= np.isfinite(y).all(axis=(1, 2))
-            blocks += zip(columns.frames[own].tolist(), y[own, :, 0], strict=True)
+            watched = columns["stream"] == self._known[number].module.stream_index
+            watched &= is_saved | self._by_progress | (columns["module"] == number)
+            watched &= np.isfinite(y).all(axis=(1, 2))
+            blocks += zip(columns.frames[watched].tolist(), y[watched, :, 0], strict=True)
             del blocks[: -(FOLLOWED_FRAMES // columns.tau if is_saved else LAST_BLOCKS)]
 
     def followed(self, outline: Outline) -> list[Panel]:
@@ -246,7 +248,7 @@ class ModulesView:
             best = next(iter(fits(spec.truth, values[np.searchsorted(frames, t)], y)), None)
             if best is None:
                 continue
-            s, root = self._own[number].module.stream_index, f"learned/{number}"
+            s, root = self._known[number].module.stream_index, f"learned/{number}"
             stream, line = spec.streams[s], best(values[:, best.column])[:, None]
             name, where = f"{best.function}, fitted to it", outline.blocks.iteration(t)
             self._rows.lines(f"{root}/followed", [name], at, line, [GREY], width=BROAD, gap=1)

@@ -63,17 +63,17 @@ def build_overlay(
         table = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         recording.log("summary", table, static=True)
         for number, (run, row, root) in enumerate(zip(runs, compared, roots, strict=True)):
-            header, shown = row.outline.header, row.outline.streams(MOST_STREAMS)
+            header, selected = row.outline.header, row.outline.streams(MOST_STREAMS)
             rows = Rows(recording, header.spec)
             for signals in read_columns(run, header):
-                _write_curves(rows, root, signals, shown, number, row.name)
+                _write_curves(rows, root, signals, selected, number, row.name)
             rows.flush()
             written |= rows.spans.keys()
         recording.send_blueprint(_layout(compared, roots, written, tab))
 
 
 def _write_curves(
-    rows: Rows, root: str, signals: SignalColumns, shown: Sequence[int], number: int, name: str
+    rows: Rows, root: str, signals: SignalColumns, selected: Sequence[int], number: int, name: str
 ) -> None:
     """Write the curves of a run, and its learning error in the blocks of each stream."""
     for signal in CURVES:
@@ -83,12 +83,12 @@ def _write_curves(
         rows.lines(
             f"{root}/{signal}", [name] * count, signals.times(), values, [colour(number)] * count
         )
-    for s in shown:
-        own = np.flatnonzero(signals["stream"] == s)
-        if len(own):
-            untested = np.isnan(signals["tested"][own])
-            errors = np.where(untested, np.nan, signals[ERROR][own])[:, None]
-            at = signals.frames[own], signals.iterations[own]
+    for s in selected:
+        watched = np.flatnonzero(signals["stream"] == s)
+        if len(watched):
+            untested = np.isnan(signals["tested"][watched])
+            errors = np.where(untested, np.nan, signals[ERROR][watched])[:, None]
+            at = signals.frames[watched], signals.iterations[watched]
             path = f"{root}/{ERROR}/{part(rows.spec.streams, s)}"
             rows.lines(path, [name], at, errors, [colour(number)], gap=signals.tau)
 
@@ -109,8 +109,10 @@ def _layout(
     table = rrb.TextDocumentView(origin="/summary", name="Runs")
     grid = rrb.Grid(*panels(CURVES), grid_columns=2)
     tabs = [rrb.Vertical(table, grid, row_shares=[1, 3], name="Overview")]
-    names, shown = outline.names(), outline.streams(MOST_STREAMS)
-    errors = {f"{ERROR}/{part(names, s)}": f"Learning error of {drawable(names[s])}" for s in shown}
+    names, selected = outline.names(), outline.streams(MOST_STREAMS)
+    errors = {
+        f"{ERROR}/{part(names, s)}": f"Learning error of {drawable(names[s])}" for s in selected
+    }
     if views := panels(errors):
         tabs.append(rrb.Vertical(*views, name="Streams"))
     return blueprint(*tabs, name="Comparison", timeline=ITERATION, length=length, tab=tab)

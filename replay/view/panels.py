@@ -60,7 +60,7 @@ def run_layout(
 
     Args:
         outline: the run in short.
-        rows: what was written; None before anything is.
+        rows: the written rows; None before there are any.
         has_scene: the world is there in 3D.
         followed: panels of what each module has learned.
         sheets: modules whose images of least to greatest output are there.
@@ -80,7 +80,7 @@ class RunLayout:
 
     Args:
         outline: the run in short.
-        rows: what was written; None before anything is: then every panel is there.
+        rows: the written rows; None before there are any: then every panel is there.
         has_scene: the world is there in 3D.
     """
 
@@ -100,16 +100,16 @@ class RunLayout:
         return rrb.Horizontal(*columns, column_shares=[2, 5], name=tab.name)
 
     def _column(self, panels: Sequence[Panel], name: str) -> rrb.Container:
-        """Return panels below one another, and those of modules beside one another."""
-        found: list[tuple[Panel, Views]] = []
+        """Return panels below one another, and panels of modules beside one another."""
+        placed: list[tuple[Panel, Views]] = []
         for panel in panels:
             if views := self._views(panel):
-                if panel.beside and found:
-                    found[-1][1].extend(views)
+                if panel.beside and placed:
+                    placed[-1][1].extend(views)
                 else:
-                    found += [(panel, views[i : i + ACROSS]) for i in range(0, len(views), ACROSS)]
-        heights = self._heights([panel for panel, _ in found])
-        return rrb.Vertical(*(beside(views) for _, views in found), row_shares=heights, name=name)
+                    placed += [(panel, views[i : i + ACROSS]) for i in range(0, len(views), ACROSS)]
+        heights = self._heights([panel for panel, _ in placed])
+        return rrb.Vertical(*(beside(views) for _, views in placed), row_shares=heights, name=name)
 
     def _heights(self, panels: Sequence[Panel]) -> list[float]:
         """Return the heights of rows, so that a small screen shows each lane."""
@@ -118,7 +118,7 @@ class RunLayout:
         plots = sum(p.height for p, count in zip(panels, counts, strict=True) if not count)
         left = max(HEIGHT - sum(high), LEAST * counts.count(0))
         pairs = zip(panels, high, strict=True)
-        return [float(own or left * panel.height / plots) for panel, own in pairs]
+        return [float(lane or left * panel.height / plots) for panel, lane in pairs]
 
     def _views(self, panel: Panel) -> Views:
         """Return the views of a panel: none, one, or one for each module."""
@@ -192,7 +192,7 @@ class RunLayout:
         return rrb.Vertical(above, *below, row_shares=[5, *(2 for _ in below)], name="World")
 
     def modules(self, sheets: Collection[int]) -> rrb.Container:
-        """Return the modules, each on a page of its own; many stand on pages together."""
+        """Return the modules, each on a page of its own; many share pages."""
         count = max(self._outline.modules, len(self._outline.saved))
         truth = Panel("What the world knows", ("/world/truth",), "near")
         known: Views = [*(self._views(truth) if self._spec.truth else ()), events("Events")]
@@ -242,12 +242,12 @@ class RunLayout:
         ]
 
     def _streams(self, title: str) -> rrb.View | rrb.Container:
-        """Return what each stream showed last; of a scene or of numbers what is watched now."""
+        """Return the last image of each stream; of a scene or of numbers the input."""
         if self._has_scene or not self._spec.images:
             return self._input(title)
         count = min(len(self._spec.streams), MOST_STREAMS)
-        shown = bounds(count, *self._spec.frame_shape)
-        return images(f"/{WALL}", "What each stream showed last", shown)
+        wall = bounds(count, *self._spec.frame_shape)
+        return images(f"/{WALL}", "What each stream showed last", wall)
 
     def _input(self, name: str) -> rrb.View | rrb.Container:
         """Return the learner's input: an image with the name of its stream, or the last values."""

@@ -72,9 +72,10 @@ _DRAWN = (
 @lru_cache(maxsize=4096)
 def drawable(text: str) -> str:
     """Return a text without the letters that the viewer cannot draw."""
-    kept = (c for c in text if c not in "⟨⟩")
+    letters = (c for c in text if c not in "⟨⟩")
     return "".join(
-        c if c == "\n" or any(low <= ord(c) <= high for low, high in _DRAWN) else "?" for c in kept
+        c if c == "\n" or any(low <= ord(c) <= high for low, high in _DRAWN) else "?"
+        for c in letters
     )
 
 

@@ -115,7 +115,7 @@ class RunView:
 
 
 class Inputs:
-    """Writes what was watched, the ground truth, and events in words.
+    """Writes the watched frames, the ground truth, and events in words.
 
     Args:
         rows: of the recording.
@@ -280,14 +280,14 @@ class SignalCurves:
         one candidate to the next; interest is where the stream was hardly watched.
         """
         for s in self._streams:
-            own, name = columns["stream"] == s, self._names[s]
+            watched, name = columns["stream"] == s, self._names[s]
             place, rgb = part(self._names, s), colour(s)
-            untested = np.isnan(columns["tested"][own])
-            for signal in OF_STREAM if own.any() else ():
-                values = power_of_ten(np.where(untested, np.nan, columns[signal][own]))
+            untested = np.isnan(columns["tested"][watched])
+            for signal in OF_STREAM if watched.any() else ():
+                values = power_of_ten(np.where(untested, np.nan, columns[signal][watched]))
                 rgbs = [faint(rgb) if signal == "fitted" else rgb]
                 names = [f"{SIGNALS[signal].symbol} {name}"]
-                yield Curve(f"streams/log_{signal}/{place}", names, values, rgbs, own)
+                yield Curve(f"streams/log_{signal}/{place}", names, values, rgbs, watched)
             interest = columns["interest"][:, s]
             values = np.where(interest < HARDLY_WATCHED, interest, np.nan)
             yield Curve(f"streams/interest/{place}", [name], values, [rgb])

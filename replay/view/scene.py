@@ -69,13 +69,13 @@ PRESET = (
 def world_of_run(
     rows: Rows, header: RunHeader, folder: Path, streams: Sequence[int], every: int
 ) -> tuple[SceneView | WallView | None, list[str]]:
-    """Return a run's world, and what is uncertain about it.
+    """Return a run's world, and its uncertain parts.
 
     Args:
         rows: of the recording.
         header: of the run's log.
         folder: of the run.
-        streams: those that are shown.
+        streams: that are shown.
         every: frames from one pose of the scene to the next.
 
     Returns:
@@ -105,8 +105,8 @@ def _learned_from(header: RunHeader, folder: Path, sha256: str) -> Scenery | Non
     named = _table(header.manifest.get("command")).get("source")
     for name in named if isinstance(named, list) else []:
         with contextlib.suppress(CdmisfaError, OSError, ValueError):
-            if found := scenery_of_recording(folder / str(name), sha256=sha256):
-                return found
+            if scenery := scenery_of_recording(folder / str(name), sha256=sha256):
+                return scenery
     return None
 
 
@@ -124,8 +124,8 @@ def scenery_of_recording(path: Path, sha256: str | None = None) -> Scenery | Non
     data, pose = b"{}", None
     for file in log_files(path):  # the first has it, unless they are many
         with LogReader(file) as reader:
-            if own := [entry for entry in reader.attachments if entry.name == CONFIG_NAME]:
-                data, pose = bytes(reader.attachment_data(own[0])), first_pose(reader)
+            if entries := [entry for entry in reader.attachments if entry.name == CONFIG_NAME]:
+                data, pose = bytes(reader.attachment_data(entries[0])), first_pose(reader)
                 break
     if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
         return None
@@ -145,7 +145,7 @@ class SceneView:
 
     Args:
         rows: of the recording.
-        scenery: what stands where.
+        scenery: the robot and the objects around it.
         every: frames from one pose to the next.
 
     Attributes:
@@ -154,7 +154,7 @@ class SceneView:
 
     def __init__(self, rows: Rows, scenery: Scenery, every: int) -> None:
         self._rows, self._spec, self._every = rows, rows.spec, every
-        self._scenery, self._watched, self._shown = scenery, -1, False
+        self._scenery, self._watched, self._is_posed = scenery, -1, False
         self._looks: Gaze | None = None
         self._joints: UrdfTree | None = None
         self.notes: list[str] = []
@@ -177,7 +177,7 @@ class SceneView:
             self.notes = [f"the robot's body is not shown: {error}"]
 
     def take(self, batch: Batch) -> None:
-        """Write what a log holds of some iterations."""
+        """Write the messages of some iterations."""
         for columns in batch.signals:
             self._turn(columns)
         for frames, truth in batch.truth:
@@ -186,8 +186,8 @@ class SceneView:
 
     def move(self, frames: IntArray, truth: FloatArray) -> None:
         """Put the objects where (n, D) truth says they are at n frames."""
-        shown = frames % self._every == 0
-        frames, truth = frames[shown], truth[shown]
+        drawn = frames % self._every == 0
+        frames, truth = frames[drawn], truth[drawn]
         for thing in self._objects:
             places = thing.places(self._spec.truth, truth)
             self._rows.buffer(f"{SCENE}/{thing.name}", (frames, None), places, encode=_places)
@@ -212,20 +212,20 @@ class SceneView:
         if view not in self._spec.streams or yaw not in self._spec.truth or not len(blocks.starts):
             return
         s, places = self._spec.streams.index(view), blocks.places(frames)
-        shown = np.flatnonzero((blocks.streams[places] == s) & (frames % self._every == 0))
-        yaws, gaze = truth[shown, self._spec.truth.index(yaw)], self._scenery.gazes[0]
-        at = zip(frames[shown].tolist(), blocks.iterations[places[shown]].tolist(), strict=True)
+        drawn = np.flatnonzero((blocks.streams[places] == s) & (frames % self._every == 0))
+        yaws, gaze = truth[drawn, self._spec.truth.index(yaw)], self._scenery.gazes[0]
+        at = zip(frames[drawn].tolist(), blocks.iterations[places[drawn]].tolist(), strict=True)
         gazes = (self._scenery.turned(gaze, turned) for turned in yaws)
         self._look([(*when, look, colour(s)) for when, look in zip(at, gazes, strict=True)])
 
     def _look(self, poses: Sequence[tuple[int, int, Gaze, Rgb]]) -> None:
-        """Show where the head looks at frames, in iterations, and the colour of what it watches."""
+        """Show where the head looks at frames, in iterations, and the watched view's colour."""
         if not poses:
             return
         frames, iterations, gazes, rgbs = zip(*poses, strict=True)
         at = np.array(frames), np.array(iterations)
-        if not self._shown:
-            self._shown = True  # the eyes are the same in every view, and the arms never move
+        if not self._is_posed:
+            self._is_posed = True  # the eyes are the same in every view, and the arms never move
             edges = rr.LineStrips3D(pyramid(gazes[0].middle), radii=[THICK])
             self._rows.log(f"{WATCHING}/edges", edges)
             for name, angle in {**self._scenery.arms, NECK_PITCH: gazes[0].pitch}.items():
@@ -273,7 +273,7 @@ def pyramid(eye: Eye) -> list[list[list[float]]]:
 
 
 def _shape(thing: Thing, light: float = 0.0) -> Any:
-    """Return what a thing looks like; grey ones are made lighter."""
+    """Return the shape and colour of a thing; grey ones are made lighter."""
     light = light if len(set(thing.colour)) == 1 else 0.0
     rgb = [round(255 * min(part + light, 1.0)) for part in thing.colour]
     half = [size / 2 for size in thing.size]
@@ -286,7 +286,7 @@ def _shape(thing: Thing, light: float = 0.0) -> Any:
 
 
 def write_body(recording: rr.RecordingStream, robot: str) -> UrdfTree:
-    """Show a robot that stands upright in the frame of the scene, and return its joints.
+    """Show a robot upright in the frame of the scene, and return its joints.
 
     Args:
         recording: the recording.
@@ -303,20 +303,20 @@ def write_body(recording: rr.RecordingStream, robot: str) -> UrdfTree:
         raise ValueError(f"icub-models has no {robot[:60]!r}")
     model = Path(icub_models.get_model_file(robot))
     share = next(folder for folder in model.parents if (folder / "robots").is_dir())
-    shown: Any = ElementTree.parse(model)
-    shown.getroot().set("name", BODY)
-    for link in shown.iter("link"):
+    urdf: Any = ElementTree.parse(model)
+    urdf.getroot().set("name", BODY)
+    for link in urdf.iter("link"):
         for collision in link.findall("collision"):
             link.remove(collision)
-    for mesh in shown.iter("mesh"):
+    for mesh in urdf.iter("mesh"):
         mesh.set("filename", mesh.get("filename", "").replace(PACKAGE, f"{share}/"))
     with tempfile.TemporaryDirectory(prefix="cdmisfa-robot-") as folder:
         file, joints = Path(folder) / model.name, f"{SCENE}/joints"
-        shown.write(file)
+        urdf.write(file)
         tree = UrdfTree.from_file_path(
             file, entity_path_prefix=SCENE, static_transform_entity_path=joints
         )
         tree.log_urdf_to_recording(recording)
-    stands = rr.Transform3D(parent_frame=f"tf#/{SCENE}", child_frame=tree.root_link().name)
-    recording.log(f"{SCENE}/stands", stands, static=True)
+    upright = rr.Transform3D(parent_frame=f"tf#/{SCENE}", child_frame=tree.root_link().name)
+    recording.log(f"{SCENE}/stands", upright, static=True)
     return tree

@@ -74,7 +74,7 @@ class WallView:
 
     Args:
         rows: of the recording.
-        streams: those that are shown.
+        streams: that are shown.
         by_progress: the run is one of the progress learner.
     """
 
@@ -89,7 +89,7 @@ class WallView:
             rows.log(self._paths[s], rr.Transform3D(translation=[*corner, 0.0]))
 
     def take(self, batch: Batch) -> None:
-        """Write what a log holds of some iterations."""
+        """Write the messages of some iterations."""
         for columns in batch.signals:
             self._frame(columns)
             for s in self._paths:
@@ -100,9 +100,9 @@ class WallView:
             last = np.flatnonzero(np.diff(places, append=len(blocks.starts)))
             streams = blocks.streams[places[last]]
             for s in self._paths.keys() & set(streams.tolist()):
-                shown = last[streams == s]
-                at = frames[shown], blocks.iterations[places[shown]]
-                self._rows.frames(self._paths[s], at, images[shown])
+                rows = last[streams == s]
+                at = frames[rows], blocks.iterations[places[rows]]
+                self._rows.frames(self._paths[s], at, images[rows])
 
     def _frame(self, columns: SignalColumns) -> None:
         """Put the frame around the watched stream; around one that is not shown it has no size."""
