@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.modules import Module, columns_of
 from replay.view.build import recording_to, view_entities
-from replay.view.layouts import NEAR, blueprint, images, lines
+from replay.view.layouts import NEAR, blueprint, curve_view, images
 from replay.view.rows import MOST_STREAMS, Rows, drawable, part
 
 if TYPE_CHECKING:
@@ -72,12 +72,12 @@ class ViewSink:
         stream, name = part(self._spec.streams, s), drawable(self._spec.streams[s])
         entity, end = f"/{view_entities(self._spec)[s]}", self._end
         column = rrb.Vertical(
-            images(entity, name) if self._spec.images else lines(name, [entity], end),
-            lines("Novelty of blocks: known below 1", [f"/novelty/{stream}"], end),
-            lines("Slowness of first outputs [1/frame]", [f"/slowness/{stream}"], end),
+            images(entity, name) if self._spec.images else curve_view(name, [entity], end),
+            curve_view("Novelty of blocks: known below 1", [f"/novelty/{stream}"], end),
+            curve_view("Slowness of first outputs [1/frame]", [f"/slowness/{stream}"], end),
         )
         outputs = [
-            lines(f"Module {m.index}: outputs", [f"/outputs/{stream}/{m.index}"], near=NEAR)
+            curve_view(f"Module {m.index}: outputs", [f"/outputs/{stream}/{m.index}"], near=NEAR)
             for m, _ in self._modules
         ]
         return rrb.Horizontal(column, rrb.Vertical(*outputs), column_shares=[2, 3], name=name)

@@ -26,7 +26,7 @@ from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_batches, read_header
 from replay.runs.modules import load_modules
 from replay.runs.run import Tally, read_outline
-from replay.view.layouts import blueprint, images, lines, scene
+from replay.view.layouts import blueprint, curve_view, images, scene
 from replay.view.panels import run_layout
 from replay.view.rows import MOST_STREAMS, Rows, drawable, part
 from replay.view.run import RunView
@@ -230,7 +230,7 @@ def recording_layout(
     places = list(zip(view_entities(spec), map(drawable, spec.streams), strict=True))
     tabs = list[rrb.Container]()
     views: rrb.Container = rrb.Vertical(
-        *(lines(name, [f"/{entity}"], end) for entity, name in places)
+        *(curve_view(name, [f"/{entity}"], end) for entity, name in places)
     )
     if spec.images:
         views_of = [images(f"/{entity}", name) for entity, name in places]
@@ -238,6 +238,6 @@ def recording_layout(
     if has_scene:
         column = rrb.Vertical(*(images(f"/{entity}", name) for entity, name in places))
         tabs.append(rrb.Horizontal(scene(), column, column_shares=[5, 2], name="World"))
-    below = [lines("What the world knows", ["/world/truth"], end)] if spec.truth else []
+    below = [curve_view("What the world knows", ["/world/truth"], end)] if spec.truth else []
     tabs.append(rrb.Vertical(views, *below, name="Views"))
     return blueprint(*tabs, name="Recording", length=end, tab=tab)

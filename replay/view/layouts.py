@@ -132,7 +132,7 @@ def blueprint(
     )
 
 
-def lines(
+def curve_view(
     name: str,
     entities: Sequence[str],
     end: int = 0,
@@ -174,7 +174,7 @@ def lines(
 def lanes(
     name: str, entities: Sequence[str], end: int = 0, *, near: int = 0, room: bool = True
 ) -> rrb.View:
-    """Return states over time, in line with plots of the same time; see `lines`."""
+    """Return states over time, in line with plots of the same time; see `curve_view`."""
     axis = None
     if near:
         axis = _axis(-near, round(ROOM * near) if room else 0, CURSOR)

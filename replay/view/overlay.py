@@ -14,7 +14,7 @@ from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Row
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
-from replay.view.layouts import blueprint, lines
+from replay.view.layouts import blueprint, curve_view
 from replay.view.rows import ITERATION, MOST_STREAMS, Rows, drawable, part, power_of_ten
 from replay.view.summary import text_table
 
@@ -101,7 +101,7 @@ def _layout(
 
     def panels(titles: dict[str, str]) -> list[rrb.View]:
         return [
-            lines(title, [f"/{root}/{entity}" for root in roots], length)
+            curve_view(title, [f"/{root}/{entity}" for root in roots], length)
             for entity, title in titles.items()
             if any(f"{root}/{entity}" in written for root in roots)
         ]

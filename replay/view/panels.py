@@ -16,10 +16,10 @@ from replay.view.layouts import (
     Views,
     beside,
     blueprint,
+    curve_view,
     events,
     images,
     lanes,
-    lines,
     scene,
     tabs_of,
 )
@@ -157,7 +157,7 @@ class RunLayout:
         """Return the curves of a panel, with a legend where they are several."""
         several = len(entities) > 1 or "*" in entities[0] or self._outline.outputs > 1
         several |= entities[0] in ("/decision/attention", "/world/truth")
-        return lines(
+        return curve_view(
             title,
             entities,
             self._end,
@@ -225,7 +225,7 @@ class RunLayout:
                 ends["of its stream"] = int(later[-1]) + self._outline.tau
             entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
             windows: Views = [
-                lines(f"The last {NEAR} frames {words}", entities, end, start=end - NEAR)
+                curve_view(f"The last {NEAR} frames {words}", entities, end, start=end - NEAR)
                 for words, end in ends.items()
             ]
             output.append(beside(windows))
@@ -238,7 +238,7 @@ class RunLayout:
         output = f"Output of module {i} wherever its own stream was watched"
         return [
             self._weights(f"/modules/{i}/weights", f"Weights of module {i}{colours}"),
-            lines(output, [f"/modules/{i}/output", f"/modules/{i}/saved"], self._end),
+            curve_view(output, [f"/modules/{i}/output", f"/modules/{i}/saved"], self._end),
         ]
 
     def _streams(self, title: str) -> rrb.View | rrb.Container:
@@ -255,7 +255,7 @@ class RunLayout:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
-        values = lines(name, ["/world/watched"], near=NEAR)
+        values = curve_view(name, ["/world/watched"], near=NEAR)
         whose = lanes("Of which stream", ["/attends"], near=NEAR)
         return rrb.Vertical(values, whose, row_shares=[3, 2])
 
