@@ -135,10 +135,10 @@ def record(
     elif not holds_recording(folder):
         raise UsageError(f"{folder} holds no recording to go on with: choose another folder")
     recording = recording_spec(source, settings, scene)
-    for view in views or ():
-        if view not in recording.spec.streams:
-            raise UsageError(f"no view {view!r}: name one of {', '.join(recording.spec.streams)}")
-    chosen = [name for name in recording.spec.streams if not views or name in views]
+    streams = recording.spec.streams
+    if unknown := [view for view in views or () if view not in streams]:
+        raise UsageError(f"no view {unknown[0]!r}: name one of {', '.join(streams)}")
+    chosen = [name for name in streams if not views or name in views]
     default = length or DEFAULT_FRAMES
     with ExitStack() as open_logs:
         stale = other_recordings(folder, recording) if force else []
@@ -152,11 +152,9 @@ def record(
         logs = ViewLogs(folder, recording, settings, places, frames, split, poses)
         open_logs.callback(logs.abandon)
         starts = logs.starts()
-        blocks = (
-            render_in_processes(scene, starts, frames, jobs)
-            if scene and jobs > 1 and starts
-            else take_here(source, starts, frames)
-        )
+        blocks = take_here(source, starts, frames)
+        if scene and jobs > 1 and starts:
+            blocks = render_in_processes(scene, starts, frames, jobs)
         with contextlib.closing(blocks):
             for block in blocks:
                 logs.write(block)
