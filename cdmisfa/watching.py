@@ -17,6 +17,7 @@ from cdmisfa.core.signals import BlockSignals
 
 try:
     from gymnasium import Env
+    from gymnasium.error import ResetNeeded
     from gymnasium.spaces import Box, Discrete
 except ImportError:
 
@@ -131,13 +132,13 @@ class WatchEnv(Env):
             `info`.
 
         Raises:
-            UsageError: there is no episode.
+            ResetNeeded: there is no episode.
             ValueError: there is no such stream.
             LogExhaustedError: the source has not enough for a single block.
         """
         learner: Any = self.learner
         if self._ended:
-            raise UsageError("there is no episode, or it is over: call reset()")
+            raise ResetNeeded("there is no episode, or it is over: call reset()")
         reward, terminated = 0.0, False
         turn_to(self._source, self._watched, int(action))
         self._watched = int(action)

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from waiting import python
 
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.progress.attention import ProgressConfig
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.watching import WatchEnv
@@ -104,7 +105,7 @@ def test_where_the_source_ends_it_is_truncated() -> None:
     assert [truncated for _, _, _, truncated, _ in steps] == [False, False, True]
     assert steps[2][1] == 0.0
     np.testing.assert_array_equal(steps[2][0], steps[1][0])
-    with pytest.raises(UsageError, match="call reset"):
+    with pytest.raises(ResetNeeded, match="call reset"):
         env.step(0)
     env.reset(seed=0)
     with pytest.raises(LogExhaustedError, match="20 frames are left"):

@@ -184,8 +184,9 @@ def read_json(path: Path, remedy: str, *, most: int = MAX_JSON) -> Any:
 
 
 def _check(path: Path, limit: int | None) -> None:
-    found = os.stat(path)
-    if not stat.S_ISREG(found.st_mode):
-        raise UsageError(f"{path}: no regular file")
-    if limit is not None and found.st_size > limit:
-        raise UsageError(f"{path}: {found.st_size} bytes, above the limit of {limit}")
+    status = os.stat(path)
+    problem = "" if stat.S_ISREG(status.st_mode) else "no regular file"
+    if limit is not None and status.st_size > limit:
+        problem = problem or f"{status.st_size} bytes, above the limit of {limit}"
+    if problem:
+        raise UsageError(f"{path}: {problem}")

@@ -226,7 +226,7 @@ def open_source(
     """
     if is_scene(words):
         if how.get("episodes"):
-            raise UsageError(f"{words[0]} is a scene: episodes are of logs, as of recordings of it")
+            raise UsageError(f"{words[0]} is a scene: --episodes is for logs")
         scene = configure(str(words[0]), preset, settings, seed, inputs)
         return scene.open_scene(), scene
     inputs = read_inputs(inputs, preset, settings)
@@ -283,11 +283,11 @@ def open_logs(
         )
     for path in (paths := locations(words)):
         if not path.exists():
-            if str(path) in SCENES:
-                raise UsageError(f"{path} is a scene: name it alone")
             _, colon, address = str(path).partition(":")
-            kinds = [f"{kind}:{address}" for kind in CAMERAS if colon]
-            raise no_such(path, [*SCENES, *kinds], f"the scenes are {', '.join(SCENES)}")
+            known = [*SCENES, *(f"{kind}:{address}" for kind in CAMERAS if colon)]
+            if str(path) in SCENES:
+                raise no_such(path, [], "a scene is named alone")
+            raise no_such(path, known, f"the scenes are {', '.join(SCENES)}")
     how: Any = {"loop": loop, "salvage": salvage}
     source: StoredSource | None = None
     if episodes or may_be_corpus(words):

@@ -8,7 +8,6 @@ import numpy as np
 
 from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.errors import UsageError
 
 
 def project(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
@@ -27,13 +26,9 @@ def project(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
         (n, R).
 
     Raises:
-        UsageError: these are no frames of I values, or phi and offset no weights of some rows.
+        UsageError: these are no frames of I values, or there are not R offsets.
     """
     phi, offset = np.asarray(phi, dtype=np.float64), np.asarray(offset, dtype=np.float64)
-    if phi.ndim != 2 or offset.shape != phi.shape[:1]:
-        raise UsageError(
-            f"weights of shape {phi.shape} and offsets of {offset.shape} given: give (R, I), (R,)"
-        )
     return kernels.outputs(phi, offset, frames)
 
 
