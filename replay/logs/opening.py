@@ -203,13 +203,13 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
     """
     kind = log_format(path)
     if kind == "dataset":
-        return lerobot.channels(path)
+        return lerobot.dataset_channels(path)
     if kind == "bag":
-        return bag.channels(path, whole=whole)
+        return bag.bag_channels(path, whole=whole)
     if kind == "table":
-        return table.channels(path)
+        return table.table_channels(path)
     if kind == "arrays":
-        return arrays.channels(path)
+        return arrays.array_channels(path)
     with open_stream(path) as stream:
         first, last = (None, None) if stream.times is None else map(int, stream.times[[0, -1]])
         facts = ChannelFacts(

@@ -121,7 +121,7 @@ def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def channels(path: Path) -> list[ChannelFacts]:
+def array_channels(path: Path) -> list[ChannelFacts]:
     """Return the arrays of a file; raises as `load_numbers`."""
     facts = []
     for name, array in load_numbers(path).items():

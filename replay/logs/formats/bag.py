@@ -123,7 +123,7 @@ def streams(
     return opened_streams
 
 
-def channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
+def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
     """Return the topics of a bag, by the index of a .bag or the columns of a database.
 
     Args:
@@ -163,7 +163,7 @@ def _remark(path: Path) -> str:
 
 @contextlib.contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag; raises as `channels` does."""
+    """Open a bag; raises as `bag_channels` does."""
     try:
         from rosbags.rosbag1 import Reader as Rosbag1
         from rosbags.rosbag2 import Reader as Rosbag2

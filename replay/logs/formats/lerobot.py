@@ -204,7 +204,7 @@ def is_dataset(path: Path) -> bool:
     return (path / INFO).is_file()
 
 
-def channels(path: Path) -> list[ChannelFacts]:
+def dataset_channels(path: Path) -> list[ChannelFacts]:
     """Return the features of a dataset, one value a frame."""
     info = _info(path)
     facts = []

@@ -136,7 +136,7 @@ def number_stream(
     )
 
 
-def channels(path: Path) -> list[ChannelFacts]:
+def table_channels(path: Path) -> list[ChannelFacts]:
     """Return the columns of a table; raises as `streams`."""
     table, kind = _read(path), path.suffix[1:]
     remark = f"{path}: a table has no checksums, changed numbers would go unnoticed"
