@@ -14,7 +14,7 @@ from folders import contents
 from live_cameras import SHAPE, bar
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
-from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.recording import RecordingStoppedError, record
 from replay.inputs import open_recording
 
@@ -124,28 +124,3 @@ def test_a_source_that_ends_is_recorded_to_its_end(tmp_path: Path) -> None:
     assert [file.frames for file in files] == [70, 70]
     with pytest.raises(UsageError, match=r"--frames is 71: .*no more than the 70"):
         record(Webcams(length=70), tmp_path / "other", frames=71)
-
-
-IMAGES = SourceSpec(("a", "b"), (4, 6, 3), "uint8")
-FAST = SourceSpec(("a", "b"), SHAPE, "uint8", fps=1e7)
-OTHER = SourceSpec(("left", "right"), (9, 9), "uint8")
-
-
-@pytest.mark.parametrize(
-    ("spec", "options", "words"),
-    [
-        (IMAGES, {}, r"\(4, 6, 3\) uint8"),
-        (FAST, {}, "give its source such an fps"),
-        (OTHER, {}, r"left shows \(12, 16\) uint8 at frame 0, not the \(9"),
-        (None, {"jobs": 2}, "only a scene can be opened by several processes"),
-        (None, {"folder": "s3://x/y"}, "s3://x/y is a URL: name a path on this machine"),
-    ],
-)
-def test_what_cannot_be_recorded_is_refused(
-    tmp_path: Path, spec: SourceSpec | None, options: dict[str, Any], words: str
-) -> None:
-    source = Webcams()
-    source.spec = spec or source.spec
-    with pytest.raises(CdmisfaError, match=words):
-        record(source, **{"folder": tmp_path / "rec", "frames": 9, **options})
-    assert not list(tmp_path.glob("rec/*.mcap"))

@@ -25,15 +25,8 @@ from cdmisfa.modules import Module
 from replay.runs.modules import load_modules
 
 FRAMES = 6000
-LEARN = (
-    "--set",
-    "input.time=t",
-    "--set",
-    "learner.expansion=none",
-    "--set",
-    "learner.outputs=2",
-    "--json",
-)
+SETTINGS = ("input.time=t", "learner.expansion=none", "learner.outputs=2")
+LEARN = (*(word for setting in SETTINGS for word in ("--set", setting)), "--json")
 
 
 def values(frames: int = FRAMES) -> NDArray[Any]:
