@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from cdmisfa import kernels
 from cdmisfa.core.arrays import as_array, centred, mean_of, without_table
-from cdmisfa.core.blocks import PIXEL, UINT8
+from cdmisfa.core.blocks import PIXEL, UINT8, Described
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, expanded_size
-from cdmisfa.core.shown import Shown, weights
 
 if TYPE_CHECKING:  # the mind knows no images: who saves a module adds how they became frames
     from recorder.images.framing import Recipe
@@ -26,7 +25,7 @@ CHUNK = 1024
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Module(Shown):
+class Module(Described):
     """A frozen abstraction with the policy that led to it.
 
     Attributes:
@@ -169,12 +168,6 @@ class Module(Shown):
             "frames": shape,
             "slowness": eta,
         }
-
-    def _picture(self) -> NDArray[np.uint8] | None:
-        """The weights of the slowest output."""
-        own = self.frame_shape
-        plain = len(own) == 2 and prod(own) == self.phi.shape[1]
-        return weights(self.phi[0].reshape(own if plain else (1, -1)))
 
 
 def columns_of(modules: Sequence[Module]) -> Iterator[tuple[Module, slice]]:

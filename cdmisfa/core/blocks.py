@@ -7,6 +7,7 @@ whichever is watched, as the channels of a television do.
 from __future__ import annotations
 
 import contextlib
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time_of, times_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from cdmisfa.core.shown import Shown
 
 # The only type whose values are pixels, and the value of one step of a pixel.
 UINT8 = np.dtype(np.uint8)
@@ -190,7 +190,22 @@ class LongSource(FrameSource, Protocol):
         """What `describe` says, with less of each file where reading all of them takes long."""
 
 
-class ForwardSource(Shown, FrameSource):
+class Described:
+    """An object whose `repr` states some facts about it."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def _facts(self) -> Mapping[str, Any]:
+        """Return facts about the object, by names."""
+
+    def __repr__(self) -> str:
+        first, *rest = self._facts().items()
+        facts = "".join(f", {name} {value}" for name, value in rest)
+        return f"<{type(self).__name__} {first[1]}{facts}>"
+
+
+class ForwardSource(Described, FrameSource):
     """A source that holds its spec and its clock, and need not be able to go back.
 
     A class that derives from it sets `_spec`, and `_t` where its first frame is not 0.

@@ -10,11 +10,10 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.blocks import Described, SourceSpec
 from cdmisfa.core.errors import UsageError, did_you_mean
-from cdmisfa.core.shown import Shown
 from cdmisfa.experiments.sources import open_logs
-from cdmisfa.public.shown import view
+from cdmisfa.public.viewing import view
 from recorder.images.options import InputOptions
 from replay.inputs import open_arrays
 
@@ -29,7 +28,7 @@ def as_words(given: Given) -> tuple[str, ...]:
     return tuple(map(str, several)) if all(isinstance(w, str | Path) for w in several) else ()
 
 
-class Recording(Shown):
+class Recording(Described):
     """A recording, external logs, or arrays, to look at and to learn from.
 
     Args:

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import replay.runs.run
+from cdmisfa.core.blocks import Described
 from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.core.learning import Learner
-from cdmisfa.core.shown import Shown
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.resume import Recomputation
 from cdmisfa.public.recording import Recording, as_words
-from cdmisfa.public.shown import attended_image, view
+from cdmisfa.public.viewing import view
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
 from replay.runs.run import read_outline
 
@@ -32,7 +32,7 @@ class UnknownSignalError(UsageError, KeyError):
     __str__ = Exception.__str__  # a KeyError's is quoted
 
 
-class Signals(Shown, Mapping[str, "NDArray[Any]"]):
+class Signals(Described, Mapping[str, "NDArray[Any]"]):
     """The signals of a run: arrays by name, and one table with a row per iteration.
 
     `signals["reward"]` is an array (iterations, ...), NaN where a value is missing. In tables
@@ -88,7 +88,7 @@ def _refuse_unknown(name: str, known: Collection[str]) -> None:
         raise UnknownSignalError(f"no signal {name!r}: {did_you_mean(str(name), known)}")
 
 
-class Run(Shown, replay.runs.run.Run):
+class Run(Described, replay.runs.run.Run):
     """A run on disk; each part is read when it is first used.
 
     Args:
@@ -214,7 +214,3 @@ class Run(Shown, replay.runs.run.Run):
             "modules": "; ".join(modules) or "none",
             "ended": (self.result or {}).get("ended", "broken off"),
         }
-
-    def _picture(self) -> NDArray[np.uint8] | None:
-        streams = self.signals["stream"]
-        return attended_image(streams, len(self.streams)) if len(streams) else None

@@ -1,4 +1,4 @@
-"""Small pictures of runs and recordings, and their views."""
+"""Views of runs and recordings in a notebook, a window or a file."""
 
 from __future__ import annotations
 
@@ -9,34 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cdmisfa.core.shown import ROW, WIDTH
 from recorder.images.options import InputOptions
-from replay.palette import colour
 
+# Pixels of the height of a view in a notebook.
 HEIGHT = 600
-"""Pixels of the height of a view in a notebook."""
-
-
-def attended_image(streams: NDArray[Any], count: int) -> NDArray[np.uint8]:
-    """Return an image of the attended stream over time: a row a stream, time to the right.
-
-    Args:
-        streams: (n,) the stream of each iteration.
-        count: how many there are.
-    """
-    width = min(WIDTH, len(streams))
-    columns = np.arange(len(streams)) * width // max(len(streams), 1)
-    share = np.zeros((count, width))
-    np.add.at(share, (streams, columns), 1)
-    share /= np.maximum(share.sum(axis=0), 1)
-    colours = np.array([colour(s) for s in range(count)], float)
-    picture = 255 - share[:, :, None] * (255 - colours[:, None, :])
-    wide = np.repeat(picture, max(WIDTH // max(width, 1), 1), axis=1)
-    height = max(min(ROW, 10 * ROW // max(count, 1)), 1)
-    return np.repeat(wide, height, axis=0).astype(np.uint8)
 
 
 def view(
