@@ -11,7 +11,7 @@ def main() -> NoReturn:
     end_at_once()  # while the rest is imported, too
     from cdmisfa.cli import app
 
-    app.main()
+    app.run_process()
 
 
 def run(args: Sequence[str]) -> int:

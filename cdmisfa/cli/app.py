@@ -121,7 +121,7 @@ def cli() -> None:
     """
 
 
-def main() -> NoReturn:
+def run_process() -> NoReturn:
     """Run the command line of this process."""
     # Imports create many objects and free none. With Python's threshold of 700, collecting garbage
     # took a seventh of the time of a short command.

@@ -45,9 +45,9 @@ def line(text: object = "", *, err: bool = False) -> None:
     click.echo(_safe(text), err=err)
 
 
-def lines(text: str) -> None:
+def text(content: str) -> None:
     """Print several lines to stdout."""
-    for each_line in text.removesuffix("\n").split("\n"):
+    for each_line in content.removesuffix("\n").split("\n"):
         line(each_line)
 
 

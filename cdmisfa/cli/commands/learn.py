@@ -176,6 +176,8 @@ def _opened(
     live = any(map(is_live, words))
     if record_to is not None and not live:
         raise UsageError("--record is for live streams: leave it out")
+    if live and resumed:
+        raise UsageError("live streams cannot go back: learn from a recording of them")
     for folder in filter(None, (out, record_to) if live else ()):
         refuse_existing(folder, force=force, goes_on=False)
     with bar("opening", "logs") as shown:

@@ -95,7 +95,7 @@ def record_command(
     start = read_start(out) if resume else RecordingStart()
     if start.scene in NO_SCENES:
         command = f"cdmisfa convert SOURCE -o {printing.quoted(out)} --resume"
-        raise UsageError(f"{out} is of no scene: resume a conversion with {command}")
+        raise UsageError(f"{out} is of no scene: live streams cannot go back; {command}")
     scene = " ".join(source) or start.scene
     if not scene and resume and not (frames or split) and (files := recorded(out)):
         printing.status(f"{out} is complete: nothing was left to record")

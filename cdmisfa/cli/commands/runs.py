@@ -74,7 +74,7 @@ def _print_comparison(rows: Sequence[Row]) -> None:
         if second.difference is not None:
             printing.line(f"first difference: {second.difference}")
     for explanation in filter(None, (row.explanation() for row in rows)):
-        printing.lines(explanation)
+        printing.text(explanation)
     if len(rows) == 2 and second.difference and second.difference.signal:
         printing.line(f"signals of iteration {second.difference.iteration} that differ:")
         printing.table(("signal", *names), second.difference.differing_signals())
@@ -208,4 +208,4 @@ def signals_command(markdown: bool, as_json: bool) -> None:
     from cdmisfa.experiments import documents
 
     table = documents.markdown(columns, [[f"`{name}`", *cells] for name, *cells in rows])
-    printing.lines(SIGNALS_PAGE.format(version=SCHEMA_VERSION, table=table))
+    printing.text(SIGNALS_PAGE.format(version=SCHEMA_VERSION, table=table))

@@ -158,7 +158,7 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
     if as_json:
         printing.json_document(results.as_json(points))
     elif csv:
-        printing.lines(results.as_csv(points))
+        printing.text(results.as_csv(points))
     else:
         printing.table(*results.as_table(points))
 
@@ -221,7 +221,7 @@ def reproduce_command(
     if as_json:
         printing.document(experiments=documents)
     else:
-        printing.lines("\n".join(f"{d['title']}\n\n{markdown_tables(d)}" for d in documents))
+        printing.text("\n".join(f"{d['title']}\n\n{markdown_tables(d)}" for d in documents))
     for document in documents:
         check_claims(document)
 
