@@ -26,8 +26,8 @@ from replay.runs.folders import RUN_FILE, is_run
 from replay.storage.location import is_url, location
 from replay.storage.opening import log_files, natural_order, no_such, starts_as_log
 
+# Called with logs that were opened to be shown, to print what they are.
 About = Callable[[LoggedSource], None]
-"""Called with logs that were opened to be shown, to print what they are."""
 
 
 def open_log(

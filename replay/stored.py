@@ -17,17 +17,17 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.images.options import Centre
 from replay.storage.identity import Identity
 
+# The frames [start, stop).
 Span = tuple[int, int]
-"""The frames [start, stop)."""
 
+# Frames of an episode that are read at once for its mean.
 PIECE: Final = 64
-"""Frames of an episode that are read at once for its mean."""
 
+# Logs with up to this many bytes are hashed before anything else is done; longer ones later.
 AT_ONCE: Final = 64 * 1024 * 1024
-"""Logs with up to this many bytes are hashed before anything else is done; longer ones later."""
 
+# Called with the number of bytes that were hashed, and of all bytes.
 Progress = Callable[[int, int], None]
-"""Called with the number of bytes that were hashed, and of all bytes."""
 
 
 class StoredSource(ClockedSource):
@@ -59,8 +59,8 @@ class StoredSource(ClockedSource):
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     _loop: bool
+    # The frames of the first lap that each stream has.
     _held: Sequence[Sequence[Span]]
-    """The frames of the first lap that each stream has."""
     _means: dict[int, tuple[Span, NDArray[Any]]] | None = None
     _identities: Sequence[Identity] | None = None
 

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 NANOSECONDS = 1_000_000_000
 
+# Log time of frame 0 where nothing else is set: 2016-01-01, the year of the paper.
 START_NS = 1_451_606_400_000_000_000
-"""Log time of frame 0 where nothing else is set: 2016-01-01, the year of the paper."""
 
+# Frames a second of the slowest clock; the fastest has one a nanosecond, the unit of time.
 SLOWEST = 1e-6
-"""Frames a second of the slowest clock; the fastest has one a nanosecond, the unit of time."""
 
+# Fewest and most frames a second that a recording can have, or logs of cameras be sampled at.
 RECORDED_FPS = (1e-3, 1e6)
-"""Fewest and most frames a second that a recording can have, or logs of cameras be sampled at."""
 
 Times = NDArray[np.int64]
 

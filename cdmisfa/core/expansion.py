@@ -40,6 +40,7 @@ def _pairs(size: int) -> tuple[NDArray[np.intp], ...]:
     return np.triu_indices(size)
 
 
+# Every expansion, by the name that `learner.expansion` takes.
 EXPANSIONS: Registry[Expansion] = Registry(
     "learner.expansion",
     {
@@ -47,7 +48,6 @@ EXPANSIONS: Registry[Expansion] = Registry(
         "quadratic": Expansion(lambda n: n + n * (n + 1) // 2, _inputs_and_products),
     },
 )
-"""Every expansion, by the name that `learner.expansion` takes."""
 
 
 def expanded_size(kind: str, n_inputs: int) -> int:

@@ -110,8 +110,8 @@ class Learner(Protocol):
         """Its part of a run's result, as JSON values."""
 
 
+# Key of a run's manifest: `arithmetic_of` its learner.
 ARITHMETIC = "arithmetic"
-"""Key of a run's manifest: `arithmetic_of` its learner."""
 
 
 def arithmetic_of(learner: Learner) -> int:

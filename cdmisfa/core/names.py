@@ -11,9 +11,9 @@ from datetime import timedelta
 _OF_VIEWS = re.compile(r"(/view/|observation\.images\.)+(?=.)")
 _LONGEST = 64
 
+# How a column of truth is called that is the action for a frame, that is 1 where an episode of a
+# task begins, or that is a joint of the robot.
 ACTION, BEGINS, JOINT = "action_", "begins_", "head_"
-"""How a column of truth is called that is the action for a frame, that is 1 where an episode of a
-task begins, or that is a joint of the robot."""
 
 
 def counted(number: int, what: str, form: str = "") -> str:

@@ -42,8 +42,8 @@ else:
         pass
 
 
+# Samples that are made float64 at once: whole pieces, so that it does not matter.
 CHUNK = 16 * PIECE
-"""Samples that are made float64 at once: whole pieces, so that it does not matter."""
 
 
 class _SlowFeatures(_Estimator):

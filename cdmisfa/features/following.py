@@ -16,14 +16,14 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.features.outputs import slowness_by_moments
 from cdmisfa.features.recursive import RecursiveFeature
 
+# Frames (n, I) in their order, and whether some are missing before them.
 Pieces = Iterable[tuple[NDArray[Any], bool]]
-"""Frames (n, I) in their order, and whether some are missing before them."""
 
+# Directions that are kept while frames are taken in, for each that is wanted of all of them.
 KEPT = 8
-"""Directions that are kept while frames are taken in, for each that is wanted of all of them."""
 
+# Share of the largest variance below which a direction holds rounding noise.
 NOTHING = 1e-10
-"""Share of the largest variance below which a direction holds rounding noise."""
 
 
 class BatchOutputs(NamedTuple):

@@ -18,8 +18,8 @@ from typing import Any
 from setuptools import build_meta
 from setuptools.build_meta import *  # noqa: F403 - the hooks that stay as they are
 
+# Clang, and all it needs to link, in 100 MB.
 ZIG = "ziglang>=0.13,<0.18"
-"""Clang, and all it needs to link, in 100 MB."""
 
 
 def compiler() -> str | None:

@@ -10,6 +10,7 @@ from cffi import FFI
 
 HERE = Path("cdmisfa/kernels")
 
+# All are one translation unit, so that nothing of them is visible outside.
 FILES = (
     "elementary.c",
     "projection.c",
@@ -21,16 +22,15 @@ FILES = (
     "agent.c",
     "frames.c",
 )
-"""All are one translation unit, so that nothing of them is visible outside."""
 
+# No more multiply-adds than are written, and `sqrt` as an instruction.
 FLAGS = ["-O3", "-g0", "-std=gnu11", "-ffp-contract=off", "-fno-math-errno", "-Wall", "-Wno-psabi"]
-"""No more multiply-adds than are written, and `sqrt` as an instruction."""
 
 MACHINE = platform.machine().lower().replace("amd64", "x86_64").replace("arm64", "aarch64")
 X86 = MACHINE == "x86_64"
 
+# For every processor of this kind, though Python may have been built for that of one machine.
 ANY = {"x86_64": ["-march=x86-64"], "aarch64": ["-march=armv8-a"]}.get(MACHINE, [])
-"""For every processor of this kind, though Python may have been built for that of one machine."""
 
 if "ziglang" in os.environ.get("CC", ""):
     ANY = []  # said where it is called: it compiles what it links with, too

@@ -24,25 +24,26 @@ from recorder.images.options import IMAGES, RECIPE, InputOptions
 from recorder.images.pixels import Shown
 from recorder.images.videos import VideoPackets
 
+# Names of the protocol, the newer first.
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Names of the protocol, the newer first."""
 
 _SUBSCRIPTION: Final = 1
 _DATA: Final = 1
+
+# Seconds in which the server must answer.
 _TIMEOUT: Final = 10.0
-"""Seconds in which the server must answer."""
 
+# Seconds to wait for a topic that the server does not have yet.
 TOPIC_SECONDS: Final = 5.0
-"""Seconds to wait for a topic that the server does not have yet."""
 
+# Times to subscribe again: servers name a new channel a moment before they know it.
 _TRIES: Final = 5
-"""Times to subscribe again: servers name a new channel a moment before they know it."""
 
+# Seconds before each of these times.
 _AGAIN: Final = 0.2
-"""Seconds before each of these times."""
 
+# Header of a message: opcode, subscription, log time in nanoseconds.
 HEADER: Final = struct.Struct("<BIQ")
-"""Header of a message: opcode, subscription, log time in nanoseconds."""
 
 # Errors in the threads of websockets are raised here, too: it need not log them with a traceback.
 logging.getLogger("websockets").addHandler(logging.NullHandler())

@@ -26,30 +26,31 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.cameras.readers import CameraState, Readers, Stamped
 from recorder.images.pixels import Shown
 
+# Seconds for which a tick waits for an image that is on its way.
 PATIENCE: Final = 0.2
-"""Seconds for which a tick waits for an image that is on its way."""
 
+# Seconds in which every camera must show its first image.
 START: Final = 30.0
-"""Seconds in which every camera must show its first image."""
 
+# Counts of each stream: images that came; ticks that show the image of the tick before; images
+# that no tick shows, as a newer one had come; images that came after a tick was decided which
+# should have shown them; images no newer than one before them, which are not shown; ticks without
+# an image.
 COUNTED: Final = ("messages", "repeated", "dropped", "late", "disordered", "missing")
-"""Counts of each stream: images that came; ticks that show the image of the tick before; images
-that no tick shows, as a newer one had come; images that came after a tick was decided which should
-have shown them; images no newer than one before them, which are not shown; ticks without an image.
-"""
 
+# Seconds a second by which a camera's clock may be slow.
 DRIFT: Final = 1e-3
-"""Seconds a second by which a camera's clock may be slow."""
 
+# Seconds by which presentation times differ from those due if they start again.
 JUMP: Final = 1.0
-"""Seconds by which presentation times differ from those due if they start again."""
 
+# Images in a row that are later than `JUMP` before presentation times count as started again.
 LATE: Final = 60
-"""Images in a row that are later than `JUMP` before presentation times count as started again."""
 
 _POLL: Final = NANOSECONDS // 10
+
+# Images by which a camera's rate is measured if the camera does not state it.
 _MEASURED: Final = 12
-"""Images by which a camera's rate is measured if the camera does not state it."""
 
 
 class Steady:

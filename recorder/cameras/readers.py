@@ -15,14 +15,14 @@ from recorder.images.framing import Framing, framings, size_of
 from recorder.images.options import Fit, OnLoss, Size
 from recorder.images.pixels import Shown
 
+# Most bytes of images in the queue of one camera.
 QUEUE_BYTES: Final = 64 * 1024 * 1024
-"""Most bytes of images in the queue of one camera."""
 
+# Seconds from a loss to the first try to reconnect, and the longest time between two tries.
 _DELAYS: Final = (0.5, 30.0)
-"""Seconds from a loss to the first try to reconnect, and the longest time between two tries."""
 
+# Seconds for which closing waits for the threads; they are daemons, and end with the process.
 _LEAVE: Final = 0.5
-"""Seconds for which closing waits for the threads; they are daemons, and end with the process."""
 
 
 class Stamped(NamedTuple):

@@ -25,14 +25,14 @@ from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
 
 LARGEST_SEED: Final = 2**31 - 1
 
+# Frames a second of an environment that states no rate.
 FPS: Final = 30.0
-"""Frames a second of an environment that states no rate."""
 
+# The frame of each stream, and the ground truth at it, (D,) float64.
 Step = tuple[Sequence[Any], FloatArray]
-"""The frame of each stream, and the ground truth at it, (D,) float64."""
 
+# Chooses the action for an observation.
 Policy = Callable[[Any], Any]
-"""Chooses the action for an observation."""
 
 
 class SteppedSource(ForwardSource):

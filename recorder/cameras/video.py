@@ -17,14 +17,14 @@ from recorder.images.options import VIDEO_RECIPE
 from recorder.images.pixels import MAX_PIXELS
 from recorder.images.videos import frame_colors, frame_gray, most_pixels, pyav
 
+# Seconds that opening or reading a network stream may take.
 TIMEOUT: Final = 10.0
-"""Seconds that opening or reading a network stream may take."""
 
+# Pixels by which FFmpeg makes an image wider and higher at most before it checks its size.
 PADDED: Final = 64
-"""Pixels by which FFmpeg makes an image wider and higher at most before it checks its size."""
 
+# FFmpeg's flag of formats without times (AVFMT_NOTIMESTAMPS): it invents some, at 25 Hz.
 _TIMELESS: Final = 0x80
-"""FFmpeg's flag of formats without times (AVFMT_NOTIMESTAMPS): it invents some, at 25 Hz."""
 
 _NETWORK: Final = re.compile(r"[a-z][a-z0-9+]+://", re.IGNORECASE)
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@")

@@ -12,8 +12,8 @@ from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.names import stream_names
 from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, InputOptions
 
+# Endings of http addresses that are live streams; others are logs.
 _STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
-"""Endings of http addresses that are live streams; others are logs."""
 
 
 def _foxglove(word: str, name: str, options: InputOptions) -> Any:
@@ -29,13 +29,13 @@ def _video(word: str, name: str, options: InputOptions) -> Any:
     return VideoCamera(word, name, color=options.color is True)
 
 
+# By what its word begins with, the function that opens a `Camera`.
 CAMERAS: Final[dict[str, Callable[..., Any]]] = {
     "foxglove": _foxglove,
     **dict.fromkeys(
         ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp"), _video
     ),
 }
-"""By what its word begins with, the function that opens a `Camera`."""
 
 
 def is_live(word: str) -> bool:

@@ -24,30 +24,32 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.pixels import MAX_PIXELS, MalformedImage, by_bands
 
+# Pixels of the largest image that is decoded in a thread, where no memory limit is possible.
 AT_ONCE: Final = 4_000_000
-"""Pixels of the largest image that is decoded in a thread, where no memory limit is possible."""
 
 _JPEG: Final = b"\xff\xd8"
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _MARKER: Final = re.compile(rb"\xff(?=[^\x00\xff])")
 _END: Final = 0xD9
 _RESTARTS: Final = range(0xD0, 0xD8)
+
+# Marker of arithmetic coding, with which data may end before the pixels do.
 _ARITHMETIC: Final = b"\xff\xc9"
-"""Marker of arithmetic coding, with which data may end before the pixels do."""
 
 _SCAN: Final = b"\xff\xda"
+
+# Most pixels of all scans of a JPEG: 20 scans of the largest image; 10 are usual. A scan of a few
+# bytes takes as long as any other.
 _MOST_SCANNED: Final = 720_000_000
-"""Most pixels of all scans of a JPEG: 20 scans of the largest image; 10 are usual. A scan of a few
-bytes takes as long as any other."""
 
+# Padding behind a scan: libjpeg reads up to 64 bits before it needs them.
 _AHEAD: Final = b"\xff\x00" * 8
-"""Padding behind a scan: libjpeg reads up to 64 bits before it needs them."""
 
+# Bytes before the end marker that may hold no pixels: some cameras leave a few.
 _LEFT: Final = 64
-"""Bytes before the end marker that may hold no pixels: some cameras leave a few."""
 
+# Pillow's modes for 16 bits.
 _WORDS: Final = ("I;16", "I;16B", "I")
-"""Pillow's modes for 16 bits."""
 
 
 def compressed_image(data: bytes, *, color: bool = False, most: int = MAX_PIXELS) -> ByteArray:

@@ -13,11 +13,11 @@ from cdmisfa.core.errors import UsageError
 from recorder.images.options import Depth
 from recorder.images.pixels import MalformedImage
 
+# Most numbers of a message: more than any scan has.
 MOST: Final = 100_000
-"""Most numbers of a message: more than any scan has."""
 
+# Up to here float64 holds every whole number.
 EXACT: Final = 2.0**53
-"""Up to here float64 holds every whole number."""
 
 _STEP: Final = re.compile(r"\.?([^.\[\]]+)|\[(\d{1,9})\]|\[(\d{0,9}):(\d{0,9})\]")
 _PATH: Final = re.compile(rf"[^.\[\]]+(?:\.[^.\[\]]+|{_STEP.pattern.partition('|')[2]})*")

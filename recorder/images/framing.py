@@ -22,8 +22,8 @@ from recorder.images.fields import EXACT, bounded
 from recorder.images.options import Centre, Depth, Fit, Size
 from recorder.images.pixels import MalformedImage, Shown, raw_image, shrink
 
+# Most pixels of a frame if no size is given: those of the paper's frames.
 FRAME_PIXELS: Final = 48 * 128
-"""Most pixels of a frame if no size is given: those of the paper's frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,8 +188,8 @@ def _middle(image: ByteArray, size: Size) -> ByteArray:
     return image[top : top + size[0], left : left + size[1]]
 
 
+# Pixel formats of arrays, by the type and the number of a pixel's values.
 _FORMATS = {("u1", 0): "mono8", ("u2", 0): "mono16", ("u1", 3): "rgb8", ("u1", 4): "rgba8"}
-"""Pixel formats of arrays, by the type and the number of a pixel's values."""
 
 _DISTANCES = {"u2": "16UC1", "f4": "32FC1", "f8": "32FC1"}
 

@@ -30,26 +30,25 @@ from recorder.images.options import Depth, InputOptions
 from recorder.images.pixels import DISTANCES, MalformedImage, Shown, raw_image
 from recorder.images.videos import Packet, VideoPackets
 
+# The bytes of a message.
 Data = bytes | memoryview
-"""The bytes of a message."""
 
+# Decodes a message to an image or to numbers; raises MalformedImage.
+#
+# One that is `VideoPackets` has to be called with the messages in their order.
 Decoder = Callable[[Data], Shown]
-"""Decodes a message to an image or to numbers; raises MalformedImage.
 
-One that is `VideoPackets` has to be called with the messages in their order.
-"""
-
+# Decodes a message to an object with its fields; raises MalformedImage.
 Opened = Callable[[bytes], Any]
-"""Decodes a message to an object with its fields; raises MalformedImage."""
 
+# Reads the time in a message's header, nanoseconds; raises MalformedImage.
 Stamp = Callable[[Data], int]
-"""Reads the time in a message's header, nanoseconds; raises MalformedImage."""
 
+# Header of compressed_depth_image_transport: the format, and two numbers that scale distances.
 _DEPTH_HEADER: Final = struct.Struct("<iff")
-"""Header of compressed_depth_image_transport: the format, and two numbers that scale distances."""
 
+# Most commas of an image in JSON, which has some ten: lists take 20 times the memory of text.
 _MOST_COMMAS: Final = 1000
-"""Most commas of an image in JSON, which has some ten: lists take 20 times the memory of text."""
 
 _SECONDS: Final = ("sec", "secs", "seconds")
 _NANOS: Final = ("nsec", "nsecs", "nanosec", "nanos")
@@ -184,6 +183,7 @@ def _ffmpeg_packet(data: Data) -> Packet:
     return Packet(bytes(fields.data()), codec)
 
 
+# Foxglove's messages with images: their class, and their content.
 _FOXGLOVE: Final[Mapping[str, tuple[Any, Callable[[Any, bytes], Any]]]] = {
     "foxglove.RawImage": (
         RawImage,
@@ -192,7 +192,6 @@ _FOXGLOVE: Final[Mapping[str, tuple[Any, Callable[[Any, bytes], Any]]]] = {
     "foxglove.CompressedImage": (CompressedImage, lambda m, data: Compressed(data)),
     "foxglove.CompressedVideo": (CompressedVideo, lambda m, data: Packet(data, m.format)),
 }
-"""Foxglove's messages with images: their class, and their content."""
 
 
 def _foxglove(schema: str, encoding: str, data: Data) -> Any:
@@ -214,6 +213,7 @@ def _foxglove(schema: str, encoding: str, data: Data) -> Any:
         raise MalformedImage(f"a message is no {schema} ({one_line(error)})") from None
 
 
+# By schema and encoding, what reads the pixels, the compressed image or the packet.
 _CONTENT: Final[Mapping[tuple[str, str], Callable[[Data], Any]]] = {
     ("sensor_msgs/msg/Image", "cdr"): partial(_ros_raw, ros1=False),
     ("sensor_msgs/Image", "ros1"): partial(_ros_raw, ros1=True),
@@ -227,17 +227,16 @@ _CONTENT: Final[Mapping[tuple[str, str], Callable[[Data], Any]]] = {
         for encoding in ("protobuf", "json")
     },
 }
-"""By schema and encoding, what reads the pixels, the compressed image or the packet."""
 
 _VIDEOS: Final = frozenset(
     kind for kind in _CONTENT if kind[0].endswith(("CompressedVideo", "FFMPEGPacket"))
 )
 
+# Kinds of messages that hold a JPEG or PNG, which takes long to decode.
 PACKED: Final = frozenset(kind for kind in _CONTENT if kind[0].endswith("CompressedImage"))
-"""Kinds of messages that hold a JPEG or PNG, which takes long to decode."""
 
+# Types of messages with images.
 SCHEMAS: Final = tuple(sorted({schema for schema, _ in _CONTENT}))
-"""Types of messages with images."""
 
 
 def decoder_of(kind: MessageKind, options: InputOptions) -> Decoder | None:

@@ -10,55 +10,55 @@ from cdmisfa.core.config import Section, build, key
 
 # Recordings and runs state these texts: who reads one years later knows what its pixels are.
 
+# States how images become frames.
 RECIPE: Final = (
     "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
     "size: area average (Pillow BOX); turned as the EXIF of a JPEG or PNG says"
 )
-"""States how images become frames."""
 
+# States how images of videos become frames.
 VIDEO_RECIPE: Final = (
     f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
     "((Y - 16) * 510 + 219) // 438 where its range is limited, by the nearest quarter turns of its "
     "display matrix"
 )
-"""States how images of videos become frames."""
 
+# States how images become frames in colours.
 COLOR_RECIPE: Final = (
     "red, green and blue beside one another, each as gray is; of a Bayer pattern green is the mean "
     "of two; of a video by BT.709 or, where it states another or none, BT.601, in 16 bit whole "
     "numbers, with each chroma pixel repeated"
 )
-"""States how images become frames in colours."""
 
+# States how numbers become frames.
 NUMBERS_RECIPE: Final = "numbers as they are, float64"
-"""States how numbers become frames."""
 
+# (height, width) in pixels.
 Size = tuple[int, int]
-"""(height, width) in pixels."""
 
+# Distances in metres that are shown black and white, or the range that numbers are kept in.
 Depth = tuple[float, float]
-"""Distances in metres that are shown black and white, or the range that numbers are kept in."""
 
+# Whether frames show colours; "auto" looks at a log's first frames.
 Color = bool | Literal["auto"]
-"""Whether frames show colours; "auto" looks at a log's first frames."""
 
+# How an image of another ratio of the sides becomes a frame: see `fitted`.
 Fit = Literal["crop", "pad", "stretch"]
-"""How an image of another ratio of the sides becomes a frame: see `fitted`."""
 
+# What frames are shown without before anything is learned: nothing, or each episode's mean.
 Centre = Literal["run", "episode"]
-"""What frames are shown without before anything is learned: nothing, or each episode's mean."""
 
+# Which time of a message counts: when it was logged, or that in its header.
 Clock = Literal["log", "header"]
-"""Which time of a message counts: when it was logged, or that in its header."""
 
+# What frames show where a camera paused: nothing, or its last image.
 Gaps = Literal["skip", "hold"]
-"""What frames show where a camera paused: nothing, or its last image."""
 
+# How streams that differ are put on one clock: the i-th images, or the last ones at each time.
 Align = Literal["index", "time"]
-"""How streams that differ are put on one clock: the i-th images, or the last ones at each time."""
 
+# Reaction to a live stream that stalls or goes away.
 OnLoss = Literal["reconnect", "wait", "end"]
-"""Reaction to a live stream that stalls or goes away."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +96,7 @@ class InputConfig(Section):
     stall: float = key(5.0, 0.1, 1e6)
 
 
+# Options of the command line for the settings that are no keys `input.*`.
 OPTIONS: Final = {
     "topics": "--topic",
     "fields": "--field",
@@ -106,10 +107,9 @@ OPTIONS: Final = {
     "align": "--align",
     "color": "--color",
 }
-"""Options of the command line for the settings that are no keys `input.*`."""
 
+# Keys that apply to our own recordings, too: these are not read as external logs for them.
 OF_EVERY_SOURCE: Final = ("centre", "holdout", "hold", "lost", "stall")
-"""Keys that apply to our own recordings, too: these are not read as external logs for them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,5 +195,5 @@ class InputOptions(InputConfig):
         return [*words, *(word for key in self.settings() for word in ("--set", key))]
 
 
+# Images, and no numbers.
 IMAGES: Final = InputOptions()
-"""Images, and no numbers."""

@@ -13,13 +13,14 @@ from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.errors import LogDamagedError, TooSmallError, UsageError
 from recorder.images.options import Depth
 
+# Content of one message: a gray image, (height, width) uint8, or one in colours, (height, width,
+# 3), or numbers, (I,) float64.
 Shown = NDArray[Any]
-"""Content of one message: a gray image, (height, width) uint8, or one in colours, (height, width,
-3), or numbers, (I,) float64."""
 
+# Largest image that is decoded, more than one of 7680x4320.
 MAX_PIXELS: Final = 36_000_000
-"""Largest image that is decoded, more than one of 7680x4320."""
 
+# Pixel formats that are read as they are, and what each byte of a pixel is.
 ENCODINGS: Final[Mapping[str, str]] = {
     "mono8": "g",
     "8UC1": "g",
@@ -32,18 +33,17 @@ ENCODINGS: Final[Mapping[str, str]] = {
     "bgra8": "bgrX",
     "8UC4": "bgrX",
 }
-"""Pixel formats that are read as they are, and what each byte of a pixel is."""
 
+# Formats of one colour a pixel, and the colours of two by two of them, row by row.
 _BAYER: Final[Mapping[str, str]] = {
     f"bayer_{order}{bits}": order for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)
 }
-"""Formats of one colour a pixel, and the colours of two by two of them, row by row."""
 
+# Formats of distances: their numbers, and how many metres one is (REP 118).
 DISTANCES: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
-"""Formats of distances: their numbers, and how many metres one is (REP 118)."""
 
+# Pixels that are converted at a time: the steps between take several bytes for each.
 _BAND: Final = 1 << 20
-"""Pixels that are converted at a time: the steps between take several bytes for each."""
 
 
 class MalformedImage(LogDamagedError):  # noqa: N818 - its text lacks the place

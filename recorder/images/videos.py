@@ -17,23 +17,25 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import BUDGET
 from recorder.images.pixels import MAX_PIXELS, MalformedImage, raw_image
 
+# Images that a decoder holds at most if they depend on one another: 16 and its own (H.264).
 _HELD: Final = 17
-"""Images that a decoder holds at most if they depend on one another: 16 and its own (H.264)."""
 
 _FULL_RANGE: Final = 2
 _LUMA: Final = ("yuv", "yuvj", "gray", "nv12", "nv21")
+
+# Luma of limited range as full range, a value for each byte.
 _STRETCH: Final = bytes((((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 255).astype(np.uint8))
-"""Luma of limited range as full range, a value for each byte."""
 
 _BT709: Final = 1
+
+# Weights of BT.709 and BT.601: red by Cr, green by Cb and by Cr, blue by Cb.
 _WEIGHTS: Final = {
     True: (1.5748, -0.187324, -0.468124, 1.8556),
     False: (1.402, -0.344136, -0.714136, 1.772),
 }
-"""Weights of BT.709 and BT.601: red by Cr, green by Cb and by Cr, blue by Cb."""
 
+# Start of a unit of H.264 or H.265, and the first byte of its header.
 _UNIT: Final = re.compile(b"\0\0\1(.)", re.DOTALL)
-"""Start of a unit of H.264 or H.265, and the first byte of its header."""
 
 
 def frame_gray(frame: Any) -> ByteArray:
@@ -207,6 +209,7 @@ def pyav(what: str) -> Any:
     return av
 
 
+# FFmpeg's decoder by a part of a codec's name, which may be h265 or hevc_nvenc;yuv420p.
 _CODECS: Final = {
     "264": "h264",
     "265": "hevc",
@@ -214,7 +217,6 @@ _CODECS: Final = {
     "vp9": "vp9",
     "av1": "libdav1d",
 }
-"""FFmpeg's decoder by a part of a codec's name, which may be h265 or hevc_nvenc;yuv420p."""
 
 
 def _codec(stated: str) -> str:
@@ -231,6 +233,7 @@ def _begins_vp9(data: bytes) -> bool:
     return head >> 6 == 2 and head >> last & 3 == 0
 
 
+# By FFmpeg's decoder: whether the data of an image need no image before it.
 _BEGINS: Final[dict[str, Callable[[bytes], bool]]] = {
     # a unit of an IDR picture; one of an IRAP picture
     "h264": lambda data: any(unit[1][0] & 31 == 5 for unit in _UNIT.finditer(data)),
@@ -239,4 +242,3 @@ _BEGINS: Final[dict[str, Callable[[bytes], bool]]] = {
     # a sequence header, behind the delimiter that FFmpeg puts before each image
     "libdav1d": lambda data: (data.removeprefix(b"\x12\0") or b"\0")[0] >> 3 & 15 == 1,
 }
-"""By FFmpeg's decoder: whether the data of an image need no image before it."""

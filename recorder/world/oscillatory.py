@@ -15,8 +15,8 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.kernels import cos, sin
 from recorder.config import SceneConfig, check_view_names
 
+# Frames after which every oscillatory stream repeats: theta_t = 2 pi t / 500.
 PERIOD = 500
-"""Frames after which every oscillatory stream repeats: theta_t = 2 pi t / 500."""
 
 
 def x1(theta: FloatArray) -> FloatArray:

@@ -21,21 +21,20 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
 
+# Opens a scene's source by its configuration and the clock of the frames.
+#
+# Worker processes import the function: it must not be local.
 Opener = Callable[[Any, RecordConfig], SeekableSource]
-"""Opens a scene's source by its configuration and the clock of the frames.
-
-Worker processes import the function: it must not be local.
-"""
 
 
+# Stream, first frame and number of frames of a block.
 Request = tuple[int, int, int]
-"""Stream, first frame and number of frames of a block."""
 
+# Frames rendered at a time; divides `motions.CHUNK`, so no block needs two chunks.
 BLOCK = 64
-"""Frames rendered at a time; divides `motions.CHUNK`, so no block needs two chunks."""
 
+# Blocks that each process may render ahead of the writer.
 _AHEAD = 3
-"""Blocks that each process may render ahead of the writer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +58,7 @@ def _open_oscillatory(config: OscillatoryConfig, record: RecordConfig) -> Seekab
     return OscillatorySource(config.streams, fps=record.fps, start_ns=record.start_ns)
 
 
+# The live scenes.
 SCENES: Registry[Scene] = Registry(
     "scene",
     {
@@ -66,7 +66,6 @@ SCENES: Registry[Scene] = Registry(
         "oscillatory": Scene(OscillatoryConfig, _open_oscillatory, "oscillatory"),
     },
 )
-"""The live scenes."""
 
 
 @dataclass(frozen=True, slots=True)

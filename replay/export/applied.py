@@ -24,8 +24,8 @@ from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, VectorEncoder, varint, view_topic
 from replay.runs.codec import Layout, define_message
 
+# Rows that a table writes at once: a Parquet file with fewer rows a group is much larger.
 ROWS: Final = 8192
-"""Rows that a table writes at once: a Parquet file with fewer rows a group is much larger."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 OUTPUT_SCHEMA: Final = "cdmisfa.ModuleOutput"
@@ -62,8 +62,8 @@ class Applied:
     novelty: FloatArray
 
 
+# Takes the outputs block by block.
 AppliedSink = Callable[[Applied], None]
-"""Takes the outputs block by block."""
 
 
 @contextlib.contextmanager

@@ -16,14 +16,14 @@ from replay.export.tables import TABLES
 from replay.inputs import About, holds_run, is_recording, open_to_look
 from replay.logs.source import LoggedSource
 
+# Forms of the signals of a run, and forms of frames.
 FORMS: Final = (*TABLES, "images", "mp4", "lerobot")
-"""Forms of the signals of a run, and forms of frames."""
 
+# Attributes that must be equal in the logs that become one dataset.
 EQUAL: Final = ("streams", "frame_shape", "dtype", "truth", "fps")
-"""Attributes that must be equal in the logs that become one dataset."""
 
+# Endings of exported files: `force` replaces a folder only if it holds no others.
 WRITTEN: Final = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
-"""Endings of exported files: `force` replaces a folder only if it holds no others."""
 
 
 def export(

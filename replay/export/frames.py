@@ -25,20 +25,20 @@ from replay.logs.clock import intersection
 from replay.logs.source import LoggedSource
 from replay.stored import Span
 
+# Most frames and bytes in memory at once, unless one frame is larger.
 PIECE, PIECE_BYTES = 1000, 64 * 2**20
-"""Most frames and bytes in memory at once, unless one frame is larger."""
 
+# x264's quality at which a difference is hardly visible.
 LOSSY = {"crf": "18", "preset": "medium"}
-"""x264's quality at which a difference is hardly visible."""
 
+# x264's lossless mode.
 EXACT = {"qp": "0", "preset": "medium"}
-"""x264's lossless mode."""
 
+# Chroma of gray.
 NEUTRAL = 128
-"""Chroma of gray."""
 
+# FFmpeg's AVCOL_RANGE_JPEG: luma from 0 to 255.
 FULL_RANGE = 2
-"""FFmpeg's AVCOL_RANGE_JPEG: luma from 0 to 255."""
 
 
 def pieces(

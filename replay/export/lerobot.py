@@ -28,19 +28,20 @@ from replay.stored import Span
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+
+# LeRobot's limit for files in a folder. Each log is one video a stream; numbers are one table.
 FILES = 1000
-"""LeRobot's limit for files in a folder. Each log is one video a stream; numbers are one table."""
 
+# Frames from one key frame to the next, as in LeRobot: training reads single frames.
 KEY_EVERY = 2
-"""Frames from one key frame to the next, as in LeRobot: training reads single frames."""
 
+# LeRobot's names of actions, of the state of a robot or an agent, and of other ground truth.
 ACTIONS, STATE, WORLD = "action", "observation.state", "observation.environment_state"
-"""LeRobot's names of actions, of the state of a robot or an agent, and of other ground truth."""
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
+# Values (n,) or (n, k) of each feature, and the names of its k numbers.
 Columns = dict[str, tuple[NDArray[Any], list[str] | None]]
-"""Values (n,) or (n, k) of each feature, and the names of its k numbers."""
 
 Stats = dict[str, NDArray[Any]]
 

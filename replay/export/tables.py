@@ -25,8 +25,8 @@ from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, Signal
 from replay.runs.columns import padded, whole_signals
 from replay.runs.log import RunHeader, read_columns, read_header
 
+# Signals with a value for each frame: a row of an iteration would need thousands of cells.
 CSV_LEAVES_OUT = tuple(s.name for s in SIGNALS.values() if "T" in s.dims)
-"""Signals with a value for each frame: a row of an iteration would need thousands of cells."""
 
 
 def write_parquet(run: Path, out: Path) -> int:
@@ -79,16 +79,15 @@ def write_csv(run: Path, out: Path) -> int:
     return rows
 
 
+# Function that writes each form of a run's signals.
+#
+# Args: the run and the new file. Raises: UsageError without such a run, LogDamagedError if it
+# cannot be read.
 TABLES: dict[str, Callable[[Path, Path], int]] = {
     "csv": write_csv,
     "parquet": write_parquet,
     "npz": write_npz,
 }
-"""Function that writes each form of a run's signals.
-
-Args: the run and the new file. Raises: UsageError without such a run, LogDamagedError if it cannot
-be read.
-"""
 
 
 def signals_table(run: Path, names: Sequence[str]) -> pa.Table:

@@ -16,17 +16,20 @@ from cdmisfa.core.clock import NANOSECONDS, times_of
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.stored import Span, outside
 
+# Most frames that streams are aligned to.
 MAX_FRAMES: Final = 2**31
-"""Most frames that streams are aligned to."""
-GAP_STEPS: Final = 10
-"""A pause between two rows of more than this many median steps is a gap."""
-UNEVEN: Final = 0.01
-"""Rates that differ by less than this share are the same."""
-JITTER: Final = 0.75
-"""Share of a frame by which the time of a row may differ from that of its frame."""
 
+# A pause between two rows of more than this many median steps is a gap.
+GAP_STEPS: Final = 10
+
+# Rates that differ by less than this share are the same.
+UNEVEN: Final = 0.01
+
+# Share of a frame by which the time of a row may differ from that of its frame.
+JITTER: Final = 0.75
+
+# The row that each frame shows, (frames,), none after a later one.
 Rows = range | IntArray
-"""The row that each frame shows, (frames,), none after a later one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,39 +9,39 @@ from numpy.typing import NDArray
 
 from replay.stored import StoredSource
 
+# Frames at the beginning that are looked at.
 LOOKED: Final = 2000
-"""Frames at the beginning that are looked at."""
 
+# One frame in so many is: what lasts is the same in two of them, and noise is not.
 STEP: Final = 5
-"""One frame in so many is: what lasts is the same in two of them, and noise is not."""
 
+# Parts of a picture's height, and of its width, whose mean colours are compared.
 _CELLS = 8
-"""Parts of a picture's height, and of its width, whose mean colours are compared."""
 
+# Of red, green and blue, as grey frames show them.
 _BRIGHTNESS: Final = np.array((0.299, 0.587, 0.114))[:, None, None]
-"""Of red, green and blue, as grey frames show them."""
 
+# Change of red or blue over that of brightness, up to which grey shows it as well; a red ball on
+# black comes to that.
 _MOST_RATIO: Final = 2.0
-"""Change of red or blue over that of brightness, up to which grey shows it as well; a red ball on
-black comes to that."""
 
 _FEWEST = 20
 
+# Hue is worth three times the pixels from this share of the variance of brightness on.
 _SHARE = 0.1
-"""Hue is worth three times the pixels from this share of the variance of brightness on."""
 
+# Share of its variance that must last from one frame looked at to the next.
 _LASTING = 0.3
-"""Share of its variance that must last from one frame looked at to the next."""
 
+# Variance, in steps of a pixel squared, below which hue is the rounding of pictures.
 _LEAST = 0.25
-"""Variance, in steps of a pixel squared, below which hue is the rounding of pictures."""
 
 
+# What was chosen, in words.
 CHOSEN: Final = {
     True: "--color auto: hue varies where brightness does not, frames show red, green and blue",
     False: "--color auto: hue tells no more than brightness, frames are grey",
 }
-"""What was chosen, in words."""
 
 
 def shows_hue(source: StoredSource) -> bool:

@@ -16,11 +16,11 @@ from replay.logs.stream import BROKEN, LogStream
 
 SALVAGE: Final = "learn and convert replace broken images with --salvage"
 
+# Images that are decoded at once.
 CORES: Final = thread_count()
-"""Images that are decoded at once."""
 
+# The number of a stream, and a row of it.
 Place = tuple[int, int]
-"""The number of a stream, and a row of it."""
 
 
 class DecodingAhead:

@@ -41,19 +41,19 @@ FORMATS: Final[Mapping[Format, Streams]] = {
     "arrays": arrays.streams,
 }
 
+# Formats of files that are known by their endings; other files are MCAP.
 _BY_ENDING: Final[Mapping[str, Format]] = {
     **dict.fromkeys(video.ENDINGS, "video"),
     **dict.fromkeys(bag.ENDINGS, "bag"),
     **dict.fromkeys(table.ENDINGS, "table"),
     **dict.fromkeys(arrays.ENDINGS, "arrays"),
 }
-"""Formats of files that are known by their endings; other files are MCAP."""
 
+# Endings of logs in one file, but MCAP's.
 ENDINGS: Final = tuple(_BY_ENDING)
-"""Endings of logs in one file, but MCAP's."""
 
+# Topics that mean every one with images.
 ALL: Final = ("*",)
-"""Topics that mean every one with images."""
 
 
 def log_format(path: Path) -> Format:

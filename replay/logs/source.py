@@ -32,8 +32,8 @@ from replay.logs.stream import BROKEN, LogStream, Rows
 from replay.storage.identity import Identity, McapIdentity
 from replay.stored import Span, StoredSource, outside
 
+# Frames behind a block that are decoded ahead, at least: some show the same image.
 LIKELY: Final = 32
-"""Frames behind a block that are decoded ahead, at least: some show the same image."""
 
 COLORS: Final = "red, green and blue beside one another"
 

@@ -20,13 +20,13 @@ from recorder.images.pixels import MalformedImage, Shown
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord
 
+# Log times from here on are beyond any clock, in nanoseconds.
 LAST_NS: Final = 2**62
-"""Log times from here on are beyond any clock, in nanoseconds."""
 
 Result = TypeVar("Result")
 
+# Rows of a stream: one a message, image or row of a table, from 0.
 Rows = range | IntArray
-"""Rows of a stream: one a message, image or row of a table, from 0."""
 
 
 class UnreadableError(LogDamagedError):
@@ -37,8 +37,8 @@ class NothingLoggedError(LogDamagedError):
     """A log that was cut before its first message."""
 
 
+# Errors of one image, behind which there may be whole ones.
 BROKEN: Final = (MalformedImage, MalformedRecord, UnreadableError)
-"""Errors of one image, behind which there may be whole ones."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,20 +28,20 @@ from replay.runs.run import Run, Tally
 
 TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 
+# Frames on which a module's outputs are drawn and fitted: as many dots as a plot can show.
 MOST_OUTPUTS = 2000
-"""Frames on which a module's outputs are drawn and fitted: as many dots as a plot can show."""
 
+# Last frames of a stream on which all outputs of its module are drawn side by side.
 RECENT = 80
-"""Last frames of a stream on which all outputs of its module are drawn side by side."""
 
+# Last frames of a stream of numbers that its card shows.
 VALUES = 200
-"""Last frames of a stream of numbers that its card shows."""
 
+# Modules whose outputs are computed: the time to read a run grows with their number.
 MOST_MODULES = 40
-"""Modules whose outputs are computed: the time to read a run grows with their number."""
 
+# Events that are listed: the first and the last of a run.
 MOST_EVENTS = 400
-"""Events that are listed: the first and the last of a run."""
 
 
 class ModuleData:

@@ -12,14 +12,13 @@ from markupsafe import Markup
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 
+# Units across a plot: about one a pixel on a screen, so 0.1 is exact enough.
 WIDE = 1000
-"""Units across a plot: about one a pixel on a screen, so 0.1 is exact enough."""
 
+# Places across a plot at which a curve keeps its least and its greatest value.
+#
+# A curve of a million values so takes at most 1,000 points, about 12 kB.
 PLACES = 500
-"""Places across a plot at which a curve keeps its least and its greatest value.
-
-A curve of a million values so takes at most 1,000 points, about 12 kB.
-"""
 
 
 def number(value: float) -> str:

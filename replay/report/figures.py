@@ -18,26 +18,26 @@ from replay.report.drawing import WIDE, Axis, Plot
 from replay.report.measurements import Measurement
 from replay.runs.run import Outline
 
+# Pixels from one row of a timeline to the next, and of its bars; `.names div` of page.css.
 ROW, BAR = 22, 16
-"""Pixels from one row of a timeline to the next, and of its bars; `.names div` of page.css."""
 
+# Pixels of a plot from top to bottom.
 TALL, FLAT, SMALL = 140, 96, 56
-"""Pixels of a plot from top to bottom."""
 
+# Streams in a timeline, the most watched: more do not fit on a screen.
 STREAMS = 60
-"""Streams in a timeline, the most watched: more do not fit on a screen."""
 
+# Bars of a stream in a timeline, each of as many blocks: 2.5 pixels are still seen.
 BARS = 400
-"""Bars of a stream in a timeline, each of as many blocks: 2.5 pixels are still seen."""
 
+# Modules whose numbers a timeline shows; of more modules the words would overlap.
 NAMED = 12
-"""Modules whose numbers a timeline shows; of more modules the words would overlap."""
 
+# Most pixels across or down of an image: a page must stay below 2 MB.
 FRAME, THUMBNAIL, WEIGHTS = 96, 160, 128
-"""Most pixels across or down of an image: a page must stay below 2 MB."""
 
+# Numbers of a frame that are written out.
 NUMBERS = 12
-"""Numbers of a frame that are written out."""
 
 
 def colour_class(index: int) -> str:

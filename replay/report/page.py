@@ -19,12 +19,13 @@ from replay.report.figures import colour_class, curves, timeline
 from replay.report.run_page import command, run_content
 from replay.runs.compare import side_by_side
 
+# Size of a page that mail programs still send and phones still open.
 MOST_BYTES = 2_000_000
-"""Size of a page that mail programs still send and phones still open."""
 
+# Watched frames to keep: fewer if the page would be too large.
 FRAMES = (192, 96, 48, 24, 12)
-"""Watched frames to keep: fewer if the page would be too large."""
 
+# Signals that the page of several runs draws over each other.
 CURVES = {
     "learning_error": "Learning error of the watched stream",
     "eta_dot": "Change of slowness |η̇| of the first output",
@@ -32,13 +33,12 @@ CURVES = {
     "share": "Share of recent blocks that are novel and of the same stream",
     "epsilon": "Probability of a random action ε",
 }
-"""Signals that the page of several runs draws over each other."""
 
+# Those of them that fall over several powers of ten.
 LOGARITHMIC = ("learning_error", "eta_dot", "tested")
-"""Those of them that fall over several powers of ten."""
 
+# Runs whose timelines are drawn: more make the page too large.
 TIMELINES = 24
-"""Runs whose timelines are drawn: more make the page too large."""
 
 
 def report_of_run(path: Path, reproducible: str = "not examined", again: str = "") -> str:

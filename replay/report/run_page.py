@@ -32,21 +32,21 @@ from replay.report.figures import (
 )
 from replay.report.measurements import Measurement, attempts, measurements_of
 
+# Streams that have a card, the most watched, and those that are visible at once.
 CARDS, OPEN_CARDS = 64, 12
-"""Streams that have a card, the most watched, and those that are visible at once."""
 
+# Modules that have a section with images and plots; the table lists all.
 SECTIONS = 12
-"""Modules that have a section with images and plots; the table lists all."""
 
+# Files of a source that are listed; run.json lists all.
 MOST_FILES = 100
-"""Files of a source that are listed; run.json lists all."""
 
+# Slowness on new frames over that on frames learned from, from which a table marks it: a module
+# that has learned accidents of its frames is slower on them than on others.
 OVERFITTED = 1.25
-"""Slowness on new frames over that on frames learned from, from which a table marks it: a module
-that has learned accidents of its frames is slower on them than on others."""
 
+# Correlation from which a table marks two modules as alike: `SAME` of the progress learner.
 ALIKE = 0.8
-"""Correlation from which a table marks two modules as alike: `SAME` of the progress learner."""
 
 
 def command(*words: object) -> str:

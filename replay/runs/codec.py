@@ -36,8 +36,8 @@ from replay.runs.columns import SignalColumns, columns_of_records
 SIGNALS_SCHEMA = "cdmisfa.BlockSignals"
 MATRIX_SCHEMA = "cdmisfa.Matrix"
 
+# Field with the sizes of every dimension of every array.
 SHAPES = "shapes"
-"""Field with the sizes of every dimension of every array."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _VARINT, _FIXED64, _LENGTH_DELIMITED = 0, 1, 2
@@ -59,24 +59,24 @@ _TYPES = {
     "bool": _Type(_FIELD.TYPE_BOOL, _VARINT, np.dtype("u1"), "?"),
 }
 
+# Signals whose fields are numbered after that of `SHAPES`: numbers of fields stay as they are.
 _BEHIND_SHAPES = (
     *("roc_error_inst", "roc_error", "roc_error_frozen", "change", "tested", "fitted"),
     *("learning_error", "interest", "state", "typical", "regret"),
 )
-"""Signals whose fields are numbered after that of `SHAPES`: numbers of fields stay as they are."""
 
 _STORED = sorted(SIGNALS.values(), key=lambda s: s.name in _BEHIND_SHAPES)
 _FIRST = [s.name for s in _STORED if s.name not in _BEHIND_SHAPES]
 _NUMBERS = {name: n for n, name in enumerate((*_FIRST, SHAPES, *_BEHIND_SHAPES), start=1)}
 _SCALARS = [s for s in _STORED if not s.dims]
+
+# The signals in the order in which messages hold them: scalars, then arrays.
 _ARRAYS = [s for s in _STORED if s.dims]
-"""The signals in the order in which messages hold them: scalars, then arrays."""
 
+# Tag and value of t, of the number of columns, and the values' tag and length.
+#
+# The length is a varint of five bytes, which any reader takes and which has a fixed place.
 _MATRIX_HEAD = struct.Struct("<BqBIB5s")
-"""Tag and value of t, of the number of columns, and the values' tag and length.
-
-The length is a varint of five bytes, which any reader takes and which has a fixed place.
-"""
 
 
 class Layout:
@@ -165,8 +165,9 @@ _SCALARS_OF = attrgetter(*(s.name for s in _SCALARS))
 _ARRAYS_OF = attrgetter(*(s.name for s in _ARRAYS))
 _SHAPE_OF = attrgetter("shape")
 _ARRAY_TYPES = [_TYPES[s.dtype].stored for s in _ARRAYS]
+
+# The tag of each scalar, and a place for its value.
 _TAGGED: list[Any] = [x for s in _SCALARS for x in (_tag(s), None)]
-"""The tag of each scalar, and a place for its value."""
 _SCALARS_STRUCT = struct.Struct(
     "<" + "".join(f"{len(_tag(s))}s{_TYPES[s.dtype].code}" for s in _SCALARS)
 )

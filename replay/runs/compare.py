@@ -18,21 +18,21 @@ from replay.runs.log import read_columns, read_header
 from replay.runs.provenance import comparable, stated_source
 from replay.runs.run import Outline, read_outline
 
+# Values of an array that are printed in full; a line of the terminal holds about as many.
 MAX_VALUES = 4
-"""Values of an array that are printed in full; a line of the terminal holds about as many."""
 
+# Letters of a setting that are printed.
 MAX_LETTERS = 60
-"""Letters of a setting that are printed."""
 
+# Named keys of those that only one run has: two learners may have dozens.
 MAX_KEYS = 5
-"""Named keys of those that only one run has: two learners may have dozens."""
 
 IDENTICAL = "identical, bit for bit"
 
 HEAD = ("run", "seed", "iterations", "modules", "against the first run")
 
+# Key of the number of iterations among the outcomes of streams.
 ITERATIONS = "iterations"
-"""Key of the number of iterations among the outcomes of streams."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,29 +12,29 @@ from recorder.log.files import partial_path
 from recorder.mcap.reader import LogReader
 from replay.storage.opening import no_such
 
+# Name of the log in a run's folder.
 RUN_FILE = "run.mcap"
-"""Name of the log in a run's folder."""
 
+# Name of the file with the command, the source and the result of a run.
 RUN_JSON = "run.json"
-"""Name of the file with the command, the source and the result of a run."""
 
+# Name of the file of the frozen modules.
 MODULES_FILE = "modules.npz"
-"""Name of the file of the frozen modules."""
 
+# Name of the view.
 VIEW_FILE = "run.rrd"
-"""Name of the view."""
 
+# Name of the report.
 REPORT_FILE = "report.html"
-"""Name of the report."""
 
+# Name of the metadata record that makes a log that of a run.
 RUN_METADATA = "cdmisfa.run"
-"""Name of the metadata record that makes a log that of a run."""
 
+# Name of the metadata record of a finished run; see `final_record`.
 FINAL_METADATA = "cdmisfa.final"
-"""Name of the metadata record of a finished run; see `final_record`."""
 
+# Name of the file with the trials that a sweep was last asked for.
 REQUEST = "sweep.json"
-"""Name of the file with the trials that a sweep was last asked for."""
 
 
 def run_log(path: Path) -> Path:

@@ -29,13 +29,14 @@ from replay.storage.arrays import contents, stored_arrays
 KEYFRAME_TOPIC = "/keyframe"
 KEYFRAME_SCHEMA = "cdmisfa.Keyframe"
 
+# Rises when the state of a learner changes its meaning.
 KEYFRAME_VERSION = 1
-"""Rises when the state of a learner changes its meaning."""
 
 _ABOUT_FACTS = "JSON: name, type and shape of each array, and more"
 _MODULES = "modules."
+
+# What of a module follows from the source, which the log's header states.
 _OF_SOURCE = ("frame_shape", "recipe")
-"""What of a module follows from the source, which the log's header states."""
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _KEYFRAME, KEYFRAME_DEFINITION = define_message(
     KEYFRAME_SCHEMA,

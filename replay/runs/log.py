@@ -37,8 +37,8 @@ PHI_TOPIC = "/phi"
 TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
 
+# Iterations between two weights that a log keeps.
 PHI_EVERY = 50
-"""Iterations between two weights that a log keeps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,14 +149,14 @@ def header_in(reader: LogReader) -> RunHeader:
 
 TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, PHI_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 
+# Most iterations of a batch.
 BATCH_ITERATIONS = 500
-"""Most iterations of a batch."""
 
+# Bytes of messages after which a batch ends earlier.
 MAX_BYTES = 16 * 1024 * 1024
-"""Bytes of messages after which a batch ends earlier."""
 
+# (n,) frames and (n, ...) their values.
 Frames = tuple[IntArray, NDArray[Any]]
-"""(n,) frames and (n, ...) their values."""
 
 _ITERATION = re.compile(r"iteration (\d{1,18})")
 

@@ -19,6 +19,8 @@ from replay.runs.folders import MODULES_FILE
 from replay.storage.arrays import read_arrays
 
 _FIELDS = [field.name for field in dataclasses.fields(Module)]
+
+# Scalar fields, and the kinds of numpy type that each may be stored as.
 _SCALARS = {
     **dict.fromkeys(("index", "stream_index", "iteration"), "iu"),
     "stream": "U",
@@ -26,7 +28,6 @@ _SCALARS = {
     "recipe": "U",
     "scale": "f",
 }
-"""Scalar fields, and the kinds of numpy type that each may be stored as."""
 
 
 def save_modules(path: Path, modules: Iterable[Module]) -> None:

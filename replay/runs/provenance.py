@@ -16,15 +16,15 @@ from replay.runs.folders import MODULES_FILE, read_run_json
 from replay.runs.log import read_header
 from replay.storage.identity import file_sha256
 
+# Keys under which a source's description lists its files, each as a table.
 FILE_LISTS = ("files", "views")
-"""Keys under which a source's description lists its files, each as a table."""
 
 WHOLE = "sha256"
 SAMPLE = "sample_sha256"
 HASHES = {WHOLE, SAMPLE}
 
+# Description of a source file: its name, size and hashes.
 File = Mapping[str, Any]
-"""Description of a source file: its name, size and hashes."""
 
 
 def final_record(

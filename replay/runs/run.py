@@ -20,12 +20,12 @@ from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.modules import load_modules
 
+# Signals whose values an outline holds for every iteration.
 LINES = (
     *("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsilon"),
     *("change", "tested", "fitted", "learning_error", "interest", "typical", "regret"),
     *("module", "novel", "novel_blocks", "roc_error", "variance"),
 )
-"""Signals whose values an outline holds for every iteration."""
 
 
 class Run:

@@ -45,14 +45,14 @@ from replay.runs.log import (
     RunHeader,
 )
 
+# More log time than any run has.
 NEVER_NS = 2**62
-"""More log time than any run has."""
 
+# Size at which a chunk of the log is closed.
 CHUNK_BYTES = 1024 * 1024
-"""Size at which a chunk of the log is closed."""
 
+# Longest time for which something that was written waits for the operating system.
 FLUSH_SECONDS = 1.0
-"""Longest time for which something that was written waits for the operating system."""
 
 
 class RunWriter(Sink):

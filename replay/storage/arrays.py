@@ -18,16 +18,17 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import one_line
 from cdmisfa.core.untrusted import open_regular
 
+# Largest file of arrays that is read.
 MAX_BYTES: Final = 192 * 1024 * 1024
-"""Largest file of arrays that is read."""
 
 _PLAIN = re.compile(r"[<|][bifuU]\d{1,6}")
+
+# The errors of numpy and zipfile for files that are damaged, or hold something else.
 NOT_ARRAYS: Final = (
     *(MemoryError, OverflowError, RecursionError, SyntaxError, TokenError, zlib.error),
     *(OSError, EOFError, LookupError, TypeError, ValueError, AttributeError, RuntimeError),
     zipfile.BadZipFile,
 )
-"""The errors of numpy and zipfile for files that are damaged, or hold something else."""
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:

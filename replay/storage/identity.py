@@ -13,14 +13,15 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import check_regular
 from recorder.mcap.reader import LogReader
 
+# Bytes of a piece of a sample, of which there are `PIECES`.
 PIECE: Final = 4096
-"""Bytes of a piece of a sample, of which there are `PIECES`."""
 PIECES: Final = 16
-BLOCK: Final = 1 << 20
-"""Bytes that are hashed at a time."""
 
+# Bytes that are hashed at a time.
+BLOCK: Final = 1 << 20
+
+# Called with the number of bytes that were hashed since the last call.
 Counted = Callable[[int], None]
-"""Called with the number of bytes that were hashed since the last call."""
 
 
 class Identity:

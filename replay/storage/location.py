@@ -15,12 +15,14 @@ from typing import Any, Final
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 
 SCHEMES: Final = ("s3", "http", "https")
+
+# Environment variable with the folder of copies, so that processes started here share it.
 COPIES: Final = "CDMISFA_COPIES"
-"""Environment variable with the folder of copies, so that processes started here share it."""
 
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@|[?#].*")
+
+# How long a web server may send nothing: aiohttp's own limit of 300 s in all ends large copies.
 _SILENT_SECONDS: Final = 60.0
-"""How long a web server may send nothing: aiohttp's own limit of 300 s in all ends large copies."""
 
 
 def is_url(word: str | Path) -> bool:

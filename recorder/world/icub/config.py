@@ -23,9 +23,9 @@ def place(low: float, high: float) -> Range:
     return default
 
 
+# Corners of the table of a furnished room, and of that which pictures from outside show: the plain
+# one fills every eye image, and would hide the robot's legs. Root frame, metres.
 TABLE_FROM, TABLE_TO = (-0.95, -0.75), (-0.3, 0.75)
-"""Corners of the table of a furnished room, and of that which pictures from outside show: the plain
-one fills every eye image, and would hide the robot's legs. Root frame, metres."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from recorder.world.icub.config import EyesConfig
 from recorder.world.icub.head import bent
 from recorder.world.icub.world import World
 
+# Thousandths of red, green and blue in grey (ITU-R BT.601); whole numbers round exactly.
 LUMA = (299, 587, 114)
-"""Thousandths of red, green and blue in grey (ITU-R BT.601); whole numbers round exactly."""
 
 Matrix = tuple[float, ...]
 
@@ -90,8 +90,8 @@ def from_afar(half: float) -> Matrix:
     )
 
 
+# Metres from which light is as good as parallel.
 AFAR = 100.0
-"""Metres from which light is as good as parallel."""
 
 
 def seen_from(view: Matrix, places: FloatArray) -> FloatArray:

@@ -22,20 +22,20 @@ from recorder.world.icub.room import room_of
 from recorder.world.icub.shadows import LAMP, TEXEL, ObjectShadow, RoomShadows
 from recorder.world.icub.world import World
 
+# Rays of a plate for each ray of a frame, along each side.
 FINE = 2
-"""Rays of a plate for each ray of a frame, along each side."""
 
+# Shares of the ambient light, of the lamp's light, and of mirrored light.
 LIGHTING = {"lightAmbientCoeff": 0.62, "lightDiffuseCoeff": 0.68, "lightSpecularCoeff": 0.1}
-"""Shares of the ambient light, of the lamp's light, and of mirrored light."""
 
+# The share of light lost far from the lamp, that distance, and the brightest place, metres.
 _POOL, _WIDE, _UNDER = 0.25, 0.8, (-0.55, -0.1)
-"""The share of light lost far from the lamp, that distance, and the brightest place, metres."""
 
+# Rows and columns of a picture.
 Part = tuple[slice, slice]
-"""Rows and columns of a picture."""
 
+# Metres from the table's height within which a pixel counts as the table.
 _FLAT = 0.003
-"""Metres from the table's height within which a pixel counts as the table."""
 
 
 @dataclass(frozen=True, slots=True)

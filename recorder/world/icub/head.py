@@ -10,18 +10,19 @@ import numpy as np
 
 from cdmisfa.core.arrays import FloatArray
 
+# The view of a roaming head, and the column of truth with its angle to the left.
 ROAM, YAW = "roam", "head_yaw"
-"""The view of a roaming head, and the column of truth with its angle to the left."""
 
+# Frames after which a roaming head may turn to another view.
 FRAMES_OF_A_LOOK = 60
-"""Frames after which a roaming head may turn to another view."""
 
+# Degrees that a roaming head turns in a frame by default; `scene.transit` changes it.
 ROAMS_BY = 7.5
-"""Degrees that a roaming head turns in a frame by default; `scene.transit` changes it."""
 
+# Degrees in a frame below which the head jumps: a turn would take thousands of frames.
 SLOWEST_TURN = 0.1
-"""Degrees in a frame below which the head jumps: a turn would take thousands of frames."""
 
+# Angles of the joints of both arms where they rest on the table, degrees; without l_ and r_.
 ARMS = {
     "shoulder_pitch": -30.0,
     "shoulder_roll": 30.0,
@@ -29,13 +30,12 @@ ARMS = {
     "elbow": 50.0,
     "wrist_prosup": 60.0,
 }
-"""Angles of the joints of both arms where they rest on the table, degrees; without l_ and r_."""
 
 _ROAM, _DIGITS = 0x40A3, 6
 
 
+# Origins of iCub v2.5's joints of the neck, that of its yaw while its pitch is 0; root frame.
 NECK, NECK_PITCH = (-0.010809, 0.0, 0.241953), (-0.010809, 0.0, 0.254797)
-"""Origins of iCub v2.5's joints of the neck, that of its yaw while its pitch is 0; root frame."""
 
 Place = tuple[float, float, float]
 

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.world.icub.config import IcubConfig
 
+# Rays along each side of a pixel, which are averaged.
 SAMPLES = 2
-"""Rays along each side of a pixel, which are averaged."""
 
+# Frames in which drifting light changes from its minimum to its maximum.
 _RISE = 1500
-"""Frames in which drifting light changes from its minimum to its maximum."""
 
 _NOISE = 0x4015E
+
+# Mean of an image to which the eyes adapt.
 _EXPOSED = np.float32(128)
-"""Mean of an image to which the eyes adapt."""
 
 _BYTES = 4
 _SPREAD = np.float32(1 / np.sqrt(_BYTES * (256**2 - 1) / 12))

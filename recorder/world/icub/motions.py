@@ -17,11 +17,11 @@ from cdmisfa.core.arrays import FloatArray
 from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
 from recorder.world.icub.world import silenced, start_simulator
 
+# Frames drawn at a time.
 CHUNK = 4096
-"""Frames drawn at a time."""
 
+# Spawn key of the world: the learner may spawn its own generators from the same seed.
 _WORLD = 0x1C0B
-"""Spawn key of the world: the learner may spawn its own generators from the same seed."""
 
 
 def toggling_motion(config: BoxConfig, generator: np.random.Generator) -> Iterator[FloatArray]:
@@ -103,21 +103,22 @@ def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
     return limits[0] + (limits[1] - limits[0]) * unit
 
 
+# Steps of 1/240 s in a frame: the objects have an eighth of a second to follow.
 STEPS = 30
-"""Steps of 1/240 s in a frame: the objects have an eighth of a second to follow."""
 
+# Frames stepped at a time.
 _AHEAD = 64
-"""Frames stepped at a time."""
 
+# Decimals of a pose: those beyond differ with the processor's sine and cosine.
 _DIGITS = 5
-"""Decimals of a pose: those beyond differ with the processor's sine and cosine."""
 
 _MASSES = (0.25, 0.3, 0.15)
-_FORCE = 12.0
-"""Of a magnet at most, newtons."""
 
+# Of a magnet at most, newtons.
+_FORCE = 12.0
+
+# Metres that a magnet is too low: it holds its object on the table, where the ball rolls.
 _PRESS = 0.002
-"""Metres that a magnet is too low: it holds its object on the table, where the ball rolls."""
 
 _FRICTION, _OF_TABLE = 0.4, 0.5
 

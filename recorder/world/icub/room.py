@@ -20,17 +20,17 @@ from cdmisfa.core.arrays import ByteArray
 from recorder.world.icub.config import TABLE_FROM, TABLE_TO, IcubConfig
 from recorder.world.icub.textures import texture
 
+# Metres after which the texture of a box repeats.
 PERIOD = 1.6
-"""Metres after which the texture of a box repeats."""
 
+# Corners of a circle.
 AROUND = 16
-"""Corners of a circle."""
 
+# Steps of a last digit to try in x, y and z, the smallest first.
 _STEPS = np.array(
     sorted(itertools.product(range(-3, 4), repeat=3), key=lambda steps: sum(map(abs, steps))),
     np.float32,
 )
-"""Steps of a last digit to try in x, y and z, the smallest first."""
 
 
 @dataclass(slots=True)

@@ -15,20 +15,20 @@ from recorder.world.icub.eyes import AFAR, Matrix, from_afar, metres, seen_from,
 from recorder.world.icub.room import Room
 from recorder.world.icub.world import World
 
+# Direction to the lamp, root frame.
 LAMP = (-0.45, -0.6, 1.0)
-"""Direction to the lamp, root frame."""
 
+# Half the lamp's size, as a share of its height.
 _WIDTH = 0.09
-"""Half the lamp's size, as a share of its height."""
 
+# Points of a lamp of half size 1.
 _ROUND = [(i / 2, j / 2) for i in range(-2, 3) for j in range(-2, 3) if i * i + j * j <= 5]
-"""Points of a lamp of half size 1."""
 
+# Pixels, half size and middle of the lamp's image of the room, metres.
 _SIDE, _REACH, _MIDDLE = 1024, 2.6, (-0.5, 0.0, -0.3)
-"""Pixels, half size and middle of the lamp's image of the room, metres."""
 
+# Metres from a body to its shadow at least, and width of a shadow's edge.
 _SLACK, _BLUR = 0.02, 0.01
-"""Metres from a body to its shadow at least, and width of a shadow's edge."""
 
 
 class RoomShadows:
@@ -98,11 +98,11 @@ class ObjectShadow:
         return np.asarray(self._share[i, j])
 
 
+# Metres of a pixel of an object's shadow.
 TEXEL = 0.004
-"""Metres of a pixel of an object's shadow."""
 
+# Depth of a pixel without a body.
 _NOTHING = np.float32(0.9999)
-"""Depth of a pixel without a body."""
 
 
 def _flattened(lamp: tuple[float, float, float], height: float) -> Matrix:

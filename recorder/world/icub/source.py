@@ -18,14 +18,14 @@ from recorder.world.icub.lens import light
 from recorder.world.icub.motions import Motions, PhysicalMotions
 from recorder.world.icub.world import World
 
+# Columns of ground truth: the objects' positions in the paper's coordinates, metres.
 TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
-"""Columns of ground truth: the objects' positions in the paper's coordinates, metres."""
 
+# More columns if physics moves the objects: heights of their middles, root frame, metres.
 HEIGHTS = tuple(f"object{i}_z" for i in (1, 2, 3))
-"""More columns if physics moves the objects: heights of their middles, root frame, metres."""
 
+# Column with the factor of drifting light.
 LIGHT = "light"
-"""Column with the factor of drifting light."""
 
 
 class IcubSource(ClockedSource):

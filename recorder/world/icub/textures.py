@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 
+# Pixels of a texture along each side.
 SIDE = 512
-"""Pixels of a texture along each side."""
 
 Pixels = NDArray[np.float32]
 Colour = Sequence[float]
@@ -99,6 +99,7 @@ def _painted(base: Colour, value: Pixels) -> Pixels:
     return np.clip(value[..., None] * np.array(base, np.float32), 0.0, 1.0)
 
 
+# By name: functions of a colour, a seed, and a count of boards, tiles, spots ...
 TEXTURES: dict[str, Callable[[Colour, int, int], Pixels]] = {
     "wood": wood,
     "tiles": tiles,
@@ -106,7 +107,6 @@ TEXTURES: dict[str, Callable[[Colour, int, int], Pixels]] = {
     "die": die,
     "label": box_label,
 }
-"""By name: functions of a colour, a seed, and a count of boards, tiles, spots ..."""
 
 
 @cache

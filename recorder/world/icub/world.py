@@ -24,8 +24,8 @@ from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.head import ARMS
 from recorder.world.icub.room import Piece, Room
 
+# The joints that turn the head to the left, the last of the neck, and bend it upwards.
 NECK_YAW, NECK_PITCH = b"neck_yaw", b"neck_pitch"
-"""The joints that turn the head to the left, the last of the neck, and bend it upwards."""
 
 _AWAY = (0.0, 0.0, -100.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)

@@ -25,14 +25,14 @@ from replay.storage.arrays import NOT_ARRAYS
 
 ENDINGS: Final = (".npy", ".npz")
 
+# Frames a second by default, as arrays have no times.
 FPS: Final = 50.0
-"""Frames a second by default, as arrays have no times."""
 
+# How arrays of other types than uint8 become frames, for the record.
 RECIPE: Final = (
     "pictures: truth as 0 and 255, 16 bit by its high byte, floats of 0 to 1 as round(255 x); "
     "numbers as they are, float64"
 )
-"""How arrays of other types than uint8 become frames, for the record."""
 
 _FORMS: Final = (
     "give (n,) or (n, values) numbers, or pictures as (n, height, width), or (n, height, width, 3) "

@@ -26,11 +26,13 @@ from replay.logs.stream import ChannelFacts, LogStream, limited
 ENDINGS: Final = (".bag", ".db3")
 
 METADATA: Final = "metadata.yaml"
+
+# Largest metadata.yaml that is read, in bytes.
 MAX_METADATA: Final = 1024 * 1024
-"""Largest metadata.yaml that is read, in bytes."""
+
+# Largest ratio of a packed file's contents to its size, beyond the size of a chunk. Only images of
+# one colour are packed to less.
 MOST_TIMES: Final = 100
-"""Largest ratio of a packed file's contents to its size, beyond the size of a chunk. Only images
-of one colour are packed to less."""
 
 
 class Bag(NamedTuple):

@@ -20,8 +20,8 @@ from replay.storage.opening import natural_order
 
 ENDINGS: Final = (".jpeg", ".jpg", ".png")
 
+# Largest file that is read as an image.
 MAX_IMAGE: Final = 64 * 1024 * 1024
-"""Largest file that is read as an image."""
 
 
 def streams(

@@ -26,8 +26,9 @@ from replay.logs.formats.video import VideoFile
 from replay.logs.stream import ChannelFacts, LogStream, explained, limited
 
 INFO: Final = "meta/info.json"
+
+# Frames that would fit between two episodes, of which nobody knows when they were.
 PAUSE: Final = 20
-"""Frames that would fit between two episodes, of which nobody knows when they were."""
 
 _IMAGES: Final = ("video", "image")
 

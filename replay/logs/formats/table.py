@@ -20,17 +20,17 @@ from replay.logs.stream import LAST_NS, ChannelFacts, LogStream, limited, picked
 
 ENDINGS: Final = (".csv", ".parquet")
 
+# Units of a column of times, in nanoseconds.
 UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
-"""Units of a column of times, in nanoseconds."""
 
+# Largest file that is read as a table, which is held in memory.
 MAX_BYTES: Final = 1024**3
-"""Largest file that is read as a table, which is held in memory."""
 
+# Most rows of a file with fewer bytes than rows, as each has a place on the clock, too.
 MAX_ROWS: Final = 4 * 1024**2
-"""Most rows of a file with fewer bytes than rows, as each has a place on the clock, too."""
 
+# Words for a missing value that PyArrow does not know by itself.
 _MISSING: Final = (" ", "-", "--", "?", "<NA>", "None", "none", "na", "n.a.", "N.A.", "Null")
-"""Words for a missing value that PyArrow does not know by itself."""
 
 _NUMBER: Final = r"^[ \t]*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?[ \t]*$"
 

@@ -26,13 +26,15 @@ from replay.logs.stream import LogStream, UnreadableError, limited
 
 ENDINGS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
 _UNTIMED: Final = ("avi", "asf")
+
+# Containers without an index, in which FFmpeg may find a place behind the one that is sought.
 _UNSURE: Final = ("mpeg", "mpegts")
-"""Containers without an index, in which FFmpeg may find a place behind the one that is sought."""
 
 _BEGIN: Final = -(2**40)
 _NOWHERE: Final = 2**62
+
+# Frames that are decoded and passed over rather than sought.
 _FORWARD: Final = 256
-"""Frames that are decoded and passed over rather than sought."""
 
 
 def streams(

@@ -24,12 +24,15 @@ from replay.logs.formats.recording import ViewFile
 from replay.logs.stream import LogStream, Rows
 
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
+
+# Fewest bytes of a log of a recording whose header is written.
 _SMALLEST: Final = 64
-"""Fewest bytes of a log of a recording whose header is written."""
+
+# Keys of a view's metadata that say what was recorded.
 SCENE: Final = ("scene", "seed", "config_sha256")
-"""Keys of a view's metadata that say what was recorded."""
+
+# Keys that are the same in all files of a recording.
 _SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", "gaps", *SCENE)
-"""Keys that are the same in all files of a recording."""
 
 
 class SeveralRecordingsError(UsageError):
