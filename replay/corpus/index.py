@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -129,7 +129,11 @@ def index_logs(
         table = table.filter(pc.is_in(table["path"], pa.array(logs, pa.string()))).cast(SCHEMA)
         new: list[pa.Table] = []
         try:
-            for batch, (rows, gone) in _read(to_read, deep, jobs):
+            batches = [to_read[at : at + BATCH] for at in range(0, len(to_read), BATCH)]
+            work = functools.partial(read_rows, deep=deep)
+            processes = min(jobs, math.ceil(len(batches) / 4))
+            for number, (rows, gone) in run_all(work, batches, jobs=processes):
+                batch = [log.path for log in batches[number]]
                 table = table.filter(pc.invert(pc.is_in(table["path"], pa.array(batch))))
                 new.append(rows)
                 indexed.gone += gone
@@ -324,16 +328,6 @@ def _known_states(table: pa.Table, deep: bool) -> dict[str, tuple[int, str]]:
     )
     columns = (known[name].to_pylist() for name in ("path", "bytes", "changed"))
     return {path: (size, changed) for path, size, changed in zip(*columns, strict=True)}
-
-
-def _read(
-    logs: Sequence[ListedLog], deep: bool, jobs: int
-) -> Iterator[tuple[list[str], tuple[pa.Table, list[str]]]]:
-    """Yield the paths of a batch of logs, with their rows and the paths of logs that are gone."""
-    batches = [logs[at : at + BATCH] for at in range(0, len(logs), BATCH)]
-    work = functools.partial(read_rows, deep=deep)
-    for number, result in run_all(work, batches, jobs=min(jobs, math.ceil(len(batches) / 4))):
-        yield [log.path for log in batches[number]], result
 
 
 def _write(tables: Sequence[pa.Table], index: Path) -> pa.Table:

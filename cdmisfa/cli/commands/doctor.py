@@ -64,11 +64,6 @@ def _check_packages() -> Iterator[Check]:
     yield Check("python", sys.version_info >= (3, 11), f"{version}, {platform.machine()}")
     for name in REQUIRED:
         yield _check_package(name, f"pip install {name}", "")
-    owners = metadata.packages_distributions()
-    for name in ("recorder", "replay"):  # names that packages of others may have, too
-        if others := sorted(set(owners.get(name, ())) - {"cdmisfa"}):
-            detail = f"also of {', '.join(others)}: give cdmisfa an environment of its own"
-            yield Check(f"name {name}", False, detail)
     for extra, (modules, needed_for) in EXTRAS.items():
         ok = all(find_spec(module) is not None for module in modules)
         detail = "installed" if ok else f"pip install 'cdmisfa[{extra}]'"
