@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import atexit
+import contextlib
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Self, TypeAlias
@@ -13,13 +16,15 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import Described, SourceSpec
 from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.experiments.sources import open_logs
-from cdmisfa.public.viewing import view
 from recorder.images.options import InputOptions
 from replay.inputs import open_arrays
 
 Given: TypeAlias = Any
 """A source for `learn`: arrays, tables, mappings of these by names of streams, paths and URLs of
 logs, names of scenes, words of live streams, or an open source."""
+
+HEIGHT = 600
+"""Pixels of the height of a view in a notebook."""
 
 
 def as_words(given: Given) -> tuple[str, ...]:
@@ -142,3 +147,40 @@ class Recording(Described):
 
     def _facts(self) -> Mapping[str, Any]:
         return {"recording": ", ".join(self.words) or "arrays", **self.spec.facts()}
+
+
+def view(
+    paths: Sequence[Path],
+    save: str | Path | None,
+    *,
+    tab: str | None = None,
+    inputs: InputOptions | None = None,
+) -> None:
+    """Show a run or a recording below a notebook's cell, else in a window; or write its view.
+
+    Args:
+        paths: the run's folder, or the files of the recording.
+        save: the file of the view.
+        tab: the name of the tab that is open.
+        inputs: the streams of logs, and how they become frames.
+    """
+    from replay.view.build import build_view, view_of
+
+    how: dict[str, Any] = {"beside": paths[1:], "tab": tab, "inputs": inputs}
+    if save is not None:
+        build_view(paths[0], Path(save), **how)
+        return
+    from replay.viewer import open_window, served
+
+    ipython: Any = sys.modules.get("IPython")
+    if ipython is None or not hasattr(ipython.get_ipython(), "kernel"):
+        with view_of(paths[0], **how) as file:
+            open_window(file)
+        return
+    file = _until_exit.enter_context(view_of(paths[0], **how))
+    _, address = _until_exit.enter_context(served(file))
+    ipython.display.display(ipython.display.IFrame(address, "100%", HEIGHT))
+
+
+_until_exit = contextlib.ExitStack()
+atexit.register(_until_exit.close)

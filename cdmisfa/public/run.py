@@ -17,8 +17,7 @@ from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.resume import Recomputation
-from cdmisfa.public.recording import Recording, as_words
-from cdmisfa.public.viewing import view
+from cdmisfa.public.recording import Recording, as_words, view
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
 from replay.runs.run import read_outline
 
