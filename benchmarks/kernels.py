@@ -149,10 +149,7 @@ def measure_still(rounds: int) -> list[list[Any]]:
     rows = []
     for components, outputs in ((8, 1), (16, 5), (32, 5), (64, 5)):
         config = LearnerConfig(components=components, outputs=outputs, nu=0.01, tau=40)
-        work = {
-            "still": learning_blocks(config, shown),
-            "noise": learning_blocks(config, noisy),
-        }
+        work = {"still": learning_blocks(config, shown), "noise": learning_blocks(config, noisy)}
         times = interleaved(work, 3 * rounds)
         gain = f"{ratio(times['noise'], times['still']):.2f}x"
         still, all_of_it = middle(times["still"], 3), middle(times["noise"], 3)

@@ -17,12 +17,7 @@ from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.log.files import (
-    folder_here,
-    holds_recording,
-    prepared_folder,
-    refuse_existing,
-)
+from recorder.log.files import folder_here, holds_recording, prepared_folder, refuse_existing
 from recorder.log.manifest import RecordingSpec, RecordingStart, store_start
 from recorder.log.resume import (
     ViewResume,

@@ -105,11 +105,7 @@ def test_the_same_bytes_come_of_processes_and_of_dask_though_a_worker_is_killed(
     assert (applied_now(there), there.failed) == ((12, 0), [])
     address, workers = cluster
     far = apply_to_logs(
-        run,
-        [str(logs)],
-        tmp_path / "far",
-        scheduler=address,
-        progress=lambda *_: workers[0].kill(),
+        run, [str(logs)], tmp_path / "far", scheduler=address, progress=lambda *_: workers[0].kill()
     )
     assert workers[0].wait() == -signal.SIGKILL
     assert (applied_now(far), far.failed) == ((12, 0), [])

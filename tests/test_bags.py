@@ -143,10 +143,7 @@ def test_a_packed_bag_is_the_same(tmp_path: Path, kind: str) -> None:
         writer.set_compression(rosbag2.CompressionMode[kind], rosbag2.CompressionFormat.ZSTD)
     with writer:
         fill(writer, store, store.serialize_ros1 if ros1 else store.serialize_cdr, ros1)
-    with (
-        open_stream(packed, TOPICS[0]) as images,
-        open_stream(whole, TOPICS[0]) as expected,
-    ):
+    with open_stream(packed, TOPICS[0]) as images, open_stream(whole, TOPICS[0]) as expected:
         np.testing.assert_array_equal(images.times, expected.times)  # type: ignore[arg-type]
         for row in (*range(COUNT), 1, 3):
             np.testing.assert_array_equal(images.image(row), expected.image(row))

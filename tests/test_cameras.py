@@ -69,10 +69,7 @@ def test_the_refusal_prints_a_command_that_works(cdmisfa: Cdmisfa, logs: Path) -
     assert refused.code == 2
     command = shlex.split(refused.err.split("as with: cdmisfa ")[1])
     command[-1] = str(logs / "run")
-    for words in (
-        (*command, *QUICK),
-        ("export", uneven, "--to", "images", "-o", logs / "out"),
-    ):
+    for words in ((*command, *QUICK), ("export", uneven, "--to", "images", "-o", logs / "out")):
         done = cdmisfa(*words)
         assert done.code == 0, done.err
         assert "cam_right: 45 images, 44 frames repeated, 0 images dropped" in done.err

@@ -47,11 +47,7 @@ class TestJson:
             assert keys <= set(channel)
 
     def test_info_in_words(
-        self,
-        cdmisfa: Cdmisfa,
-        oscillatory_recording: Path,
-        oscillatory_run: Path,
-        tmp_path: Path,
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, oscillatory_run: Path, tmp_path: Path
     ) -> None:
         done = cdmisfa("info", oscillatory_run)
         assert done.code == 0

@@ -71,12 +71,7 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
 
     with pytest.raises(OSError):  # noqa: PT011 - what stops it is no matter
         record_scene(
-            "oscillatory",
-            folder,
-            OscillatoryConfig(seed=7),
-            frames=400,
-            split=5.0,
-            progress=stop,
+            "oscillatory", folder, OscillatoryConfig(seed=7), frames=400, split=5.0, progress=stop
         )
     again = ("record", "--resume", "-o", folder)
     for wrong, what in (

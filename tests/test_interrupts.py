@@ -68,10 +68,7 @@ WAITING = "recorder.cameras.readers.Readers.wait"
 @pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize(
     ("source", "command", "where"),
-    [
-        ("rtsp://{}/left", "learn", WAITING),
-        ("gym:Pendulum-v1", "record", "gymnasium.make"),
-    ],
+    [("rtsp://{}/left", "learn", WAITING), ("gym:Pendulum-v1", "record", "gymnasium.make")],
 )
 def test_while_a_source_is_opened_nothing_else_is_blamed(
     cdmisfa: Cdmisfa,

@@ -184,10 +184,7 @@ def block(stream: int = 0, t: int = 0, frames: np.ndarray = FRAMES) -> Block:
     [
         (lambda s: block((s + 1) % 3), "not 100 frames of stream"),
         (lambda s: block(s, frames=FRAMES[:99]), "not 99 frames of stream"),
-        (
-            lambda s: block(s, frames=np.zeros((100, 3))),
-            r"not 100 frames .* \(3,\) float64",
-        ),
+        (lambda s: block(s, frames=np.zeros((100, 3))), r"not 100 frames .* \(3,\) float64"),
         (lambda s: block(s, frames=np.zeros((100, 2), np.float32)), r"\(2,\) float32"),
     ],
 )

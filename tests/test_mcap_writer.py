@@ -26,12 +26,7 @@ def test_the_bytes_are_those_of_the_mcap_package(seed, monkeypatch):
     )
     theirs.start(profile="p", library="l")
     ours = McapWriter(
-        two,
-        library="l",
-        profile="p",
-        compression=compression,
-        chunk_size=size,
-        aside=seed % 2 == 1,
+        two, library="l", profile="p", compression=compression, chunk_size=size, aside=seed % 2 == 1
     )
     channels: list[int] = []
     for step in range(rng.randrange(80)):

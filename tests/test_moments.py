@@ -269,10 +269,7 @@ def test_a_fork_that_changes_nothing_is_its_parent(place: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("parent", "key", "at"),
-    [
-        ("2.0-loop", "learner.nu=0.03", 31),
-        ("2.0-live", "learner.nu=0.02", 0),
-    ],
+    [("2.0-loop", "learner.nu=0.03", 31), ("2.0-live", "learner.nu=0.02", 0)],
 )
 def test_forks_of_forks_are_resumed_and_checked(
     place: Path,

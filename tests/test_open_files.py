@@ -144,9 +144,7 @@ def test_the_bytes_are_the_same_however_few_files_are_open(
     assert len(contents(tmp_path / "open")) == 5
 
 
-def test_more_views_than_files_may_be_open_are_recorded_learned_and_checked(
-    tmp_path: Path,
-) -> None:
+def test_more_views_than_files_may_be_open_are_recorded_learned_and_checked(tmp_path: Path) -> None:
     record_them = (
         "from test_open_files import ManyViews\n"
         "from recorder.recording import record\n"

@@ -16,7 +16,7 @@ PAGES = sorted(
         *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
         *(ROOT / "docs").rglob("*.md"),
         *(ROOT / ".github").rglob("*.*"),
-    ],
+    ]
 )
 
 

@@ -15,19 +15,9 @@ from moving_pictures import MovingPictures
 
 from cdmisfa import Run
 from cdmisfa.agents.progress import candidate as held
-from cdmisfa.agents.progress.attention import (
-    RECENT,
-    RULES,
-    ProgressConfig,
-    Situation,
-)
+from cdmisfa.agents.progress.attention import RECENT, RULES, ProgressConfig, Situation
 from cdmisfa.agents.progress.candidate import WHITE_NOISE, Candidate, learning_error
-from cdmisfa.agents.progress.judging import (
-    flatness,
-    gain,
-    hopeless,
-    promising,
-)
+from cdmisfa.agents.progress.judging import flatness, gain, hopeless, promising
 from cdmisfa.agents.progress.learner import ProgressLearner
 from cdmisfa.core.blocks import Block, freeze
 from cdmisfa.core.signals import canonical_bytes

@@ -193,11 +193,9 @@ def test_modules_take_the_pictures_that_they_learned_from(kind: Any) -> None:
     t = np.arange(3000)
     drift = 128 + 100 * np.sin(t / 60)[:, None, None] * np.linspace(0, 1, 40)[None, :, None]
     shown = (drift + np.zeros((1, 1, 60))).astype(np.uint8)
-    given = {
-        np.uint8: shown,
-        np.uint16: shown.astype(np.uint16) << 8,
-        np.float64: shown / 255,
-    }[kind]
+    given = {np.uint8: shown, np.uint16: shown.astype(np.uint16) << 8, np.float64: shown / 255}[
+        kind
+    ]
     recording = Recording(given, size=(20, 30))
     run = learn(recording)
     (module, *_) = run.modules

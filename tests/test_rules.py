@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.agent import (
-    add_reward,
-    curiosity_reward,
-    expert_reward,
-    other_stream,
-)
+from reference.agent import add_reward, curiosity_reward, expert_reward, other_stream
 
 from cdmisfa.core.config import LearnerConfig
 

@@ -147,9 +147,7 @@ def test_failed_trials_are_listed_and_retried_when_asked(
     assert computed == [0, 1, 2]
 
 
-def test_a_row_that_was_cut_short_is_computed_again_and_a_damaged_one_named(
-    tmp_path: Path,
-) -> None:
+def test_a_row_that_was_cut_short_is_computed_again_and_a_damaged_one_named(tmp_path: Path) -> None:
     sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     whole = (tmp_path / ROWS).read_bytes()
     (tmp_path / ROWS).write_bytes(whole[:-10])
@@ -218,9 +216,7 @@ def test_ctrl_c_of_a_terminal_ends_the_command_and_its_workers(tmp_path: Path) -
 
 
 def test_dask_gives_the_same_rows_though_a_worker_is_killed(
-    tmp_path: Path,
-    local: dict[str, Any],
-    cluster: tuple[str, list[subprocess.Popen[bytes]]],
+    tmp_path: Path, local: dict[str, Any], cluster: tuple[str, list[subprocess.Popen[bytes]]]
 ) -> None:
     address, workers = cluster
     asked = threading.Event()

@@ -8,14 +8,7 @@ import itertools
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from run_data import (
-    IMAGE,
-    PROGRESS,
-    UNTOLD,
-    VECTOR,
-    by_progress,
-    write_run,
-)
+from run_data import IMAGE, PROGRESS, UNTOLD, VECTOR, by_progress, write_run
 from view_data import View, scalars
 
 from replay.runs.run import read_outline

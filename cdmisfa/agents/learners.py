@@ -14,8 +14,7 @@ from cdmisfa.core.errors import Registry, UsageError, one_line
 from cdmisfa.core.learning import Learner
 
 LEARNERS: Registry[type[Any]] = Registry(
-    "learner.algorithm",
-    {"2.0": CuriousLearner, "1.0": CuriousLearner, "progress": ProgressLearner},
+    "learner.algorithm", {"2.0": CuriousLearner, "1.0": CuriousLearner, "progress": ProgressLearner}
 )
 
 

@@ -57,7 +57,7 @@ HELP = {
         "demo": ("trials", "Record, learn, check and show an example in a few minutes."),
     },
     "This machine": {
-        "doctor": ("doctor", "Check which required and optional software is installed."),
+        "doctor": ("doctor", "Check which required and optional software is installed.")
     },
 }
 """Commands by their heading on the help page: module in `cdmisfa.cli.commands`, first sentence.

@@ -72,9 +72,7 @@ def end_at_once(code: int | None = None) -> None:
 
 
 @contextmanager
-def stoppable(
-    notice: str = "finishing what is begun; again to stop at once\n",
-) -> Iterator[Stop]:
+def stoppable(notice: str = "finishing what is begun; again to stop at once\n") -> Iterator[Stop]:
     """Let the body finish its step at the first signal, and print `notice`; the second interrupts.
 
     Yields:

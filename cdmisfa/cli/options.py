@@ -119,10 +119,7 @@ INPUTS = {
         help="Skip what a log has before this time, in seconds or as MINUTES:SECONDS.",
     ),
     "end": click.option(
-        "--end",
-        type=parse_seconds,
-        metavar="TIME",
-        help="Skip what a log has from this time on.",
+        "--end", type=parse_seconds, metavar="TIME", help="Skip what a log has from this time on."
     ),
     "align": click.option(
         "--align",

@@ -189,8 +189,7 @@ class BlockSignals:
         "1/frame",
     )
     learning_error: float = _signal(
-        "e",
-        "Learning error of the candidate, c + |ln(η_test / η_fit)|; progress learner only.",
+        "e", "Learning error of the candidate, c + |ln(η_test / η_fit)|; progress learner only."
     )
     interest: FloatArray = _signal(
         "",

@@ -188,12 +188,7 @@ def apply_to_log(
 
 
 def written_to(
-    place: Path,
-    spec: SourceSpec,
-    modules: Sequence[Module],
-    *,
-    force: bool,
-    log: str | None = None,
+    place: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool, log: str | None = None
 ) -> AbstractContextManager[AppliedSink]:
     """Open the sink that writes a file of outputs, by the ending of its name; see `written`."""
     if place.suffix.lower() == ".rrd":

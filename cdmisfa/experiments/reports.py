@@ -13,10 +13,7 @@ from replay.runs.folders import REPORT_FILE, run_log, runs_in
 
 
 def write_report(
-    words: Sequence[str | Path],
-    out: Path | None = None,
-    *,
-    force: bool = False,
+    words: Sequence[str | Path], out: Path | None = None, *, force: bool = False
 ) -> Path:
     """Write the report of a run, of several runs or of a folder of runs.
 

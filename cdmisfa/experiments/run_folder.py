@@ -240,12 +240,7 @@ def with_recipes(
 
 @contextlib.contextmanager
 def opened_log(
-    folder: Path,
-    source: FrameSource,
-    manifest: Mapping[str, Any],
-    *,
-    force: bool,
-    resumed: bool,
+    folder: Path, source: FrameSource, manifest: Mapping[str, Any], *, force: bool, resumed: bool
 ) -> Iterator[RunWriter]:
     """Open the log of a run, which is to be finished in the context, and lock its folder.
 

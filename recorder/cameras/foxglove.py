@@ -66,13 +66,7 @@ class FoxgloveCamera:
     rate: float | None = None
     recipe = RECIPE
 
-    def __init__(
-        self,
-        host: str,
-        topic: str,
-        name: str,
-        options: InputOptions = IMAGES,
-    ) -> None:
+    def __init__(self, host: str, topic: str, name: str, options: InputOptions = IMAGES) -> None:
         self.name, self._options = name, options
         self._server, self._topic = f"ws://{host}", topic.rstrip("/")
         self._where = f"foxglove://{host.rpartition('@')[2]}"

@@ -89,11 +89,7 @@ class ArraySource(SteppedSource):
     """
 
     def __init__(
-        self,
-        streams: Mapping[str, Iterable[Any]],
-        *,
-        fps: float = 50.0,
-        start_ns: int = START_NS,
+        self, streams: Mapping[str, Iterable[Any]], *, fps: float = 50.0, start_ns: int = START_NS
     ) -> None:
         if not isinstance(streams, Mapping) or not streams:
             raise UsageError(

@@ -210,13 +210,7 @@ def pyav(what: str) -> Any:
 
 
 # FFmpeg's decoder by a part of a codec's name, which may be h265 or hevc_nvenc;yuv420p.
-_CODECS: Final = {
-    "264": "h264",
-    "265": "hevc",
-    "hevc": "hevc",
-    "vp9": "vp9",
-    "av1": "libdav1d",
-}
+_CODECS: Final = {"264": "h264", "265": "hevc", "hevc": "hevc", "vp9": "vp9", "av1": "libdav1d"}
 
 
 def _codec(stated: str) -> str:

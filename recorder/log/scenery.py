@@ -17,16 +17,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import LogDamagedError
 from recorder.world.icub.config import TABLE_FROM, TABLE_TO
-from recorder.world.icub.head import (
-    ARMS,
-    ROAM,
-    YAW,
-    neck_at,
-    quaternion,
-    turn,
-    turn_frames,
-    turns,
-)
+from recorder.world.icub.head import ARMS, ROAM, YAW, neck_at, quaternion, turn, turn_frames, turns
 from recorder.world.icub.room import painted
 
 KIND = "icub"  # name of the scene

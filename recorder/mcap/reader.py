@@ -46,11 +46,7 @@ class LogReader(LogStructure):
     """
 
     def __init__(
-        self,
-        log: str | Path | Store,
-        *,
-        salvage: bool = False,
-        check: Check | None = None,
+        self, log: str | Path | Store, *, salvage: bool = False, check: Check | None = None
     ) -> None:
         """Open a log.
 

@@ -33,13 +33,7 @@ from mcap.records import (
 )
 
 from recorder.config import Compression
-from recorder.mcap.records import (
-    INDEX_HEADER,
-    MAGIC,
-    MESSAGE_HEADER,
-    chunk_head,
-    crc32,
-)
+from recorder.mcap.records import INDEX_HEADER, MAGIC, MESSAGE_HEADER, chunk_head, crc32
 
 _OF_MESSAGE: Final = int(Opcode.MESSAGE)
 _MESSAGE_SIZE: Final = MESSAGE_HEADER.size

@@ -14,15 +14,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.names import counted
 from recorder.images.options import InputOptions
 from replay.corpus.index import logs_of_corpus
-from replay.corpus.logs import (
-    Episode,
-    Log,
-    are_alike,
-    by_numbers,
-    episode_of,
-    names_of,
-    sampled,
-)
+from replay.corpus.logs import Episode, Log, are_alike, by_numbers, episode_of, names_of, sampled
 from replay.inputs import open_log
 from replay.logs.formats.lerobot import PAUSE
 from replay.logs.source import LoggedSource

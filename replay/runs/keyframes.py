@@ -44,13 +44,7 @@ _KEYFRAME, KEYFRAME_DEFINITION = define_message(
     [
         ("iteration", 1, _FIELD.TYPE_SFIXED64, False, "Iterations done"),
         ("t", 2, _FIELD.TYPE_SFIXED64, False, "Next frame"),
-        (
-            "facts",
-            3,
-            _FIELD.TYPE_STRING,
-            False,
-            _ABOUT_FACTS,
-        ),
+        ("facts", 3, _FIELD.TYPE_STRING, False, _ABOUT_FACTS),
         ("values", 4, _FIELD.TYPE_BYTES, False, "The arrays, one after the other"),
     ],
 )

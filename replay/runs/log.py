@@ -23,11 +23,7 @@ from cdmisfa.core.untrusted import MAX_LIST, parse_json
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import PARTIAL
-from replay.runs.codec import (
-    decode_columns,
-    decode_matrices,
-    parsed,
-)
+from replay.runs.codec import decode_columns, decode_matrices, parsed
 from replay.runs.columns import Blocks, SignalColumns
 from replay.runs.folders import RUN_FILE, RUN_METADATA, run_log
 

@@ -90,12 +90,7 @@ def known_to(
 
 
 def recognise(
-    agent: Agent,
-    rules: Rules,
-    frozen: Frozen,
-    frames: NDArray[Any],
-    x: FloatArray,
-    scale: float,
+    agent: Agent, rules: Rules, frozen: Frozen, frames: NDArray[Any], x: FloatArray, scale: float
 ) -> tuple[int, FloatArray, FloatArray, FloatArray]:
     """What knows a block; outputs, slowness and clustering error of the modules."""
     M, J = frozen.band_mean.shape

@@ -270,11 +270,7 @@ def export_command(
 @options.as_json
 @options.quiet
 def index_command(
-    corpus: tuple[str, ...],
-    out: Path | None,
-    deep: bool,
-    jobs: int | None,
-    as_json: bool,
+    corpus: tuple[str, ...], out: Path | None, deep: bool, jobs: int | None, as_json: bool
 ) -> int:
     """Index many logs: streams, times and damage in one Parquet file.
 

@@ -152,10 +152,7 @@ def _record_live(
         )
         with bar("recording", "frames") as shown:
             record_watched(
-                recorded,
-                frames=frames,
-                stop=stop,
-                progress=lambda done: shown.update(done, frames),
+                recorded, frames=frames, stop=stop, progress=lambda done: shown.update(done, frames)
             )
     if recorded.ended and not stop():
         printing.status(f"ended at frame {recorded.t}: {recorded.ended}")

@@ -102,10 +102,7 @@ def _iterations(
 @options.source
 @options.as_json
 def check_command(
-    run: Path,
-    iterations: tuple[int, int | None],
-    source: tuple[str, ...],
-    as_json: bool,
+    run: Path, iterations: tuple[int, int | None], source: tuple[str, ...], as_json: bool
 ) -> int:
     """Learn a run again from its source and compare every signal.
 
