@@ -52,7 +52,6 @@ class Indexed:
         broken: number of logs with a problem.
         kinds: logs, files, streams, bytes and seconds of each kind of log; a recording is one log.
         problems: `path` and `problem` of the first `MOST_PROBLEMS` logs that have one.
-        replaced: why an earlier index was replaced, or "".
         stopped: whether it was stopped before all logs were read.
     """
 
@@ -65,7 +64,6 @@ class Indexed:
     broken: int = 0
     kinds: list[dict[str, Any]] = field(default_factory=list)
     problems: list[dict[str, Any]] = field(default_factory=list)
-    replaced: str = ""
     stopped: bool = False
 
 
@@ -118,10 +116,7 @@ def index_logs(
         logs = _logs_by_path(words, index.parent)
         table = SCHEMA.empty_table()
         if index.exists():
-            if (version := _version(index)) == VERSION:
-                table = read_index(index)
-            else:
-                indexed.replaced = f"{index} has version {version}: it is replaced"
+            table = read_index(index)
         known = _known_states(table, deep)
         to_read = [log for path, log in sorted(logs.items()) if known.get(path) != log[1:3]]
         indexed.gone = [path for path in pc.unique(table["path"]).to_pylist() if path not in logs]
@@ -145,7 +140,7 @@ def index_logs(
                 if indexed.read % SAVED_EVERY < len(batch):
                     _write([table, *new], index)
         finally:
-            if indexed.read or indexed.gone or not index.exists() or indexed.replaced:
+            if indexed.read or indexed.gone or not index.exists():
                 table = _write([table, *new], index)
     _summarize(indexed, table)
     return indexed
@@ -257,9 +252,12 @@ def logs_of_corpus(words: Sequence[str | Path]) -> list[list[Path]] | None:
 def is_index(path: Path) -> bool:
     """Return whether a file is an index."""
     try:
-        return path.suffix == ".parquet" and path.is_file() and _version(path) > 0
+        if path.suffix == ".parquet" and path.is_file():
+            _check_index(path)
+            return True
     except CdmisfaError:
-        return False
+        pass
+    return False
 
 
 def read_index(path: Path) -> pa.Table:
@@ -269,8 +267,7 @@ def read_index(path: Path) -> pa.Table:
         UsageError: it is no index, or one of another version.
         LogDamagedError: it is damaged.
     """
-    if (version := _version(path)) != VERSION:
-        raise UsageError(f"{path} has version {version}, not {VERSION}: run cdmisfa index again")
+    _check_index(path)
     try:
         with pq.ParquetFile(path) as file:  # `read_table` would import pandas if installed
             return file.read()
@@ -278,7 +275,8 @@ def read_index(path: Path) -> pa.Table:
         raise _damaged(path, error) from error
 
 
-def _version(path: Path) -> int:
+def _check_index(path: Path) -> None:
+    """Raise an error if a file is no index of this version."""
     check_regular(path)
     version = b""
     if path.suffix == ".parquet":  # else it is a log, which nobody should remove
@@ -286,9 +284,8 @@ def _version(path: Path) -> int:
             version = (pq.read_schema(path).metadata or {}).get(MARK, b"")
         except (pa.ArrowException, OSError) as error:
             raise _damaged(path, error) from error
-    if not version.isdigit():
-        raise UsageError(f"{path} is no index of logs: name another file")
-    return int(version)
+    if version != str(VERSION).encode():
+        raise UsageError(f"{path} is no index of logs of version {VERSION}: name another file")
 
 
 def _damaged(path: Path, error: Exception) -> LogDamagedError:

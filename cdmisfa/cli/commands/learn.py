@@ -174,10 +174,11 @@ def _opened(
     from recorder.log.files import refuse_existing
 
     live = any(map(is_live, words))
-    if record_to is not None and not live:
-        raise UsageError("--record is for live streams: leave it out")
-    if live and resumed:
-        raise UsageError("live streams cannot go back: learn from a recording of them")
+    if (live and resumed) or (record_to is not None and not live):
+        raise UsageError(
+            "--record is for live streams, and --resume for all others: live streams cannot go "
+            "back, learn from a recording of them"
+        )
     for folder in filter(None, (out, record_to) if live else ()):
         refuse_existing(folder, force=force, goes_on=False)
     with bar("opening", "logs") as shown:

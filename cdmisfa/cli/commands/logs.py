@@ -289,11 +289,9 @@ def index_command(
             progress=shown.update,
             stop=stop,
         )
-    if indexed.replaced:
-        printing.warning(indexed.replaced)
     if as_json:
         values = dataclasses.asdict(indexed)
-        del values["replaced"], values["stopped"]
+        del values["stopped"]
         printing.document(**values, complete=not indexed.stopped)
     else:
         _print_index(indexed)

@@ -84,8 +84,6 @@ def record_command(
 
     limit = parse_split(split) if split else None
     if any(map(is_live, source)):
-        if resume or views or jobs > 1:
-            raise UsageError("live streams: leave out --resume, --view and --jobs")
         return _record_live(
             source, out, inputs, preset, settings, seed or 0, frames, limit, force, as_json
         )
