@@ -30,14 +30,22 @@ class KernelAgent:
         changes = np.full(len(y), np.nan)
         changes[: np.size(xi)] = xi
         self.out["known_by"] = known_by
-        kernels.think(self.struct, changes, y, self.t, np.array(draws, dtype=float))
+        arrays = (np.ascontiguousarray(a, float) for a in (changes, y, draws))
+        first, second, third = (kernels.ffi.from_buffer("double[]", a) for a in arrays)
+        code = kernels.lib.think(self.struct.pointer, first, second, self.t, third)
+        kernels.check(code, "the learner")
         self.t += len(y)
         return dict(zip(OUTCOME.names or (), self.out[0].item(), strict=True))
 
     def recognise(self, frozen: Frozen, frames: Any, x: Any) -> tuple[int, Any, Any, Any]:
         """What knows a block; outputs, slowness and clustering error of the frozen modules."""
         shown, expanded = kernels.frames_of(frames), kernels.frames_of(x)
-        told = kernels.recognise(self.struct, frozen.struct, shown, expanded)
+        (M, J), n = frozen.band_mean.shape, len(frames)
+        told = np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
+        stack = frozen.struct
+        structs = (s.pointer for s in (self.struct, stack, shown, expanded))
+        into = (kernels.ffi.from_buffer("double[]", array) for array in told)
+        kernels.check(kernels.lib.recognise(*structs, *into), "the learner")
         return int(self.out["known_by"][0]), *told
 
     def values(self) -> np.ndarray:

@@ -263,8 +263,3 @@ def test_what_does_not_fit_is_refused() -> None:
     one, two = (kernels.frames_of(np.zeros((n, 5))) for n in (1800, 1801))
     with pytest.raises(UsageError, match="frames given as"):
         learner.repeat(one, two, np.zeros((4, 3)))
-    known = KernelAgent(LearnerConfig(tau=5))
-    with pytest.raises(UsageError, match=r"xi given as \(4,\): give \(5,\)"):
-        kernels.think(known.struct, np.zeros(4), np.zeros((5, 1)), 0, np.zeros(3))
-    with pytest.raises(UsageError, match=r"y given as \(5, 2\)"):
-        kernels.think(known.struct, np.zeros(5), np.zeros((5, 2)), 0, np.zeros(3))

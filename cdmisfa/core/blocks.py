@@ -246,7 +246,8 @@ class ClockedSource(ForwardSource, SeekableSource):
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t; see `SeekableSource.seek`."""
-        check_frame(t)
+        if t < 0:
+            raise ValueError(f"there is no frame {t}: the first is 0")
         self._t = t
 
 
@@ -356,16 +357,6 @@ def _as_one(run: Sequence[Block]) -> Block:
     frames = freeze(np.concatenate([block.frames for block in run]))
     truth = freeze(np.concatenate([block.truth for block in run]))
     return Block(run[0].stream, run[0].t, frames, truth)
-
-
-def check_frame(t: int) -> None:
-    """Refuse a place on the clock that no source has.
-
-    Raises:
-        ValueError: before frame 0.
-    """
-    if t < 0:
-        raise ValueError(f"there is no frame {t}: the first is 0")
 
 
 def freeze(array: NDArray[Any]) -> NDArray[Any]:

@@ -260,36 +260,16 @@ def iterate(
         Outputs (n, J), NaN where the block is not novel; those of the frozen modules (M, n, J),
         their slowness (M, J) and clustering error (M,).
     """
-    _expect_block(agent, frozen, shown, x)
-    _expect_feature(agent, feature, x)
-    y = np.empty((agent.pointer.tau, agent.pointer.outputs))
-    results = (y, *_frozen_results(agent, frozen))
+    n, J, M = agent.pointer.tau, agent.pointer.outputs, frozen.pointer.modules
+    expect("frames", (shown.pointer.n, x.pointer.n), (n, n))
+    _expect_inputs(agent, frozen, feature, x)
+    results = np.empty((n, J)), np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
     code = lib.iterate(
         *(agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer),
         *(t, readable("uniforms", uniforms, (3,)), *(_buffer("double[]", r) for r in results)),
     )
     check(code, "the learner")
     return results
-
-
-def recognise(
-    agent: Struct, frozen: Struct, shown: Struct, x: Struct
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute the first part of `iterate`: the agent's outcome says what knows the block."""
-    _expect_block(agent, frozen, shown, x)
-    results = _frozen_results(agent, frozen)
-    into = (_buffer("double[]", array) for array in results)
-    code = lib.recognise(agent.pointer, frozen.pointer, shown.pointer, x.pointer, *into)
-    check(code, "the learner")
-    return results
-
-
-def think(agent: Struct, xi: Any, y: FloatArray, t: int, uniforms: FloatArray) -> None:
-    """Compute the last part, after `recognise` and an update with weight changes xi (n,)."""
-    n, J = agent.pointer.tau, agent.pointer.outputs
-    arrays = readable("xi", xi, (n,)), readable("y", y, (n, J))
-    code = lib.think(agent.pointer, *arrays, t, readable("uniforms", uniforms, (3,)))
-    check(code, "the learner")
 
 
 def iterations(
@@ -306,8 +286,7 @@ def iterations(
     n, rows, streams = len(uniforms), shown.pointer.n, agent.pointer.streams
     enough = rows > streams * agent.pointer.tau
     expect("frames", (x.pointer.n, rows % streams, enough), (rows, 0, True))
-    _expect_feature(agent, feature, x)
-    expect("frozen modules", frozen.pointer.inputs, x.pointer.size)
+    _expect_inputs(agent, frozen, feature, x)
     draws, curves = readable("uniforms", uniforms, (n, 3)), kept.pointer if kept else ffi.NULL
     done: int = lib.iterations(
         *(agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer),
@@ -324,20 +303,10 @@ def action_values(agent: Struct) -> FloatArray:
     return Q
 
 
-def _expect_block(agent: Struct, frozen: Struct, shown: Struct, x: Struct) -> None:
-    tau = agent.pointer.tau
-    expect("frames", (shown.pointer.n, x.pointer.n), (tau, tau))
-    expect("frozen modules", frozen.pointer.inputs, x.pointer.size)
-
-
-def _expect_feature(agent: Struct, feature: Struct, x: Struct) -> None:
+def _expect_inputs(agent: Struct, frozen: Struct, feature: Struct, x: Struct) -> None:
     sizes = feature.pointer.inputs, feature.pointer.outputs
     expect("the abstraction", sizes, (x.pointer.size, agent.pointer.outputs))
-
-
-def _frozen_results(agent: Struct, frozen: Struct) -> tuple[FloatArray, FloatArray, FloatArray]:
-    M, n, J = frozen.pointer.modules, agent.pointer.tau, agent.pointer.outputs
-    return np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
+    expect("frozen modules", frozen.pointer.inputs, x.pointer.size)
 
 
 def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:

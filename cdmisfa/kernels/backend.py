@@ -1,18 +1,12 @@
-"""Setuptools as build backend, which takes a C compiler from PyPI where the machine has none.
-
-With SOURCE_DATE_EPOCH in the environment, what it builds is the same bytes each time.
-"""
+"""Setuptools as build backend, which takes a C compiler from PyPI where the machine has none."""
 
 from __future__ import annotations
 
-import gzip
 import os
 import shlex
 import shutil
 import sys
 import sysconfig
-import tarfile
-from pathlib import Path
 from typing import Any
 
 from setuptools import build_meta
@@ -44,14 +38,6 @@ def build_wheel(*args: Any, **options: Any) -> str:
     return str(build_meta.build_wheel(*args, **options))
 
 
-def build_sdist(folder: str, *args: Any, **options: Any) -> str:
-    """Build a source archive."""
-    name = str(build_meta.build_sdist(folder, *args, **options))
-    if date := os.environ.get("SOURCE_DATE_EPOCH"):
-        _pack_again(Path(folder, name), int(date))
-    return name
-
-
 def build_editable(*args: Any, **options: Any) -> str:
     """Build the kernels in the checkout, and a wheel that points to it."""
     _choose_compiler()
@@ -72,21 +58,3 @@ def _choose_compiler() -> None:
         os.environ["ZIG_GLOBAL_CACHE_DIR"] = os.path.abspath("build/zig")
         # The flags of the compiler that Python was built with may be unknown to this one.
         sysconfig.get_config_vars()["CFLAGS"] = ""
-
-
-def _pack_again(archive: Path, date: int) -> None:
-    """Pack a source archive without what says when, by whom and in which order it was packed."""
-    packed = archive.with_suffix(".again")
-    with (
-        tarfile.open(archive) as old,
-        packed.open("wb") as file,
-        gzip.GzipFile("", "wb", fileobj=file, mtime=date) as stream,
-        tarfile.open(fileobj=stream, mode="w") as new,
-    ):
-        for member in sorted(old.getmembers(), key=lambda member: member.name):
-            member.mtime, member.pax_headers = date, {}
-            member.uid = member.gid = 0
-            member.uname = member.gname = ""
-            member.mode = 0o755 if member.mode & 0o100 else 0o644
-            new.addfile(member, old.extractfile(member) if member.isfile() else None)
-    packed.replace(archive)

@@ -195,7 +195,10 @@ def decode_signals(data: bytes, where: str = "record") -> BlockSignals:
     fields: dict[str, Any] = {s.name: getattr(decoded, s.name) for s in _SCALARS}
     for signal in _ARRAYS:
         shape = tuple(size for _, size in zip(signal.dims, sizes, strict=False))
-        fields[signal.name] = _array(getattr(decoded, signal.name), shape, signal, where)
+        values = getattr(decoded, signal.name)
+        if len(shape) != len(signal.dims) or math.prod(shape) != len(values):
+            raise LogDamagedError(f"{where}: {signal.name} has {len(values)} values for {shape}")
+        fields[signal.name] = np.array(values, dtype=signal.dtype).reshape(shape)
     return BlockSignals(**fields)
 
 
@@ -220,14 +223,6 @@ def decode_columns(messages: Sequence[bytes], where: str = "record") -> Iterator
         yield SignalColumns(values)
 
 
-def _array(values: Any, shape: tuple[int, ...], signal: Signal, where: str) -> NDArray[Any]:
-    if len(shape) != len(signal.dims) or math.prod(shape) != len(values):
-        raise LogDamagedError(
-            f"{where}: {signal.name} has {len(values)} values for shape {shape}, see cdmisfa verify"
-        )
-    return np.array(values, dtype=signal.dtype).reshape(shape)
-
-
 def iteration_of(data: bytes, where: str = "record") -> int:
     """Return the iteration of the record in the bytes of a message."""
     return int(parsed(_SIGNALS, data, where).iteration)
@@ -239,14 +234,10 @@ def encode_matrix(t: int, matrix: FloatArray) -> bytes:
     return b"".join((_matrix_head(t, values.shape[1], values.nbytes), values))
 
 
-def _matrix_head(t: int, columns: int, size: int) -> bytes:
-    return _MATRIX_HEAD.pack(0x09, t, 0x15, columns, 0x1A, _five_bytes(size))
-
-
 @lru_cache
-def _five_bytes(size: int) -> bytes:
-    """Return a number as a varint of five bytes."""
-    return bytes(size >> 7 * k & 0x7F | (k < 4) << 7 for k in range(5))
+def _matrix_head(t: int, columns: int, size: int) -> bytes:
+    five = bytes(size >> 7 * k & 0x7F | (k < 4) << 7 for k in range(5))
+    return _MATRIX_HEAD.pack(0x09, t, 0x15, columns, 0x1A, five)
 
 
 def decode_matrices(

@@ -65,13 +65,8 @@ class Difference:
 
     def as_json(self) -> dict[str, Any]:
         """Return the place and both values as JSON values."""
-        return {
-            "iteration": self.iteration,
-            "signal": self.signal,
-            "place": list(self.place),
-            "first": self.first,
-            "second": self.second,
-        }
+        names = "iteration", "signal", "place", "first", "second"
+        return {name: getattr(self, name) for name in names}
 
     def differing_signals(self) -> tuple[tuple[str, str, str], ...]:
         """Return name, first and second value, as text, of the signals that differ here."""

@@ -50,8 +50,6 @@ def run_log(path: Path) -> Path:
             check_regular(candidate)
             return candidate
     if path.is_dir():
-        if any((path / name).is_file() for name in (RUN_JSON, MODULES_FILE)):
-            raise UsageError(f"{path} lost its {RUN_FILE}: run learn there again with --force")
         raise UsageError(f"{path} holds no {RUN_FILE}: name the folder of a run")
     raise no_such(path, remedy=f"name a run's folder or its {RUN_FILE}")
 

@@ -51,20 +51,9 @@ class RunHeader:
     manifest: Mapping[str, Any]
 
     @property
-    def delta(self) -> float | None:
-        """Threshold of eta-dot, None if the configuration has none."""
-        return self.number("delta")
-
-    @property
     def by_progress(self) -> bool:
         """Whether the learner is the progress learner."""
         return bool(self.setting("learner", "algorithm") == "progress")
-
-    @property
-    def settled(self) -> tuple[float, float] | None:
-        """Change and learning error below which the progress learner has learned a stream."""
-        change, agreement = self.number("settled"), self.number("agreement")
-        return None if change is None or agreement is None else (change, change + agreement)
 
     @property
     def clusters(self) -> bool:

@@ -17,33 +17,7 @@ from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
 from recorder.mcap.reader import LogReader
-from replay.runs.codec import (
-    MATRIX_DEFINITION,
-    MATRIX_SCHEMA,
-    SIGNALS_DEFINITION,
-    SIGNALS_SCHEMA,
-    decode_columns,
-    encode_matrix,
-    encode_signals,
-    iteration_of,
-)
-from replay.runs.folders import FINAL_METADATA, RUN_METADATA
-from replay.runs.keyframes import (
-    KEYFRAME_DEFINITION,
-    KEYFRAME_SCHEMA,
-    KEYFRAME_TOPIC,
-    encode_keyframe,
-)
-from replay.runs.log import (
-    BATCH_ITERATIONS,
-    EVENT_TOPIC,
-    PHI_EVERY,
-    PHI_TOPIC,
-    SIGNALS_TOPIC,
-    TRUTH_TOPIC,
-    WATCHED_TOPIC,
-    RunHeader,
-)
+from replay.runs import codec, folders, keyframes, log
 
 # More log time than any run has.
 NEVER_NS = 2**62
@@ -80,12 +54,12 @@ class RunWriter(Sink):
         *,
         force: bool = False,
         watched_every: int = 10,
-        phi_every: int = PHI_EVERY,
+        phi_every: int = log.PHI_EVERY,
     ) -> None:
         self.spec, self.path = spec, Path(path)
         self._watched_every = max(watched_every, 1)
         self._phi_every = max(phi_every, 1)
-        self._by_progress = RunHeader(spec, manifest).by_progress
+        self._by_progress = log.RunHeader(spec, manifest).by_progress
         # Learning runs faster than log time: flushing every second of log time would be too
         # often, so the wall clock decides. Of images zstd leaves a tenth less than lz4, and
         # takes twice as long.
@@ -99,7 +73,7 @@ class RunWriter(Sink):
         )
         self._next_flush = time.monotonic() + FLUSH_SECONDS
         self._log.add_metadata(
-            RUN_METADATA,
+            folders.RUN_METADATA,
             {
                 "schema": str(SCHEMA_VERSION),
                 "spec": json.dumps(asdict(spec)),
@@ -110,39 +84,43 @@ class RunWriter(Sink):
         self._last_keyframe = -1
         self._without_weights: tuple[int, int, int, Learner] | None = None
         self._channels: dict[str, int] = {}
-        matrix = MATRIX_SCHEMA, MATRIX_DEFINITION
-        self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA, SIGNALS_DEFINITION)
-        self._add_channel(PHI_TOPIC, *matrix)
-        self._add_channel(TRUTH_TOPIC, *matrix)
-        self._add_channel(KEYFRAME_TOPIC, KEYFRAME_SCHEMA, KEYFRAME_DEFINITION)
-        self._add_channel(EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR))
+        matrix = codec.MATRIX_SCHEMA, codec.MATRIX_DEFINITION
+        self._add_channel(log.SIGNALS_TOPIC, codec.SIGNALS_SCHEMA, codec.SIGNALS_DEFINITION)
+        self._add_channel(log.PHI_TOPIC, *matrix)
+        self._add_channel(log.TRUTH_TOPIC, *matrix)
+        self._add_channel(
+            keyframes.KEYFRAME_TOPIC, keyframes.KEYFRAME_SCHEMA, keyframes.KEYFRAME_DEFINITION
+        )
+        self._add_channel(log.EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR))
         self._images: list[ImageEncoder] = []
         if spec.images:
             height, width = spec.frame_shape
             self._images = [ImageEncoder(height, width, name) for name in spec.streams]
             encoder = self._images[0]
-            self._add_channel(WATCHED_TOPIC, encoder.schema, encoder.schema_data())
+            self._add_channel(log.WATCHED_TOPIC, encoder.schema, encoder.schema_data())
         else:
-            self._add_channel(WATCHED_TOPIC, *matrix)
+            self._add_channel(log.WATCHED_TOPIC, *matrix)
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """Write what one iteration gave; see `Sink`."""
         at, k, t = signals.log_time, signals.iteration, block.t
-        messages = [(SIGNALS_TOPIC, at, encode_signals(signals))]
+        messages = [(log.SIGNALS_TOPIC, at, codec.encode_signals(signals))]
         if block.truth.shape[1]:
-            messages.append((TRUTH_TOPIC, at, encode_matrix(t, block.truth)))
+            messages.append((log.TRUTH_TOPIC, at, codec.encode_matrix(t, block.truth)))
         if self._images:
             encode, every = self._images[block.stream], self._watched_every
             for i in range(-t % every, len(block), every):
                 shown = self.spec.time_ns(t + i)
-                messages.append((WATCHED_TOPIC, shown, encode(shown, block.frames[i])))
+                messages.append((log.WATCHED_TOPIC, shown, encode(shown, block.frames[i])))
         else:
             frames = block.frames.reshape(len(block), -1)
-            messages.append((WATCHED_TOPIC, at, encode_matrix(t, frames)))
+            messages.append((log.WATCHED_TOPIC, at, codec.encode_matrix(t, frames)))
         leaves = self._by_progress and signals.action == 1
         self._without_weights = at, k, t, learner
         if k % self._phi_every == 0 or signals.saved or leaves:
-            messages.append((PHI_TOPIC, at, encode_matrix(t, weights_after(signals, learner))))
+            messages.append(
+                (log.PHI_TOPIC, at, codec.encode_matrix(t, weights_after(signals, learner)))
+            )
             self._without_weights = None
         self._write(k, *messages)
         if time.monotonic() >= self._next_flush:
@@ -152,7 +130,7 @@ class RunWriter(Sink):
         """Write the last weights; the file stays open for what is written until `close`."""
         if self._without_weights is not None:
             at, k, t, learner = self._without_weights
-            self._write(k, (PHI_TOPIC, at, encode_matrix(t, learner.phi)))
+            self._write(k, (log.PHI_TOPIC, at, codec.encode_matrix(t, learner.phi)))
             self._without_weights = None
         self.flush()
 
@@ -163,7 +141,7 @@ class RunWriter(Sink):
         )
         at = self.spec.time_ns(t)
         entry.timestamp.FromNanoseconds(at)
-        self._write(iteration, (EVENT_TOPIC, at, entry.SerializeToString()))
+        self._write(iteration, (log.EVENT_TOPIC, at, entry.SerializeToString()))
 
     @property
     def size(self) -> int:
@@ -181,27 +159,29 @@ class RunWriter(Sink):
         if again or at != self._last_keyframe:
             self.flush()
             time_ns = self.spec.time_ns(keyframe.t)
-            self._write(at, (KEYFRAME_TOPIC, time_ns, encode_keyframe(keyframe)))
+            self._write(
+                at, (keyframes.KEYFRAME_TOPIC, time_ns, keyframes.encode_keyframe(keyframe))
+            )
             self._last_keyframe = at
             self.flush()
 
-    def copy_log(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
+    def copy_log(self, path: Path, iterations: int) -> Iterator[BlockSignals]:
         """Copy the first iterations of another log of the same run, and yield their signals.
 
         Messages are copied as they are, so a run that is resumed keeps its past bit for bit.
         """
-        where, taken = f"{log} {SIGNALS_TOPIC}", list[bytes]()
-        with LogReader(log) as reader:
+        where, taken = f"{path} {log.SIGNALS_TOPIC}", list[bytes]()
+        with LogReader(path) as reader:
             for entry in reader.messages(self._channels):
                 topic = entry.channel.topic
-                if topic == SIGNALS_TOPIC:
-                    if iteration_of(entry.data, where) >= iterations:
+                if topic == log.SIGNALS_TOPIC:
+                    if codec.iteration_of(entry.data, where) >= iterations:
                         break
                     taken.append(entry.data)
-                elif topic == KEYFRAME_TOPIC:
+                elif topic == keyframes.KEYFRAME_TOPIC:
                     self._last_keyframe = entry.sequence
                 self._log.write(self._channels[topic], entry.log_time, entry.data, entry.sequence)
-                if len(taken) >= BATCH_ITERATIONS:
+                if len(taken) >= log.BATCH_ITERATIONS:
                     yield from _records(taken, where)
                     taken = []
         yield from _records(taken, where)
@@ -218,7 +198,7 @@ class RunWriter(Sink):
     def close(self, final: Mapping[str, str] | None = None) -> None:
         """Write a final record where there is one, and the index; give the file its name."""
         if final is not None:
-            self._log.add_metadata(FINAL_METADATA, final)
+            self._log.add_metadata(folders.FINAL_METADATA, final)
         self._log.finish()
 
     def abandon(self) -> None:
@@ -237,5 +217,5 @@ class RunWriter(Sink):
 
 
 def _records(messages: Sequence[bytes], where: str) -> Iterator[BlockSignals]:
-    for columns in decode_columns(messages, where):
+    for columns in codec.decode_columns(messages, where):
         yield from columns.records()

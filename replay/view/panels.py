@@ -8,21 +8,8 @@ import rerun.blueprint as rrb
 
 from replay.runs.log import PHI_EVERY
 from replay.runs.run import Outline
-from replay.view.layouts import (
-    NEAR,
-    NEAR_BLOCKS,
-    Panel,
-    Tab,
-    Views,
-    beside,
-    blueprint,
-    curve_view,
-    events,
-    images,
-    lanes,
-    scene,
-    tabs_of,
-)
+from replay.view import layouts
+from replay.view.layouts import NEAR, Panel, Tab, Views, beside, curve_view, images
 from replay.view.rows import MOST_STREAMS, Rows, Span, drawable
 from replay.view.wall import WALL, bounds, sheet_size
 
@@ -71,8 +58,8 @@ def run_layout(
     """
     layout = RunLayout(outline, rows, has_scene=has_scene)
     tabs = [layout.world(followed)] if has_scene or followed else []
-    tabs += map(layout.tab, tabs_of("progress" if outline.header.by_progress else "paper"))
-    return blueprint(*tabs, layout.modules(sheets), name="Run", length=outline.end, tab=tab)
+    tabs += map(layout.tab, layouts.tabs_of("progress" if outline.header.by_progress else "paper"))
+    return layouts.blueprint(*tabs, layout.modules(sheets), name="Run", length=outline.end, tab=tab)
 
 
 class RunLayout:
@@ -131,11 +118,11 @@ class RunLayout:
             return []
         title = panel.title.format(i="{i}", **self._facts)
         if panel.kind == "lanes":
-            return [lanes(title, panel.entities, self._end)]
+            return [layouts.lanes(title, panel.entities, self._end)]
         if panel.kind == "near lanes":
-            title = f"{title}: the last {NEAR_BLOCKS} blocks"
-            blocks = NEAR_BLOCKS * max(self._outline.tau, 1)
-            return [lanes(title, panel.entities, near=blocks, room=False)]
+            title = f"{title}: the last {layouts.NEAR_BLOCKS} blocks"
+            blocks = layouts.NEAR_BLOCKS * max(self._outline.tau, 1)
+            return [layouts.lanes(title, panel.entities, near=blocks, room=False)]
         if panel.kind == "summary":
             return [rrb.TextDocumentView(origin="/summary", name=title)]
         if panel.kind == "streams":
@@ -181,10 +168,10 @@ class RunLayout:
     def world(self, followed: Sequence[Panel]) -> rrb.Container:
         """Return the world, what the learner sees and learned of it, and what happened."""
         summary = rrb.TextDocumentView(origin="/summary", name="What came of it")
-        words = rrb.Tabs(summary, events("What happened when"))
+        words = rrb.Tabs(summary, layouts.events("What happened when"))
         if self._has_scene:
             right = rrb.Vertical(self._input("What it sees now"), words, row_shares=[2, 4])
-            above = rrb.Horizontal(scene(), right, column_shares=[5, 3])
+            above = rrb.Horizontal(layouts.scene(), right, column_shares=[5, 3])
         else:
             above = rrb.Horizontal(self._streams("What it sees"), words, column_shares=[5, 3])
         plots: Views = [self._plot(panel, panel.title, panel.entities) for panel in followed]
@@ -195,7 +182,7 @@ class RunLayout:
         """Return the modules, each on a page of its own; many share pages."""
         count = max(self._outline.modules, len(self._outline.saved))
         truth = Panel("What the world knows", ("/world/truth",), "near")
-        known: Views = [*(self._views(truth) if self._spec.truth else ()), events("Events")]
+        known: Views = [*(self._views(truth) if self._spec.truth else ()), layouts.events("Events")]
         if not count:
             return rrb.Vertical(*known, name="Modules")
         pages: Views = []
@@ -256,7 +243,7 @@ class RunLayout:
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
         values = curve_view(name, ["/world/watched"], near=NEAR)
-        whose = lanes("Of which stream", ["/attends"], near=NEAR)
+        whose = layouts.lanes("Of which stream", ["/attends"], near=NEAR)
         return rrb.Vertical(values, whose, row_shares=[3, 2])
 
     def _weights(self, path: str, name: str) -> rrb.View:

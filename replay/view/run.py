@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -50,13 +50,6 @@ RECENT = 50
 WATCHED_NAME = "world/watched/name"
 
 
-class Writer(Protocol):
-    """Writes a part of a view, batch after batch."""
-
-    def take(self, batch: Batch) -> None:
-        """Write the messages of some iterations."""
-
-
 class RunView:
     """Writes a run into a recording.
 
@@ -89,7 +82,7 @@ class RunView:
         self._lanes = Lanes(rows, streams, by_progress=by_progress, piece=piece)
         self.modules = ModulesView(rows, modules, by_progress=by_progress)
         self.world, notes = world_of_run(rows, header, folder, streams, every)
-        self._writers: list[Writer] = [
+        self._writers: list[Any] = [
             SignalCurves(rows, header, streams),
             Inputs(rows),
             self._lanes,
@@ -309,10 +302,10 @@ def line_names(signal: Signal, module: int, outputs: int) -> list[str]:
 
 def thresholds_of(header: RunHeader) -> Iterator[tuple[str, str, float]]:
     """Yield entity, label and value of each line that is crossed where something is learned."""
-    if header.by_progress and header.settled is not None:
-        change, error = header.settled
+    change, agreement = header.number("settled"), header.number("agreement")
+    if header.by_progress and change and agreement:
         yield "thresholds/change", "settled below", math.log10(change)
-        yield "thresholds/learning_error", "learned below", math.log10(error)
+        yield "thresholds/learning_error", "learned below", math.log10(change + agreement)
     rules = rules_of(header)
     for rule in rules:
         value = math.log10(rule.threshold) if rule.signal == "eta_dot" else rule.threshold

@@ -19,16 +19,6 @@ from cdmisfa.agents.inputs import count_inputs, rows_of, signals_of_block
 from cdmisfa.agents.progress import judging
 from cdmisfa.agents.progress.attention import RECENT, RULES, ProgressConfig, Situation, interest
 from cdmisfa.agents.progress.candidate import Candidate, Candidates
-from cdmisfa.agents.progress.judging import (
-    GIVEN_UP,
-    KNOWN,
-    LEARNED,
-    LEARNING,
-    NO_PROGRESS,
-    PATIENCE,
-    REASONS,
-    decide,
-)
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand, expanded_size
@@ -167,7 +157,7 @@ class ProgressLearner:
         frames = expand(self._expansion, rows_of(block, self.spec, self.stream, self.tau))
         stream, count = block.stream, len(self.modules)
         row, counts = self._streams[stream], self._counts[0]
-        novel = int(row["state"]) == LEARNING
+        novel = int(row["state"]) == judging.LEARNING
         candidate = self._candidates.opened(stream, self._learning, self._streams["last"])
         y_frozen = kernels.outputs(self._phi, self._offset, frames)
         error = candidate.error
@@ -236,7 +226,7 @@ class ProgressLearner:
     @property
     def _learning(self) -> NDArray[np.bool_]:
         """(S,) which streams are being learned."""
-        return np.asarray(self._streams["state"] == LEARNING)
+        return np.asarray(self._streams["state"] == judging.LEARNING)
 
     @property
     def _policy(self) -> NDArray[np.int64]:
@@ -254,20 +244,21 @@ class ProgressLearner:
         if judging.mastered(candidate, self.config):
             del self._candidates[stream]
             return self._settle(stream, candidate, frames)
-        if state == LEARNING:
+        if state == judging.LEARNING:
             why = judging.hopeless(candidate, self.config)
             if not why and judging.stale(candidate, self.config):
                 del self._candidates[stream]
-                if row["visits"] - row["decided"] < PATIENCE * self._window:
+                if row["visits"] - row["decided"] < judging.PATIENCE * self._window:
                     return self._event(stream, "starts again: its slow feature came to rest")
-                why = NO_PROGRESS
-            if why == NO_PROGRESS and module >= 0:  # it gives what can be found there
+                why = judging.NO_PROGRESS
+            if why == judging.NO_PROGRESS and module >= 0:  # it gives what can be found there
                 return self._settle(stream, candidate, frames, module)
             if why:
-                decide(row, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
+                code, eta = judging.REASONS.index(why), float(candidate.tested[0])
+                judging.decide(row, judging.GIVEN_UP, -1, eta, code)
                 return self._event(stream, f"is given up after {row['decided']} blocks: {why}")
-        elif state == GIVEN_UP:
-            if REASONS[int(row["why"])] != NO_PROGRESS and judging.promising(
+        elif state == judging.GIVEN_UP:
+            if judging.REASONS[int(row["why"])] != judging.NO_PROGRESS and judging.promising(
                 candidate, self.config
             ):
                 self._learn_again(stream, -1)
@@ -275,7 +266,7 @@ class ProgressLearner:
         elif judging.differs(row, self._watched):
             self._learn_again(stream, module)
             return self._event(stream, f"no longer fits module {module + 1}")
-        if state != LEARNING and candidate.blocks >= PATIENCE * self._window:
+        if state != judging.LEARNING and candidate.blocks >= judging.PATIENCE * self._window:
             del self._candidates[stream]
         return ()
 
@@ -295,11 +286,11 @@ class ProgressLearner:
         module = self.modules[index]
         given = candidate.sfa.compare(module.phi[0], frames)
         judging.begin_watching(row, given.variance, given.slowness)
-        if index == before and state != LEARNING:
+        if index == before and state != judging.LEARNING:
             return ()
         eta = float(candidate.tested[0]) if new else given.slowness
         learned = module.stream_index == stream
-        decide(row, LEARNED if learned else KNOWN, index, eta)
+        judging.decide(row, judging.LEARNED if learned else judging.KNOWN, index, eta)
         if index == before:
             return self._event(stream, f"still shows what module {index + 1} gives")
         by = "learned by" if learned else f"known by {module.stream}'s"
@@ -312,7 +303,7 @@ class ProgressLearner:
     def _learn_again(self, stream: int, module: int) -> None:
         """Begin another candidate for a stream that had been decided."""
         self._candidates.pop(stream, None)
-        decide(self._streams[stream], LEARNING, module, math.nan)
+        judging.decide(self._streams[stream], judging.LEARNING, module, math.nan)
 
     def _event(self, stream: int, text: str) -> tuple[str, ...]:
         return (f"stream {self.spec.streams[stream]} {text}",)
@@ -322,7 +313,7 @@ class ProgressLearner:
         streams = self._streams
         if self._learning.any():
             return ()
-        again = (streams["state"] == GIVEN_UP) & (streams["looks"] < self.config.looks - 1)
+        again = (streams["state"] == judging.GIVEN_UP) & (streams["looks"] < self.config.looks - 1)
         for stream in np.flatnonzero(again).tolist():
             streams["looks"][stream] += 1
             self._learn_again(stream, -1)
