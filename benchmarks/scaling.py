@@ -77,7 +77,7 @@ def sweeping(trials: int) -> dict[str, Callable[[], int]]:
         return len(plan("oscillatory", grid={}, seeds=range(trials)))
 
     def configured() -> int:
-        return len([configure("oscillatory", None, (), seed) for seed in range(trials)])
+        return len([configure("oscillatory", seed=seed) for seed in range(trials)])
 
     (trial,) = plan("oscillatory", grid={}, seeds=[0])
 

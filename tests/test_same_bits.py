@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from cdmisfa.core.config import Layers
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure, open_source
 
@@ -48,7 +49,7 @@ def learned() -> dict[str, str]:
     """The `signals_sha256` of each learner, of vectors and of images."""
     found = {}
     for algorithm in ("2.0", "1.0", "progress"):
-        told = configure("oscillatory", settings=[f"learner.algorithm={algorithm}"])
+        told = configure("oscillatory", Layers.read(words=[f"learner.algorithm={algorithm}"]))
         source = told.open_scene()
         result = run(source, told.learner, seed=3, max_iterations=20)
         found[algorithm] = result.signals_sha256

@@ -17,6 +17,7 @@ from benchmarks.arena.judging import judge, run_learner
 from benchmarks.arena.rules import RULES, Attentive
 from benchmarks.arena.streams import GROUPS, SETS, ArenaSource
 from cdmisfa.agents.learners import open_learner
+from cdmisfa.core.config import Layers
 from cdmisfa.experiments.documents import plain, versions, write_json
 from cdmisfa.experiments.results import mean_interval, summary
 from cdmisfa.experiments.sources import configure
@@ -44,7 +45,7 @@ def run_trials(name: str, learners: list[str], seed: int, settings: list[str]) -
     images = source.spec.images
     for learner in learners:
         words = [*f"learner.algorithm={LEARNERS[learner]}".split(), *settings]
-        config = configure("icub" if images else "oscillatory", settings=words).learner
+        config = configure("icub" if images else "oscillatory", Layers.read(words=words)).learner
         source.t = 0
         if learner in RULES:
             course = run_learner(Attentive(config, source.spec, seed, learner), source, name)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.paper import Table, study
-from cdmisfa.core.config import load_preset
+from cdmisfa.core.config import Layers, load_preset
 from cdmisfa.experiments.sources import configure
 from cdmisfa.studies.paper import icub
 from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_text, of_all
@@ -39,7 +39,7 @@ def run(settings: Settings) -> dict[str, Any]:
     words = [f"learner.algorithm={settings['learner']}"]
     words += [f"scene.{key}={real[key]}" for key in ADDED[added]]
     words += [TURNED] if added == "overlapping views" else []
-    config = configure("icub", None, words, settings["seed"])
+    config = configure("icub", Layers.read(words=words), settings["seed"])
     with contextlib.closing(config.open_scene()) as source:
         end = icub.ITERATIONS * config.learner.tau
         return icub.learn_and_judge(source, config.learner, settings["seed"], end)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS, learner_class
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
-from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_settings, section_table
+from cdmisfa.core.config import Layers, LearnerConfig, build, load_preset, section_table
 from cdmisfa.core.errors import UsageError, are_for, did_you_mean
 from recorder.cameras.words import CAMERAS, is_live, open_live, refuse_stored
 from recorder.config import RecordConfig, SceneConfig
@@ -72,6 +72,9 @@ class Configuration:
         return tables
 
 
+NO_LAYERS = Layers()
+
+
 def is_scene(words: Sequence[str | Path]) -> bool:
     """Return whether words name a live scene."""
     return len(words) == 1 and words[0] in SCENES
@@ -79,8 +82,7 @@ def is_scene(words: Sequence[str | Path]) -> bool:
 
 def configure(
     kind: str,
-    preset: str | None = None,
-    settings: Sequence[str] = (),
+    settings: Layers = NO_LAYERS,
     seed: int | None = 0,
     inputs: InputOptions | None = None,
 ) -> Configuration:
@@ -88,31 +90,29 @@ def configure(
 
     Args:
         kind: the scene, whose preset is used where none is given and the learner has none.
-        preset: name of a preset or a .toml file.
-        settings: `section.key=value` words; they win over the preset.
+        settings: preset and words.
         seed: becomes `scene.seed` where that is not set; None leaves it to `seeded`.
         inputs: options of the command line, of which a scene takes `--color` alone.
 
     Raises:
         UsageError: an unknown scene, preset, learner, section or key, or a value that misfits.
     """
-    words = parse_settings(settings)
-    misplaced = [f"input.{key}" for key in words.get("input", {})]
+    misplaced = [f"input.{key}" for key in settings.words.get("input", {})]
     if inputs is not None:
         misplaced += replace(inputs, color=inputs.color == "auto").named()
         if inputs.color:
-            words.setdefault("scene", {})["color"] = "true"
+            scene = {**settings.words.get("scene", {}), "color": "true"}
+            settings = replace(settings, words={**settings.words, "scene": scene})
     if misplaced:
         clock = "; its rate is --set record.fps=HZ" if "--rate" in misplaced else ""
         raise UsageError(f"{kind} is a scene: {are_for(misplaced, 'logs and cameras')}{clock}")
-    return _filled(kind, preset, words, None).seeded(seed)
+    return _filled(kind, settings, None).seeded(seed)
 
 
 def configure_for(
     spec: SourceSpec,
     described: Mapping[str, Any],
-    preset: str | None = None,
-    settings: Sequence[str] = (),
+    settings: Layers = NO_LAYERS,
     seed: int | None = 0,
     inputs: InputOptions | None = None,
     *,
@@ -127,7 +127,6 @@ def configure_for(
     Args:
         spec: of the source.
         described: the description that the source gives.
-        preset: see `configure`.
         settings: see `configure`.
         seed: see `configure`.
         inputs: how the source is read.
@@ -136,63 +135,52 @@ def configure_for(
     Raises:
         UsageError: as for `configure`, or a key of live scenes.
     """
-    words = parse_settings(settings)
-    misplaced = [f"scene.{key}" for key in words.get("scene", {})]
-    misplaced += [f"record.{key}" for key in words.get("record", {}) if key in CLOCK]
+    misplaced = [f"scene.{key}" for key in settings.words.get("scene", {})]
+    misplaced += [f"record.{key}" for key in settings.words.get("record", {}) if key in CLOCK]
     if misplaced and not resumed:
         raise UsageError(f"{are_for(misplaced, 'live scenes')}, and this source is none")
     scene = str(described.get("scene", ""))
-    kind = scene
-    if kind not in SCENES and preset is not None:
-        kind = str(load_preset(preset).get("scene", {}).get("kind"))
+    kind = scene if scene in SCENES else str(settings.section("scene")[0].get("kind"))
     if kind not in SCENES:
         kind = "icub" if len(spec.frame_shape) == 2 else "oscillatory"
     streams = "" if scene in SCENES else scene or str(described["kind"])
-    filled = _filled(kind, preset, words, OF_CAMERAS if streams else None)
+    filled = _filled(kind, settings, OF_CAMERAS if streams else None)
     clock = spec.fps, spec.start_ns
     filled = replace(filled, streams=streams, clock=clock, inputs=inputs or InputOptions())
     return filled.seeded(seed)
 
 
-def _filled(
-    kind: str, preset: str | None, words: dict[str, dict[str, str]], default: str | None
-) -> Configuration:
+def _filled(kind: str, settings: Layers, default: str | None) -> Configuration:
     """Fill all sections from the preset, which the learner or the scene may name, and the words."""
-    algorithm = words.get("learner", {}).get("algorithm")
-    if preset is None:
+    algorithm = settings.words.get("learner", {}).get("algorithm")
+    tables = settings.preset
+    if tables is None:
         algorithm = algorithm or default
         named = getattr(learner_class(algorithm), "preset", None) if algorithm else None
         tables = load_preset(named or SCENES[kind].preset)
         if algorithm and algorithm not in LEARNERS:
             tables["learner"] = {}  # the preset's keys are not those of a user's learner
-    else:
-        tables = load_preset(preset)
-    for section in (*tables, *words):
+        settings = replace(settings, preset=tables)
+    for section in (*tables, *settings.words):
         if section not in SECTIONS:
             raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
-    layers = {name: (tables.get(name, {}), words.get(name, {})) for name in SECTIONS}
     algorithm = algorithm or tables.get("learner", {}).get("algorithm") or LearnerConfig().algorithm
     named_learner = {"algorithm": algorithm}
     keys = learner_class(algorithm).configuration
     return Configuration(
-        learner=build(keys, "learner", *layers["learner"], named_learner),
-        scene=build(SCENES[kind].config, "scene", *layers["scene"]),
-        record=build(RecordConfig, "record", *layers["record"]),
+        learner=build(keys, "learner", *settings.section("learner"), named_learner),
+        scene=build(SCENES[kind].config, "scene", *settings.section("scene")),
+        record=build(RecordConfig, "record", *settings.section("record")),
     )
 
 
-def read_inputs(
-    inputs: InputOptions | None, preset: str | None, settings: Sequence[str]
-) -> InputOptions:
-    """Add the keys `input.*` of a preset and of settings to options.
+def read_inputs(inputs: InputOptions | None, settings: Layers) -> InputOptions:
+    """Add the keys `input.*` of settings to options.
 
     Raises:
-        UsageError: there is no such preset or key, or a value does not fit.
+        UsageError: there is no such key, or a value does not fit.
     """
-    tables = {} if preset is None else load_preset(preset)
-    words = parse_settings(settings)
-    inputs = inputs or InputOptions()
-    return inputs.configured(tables.get("input", {}), words.get("input", {}))
+    return (inputs or InputOptions()).configured(*settings.section("input"))
 
 
 def open_source(
@@ -224,12 +212,13 @@ def open_source(
     Raises:
         CdmisfaError: there is no such source or setting, or a log is damaged.
     """
+    given = Layers.read(preset, settings)
     if is_scene(words):
         if how.get("episodes"):
             raise UsageError(f"{words[0]} is a scene: --episodes is for logs")
-        scene = configure(str(words[0]), preset, settings, seed, inputs)
+        scene = configure(str(words[0]), given, seed, inputs)
         return scene.open_scene(), scene
-    inputs = read_inputs(inputs, preset, settings)
+    inputs = read_inputs(inputs, given)
     source: FrameSource
     if all(is_live(str(word)) for word in words):
         live = list(map(str, words))
@@ -239,7 +228,7 @@ def open_source(
         source = open_logs(words, inputs=inputs, **how)
     try:
         described = description(source, at_once=True)
-        chosen = preset, settings, seed, inputs
+        chosen = given, seed, inputs
         return source, configure_for(source.spec, described, *chosen, resumed=resumed)
     except BaseException:
         source.close()

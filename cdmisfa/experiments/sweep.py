@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from cdmisfa.agents.learners import LEARNERS, learner_class
-from cdmisfa.core.config import section_table
+from cdmisfa.core.config import Layers, section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.run_folder import module_table, with_recipes
@@ -121,7 +121,7 @@ def plan(
     # Workers may have another working directory.
     paths = tuple(str(w) if scene or "://" in str(w) else str(Path(w).resolve()) for w in words)
     if not scene:
-        inputs = read_inputs(inputs, preset, settings)
+        inputs = read_inputs(inputs, Layers.read(preset, settings))
         with contextlib.closing(
             open_logs(words, loop=loop, inputs=inputs, goal=("sweep", "SWEEP"))
         ) as logs:
@@ -132,11 +132,12 @@ def plan(
     trials: dict[str, Trial] = {}
     for values in itertools.product(*grid.values()):
         point = dict(zip(grid, values, strict=True))
-        with_point = (*settings, *(f"{key}={value}" for key, value in point.items()))
+        points = (f"{key}={value}" for key, value in point.items())
+        given = Layers.read(preset, (*settings, *points))
         if recorded is None:
-            configured = configure(str(words[0]), preset, with_point, None, inputs)
+            configured = configure(str(words[0]), given, None, inputs)
         else:
-            configured = configure_for(spec, recorded, preset, with_point, None, inputs)
+            configured = configure_for(spec, recorded, given, None, inputs)
         learner = configured.learner
         for seed in seeds:
             configuration = configured.seeded(seed)

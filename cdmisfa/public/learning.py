@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.blocks import FrameSource, description
+from cdmisfa.core.config import Layers
 from cdmisfa.core.learning import Sink
 from cdmisfa.experiments.holdout import hold_out
 from cdmisfa.experiments.run_folder import command_of
@@ -161,7 +162,8 @@ def _configured(
     source: FrameSource, how: dict[str, Any], inputs: InputOptions | None = None
 ) -> Configuration:
     """Return the configuration of an open source, and centre its frames as `input.centre` says."""
-    inputs = read_inputs(inputs, how["preset"], how["settings"])
+    given = Layers.read(how["preset"], how["settings"])
+    inputs = read_inputs(inputs, given)
     centre_as(inputs.centre, source, "this source")
     described = description(source, at_once=True)
-    return configure_for(source.spec, described, **how, inputs=inputs)
+    return configure_for(source.spec, described, given, how["seed"], inputs)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.blocks import SeekableSource
+from cdmisfa.core.config import Layers
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.reports import write_report
@@ -62,7 +63,7 @@ def demo(
     missing = [name for name in ("pybullet", "icub_models") if find_spec(name) is None]
     scene = STAND_IN if missing else SCENE
     preset = preset or (None if missing else PRESET)
-    configuration = configure(scene, preset, seed=seed)
+    configuration = configure(scene, Layers.read(preset), seed)
     recording, folder = out / "recordings" / f"demo-{scene}", out / "runs" / f"demo-{scene}"
 
     def learn(bar: Any, word: str | Path, out: Path | None, most: int | None) -> RunResult:

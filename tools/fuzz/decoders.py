@@ -27,6 +27,7 @@ from test_bags import ros1_bag, ros2_database
 from test_modules import learned, with_width
 
 from cdmisfa.core.blocks import Block
+from cdmisfa.core.config import Layers
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Keyframe
 from cdmisfa.experiments.sources import configure
@@ -188,7 +189,7 @@ def _presets() -> Iterator[bytes]:
 
 
 def _preset(path: Path) -> None:
-    configure("icub" if b"icub" in path.read_bytes() else "oscillatory", str(path))
+    configure("icub" if b"icub" in path.read_bytes() else "oscillatory", Layers.read(str(path)))
 
 
 def _run_json(path: Path) -> None:

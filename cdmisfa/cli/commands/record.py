@@ -75,6 +75,7 @@ def record_command(
     Or SOURCE is one or several live streams: camera:/dev/video0, rtsp://, http://.../x.mjpg,
     tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. For existing logs see cdmisfa convert.
     """
+    from cdmisfa.core.config import Layers
     from cdmisfa.experiments.sources import configure
     from recorder.cameras.words import is_live
     from recorder.config import parse_split
@@ -101,7 +102,7 @@ def record_command(
     if not scene:
         raise click.UsageError(f"name the SCENE, {' or '.join(SCENES)}")
     seed = seed if seed is not None else start.seed or 0
-    configuration = configure(scene, preset, settings, seed, inputs)
+    configuration = configure(scene, Layers.read(preset, settings), seed, inputs)
     with _writing(out, "recording", notice="") as (shown, stop):
         files = record_scene(
             scene,
