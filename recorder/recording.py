@@ -121,8 +121,6 @@ def record(
     if frames is not None and not 1 <= frames <= (length or frames):
         most = "" if length is None else f", and no more than the {length} that there are"
         raise UsageError(f"--frames is {frames}: record at least one{most}")
-    if jobs > 1 and scene is None:
-        raise UsageError(f"--jobs is {jobs}: only a scene can be opened by several processes")
     if force and resume:
         raise UsageError("--force starts anew and --resume goes on: use one of them")
     if not resume:

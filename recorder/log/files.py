@@ -114,15 +114,12 @@ def found_path(word: str, folder: Path) -> str:
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path, *, sync: bool = True) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a path to write a file or a folder at, which takes its own name once it is complete.
 
     Its folder is made; a file or folder of that name is replaced. After an error nothing is left.
-
-    Args:
-        path: the name.
-        sync: let the disk have all of a file before it takes its name, and then the name, so that
-            a power cut leaves this file or the one before.
+    The disk has all of a file before it takes its name, and then the name, so that a power cut
+    leaves this file or the one before.
 
     Raises:
         UsageError: a device or a pipe has that name, or a file that of its folder.
@@ -135,13 +132,12 @@ def atomic_write(path: Path, *, sync: bool = True) -> Iterator[Path]:
         _remove_leftovers(path)
         _remove(partial)
         yield partial
-        if sync and partial.is_file():
+        if partial.is_file():
             to_disk(partial)
         if path.is_dir() or partial.is_dir():
             _remove(path)
         os.replace(partial, path)
-        if sync:
-            to_disk(path.parent)
+        to_disk(path.parent)
     except OSError as error:
         raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:

@@ -192,28 +192,25 @@ class ViewMetadata:
                 versions={key: v for key, v in values.items() if key.startswith(_VERSION)},
                 values=dict(values),
             )
+            possible = {
+                "schema": values["schema"] == str(SCHEMA_VERSION),
+                "view": stated.view != "",
+                "stream_index": 0 <= stated.stream_index <= MAX_STREAMS,
+                "frame_shape": min(shape) > 0 and math.prod(shape) <= MAX_FRAME_VALUES,
+                "dtype": (stated.dtype, len(shape)) in (("uint8", 2), ("float64", 1)),
+                "truth": len(set(stated.truth)) == len(stated.truth)
+                and all(name.isidentifier() for name in stated.truth),
+                "fps": RECORDED_FPS[0] <= stated.fps <= RECORDED_FPS[1],
+                "start_ns": 0 <= stated.start_ns <= 2**62,
+                "first_frame": 0 <= stated.first_frame <= MAX_FRAMES,
+                "stream_count": 0 <= stated.stream_count <= MAX_STREAMS,
+            }
+            if wrong := [key for key, right in possible.items() if not right]:
+                raise ValueError(f"{wrong[0]} is {values[wrong[0]][:60]!r}")
         except (KeyError, ValueError) as error:
             raise LogDamagedError(
                 f"{path}: its recording metadata is broken ({error}): record it again"
             ) from None
-        possible = {
-            "schema": values.get("schema") == str(SCHEMA_VERSION),
-            "view": stated.view != "",
-            "stream_index": 0 <= stated.stream_index <= MAX_STREAMS,
-            "frame_shape": min(shape) > 0 and math.prod(shape) <= MAX_FRAME_VALUES,
-            "dtype": (stated.dtype, len(shape)) in (("uint8", 2), ("float64", 1)),
-            "truth": len(set(stated.truth)) == len(stated.truth)
-            and all(name.isidentifier() for name in stated.truth),
-            "fps": RECORDED_FPS[0] <= stated.fps <= RECORDED_FPS[1],
-            "start_ns": 0 <= stated.start_ns <= 2**62,
-            "first_frame": 0 <= stated.first_frame <= MAX_FRAMES,
-            "stream_count": 0 <= stated.stream_count <= MAX_STREAMS,
-        }
-        if wrong := [key for key, right in possible.items() if not right]:
-            raise LogDamagedError(
-                f"{path}: its recording metadata says {values.get(wrong[0], '')[:60]!r} for "
-                f"{wrong[0]}, which this version does not read: record it again"
-            )
         return stated
 
 

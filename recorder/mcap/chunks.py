@@ -220,7 +220,8 @@ class Chunks:
             self._cache.move_to_end(key)
             return self._cache[key]
         while self._cache and self._cached + min(segment.size, MAX_CHUNK) > CACHE_BYTES:
-            self._drop(next(iter(self._cache)))
+            _, oldest = self._cache.popitem(last=False)
+            self._cached -= len(oldest.data)
         self._cache[key] = table = self._decoded(segment)
         self._cached += len(table.data)
         return table
@@ -250,14 +251,13 @@ class Chunks:
         if self._thread is not None:
             self._thread.shutdown()
 
-    def _drop(self, key: int) -> None:
-        self._cached -= len(self._cache.pop(key).data)
-
     def _decoded(self, segment: Segment) -> MessageTable:
         ahead, self._ahead = self._ahead, None
         self._look_ahead(segment)
-        known = ahead is not None and ahead[0] == segment.offset
-        raw = ahead[1].result() if ahead is not None and known else self._records(segment)
+        if ahead is not None and ahead[0] == segment.offset:
+            raw = ahead[1].result()
+        else:
+            raw = chunk_records(self._file, segment)
         if not (segment.crc or segment.cut):
             self._without_crc()
         table, definitions, (earliest, latest) = walked_table(raw, cut=segment.cut)
@@ -280,42 +280,35 @@ class Chunks:
         slow = following.compression and _LONG <= following.stored < _PACKED * following.size
         if slow and following.size <= _LARGE and not following.cut:
             self._thread = self._thread or ThreadPoolExecutor(1)
-            future = self._thread.submit(self._records, following)
+            future = self._thread.submit(chunk_records, self._file, following)
             self._ahead = following.offset, future
 
-    def _records(self, segment: Segment) -> ByteArray:
-        """Return the records of a chunk whose CRC matches; another thread may call it."""
-        compression, size, begin = segment.compression, segment.size, segment.offset
-        check_size(compression, 0 if segment.cut else size)
-        raw = np.frombuffer(self._file.read(begin, segment.data_end - begin), np.uint8)
-        if segment.stated:
-            confirm(segment, raw.data)
-        stored = raw[segment.data_offset - begin :]
-        records = decompressed(stored, compression, min(size, MAX_CHUNK), cut=segment.cut)
-        if segment.cut:
-            return records
-        if segment.crc and crc32(records.data) != segment.crc:
-            raise MalformedRecord("its CRC does not match: damaged")
-        return freeze(records)
 
-
-def confirm(segment: Segment, data: memoryview) -> None:
-    """Compare the head of a chunk with the summary.
+def chunk_records(file: Store, segment: Segment) -> ByteArray:
+    """Read the records of a chunk, whose CRC must match; any thread may call it.
 
     Args:
-        segment: as the summary states it; its CRC is set.
-        data: the bytes of the file from its first on.
+        file: the log.
+        segment: the chunk; its CRC is set where only the summary stated it.
 
     Raises:
-        MalformedRecord: they differ.
+        MalformedRecord: the chunk is damaged, or is not as the summary states it.
     """
-    if data[:1] != bytes([Opcode.CHUNK]):
-        raise MalformedRecord("the summary points to something that is no chunk")
-    crc = int.from_bytes(data[CHUNK_HEADER.size - 4 : CHUNK_HEADER.size], "little")
-    if data[: segment.data_offset - segment.offset] != segment.head(crc):
-        raise MalformedRecord("it is not the chunk that the summary names")
-    segment.crc = crc
-    segment.stated = False
+    compression, size, begin = segment.compression, segment.size, segment.offset
+    check_size(compression, 0 if segment.cut else size)
+    raw = np.frombuffer(file.read(begin, segment.data_end - begin), np.uint8)
+    head, stored = raw.data[: segment.data_offset - begin], raw[segment.data_offset - begin :]
+    if segment.stated:
+        crc = int.from_bytes(head[CHUNK_HEADER.size - 4 : CHUNK_HEADER.size], "little")
+        if head != segment.head(crc):
+            raise MalformedRecord("it is not the chunk that the summary names")
+        segment.crc, segment.stated = crc, False
+    records = decompressed(stored, compression, min(size, MAX_CHUNK), cut=segment.cut)
+    if segment.cut:
+        return records
+    if segment.crc and crc32(records.data) != segment.crc:
+        raise MalformedRecord("its CRC does not match: damaged")
+    return freeze(records)
 
 
 def check_size(compression: str, size: int) -> None:

@@ -89,16 +89,6 @@ class LogReader(LogStructure):
     # What the file holds
 
     @property
-    def size(self) -> int:
-        """Bytes of the file."""
-        return self.file.size
-
-    @property
-    def data_complete(self) -> bool:
-        """Whether every message is there, if not the summary behind them."""
-        return self.data_crc is not None
-
-    @property
     def statistics(self) -> Statistics | None:
         """The statistics in the summary, or None."""
         return self.summary.statistics if self.summary else None
@@ -257,8 +247,15 @@ class LogReader(LogStructure):
             return None
 
     def index(self, segment: Segment, channels: Collection[int] | None = None) -> Pairs:
-        """Read a chunk's message indexes; see `Chunks.index`."""
-        return self._chunks.index(segment, channels)
+        """Read a chunk's message indexes, or those of some channels.
+
+        Raises:
+            LogDamagedError: they are larger than any chunk.
+        """
+        try:
+            return self._chunks.index(segment, channels)
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{self.path}: {segment.name}: {error}") from None
 
     def close(self) -> None:
         """Close the file; harmless when called twice."""

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -119,19 +119,9 @@ Refuse = Callable[[str, str], None]
 class IndexPart:
     """The message index of one channel in one chunk: `count` pairs at `offset` in the file."""
 
-    HEAD: ClassVar = struct.Struct("<HI")
-
     channel: int
     offset: int
     count: int
-
-    @classmethod
-    def of_record(cls, content: int, length: int, head: bytes) -> IndexPart:
-        """Parse the head of a message index record, whose content is at a place in the file."""
-        channel, size = cls.HEAD.unpack(head.ljust(cls.HEAD.size, b"\0"))
-        if size + cls.HEAD.size > length or size % 16:
-            raise MalformedRecord("a message index lies about its length")
-        return cls(channel, content + cls.HEAD.size, size // 16)
 
 
 @dataclass(slots=True)

@@ -38,6 +38,7 @@ from recorder.mcap.summary import Summary, read_summary
 # Messages outside chunks are decoded about this many bytes at once, as many as a chunk has.
 LOOSE_BYTES: Final = 1024 * 1024
 _LOOSE: Final = struct.Struct("<HIQ")
+_INDEX: Final = struct.Struct("<HI")
 _DATA_END_BYTES: Final = RECORD_HEADER.size + 4
 # Most bytes of an attachment's names.
 _BEFORE_DATA: Final = 1024 * 1024
@@ -199,12 +200,9 @@ class LogStructure:
         if self.complete and self.summary:
             for what in self.summary.contradictions(self.segments):
                 self._damaged("summary", what)
-        if self.torn is not None and not self._unverifiable(self.torn):
+        # The CRC of a cut chunk is that of records that are not there.
+        if self.torn is not None and (self.salvage or not self.torn.crc):
             self.segments.append(self.torn)
-
-    def _unverifiable(self, tail: Segment) -> bool:
-        """Return whether a cut chunk is left out: its CRC is that of records that are not there."""
-        return bool(tail.crc) and not self.salvage
 
     # The outer records
 
@@ -256,7 +254,14 @@ class LogStructure:
             self._loose_message(content, length)
             return
         if opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(content, length)
+            if self._last_chunk is None:
+                raise MalformedRecord("a message index without its chunk")
+            head = self.file.peek(content, min(length, _INDEX.size)).ljust(_INDEX.size, b"\0")
+            channel, size = _INDEX.unpack(head)
+            if size + _INDEX.size > length or size % 16:
+                raise MalformedRecord("a message index lies about its length")
+            part = IndexPart(channel, content + _INDEX.size, size // 16)
+            self._last_chunk.indexes.append(part)
             return
         self._last_chunk = None
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -293,12 +298,6 @@ class LogStructure:
         if length > MAX_DEFINITION:
             raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
         return self.file.read(content, length)
-
-    def _message_index(self, content: int, length: int) -> None:
-        if self._last_chunk is None:
-            raise MalformedRecord("a message index without its chunk")
-        head = self.file.peek(content, min(length, IndexPart.HEAD.size))
-        self._last_chunk.indexes.append(IndexPart.of_record(content, length, head))
 
     def _loose_message(self, content: int, length: int) -> None:
         """Add a message outside chunks to the messages before it."""
@@ -357,7 +356,7 @@ class LogStructure:
                 else "the data section has no end record"
             )
         self.missing = f"cut short: {what}"
-        if self.torn is not None and self._unverifiable(self.torn):
+        if self.torn is not None and self.torn.crc and not self.salvage:
             self.missing += "; recover can save part of the last chunk, unverified"
         return False
 

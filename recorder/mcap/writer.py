@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import lz4.frame
 import zstandard
@@ -49,24 +49,11 @@ _COMPRESS: Final[Mapping[Compression, tuple[str, Callable[[memoryview], bytes]]]
 }
 
 
-class Appended(Protocol):
-    """A file that is only appended to."""
-
-    def write(self, data: bytes | memoryview, /) -> int:
-        """Append all of the bytes."""
-
-    def tell(self) -> int:
-        """Return the number of bytes that were appended."""
-
-    def flush(self) -> None:
-        """Hand all of the bytes to the operating system."""
-
-
 class McapWriter:
     """Write one file, from its first byte to its last.
 
     Args:
-        out: the file.
+        out: the open file, which is only appended to.
         library: writer of the file, as its header states.
         profile: of the messages, as the header states.
         compression: of the chunks.
@@ -76,7 +63,7 @@ class McapWriter:
 
     def __init__(
         self,
-        out: Appended,
+        out: Any,
         *,
         library: str = "cdmisfa",
         profile: str = "",
@@ -109,7 +96,7 @@ class McapWriter:
     def size(self) -> int:
         """Bytes written so far, without the chunk in progress."""
         self.settle()
-        return self._out.tell()
+        return int(self._out.tell())
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Define how messages are decoded, and return its id; the same schema gets the same."""
@@ -170,19 +157,9 @@ class McapWriter:
     ) -> None:
         """Write a named file at once, outside the chunks; times in nanoseconds."""
         self.settle()
-        about: dict[str, Any] = {
-            "log_time": log_time,
-            "create_time": create_time,
-            "name": name,
-            "media_type": media_type,
-        }
-        stored = _encoded(Attachment(data=data, **about))
-        place: dict[str, Any] = {
-            "offset": self._out.tell(),
-            "length": len(stored),
-            "data_size": len(data),
-        }
-        self._attachments.append(AttachmentIndex(**place, **about))
+        stored = _encoded(Attachment(create_time, log_time, name, media_type, data))
+        place, times = (self._out.tell(), len(stored)), (log_time, create_time)
+        self._attachments.append(AttachmentIndex(*place, *times, len(data), name, media_type))
         self._append(stored)
         self._out.flush()
 
@@ -287,7 +264,7 @@ class McapWriter:
             self._grow(stop)
         self._records[self._size : stop] = data
         self._size = stop
-        if self._size > self._chunk_size:
+        if stop > self._chunk_size:
             self.end_chunk()
 
     def _grow(self, size: int) -> None:

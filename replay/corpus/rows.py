@@ -18,7 +18,7 @@ from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord
 from replay.corpus.finding import ListedLog, size_and_time
 from replay.integrity.info import describe_log, describe_reader
-from replay.integrity.report import ChannelInfo, failed_state
+from replay.integrity.report import ChannelInfo, failed
 from replay.logs.clock import missing
 from replay.logs.opening import identity_of, image_topics, only_external, open_stream
 from replay.storage.identity import Identity, McapIdentity
@@ -92,9 +92,9 @@ def read_rows(logs: Sequence[ListedLog], deep: bool) -> tuple[pa.Table, list[str
             if not isinstance(error, CdmisfaError):
                 text = error.strerror if isinstance(error, OSError) else None
                 error = LogDamagedError(text or f"{type(error).__name__}: {error}")
-            crc, state = failed_state(error)
-            streams = [{"crc": crc, "state": state}]
-            problem = str(error).removeprefix(f"{log.file}: ")
+            report = failed(log.file, error)
+            streams = [{"crc": report.crc, "state": report.state}]
+            problem = report.problems[0].what
         shared = {
             "path": log.path,
             "log": log.path,

@@ -13,13 +13,13 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.messages import SCHEMAS
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import MalformedRecord, Problem, Segment
+from recorder.mcap.records import Problem, Segment
 from replay.inputs import locations
 from replay.integrity.learned import run_facts
 from replay.integrity.report import (
@@ -150,6 +150,7 @@ def _describe_external(place: Path, most: int) -> LogReport:
     state: State = "damaged" if broken else "unchecked" if broken is None else "whole"
     if kind == "arrays":  # whole if they can be loaded
         state = "whole"
+    files = [place] if place.is_file() else place.rglob("*")
     return LogReport(
         path=str(place),
         channels=tuple(
@@ -160,15 +161,9 @@ def _describe_external(place: Path, most: int) -> LogReport:
         crc=crc,
         problems=(*missing, *(broken or ())),
         state="cut short" if missing else state,
-        size=_size_of(place),
+        size=SizeInfo(sum(path.stat().st_size for path in files if path.is_file())),
         notes=tuple(dict.fromkeys(line for c in channels for line in c.remarks)),
     )
-
-
-def _size_of(place: Path) -> SizeInfo:
-    """Return the bytes of a file, or of all files in a folder."""
-    files = [place] if place.is_file() else place.rglob("*")
-    return SizeInfo(sum(path.stat().st_size for path in files if path.is_file()))
 
 
 def describe_reader(reader: LogReader, *, decode: bool | None = None) -> LogReport:
@@ -222,7 +217,7 @@ def report_on(reader: LogReader, counts: Mapping[int, ChannelCount]) -> LogRepor
         state=state,
         notes=tuple(reader.unproven()),
         size=SizeInfo(
-            reader.size,
+            reader.file.size,
             sum(s.stored for s in segments),
             sum(s.size for s in segments),
             dict(Counter(s.compression or "none" for s in segments if s.chunked)),
@@ -316,13 +311,11 @@ def _count_by_index(reader: LogReader) -> dict[int, ChannelCount]:
     for number, segments in chunks.items():
         channel = counts[number]
         for segment in sorted(segments, key=lambda s: s.start):
-            if channel.start is not None and segment.start >= channel.start:
-                break
-            channel.widen(_times_of(reader, segment, number))
+            if channel.start is None or segment.start < channel.start:
+                channel.widen(_times_of(reader, segment, number))
         for segment in sorted(segments, key=lambda s: s.end, reverse=True):
-            if channel.end is not None and segment.end <= channel.end:
-                break
-            channel.widen(_times_of(reader, segment, number))
+            if channel.end is None or segment.end > channel.end:
+                channel.widen(_times_of(reader, segment, number))
     return counts
 
 
@@ -330,11 +323,7 @@ def _times_of(reader: LogReader, segment: Segment, number: int) -> Times:
     """Return the log times of a channel's messages in a chunk, by its message index if any."""
     if not segment.indexes:
         return _times_in(reader.table(segment), number)
-    try:
-        pairs = reader.index(segment)
-    except MalformedRecord as error:
-        raise LogDamagedError(f"{reader.path}: {segment.name}: {error}") from None
-    return np.concatenate([own[:, 0] for channel, own in pairs if channel == number])
+    return np.concatenate([pairs[:, 0] for _, pairs in reader.index(segment, (number,))])
 
 
 def _times_in(table: MessageTable | None, number: int) -> Times:

@@ -49,26 +49,6 @@ class ModuleInfo:
         return cls(module.index, module.stream, slowness, slow, module.iteration, policy)
 
 
-@dataclass(frozen=True, slots=True)
-class RunInfo:
-    """How a run was learned.
-
-    Attributes:
-        algorithm: name of its learner.
-        streams: names of the streams it learned from.
-        tau: frames of an iteration.
-        iterations: number of iterations in its log.
-        outcomes: outcome of each stream, if its learner reports them: its `stream`, `state`,
-            `module`, `blocks`, `slowness` and `why`.
-    """
-
-    algorithm: str
-    streams: tuple[str, ...]
-    tau: int
-    iterations: int
-    outcomes: tuple[Mapping[str, Any], ...]
-
-
 def run_facts(place: Path, channels: Sequence[ChannelInfo]) -> dict[str, Any]:
     """Return the fields of a report on what a run learned; none where a place is no run.
 
@@ -99,8 +79,13 @@ def run_facts(place: Path, channels: Sequence[ChannelInfo]) -> dict[str, Any]:
         header = read_header(folder)
         algorithm, tau = (header.setting("learner", key) for key in ("algorithm", "tau"))
         count = sum(c.messages for c in channels if c.topic == SIGNALS_TOPIC)
-        streams = header.spec.streams
-        facts["run"] = RunInfo(str(algorithm), streams, int(tau), count, tuple(outcomes))
+        facts["run"] = {
+            "algorithm": str(algorithm),
+            "streams": header.spec.streams,
+            "tau": int(tau),
+            "iterations": count,
+            "outcomes": outcomes,
+        }
     return facts
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,9 +17,9 @@ import numpy as np
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.files import make_folder, refuse_unless
 from recorder.log.logfile import LogFile
-from recorder.mcap.chunks import UNUSED, MessageTable, check_size, decompressed, walked_table
+from recorder.mcap.chunks import UNUSED, MessageTable, chunk_records, walked_table
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segment, crc32
+from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segment
 from recorder.mcap.store import PARTIAL, Store
 from replay.integrity.info import ChannelCount, problems_of
 from replay.integrity.report import SCHEMA
@@ -128,14 +128,9 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
         lost = _lost_messages(reader, kept)
         channels = tuple(
             ChannelRecovery(
-                channel.topic,
-                kept[number].messages,
-                lost[number],
-                kept[number].start,
-                kept[number].end,
-                dst.name,
+                reader.channels[n].topic, count.messages, lost[n], count.start, count.end, dst.name
             )
-            for number, channel in sorted(reader.channels.items())
+            for n, count in sorted(kept.items())
         )
         return Recovery(str(dst), channels, _lost(reader), tuple(repaired), unverified)
 
@@ -189,7 +184,7 @@ def _lost(reader: LogReader) -> tuple[Problem, ...]:
     """Return the damage of a log, without damaged indexes of messages that are all there."""
     problems = [problem for problem in problems_of(reader) if not problem.what.endswith(UNUSED)]
     data = f"{reader.path}: data section"
-    if reader.data_complete:
+    if reader.data_crc is not None:
         # Summary and footer only repeat what the data says, and are written again.
         index = {str(reader.path), *(f"{reader.path}: {part}" for part in ("summary", "footer"))}
         problems = [problem for problem in problems if problem.where not in index]
@@ -207,7 +202,7 @@ def _lost_messages(reader: LogReader, kept: dict[int, ChannelCount]) -> dict[int
     if stated is not None:
         return {n: max(stated.channel_message_counts.get(n, 0) - kept[n].messages, 0) for n in kept}
     counts = [s.channel_counts() for s in reader.segments if reader.table(s) is None]
-    if not reader.data_complete or None in counts:
+    if reader.data_crc is None or None in counts:
         return dict.fromkeys(kept)
     return {n: sum(c.get(n, 0) for c in counts if c is not None) for n in kept}
 
@@ -227,11 +222,9 @@ class RepairedStore(Store):
     def put(self, at: int, right: bytes, where: str, what: str) -> None:
         """Replace the bytes at a place, behind those of the last call, where they differ."""
         present = self.read(at, len(right))
-        if self._places and at < self._places[-1] + len(self._parts[-1]):
-            return
-        if present == right or len(present) < len(right):
-            return
-        if sum(map(len, self._parts)) + len(right) > _MOST_BYTES:
+        overlaps = self._places and at < self._places[-1] + len(self._parts[-1])
+        fits = sum(map(len, self._parts)) + len(right) <= _MOST_BYTES
+        if overlaps or not fits or present == right or len(present) < len(right):
             return
         self._places.append(at)
         self._parts.append(right)
@@ -263,22 +256,14 @@ def repair(reader: LogReader) -> RepairedStore:
                 chunk.crc = int.from_bytes(store.read(crc_at, 4), "little")
                 what = "its first bytes were damaged, and are made again from the summary"
                 store.put(chunk.offset, chunk.head(chunk.crc), chunk.name, what)
-            table = _checked_table(store, chunk)
+            if not chunk.crc:
+                continue
+            table, *_ = walked_table(chunk_records(store, replace(chunk, stated=False)))
         except MalformedRecord:
             continue  # the damage is in the chunk's own data, which nothing repeats
         what = "its message index was damaged, and is made again from its messages"
         store.put(chunk.data_end, _indexes(store, chunk, end, table), chunk.name, what)
     return store
-
-
-def _checked_table(store: Store, chunk: Segment) -> MessageTable:
-    """Decode the messages of a chunk whose CRC matches."""
-    check_size(chunk.compression, chunk.size)
-    stored = np.frombuffer(store.read(chunk.data_offset, chunk.stored), np.uint8)
-    raw = decompressed(stored, chunk.compression, chunk.size)
-    if not chunk.crc or crc32(raw.data) != chunk.crc:
-        raise MalformedRecord("no CRC that matches")
-    return walked_table(raw)[0]
 
 
 def _indexes(store: Store, chunk: Segment, end: int, table: MessageTable) -> bytes:
@@ -292,14 +277,10 @@ def _indexes(store: Store, chunk: Segment, end: int, table: MessageTable) -> byt
     made = b""
     while left:
         there = np.frombuffer(store.read(chunk.data_end + len(made), max(map(len, left))), np.uint8)
-        alike = [_alike(there[: len(index)], index) for index in left]
+        indexes = [np.frombuffer(index, np.uint8) for index in left]
+        alike = [float((there[: len(i)] == i[: len(there)]).mean()) for i in indexes]
         best = int(np.argmax(alike))
         if alike[best] < _ALIKE and not chunk.stated:
             return b""  # a chunk without indexes, as far as anything tells
         made += left.pop(best)
     return made
-
-
-def _alike(there: np.ndarray, index: bytes) -> float:
-    """Return the share of an index's bytes that are at a place."""
-    return float((there == np.frombuffer(index, np.uint8)[: len(there)]).mean())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -12,7 +12,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.mcap.records import Problem
 
 if TYPE_CHECKING:
-    from replay.integrity.learned import ModuleInfo, RunInfo
+    from replay.integrity.learned import ModuleInfo
 
 SCHEMA: Final = 1
 """Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
@@ -93,7 +93,9 @@ class LogReport:
         seed: the seed that all files state, if it is one.
         ended: why the run in a folder ended.
         modules: modules of the run in a folder.
-        run: how the run in a folder was learned.
+        run: how the run in a folder was learned: its `algorithm`, `streams`, `tau` (frames of an
+            iteration), `iterations` in its log, and `outcomes`, of each stream its `stream`,
+            `state`, `module`, `blocks`, `slowness` and `why` if the learner reports them.
         held_out: slowness of its modules on held-out frames.
         state: the worst state of the files.
         notes: remarks that are no problems.
@@ -113,7 +115,7 @@ class LogReport:
     seed: int | None = None
     ended: str | None = None
     modules: tuple[ModuleInfo, ...] = ()
-    run: RunInfo | None = None
+    run: Mapping[str, Any] | None = None
     held_out: Mapping[str, Any] | None = None
     state: State = "whole"
     notes: tuple[str, ...] = ()
@@ -158,7 +160,6 @@ def combined(
     path: str,
     reports: Sequence[LogReport],
     problems: Iterable[Problem] = (),
-    notes: Iterable[str] = (),
 ) -> LogReport:
     """Return one report on the files of several reports.
 
@@ -166,11 +167,9 @@ def combined(
         path: the logs, as the user named them.
         reports: one report or more.
         problems: further problems, of the files together.
-        notes: further notes.
     """
     files = [file for report in reports for file in report.files or (report,)]
     problems = (*(p for report in reports for p in report.problems), *problems)
-    notes = (*(note for report in reports for note in report.notes), *notes)
     kinds = {f.kind for f in files if f.channels or f.metadata}
     names = Counter(name for f in files for name in f.metadata)
     libraries = {f.library for f in files}
@@ -194,7 +193,7 @@ def combined(
         },
         seed=seeds.pop() if len(seeds) == 1 else None,
         state=state,
-        notes=tuple(dict.fromkeys(notes)),
+        notes=tuple(dict.fromkeys(note for report in reports for note in report.notes)),
         size=sum((f.size for f in files), SizeInfo()),
         library=libraries.pop() if len(libraries) == 1 else "",
         files=tuple(files),
@@ -203,15 +202,10 @@ def combined(
 
 def failed(place: str | Path, error: CdmisfaError) -> LogReport:
     """Report on a log that cannot be read."""
-    crc, state = failed_state(error)
-    problem = as_problem(place, error)
-    return LogReport(str(place), complete=False, crc=crc, problems=(problem,), state=state)
-
-
-def failed_state(error: CdmisfaError) -> tuple[Crc, State]:
-    """Return the checksums and the state of a log that ended in an error."""
-    damaged = isinstance(error, LogDamagedError)
-    return ("bad", "damaged") if damaged else ("unchecked", "not read")
+    report = LogReport(str(place), complete=False, problems=(as_problem(place, error),))
+    if isinstance(error, LogDamagedError):
+        return replace(report, crc="bad", state="damaged")
+    return replace(report, crc="unchecked", state="not read")
 
 
 def as_problem(path: str | Path, error: CdmisfaError) -> Problem:

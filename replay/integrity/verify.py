@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import json
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -134,13 +134,13 @@ class _Content:
     def finish(self) -> None:
         """Check the whole, after the last chunk."""
 
-    def attempt(self, step: Callable[..., None], *arguments: Any) -> None:
-        """Take a step of the check unless it has ended, and keep its error."""
-        if self.error is None:
-            try:
-                step(*arguments)
-            except CdmisfaError as error:
-                self.error = error
+    @contextlib.contextmanager
+    def errors_kept(self) -> Iterator[None]:
+        """Keep the error at which a step of the check ends."""
+        try:
+            yield
+        except CdmisfaError as error:
+            self.error = error
 
 
 class _ImageContent(_Content):
@@ -167,18 +167,17 @@ class _ViewContent(_Content):
     def __init__(self, path: Path, reader: LogReader) -> None:
         super().__init__(path, reader)
         self.view: ViewFile | None = None
-        self.attempt(self._open)
+        with self.errors_kept():
+            self.view = ViewFile(path, reader=reader)
 
     def add(self, segment: Segment) -> None:
-        if self.view is not None:
-            self.attempt(self.view.check_chunk, segment)
+        if self.view is not None and self.error is None:
+            with self.errors_kept():
+                self.view.check_chunk(segment)
 
     def finish(self) -> None:
         if self.view is not None:
             self.view.finish()
-
-    def _open(self) -> None:
-        self.view = ViewFile(self.path, reader=self.reader)
 
 
 class _RunContent(_Content):
@@ -201,13 +200,26 @@ class _RunContent(_Content):
         self._hash, self._next = SignalsHash(), 0
         self._batches: BatchReader | None = None
         self._problems: list[Problem] = []
-        self.attempt(self._open)
+        with self.errors_kept():
+            header, topics = header_in(reader), (SIGNALS_TOPIC,)
+            if self._stated is not None:
+                self._batches = BatchReader(path, header, reader.channels, topics=topics)
 
     def add(self, segment: Segment) -> None:
-        self.attempt(self._add, segment)
+        table = self.reader.table(segment)
+        if self._batches is not None and self.error is None and table is not None:
+            with self.errors_kept():
+                for batch in self._batches.take(table):
+                    self._add_signals(batch)
 
     def finish(self) -> None:
-        self.attempt(self._finish)
+        if self._batches is None or self.error is not None:
+            return
+        with self.errors_kept():
+            self._add_signals(self._batches.rest())
+        if self.error is None and self._hash.hexdigest() != self._stated:
+            what = f"its {self._hash.count} iterations are not those that the run had"
+            self._problems.append(Problem(str(self.path), what))
 
     def problems(self) -> Iterator[Problem]:
         """Yield where a run whose log is whole contradicts itself."""
@@ -232,25 +244,6 @@ class _RunContent(_Content):
             yield f"{view} is not checked: {view_again(self._folder)}"
         if self._final is None:
             yield f"{self.path} holds no final record: nothing proves what is beside it"
-
-    def _open(self) -> None:
-        header, topics = header_in(self.reader), (SIGNALS_TOPIC,)
-        if self._stated is not None:
-            self._batches = BatchReader(self.path, header, self.reader.channels, topics=topics)
-
-    def _add(self, segment: Segment) -> None:
-        table = self.reader.table(segment)
-        if self._batches is not None and table is not None:
-            for batch in self._batches.take(table):
-                self._add_signals(batch)
-
-    def _finish(self) -> None:
-        if self._batches is None:
-            return
-        self._add_signals(self._batches.rest())
-        if self._hash.hexdigest() != self._stated:
-            what = f"its {self._hash.count} iterations are not those that the run had"
-            self._problems.append(Problem(str(self.path), what))
 
     def _add_signals(self, batch: Batch) -> None:
         for signals in (record for columns in batch.signals for record in columns.records()):

@@ -119,7 +119,7 @@ class McapIdentity(Identity):
     """Identity of an MCAP file; its sample has all bytes from its data end record on."""
 
     def __init__(self, reader: LogReader) -> None:
-        self.path, self.size = reader.path, reader.size
+        self.path, self.size = reader.path, reader.file.size
         self._reader = reader
 
     def sha256(self, counted: Counted = lambda count: None) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,7 +19,6 @@ from cdmisfa.core.names import counted, lasting
 if TYPE_CHECKING:
     from recorder.images.options import InputOptions
     from replay.corpus.index import Indexed
-    from replay.integrity.learned import RunInfo
     from replay.integrity.report import ChannelInfo, LogReport, SizeInfo
 
 MOST_STREAMS = 8
@@ -68,20 +67,21 @@ def _print_info(info: LogReport) -> None:
     _print_channels(info.channels)
 
 
-def _print_run(info: LogReport, run: RunInfo) -> None:
+def _print_run(info: LogReport, run: Mapping[str, Any]) -> None:
     """Print what a run learned, with which learner, and why it ended."""
     from cdmisfa.experiments.loop import ENDINGS
 
-    more = len(run.streams) - MOST_STREAMS
-    names = ", ".join(run.streams[:MOST_STREAMS]) + (f" and {more} more" if more > 0 else "")
-    printing.line(f"learner {run.algorithm}, {counted(len(run.streams), 'stream')}: {names}")
+    streams = run["streams"]
+    more = len(streams) - MOST_STREAMS
+    names = ", ".join(streams[:MOST_STREAMS]) + (f" and {more} more" if more > 0 else "")
+    printing.line(f"learner {run['algorithm']}, {counted(len(streams), 'stream')}: {names}")
     if info.modules or info.ended is not None:  # else the modules are in the log alone
-        printing.modules(info.modules, policies=not run.outcomes)
-    for outcome in run.outcomes:
+        printing.modules(info.modules, policies=not run["outcomes"])
+    for outcome in run["outcomes"]:
         printing.stream_outcome(outcome)
     if info.held_out is not None:
         printing.held_out(info.held_out)
-    done = f"{counted(run.iterations, 'iteration')} of {counted(run.tau, 'frame')}"
+    done = f"{counted(run['iterations'], 'iteration')} of {counted(run['tau'], 'frame')}"
     if info.ended is None:
         printing.line(
             f"not ended: {done} so far; it learns, or was stopped before its modules were kept"

@@ -36,7 +36,7 @@ from recorder.log.messages import (
 )
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
-from recorder.mcap.records import MalformedRecord, Segment
+from recorder.mcap.records import Segment
 from replay.logs.clock import intersection
 from replay.stored import Span
 
@@ -337,11 +337,7 @@ class _ChannelRows:
             table = self._table(number)
             times: NDArray[np.uint64] = table.log_time[table.channel == channel]
             return times
-        try:
-            pairs = [index[:, 0] for c, index in self._reader.index(segment) if c == channel]
-        except MalformedRecord as error:
-            raise LogDamagedError(f"{self._reader.path}: {error}") from None
-        return np.concatenate(pairs)
+        return np.concatenate([p[:, 0] for _, p in self._reader.index(segment, (channel,))])
 
     def _table(self, number: int) -> MessageTable:
         """A chunk's messages; a LogDamagedError if it is damaged or has other frames."""
