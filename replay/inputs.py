@@ -36,7 +36,6 @@ def open_log(
     *,
     loop: bool = False,
     salvage: bool = False,
-    goal: tuple[str, str] = ("learn", "RUN"),
 ) -> LoggedSource:
     """Open one of our recordings, or external logs.
 
@@ -45,19 +44,17 @@ def open_log(
         inputs: how images of external logs become frames; with it paths are taken as such.
         loop: begin again at the end.
         salvage: leave out what is damaged.
-        goal: the command and the folder of its result for the remedy in an error.
 
     Raises:
         UsageError: no such log, a run, or as for `open_external`.
         LogDamagedError: a log is damaged.
     """
     inputs = inputs or InputOptions()
-    for path in paths:
-        refuse_what_is_no_log(path)
+    refuse_what_is_no_log(paths)
     if not inputs.external and not any(map(only_external, paths)):
         with contextlib.suppress(NoRecordingError):
             return open_recording(paths, loop=loop, salvage=salvage)
-    return open_external(paths, inputs, loop=loop, salvage=salvage, goal=goal)
+    return open_external(paths, inputs, loop=loop, salvage=salvage)
 
 
 def open_to_look(
@@ -72,8 +69,7 @@ def open_to_look(
         LogDamagedError: a log is damaged.
     """
     inputs = inputs or InputOptions()
-    for path in paths:
-        refuse_what_is_no_log(path)
+    refuse_what_is_no_log(paths)
     chosen = bool(inputs.topics or inputs.fields)
     source = None
     if not (chosen or any(map(only_external, paths))):
@@ -81,11 +77,10 @@ def open_to_look(
             source = open_recording(paths, salvage=salvage)
     if source is None:
         inputs = inputs if chosen else replace(inputs, topics=ALL)
-        how: Any = {"salvage": salvage, "goal": ("convert", "REC")}
         try:
-            source = open_external(paths, inputs, **how)
+            source = open_external(paths, inputs, salvage=salvage)
         except UnequalError:
-            source = open_external(paths, replace(inputs, align="time"), **how)
+            source = open_external(paths, replace(inputs, align="time"), salvage=salvage)
     try:
         source.describe_at_once()
     except BaseException:
@@ -141,7 +136,6 @@ def open_external(
     *,
     loop: bool = False,
     salvage: bool = False,
-    goal: tuple[str, str] = ("learn", "RUN"),
 ) -> LoggedSource:
     """Open external logs as streams on one clock: images of cameras, or numbers.
 
@@ -152,14 +146,13 @@ def open_external(
         loop: begin again at the end.
         salvage: leave out what is damaged, and broken images; of several logs also one that
             cannot be read: `left_out` of the source says so, as its warnings do.
-        goal: the command and the folder of its result for the remedy in an error.
 
     Raises:
         UsageError: no such log or topic, images smaller than a frame, or streams that need `align`.
         LogDamagedError: a log is damaged.
     """
     inputs = inputs or InputOptions()
-    how: Any = {"loop": loop, "salvage": salvage, "goal": goal}
+    how: Any = {"loop": loop, "salvage": salvage}
     if inputs.color == "auto":
         return _with_color(lambda options: open_external(paths, options, **how), inputs)
     files = image_logs([paths] if isinstance(paths, str | Path) else paths)
@@ -229,27 +222,19 @@ def is_recording(words: Sequence[str]) -> bool:
     return True
 
 
-def refuse_what_is_no_log(path: Path) -> None:
-    """Refuse a run, or a file that is no log.
-
-    Raises:
-        UsageError: it is one of them.
-    """
-    if not path.exists():
-        raise no_such(path)
-    if path.is_dir():
-        run = is_run(path)
-    elif starts_as_log(path):
-        run = path.name.startswith(RUN_FILE) and is_run(path)
-    elif only_external(path) or ".mcap" in path.suffixes:
-        run = False
-    else:
-        raise no_log(path)
-    if run:
-        raise UsageError(
-            f"{path} is a run, not a recording: look at it with cdmisfa view "
-            f"{shlex.quote(str(path))}, or learn from what it learned from"
-        )
+def refuse_what_is_no_log(paths: Sequence[Path]) -> None:
+    """Refuse runs, and files that are no logs, with a UsageError."""
+    for path in paths:
+        if not path.exists():
+            raise no_such(path)
+        starts = path.is_file() and starts_as_log(path)
+        if not (starts or path.is_dir() or only_external(path) or ".mcap" in path.suffixes):
+            raise no_log(path)
+        if (path.is_dir() or (starts and path.name.startswith(RUN_FILE))) and is_run(path):
+            raise UsageError(
+                f"{path} is a run, not a recording: look at it with cdmisfa view "
+                f"{shlex.quote(str(path))}, or learn from what it learned from"
+            )
 
 
 def locations(words: Sequence[str | Path]) -> list[Path]:

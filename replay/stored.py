@@ -69,10 +69,6 @@ class StoredSource(ClockedSource):
         """The frame after the last that `take` returns, of the first lap."""
         return self.first_frame + self.frames - self.held_out
 
-    def centre_by(self, centre: Centre) -> None:
-        """Show every frame as it is, or without the mean of its episode."""
-        self.centre = centre
-
     def hold_out(self, count: int) -> None:
         """Keep the last frames from `take`: modules are judged on them, see `pieces`.
 
@@ -139,7 +135,10 @@ class StoredSource(ClockedSource):
         """See `spans`."""
         if not self.gaps:
             return [(start, stop)]
-        return in_laps(self._held[stream], self.first_frame, self.frames, start, stop)
+        first, count = self.first_frame, self.frames
+        laps = range((start - first) // count, (stop - 1 - first) // count + 1)
+        shifted = ((lap * count, span) for lap in laps for span in self._held[stream])
+        return merged((max(low + by, start), min(high + by, stop)) for by, (low, high) in shifted)
 
     def episode(self, stream: int, t: int) -> Span:
         """The episode [start, stop) of a frame, in the first lap.
@@ -289,13 +288,13 @@ class StoredSource(ClockedSource):
 
 
 def centre_as(centre: Centre, source: FrameSource, name: str) -> FrameSource:
-    """Return a source with frames as modules learned from them; see `StoredSource.centre_by`.
+    """Return a source with frames as modules learned from them; see `StoredSource`.
 
     Raises:
         UsageError: the source is live, so that its episodes have no mean yet; it is closed.
     """
     if isinstance(source, StoredSource):
-        source.centre_by(centre)
+        source.centre = centre
     elif centre == "episode":
         source.close()
         raise UsageError(
@@ -311,21 +310,11 @@ def outside(gaps: Iterable[Span], first: int, stop: int) -> list[Span]:
     return [(low, high) for low, high in zip(ends[::2], ends[1::2], strict=True) if low < high]
 
 
-def in_laps(held: Sequence[Span], first: int, count: int, start: int, stop: int) -> list[Span]:
-    """The unbroken ranges of the frames [start, stop), where every lap has the same gaps.
-
-    Args:
-        held: the frames of the first lap that exist.
-        first: the first frame.
-        count: frames of a lap.
-        start: the first frame of the result.
-        stop: the frame after the last.
-    """
-    merged: list[Span] = []
-    for lap in range((start - first) // count, (stop - 1 - first) // count + 1):
-        for low, high in held:
-            low, high = max(low + lap * count, start), min(high + lap * count, stop)
-            if low < high:
-                touches = merged and merged[-1][1] == low
-                merged.append((merged.pop()[0], high) if touches else (low, high))
-    return merged
+def merged(spans: Iterable[Span]) -> list[Span]:
+    """Merge ranges that touch, given in their order, and leave out empty ones."""
+    result: list[Span] = []
+    for start, stop in spans:
+        if start < stop:
+            touches = result and result[-1][1] == start
+            result.append((result.pop()[0], stop) if touches else (start, stop))
+    return result

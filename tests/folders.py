@@ -36,9 +36,8 @@ def external(
     *,
     loop: bool = False,
     salvage: bool = False,
-    goal: tuple[str, str] = ("learn", "RUN"),
     **chosen: Any,
 ) -> LoggedSource:
     """External logs, opened with some options."""
     options = InputOptions(topics=tuple(topics), **chosen)
-    return open_external(paths, options, loop=loop, salvage=salvage, goal=goal)
+    return open_external(paths, options, loop=loop, salvage=salvage)

@@ -44,7 +44,7 @@ def test_every_frame_shows_the_last_image_at_or_before_it(
 
 
 def test_no_rate_makes_frames_without_end() -> None:
-    with pytest.raises(UsageError, match="choose a lower one"):
+    with pytest.raises(UsageError, match="choose a lower --rate"):
         by_time([times(10**18)], 1e6)
 
 

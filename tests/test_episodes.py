@@ -127,7 +127,7 @@ def test_a_looped_corpus_has_a_gap_before_it_begins_again(tmp_path: Path) -> Non
         lap = 2 * (30 + PAUSE)
         starts = [source.take(0, 20).t for _ in range(5)]
         assert starts == [0, 50, lap, lap + 50, 2 * lap]
-        source.centre_by("episode")
+        source.centre = "episode"
         source.seek(lap)
         mean = mean_of([one])
         np.testing.assert_array_equal(source.take(0, 20).frames, centred(one, mean)[:20])

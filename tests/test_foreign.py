@@ -232,7 +232,7 @@ def write(path: Path, streams: dict[str, tuple[int, int]], *, broken_from: int =
 def test_streams_that_differ_are_refused_with_what_would_work(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", {"/left": (30, 20), "/right": (15, 40)})
     topics = ["/left", "/right"]
-    with pytest.raises(UsageError, match=r"--topic /right --size 4x3 --align time --rate 50 "):
+    with pytest.raises(UsageError, match=r"--align time --rate 50$"):
         external(tmp_path / "a.mcap", topics, size=(3, 4))
     source = external(tmp_path / "a.mcap", topics, size=(3, 4), align="time", rate=50)
     right = source.take(1, 29).frames[:, 0, 0].tolist()

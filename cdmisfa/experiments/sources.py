@@ -243,7 +243,6 @@ def open_logs(
     inputs: InputOptions | None = None,
     episodes: bool = False,
     told: Progress = lambda done, total: None,
-    goal: tuple[str, str] = ("learn", "RUN"),
 ) -> SeekableSource:
     """Open a recording, external logs, or many of both as episodes.
 
@@ -254,7 +253,6 @@ def open_logs(
         inputs: how images become frames; given, paths are taken as external logs.
         episodes: each path is an episode of its own; those of an index always are.
         told: called with the number of opened episodes and the total.
-        goal: see `open_log`.
 
     Raises:
         UsageError: no path that exists.
@@ -283,6 +281,6 @@ def open_logs(
         from replay.corpus.episodes import open_episodes
 
         source = open_episodes(words, episodes and paths, inputs, told=told, **how)
-    source = source or open_log(paths, inputs, goal=goal, **how)
-    source.centre_by(inputs.centre)
+    source = source or open_log(paths, inputs, **how)
+    source.centre = inputs.centre
     return source

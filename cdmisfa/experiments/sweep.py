@@ -122,9 +122,7 @@ def plan(
     paths = tuple(str(w) if scene or "://" in str(w) else str(Path(w).resolve()) for w in words)
     if not scene:
         inputs = read_inputs(inputs, Layers.read(preset, settings))
-        with contextlib.closing(
-            open_logs(words, loop=loop, inputs=inputs, goal=("sweep", "SWEEP"))
-        ) as logs:
+        with contextlib.closing(open_logs(words, loop=loop, inputs=inputs)) as logs:
             recorded, spec = dict(logs.describe()), logs.spec
     inputs = inputs or InputOptions()
     opening = {"loop": loop, "inputs": inputs}

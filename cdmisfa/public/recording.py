@@ -98,7 +98,7 @@ class Recording(Described):
         given = self._given
         streams = given if isinstance(given, Mapping) else {"stream": given}
         source = open_arrays(streams, self.inputs, loop=loop)
-        source.centre_by(self.inputs.centre)
+        source.centre = self.inputs.centre
         return source
 
     def frames(

@@ -7,7 +7,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
@@ -29,6 +29,8 @@ MOST_EPISODES: Final = 20_000
 
 _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "time", "stamp")
 """What the description of a source states of how images became frames, the same for all logs."""
+
+Taken = TypeVar("Taken")
 
 Progress = Callable[[float, float | None], None]
 """Called with the number of logs that were opened, and of all logs."""
@@ -188,17 +190,17 @@ class EpisodeSource(StoredSource):
 
     def take(self, stream: int, n: int) -> Block:
         """See `StoredSource.take`; what is damaged is left out."""
-        while True:
-            try:
-                return super().take(stream, n)
-            except LogDamagedError as error:
-                self._leave_out(error)
+        return self._whole(super().take, stream, n)
 
     def take_all(self, n: int) -> tuple[Block, ...]:
         """See `StoredSource.take_all`; what is damaged is left out."""
+        return self._whole(super().take_all, n)
+
+    def _whole(self, take: Callable[..., Taken], *request: int) -> Taken:
+        """Take frames, again without what is damaged until nothing of them is."""
         while True:
             try:
-                return super().take_all(n)
+                return take(*request)
             except LogDamagedError as error:
                 self._leave_out(error)
 
@@ -216,7 +218,7 @@ class EpisodeSource(StoredSource):
         """See `FrameSource.close`."""
         if self._open_now is not None:
             number, source = self._open_now
-            for stream, said in getattr(source, "changes", {}).items():
+            for stream, said in source.changes.items():
                 self.changes.setdefault(self._episodes[number].spec.streams[stream], said)
             source.close()
             self._open_now = None

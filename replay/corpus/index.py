@@ -169,21 +169,13 @@ def _summarize(indexed: Indexed, table: pa.Table) -> None:
         pc.cast(pc.subtract(logs["end_ns_max"], logs["start_ns_min"]), pa.float64()), NANOSECONDS
     )
     logs = logs.append_column("seconds", pc.fill_null(seconds, 0.0))
-    columns = ("log", "files_sum", "topic_count", "bytes_sum", "seconds")
+    sums = ("files_sum", "topic_count", "bytes_sum", "seconds")
     kinds = logs.group_by("kind_first", use_threads=False).aggregate(
-        [("log", "count"), *((name, "sum") for name in columns[1:])]
+        [("log", "count"), *((name, "sum") for name in sums)]
     )
-    indexed.kinds = [
-        dict(zip(("kind", "logs", "files", "streams", "bytes", "seconds"), values, strict=True))
-        for values in sorted(
-            zip(
-                kinds["kind_first"].to_pylist(),
-                kinds["log_count"].to_pylist(),
-                *(kinds[f"{name}_sum"].to_pylist() for name in columns[1:]),
-                strict=True,
-            )
-        )
-    ]
+    kinds = kinds.select(["kind_first", "log_count", *(f"{name}_sum" for name in sums)])
+    kinds = kinds.rename_columns(["kind", "logs", "files", "streams", "bytes", "seconds"])
+    indexed.kinds = kinds.sort_by("kind").to_pylist()
 
 
 def indexed_logs(index: Path) -> list[IndexedLog]:

@@ -137,13 +137,10 @@ def episode_of(
     if len(spec.streams) == 1 and format in ("video", "table", "pictures", "arrays"):
         spec = replace(spec, streams=("stream",))  # else each file would be another stream
     stated = source.origin() if source.recorded else source.described([])
-    fields = stated.get("fields") or []
-    framings = getattr(source, "framings", [None] * len(spec.streams))
-    streams = {
-        stream: (framings[i], fields[i] if fields and isinstance(fields[0], list) else fields,
-                 source.pixels(i))
-        for i, stream in enumerate(spec.streams)
-    }  # fmt: skip
+    streams, fields = {}, stated.get("fields") or []
+    for i, stream in enumerate(spec.streams):
+        own = fields[i] if fields and isinstance(fields[0], list) else fields
+        streams[stream] = source.framings[i], own, source.pixels(i)
     return Episode(
         log,
         name,
@@ -155,7 +152,7 @@ def episode_of(
         identity=EpisodeIdentity(source, lambda: reopen(log)),
         scene=source.scene().get("scene", ""),
         stated=stated,
-        turns=getattr(source, "turns", ()),
+        turns=source.turns,
         streams=streams,
         whole=source.frames,
     )

@@ -174,7 +174,10 @@ def _decoded(place: Path, topic: str) -> dict[str, Any]:
     try:
         with open_stream(place, topic) as stream:
             shape = "x".join(map(str, stream.image(0).shape))
-            return {"shape": shape, "gaps": 0 if stream.times is None else missing(stream.times)}
+            return {
+                "shape": shape,
+                "gaps": 0 if stream.times is None else int(missing(stream.times).sum()),
+            }
     except LogDamagedError as error:
         return {"problem": str(error).removeprefix(f"{place}: ")}
     except (MalformedRecord, UsageError):  # the topic has no image

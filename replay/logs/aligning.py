@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import itertools
 import os
-import shlex
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +13,7 @@ from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import stream_name, stream_names
-from recorder.images.options import Align, InputOptions
+from recorder.images.options import InputOptions
 from replay.logs import clock as clocks
 from replay.logs.clock import Clock
 from replay.logs.formats.arrays import FPS
@@ -27,23 +24,17 @@ class UnequalError(UsageError):
     """Streams that are on no common clock unless they are aligned."""
 
 
-class Aligned(NamedTuple):
-    """Streams that have times, cut to the part that is asked for, and their clock."""
-
-    streams: list[LogStream]
-    fps: float
-    clock: Clock
-
-
 def align(
-    streams: Sequence[LogStream], options: InputOptions, goal: tuple[str, str] = ("learn", "RUN")
-) -> Aligned:
+    streams: Sequence[LogStream], options: InputOptions
+) -> tuple[list[LogStream], float, Clock]:
     """Put streams on one clock; arrays always by index.
 
     Args:
         streams: the streams, one at least.
         options: the rate, the part of the logs, and how streams that differ are aligned.
-        goal: the command and the folder of its result for the remedy in an error.
+
+    Returns:
+        The streams with times, cut to the part that is asked for, their rate and their clock.
 
     Raises:
         UnequalError: the streams differ, and no option says how to align them.
@@ -58,11 +49,10 @@ def align(
     times = list(map(_times, streams))
     by_index = arrays or (options.align == "index" and len(times) > 1)
     if options.align == "time":
-        return Aligned(streams, fps, clocks.by_time(times, fps))
+        return streams, fps, clocks.by_time(times, fps)
     if not by_index:
-        _refuse_unequal(streams, options, fps, goal)
-    clock = clocks.by_index(times, fps, gaps=not by_index)
-    return Aligned(streams, fps, clock)
+        _refuse_unequal(streams, times, fps)
+    return streams, fps, clocks.by_index(times, fps, gaps=not by_index)
 
 
 def _times(stream: LogStream) -> IntArray:
@@ -105,37 +95,23 @@ def _excerpt(stream: LogStream, options: InputOptions, zero: int) -> LogStream:
     return stream.part(np.arange(low, high), times[low:high])
 
 
-def _refuse_unequal(
-    streams: Sequence[LogStream], options: InputOptions, fps: float, goal: tuple[str, str]
-) -> None:
+def _refuse_unequal(streams: Sequence[LogStream], times: Sequence[IntArray], fps: float) -> None:
     """Refuse streams that are not on one clock, or not of the rate asked for."""
-
-    def command(align: Align) -> str:
-        words = ["cdmisfa", goal[0], *dict.fromkeys(str(stream.path) for stream in streams)]
-        for stream in streams:
-            words += ["--topic", stream.topic]
-        words += replace(options, topics=(), align=None, rate=None).words()
-        return shlex.join([*words, "--align", align, "--rate", f"{fps:g}", "-o", goal[1]])
-
-    times = list(map(_times, streams))
+    by_time = f"choose images by their times with --align time --rate {fps:g}"
     begins, ends = clocks.overlap(times)
-    for stream, stamps in zip(streams[1:], times[1:], strict=True):
-        if not (reason := clocks.unlike(times[0], stamps)):
-            continue
-        two = f"{streams[0].topic} and {stream.topic}"
-        if begins < ends:
-            raise UnequalError(
-                f"{two} have {reason}: put them on one clock, as with: {command('time')}"
-            )
-        raise UnequalError(
-            f"{two} have no time in common: take the i-th image of each together, as with: "
-            f"{command('index')}"
-        )
     for stream, stamps in zip(streams, times, strict=True):
-        if clocks.of_other_rate(stamps, fps):
+        two = f"{streams[0].topic} and {stream.topic}"
+        if reason := clocks.unlike(times[0], stamps):
+            if begins < ends:
+                raise UnequalError(f"{two} have {reason}: {by_time}")
             raise UnequalError(
-                f"{stream.topic} has {1 / clocks.step_of(stamps):g} images a second, not {fps:g}: "
-                f"choose images by their times, as with: {command('time')}"
+                f"{two} have no time in common: take the i-th image of each together with "
+                f"--align index --rate {fps:g}"
+            )
+        step = clocks.step_of(stamps)
+        if step > 0 and abs(step * fps - 1) > clocks.UNEVEN:
+            raise UnequalError(
+                f"{stream.topic} has {1 / step:g} images a second, not {fps:g}: {by_time}"
             )
 
 

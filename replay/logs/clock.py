@@ -14,7 +14,8 @@ import numpy as np
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.clock import NANOSECONDS, times_of
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.stored import Span, outside
+from recorder.log.manifest import ViewMetadata
+from replay.stored import Span, merged, outside
 
 # Most frames that streams are aligned to.
 MAX_FRAMES: Final = 2**31
@@ -59,11 +60,7 @@ def by_time(streams: Sequence[IntArray], fps: float) -> Clock:
     if stop < start:
         raise UsageError("the streams have no time in common: take each by itself, with --topic")
     ticks = (stop - start) * fps / NANOSECONDS + 1
-    if ticks > MAX_FRAMES:
-        raise UsageError(
-            f"--rate {fps:g} makes {ticks:.0f} frames: choose a lower one, or a part of the log "
-            "with --start and --end"
-        )
+    _refuse_many(ticks)
     clock = times_of(np.arange(int(ticks)), fps, start)
     rows = [np.searchsorted(times, clock, side="right") - 1 for times in streams]
     gaps: list[list[Span]] = []
@@ -98,49 +95,46 @@ def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> Clock:
         ticks[i] = max(round(int(first[i] - first[i - 1]) * fps / NANOSECONDS), 2)
     frame = np.cumsum(ticks) - ticks[0]
     spans = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
-    if frame[-1] > MAX_FRAMES:
-        line = f"it has {gaps_in_words(spans, fps)}, {frame[-1] + 1} frames in all"
-        raise UsageError(f"{line}: choose a part without, with --start or --end")
+    _refuse_many(frame[-1])
     rows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
     return Clock(int(first[0]), [rows] * len(streams), [spans] * len(streams))
 
 
-def by_number(streams: Sequence[Sequence[Span]], start_ns: int, first: int, *, gaps: bool) -> Clock:
+def _refuse_many(frames: float) -> None:
+    if frames > MAX_FRAMES:
+        raise UsageError(
+            f"the log becomes {frames:.0f} frames: choose a lower --rate, or a part of it with "
+            "--start and --end"
+        )
+
+
+def by_number(views: Iterable[Sequence[Span]], facts: ViewMetadata, name: str) -> Clock:
     """Show each frame of a recording at its number; rows are numbers of frames.
 
     Args:
-        streams: the frames that each stream has.
-        start_ns: time of frame 0, nanoseconds.
-        first: the first frame of the recording.
-        gaps: frames that a stream lacks are gaps; else they are left out of all streams.
+        views: the frames that each stream has.
+        facts: of the recording; where it states gaps, frames that a stream lacks are gaps, else
+            they are left out of all streams.
+        name: of the recording, for the error.
 
     Raises:
         LogDamagedError: no frame is in every stream.
     """
-    streams = [merged(covered) for covered in streams]
+    streams, first = [merged(covered) for covered in views], facts.first_frame
     common = streams[0]
-    if gaps:
+    if facts.gaps:
         common = [(first, max((high for covered in streams for _, high in covered), default=first))]
     else:
         for covered in streams[1:]:
             common = intersection(common, covered)
-    common = merged(span for span in common if span[0] < span[1])
+    common = merged(common)
     if not common:
-        raise LogDamagedError("no frame is there, whole, in every view")
+        raise LogDamagedError(f"{name}: no frame is there, whole, in every view")
     begins, end = common[0][0], common[-1][1]
     parts = [np.arange(low, high) for low, high in common] if len(common) > 1 else []
     rows: Rows = np.concatenate(parts) if parts else range(begins, end)
-    absent = [outside(covered, begins, end) if gaps else [] for covered in streams]
-    return Clock(start_ns, [rows] * len(streams), absent, begins)
-
-
-def merged(spans: Iterable[Span]) -> list[Span]:
-    """Merge ranges that touch, given in their order."""
-    result: list[Span] = []
-    for start, stop in spans:
-        touches = result and result[-1][1] == start
-        result.append((result.pop()[0], stop) if touches else (start, stop))
-    return result
+    absent = [outside(covered, begins, end) if facts.gaps else [] for covered in streams]
+    return Clock(facts.start_ns, [rows] * len(streams), absent, begins)
 
 
 def intersection(one: Sequence[Span], two: Sequence[Span]) -> list[Span]:
@@ -168,12 +162,6 @@ def step_of(times: IntArray) -> float:
     return float(np.median(np.diff(times)) / NANOSECONDS) if len(times) > 1 else float("nan")
 
 
-def of_other_rate(times: IntArray, fps: float) -> bool:
-    """Whether a stream has a rate that differs from another by more than a hundredth."""
-    step = step_of(times)
-    return step > 0 and abs(step * fps - 1) > UNEVEN
-
-
 def unlike(first: IntArray, times: IntArray) -> str:
     """The reason why the i-th rows of two streams do not belong together; "" if they do.
 
@@ -191,12 +179,7 @@ def pauses(times: IntArray) -> IntArray:
     return np.flatnonzero(np.diff(times) > GAP_STEPS * step) + 1 if step > 0 else np.empty(0, int)
 
 
-def missing(times: IntArray) -> int:
-    """How many rows a stream lacks between its first and last that its rate would have had."""
-    return int(_lacks(times).sum())
-
-
-def _lacks(times: IntArray) -> IntArray:
+def missing(times: IntArray) -> IntArray:
     """How many rows are missing before each row but the first, (n - 1,)."""
     step = step_of(times) * NANOSECONDS
     if not step > 0:
@@ -217,7 +200,7 @@ def retimed(times: IntArray, rows: Rows, fps: float) -> str:
     row_of = np.asarray(rows)
     frame = np.concatenate([[0], np.flatnonzero(row_of[1:] != row_of[:-1]) + 1])
     since = (times - times[0]) / NANOSECONDS
-    lacks = _lacks(times)
+    lacks = missing(times)
     lacks[pauses(times) - 1] = 0
     lost = int(lacks.sum())
     allowed = JITTER / fps + (0 if lost else UNEVEN) * since

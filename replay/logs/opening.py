@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.images.options import InputOptions
@@ -22,15 +22,8 @@ from replay.storage.opening import log_files
 Format = Literal["mcap", "split", "bag", "dataset", "pictures", "video", "table", "arrays"]
 
 
-class Streams(Protocol):
-    """Opens the streams of a log; what it opens is closed with `opened`."""
-
-    def __call__(
-        self, path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
-    ) -> list[LogStream]: ...
-
-
-FORMATS: Final[Mapping[Format, Streams]] = {
+# Functions that open the streams of a log; the ExitStack that they are given closes what they open.
+FORMATS: Final[Mapping[Format, Callable[..., list[LogStream]]]] = {
     "mcap": mcap_log.streams,
     "split": mcap_log.streams,
     "bag": bag.streams,
@@ -212,14 +205,6 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
         return arrays.array_channels(path)
     with open_stream(path) as stream:
         first, last = (None, None) if stream.times is None else map(int, stream.times[[0, -1]])
-        facts = ChannelFacts(
-            stream.topic,
-            stream.encoding,
-            "picture" if kind == "pictures" else "video",
-            stream.count,
-            first,
-            last,
-            missing=stream.missing,
-            remarks=tuple(stream.remarks),
-        )
-        return [facts]
+        schema, about = "picture" if kind == "pictures" else "video", (stream.count, first, last)
+        doubts = stream.missing, tuple(stream.remarks)
+        return [ChannelFacts(stream.topic, stream.encoding, schema, *about, True, *doubts)]

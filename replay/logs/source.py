@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.framing import Framing, framings
 from recorder.images.options import COLOR_RECIPE, InputOptions
@@ -24,7 +24,6 @@ from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
 from replay.logs import clock as clocks
 from replay.logs.aligning import align, names_of
-from replay.logs.clock import Clock
 from replay.logs.formats.views import SCENE
 from replay.logs.images import Images
 from replay.logs.opening import identity_of
@@ -46,7 +45,6 @@ class LoggedSource(StoredSource):
         options: how images become frames, and streams are aligned.
         loop: begin again at the end.
         salvage: show for a broken image the last whole one before it, else the first of all.
-        goal: the command and the folder of its result for the remedy in an error.
         logs: the external logs, MCAP files with their readers.
         opened: the files, which are closed with the source, or if it cannot be made.
 
@@ -73,12 +71,11 @@ class LoggedSource(StoredSource):
         *,
         loop: bool = False,
         salvage: bool = False,
-        goal: tuple[str, str] = ("learn", "RUN"),
         logs: Sequence[tuple[Path, LogReader | None]] = (),
         opened: ExitStack | None = None,
     ) -> None:
         self.streams, self._options = list(streams), options or InputOptions()
-        self._loop, self._salvage, self._goal = loop, salvage, goal
+        self._loop, self._salvage = loop, salvage
         self._paths = list(dict.fromkeys(stream.path for stream in streams))
         self._log_list, self._opened = logs, opened or ExitStack()
         self.recorded, self.color = bool(streams[0].views), self._options.color is True
@@ -101,19 +98,18 @@ class LoggedSource(StoredSource):
     def _open(self) -> None:
         """Put the streams on one clock, and find out how an image becomes a frame."""
         if self.recorded:
-            self._clock = clock = self._recorded_clock()
+            facts = self.streams[0].views[0].facts
+            self._clock = clock = clocks.by_number(self.coverage().values(), facts, self._name())
         else:
-            aligned = align(self.streams, self._options, self._goal)
-            self.streams, self._fps, self._clock = aligned
-            clock = aligned.clock
+            self.streams, self._fps, clock = align(self.streams, self._options)
+            self._clock = clock
         self.first_frame = self._t = clock.first
         self.frames = len(clock.rows[0])
         length = None if self._loop else self.frames
         self.framings: Sequence[Framing | None] = [None] * len(self.streams)
         if self.recorded:
             names = tuple(stream.topic for stream in self.streams)
-            spec = self.streams[0].views[0].facts.spec
-            self._spec = replace(spec, streams=names, length=length)
+            self._spec = replace(facts.spec, streams=names, length=length)
         else:
             names = names_of(self.streams)
             self._images = images = Images(self.streams, color=self.color, salvage=self._salvage)
@@ -127,7 +123,7 @@ class LoggedSource(StoredSource):
                 self._frame(i, int(rows[0]), firsts[i])
         self.gaps = any(clock.gaps) and self._options.gaps == "skip"
         if self.recorded:
-            self.gaps = self.streams[0].views[0].facts.gaps
+            self.gaps = facts.gaps
         end = self.first_frame + self.frames
         self._held = [outside(own, self.first_frame, end) for own in clock.gaps]
         self.pauses = dict(zip(names, clock.gaps, strict=True))
@@ -137,14 +133,6 @@ class LoggedSource(StoredSource):
             each = zip(names, self.streams, clock.rows, left_out, strict=True)
             for name, stream, rows, gaps in each:
                 self.alignment[name] = clocks.counts(stream.count, rows, gaps)
-
-    def _recorded_clock(self) -> Clock:
-        facts = self.streams[0].views[0].facts
-        held = list(self.coverage().values())
-        try:
-            return clocks.by_number(held, facts.start_ns, facts.first_frame, gaps=facts.gaps)
-        except LogDamagedError as error:
-            raise LogDamagedError(f"{self._name()}: {error}") from None
 
     # Frames
 

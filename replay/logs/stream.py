@@ -165,28 +165,17 @@ def joined(parts: Sequence[LogStream]) -> LogStream:
     of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
     rows = np.concatenate([np.arange(part.count) for part in parts])[order]
 
-    def place(row: int) -> tuple[LogStream, int]:
-        return parts[int(of[row])], int(rows[row])
-
     def fetch(row: int) -> tuple[LogStream, Any]:
-        part, own = place(row)
+        part, own = parts[of[row]], int(rows[row])
         return part, part.image(own) if part.read else part.fetch(own)
 
-    def decode(stored: tuple[LogStream, Any]) -> Shown:
-        part, data = stored
-        return data if part.read else part.decode(data)
+    def of_part(attribute: str, default: Any = None) -> Callable[[tuple[LogStream, Any]], Any]:
+        def function(stored: tuple[LogStream, Any]) -> Any:
+            part, data = stored
+            own = getattr(part, attribute)
+            return own(data) if own else default
 
-    def picture(stored: tuple[LogStream, Any]) -> bytes | None:
-        part, data = stored
-        return part.picture(data) if part.picture else None
-
-    def where(row: int) -> str:
-        part, own = place(row)
-        return part.name_of(own)
-
-    def pixel_format(stored: tuple[LogStream, Any]) -> str:
-        part, data = stored
-        return part.pixel_format(data) if part.pixel_format else ""
+        return function
 
     first = parts[0]
     note = f"{first.path}: {first.topic} is joined from {len(parts)} logs, by time"
@@ -195,12 +184,12 @@ def joined(parts: Sequence[LogStream]) -> LogStream:
         count=len(times),
         times=times[order],
         fetch=fetch,
-        decode=decode,
-        picture=picture,
+        decode=of_part("decode"),
+        picture=of_part("picture"),
         read=None,
         held=lambda: max(part.held() for part in parts),
-        where=where,
-        pixel_format=pixel_format,
+        where=lambda row: parts[of[row]].name_of(int(rows[row])),
+        pixel_format=of_part("pixel_format", ""),
         warnings=[note, *(warning for part in parts for warning in part.warnings)],
     )
 

@@ -192,11 +192,10 @@ def convert_command(
     if live := next(filter(is_live, source), None):
         raise UsageError(f"{live} is a live stream: cdmisfa record {shlex.join(source)} -o REC")
     paths = locations(source)
-    for path in paths:
-        refuse_what_is_no_log(path)
+    refuse_what_is_no_log(paths)
     if not resume:
         refuse_existing(out, force=force)
-    opened = open_external(paths, inputs, salvage=salvage, goal=("convert", str(out)))
+    opened = open_external(paths, inputs, salvage=salvage)
     with contextlib.closing(opened) as frames:
         printing.source(frames)
         with _writing(out, "converting") as (shown, stop):

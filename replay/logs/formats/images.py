@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import check_regular, read_regular
 from recorder.images.compressed import check_png, compressed_image
 from recorder.images.options import InputOptions
@@ -33,18 +32,12 @@ def streams(
     files = image_files(path)
     endings = {file.suffix.lower()[1:] for file in files}
 
-    def fetch(row: int) -> bytes:
-        try:
-            return read_regular(files[row], MAX_IMAGE)
-        except UsageError as error:
-            raise LogDamagedError(f"it was a picture when it was found: {error}") from None
-
     remark = f"{path}: a JPEG has no checksums, damaged pixels may go unnoticed"
     stream = LogStream(
         path=path,
         topic=topic,
         count=len(files),
-        fetch=fetch,
+        fetch=lambda row: read_regular(files[row], MAX_IMAGE),
         decode=partial(compressed_image, color=options.color is True),
         picture=bytes,
         where=lambda row: str(files[row]),

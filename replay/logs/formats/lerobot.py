@@ -134,9 +134,7 @@ class _Camera:
         if not self.video:
             return self._picture(place)
         times = self._images.times
-        if not (
-            place < len(times) and abs(int(times[place]) / NANOSECONDS * self._fps - place) < 0.5
-        ):
+        if place >= len(times) or abs(times[place] / NANOSECONDS * self._fps - place) >= 0.5:
             raise MalformedRecord(f"{name} has no frame at {place / self._fps:g} s")
         return place
 
@@ -144,14 +142,11 @@ class _Camera:
         """Decode what `fetch` returns."""
         if not self.video:
             return compressed_image(stored, color=self._color)
-        image: ByteArray = self._images.image(stored)
-        return image
+        return np.asarray(self._images.image(stored))
 
     def held(self) -> int:
         """Bytes of the file that is open."""
-        if self._images is None:
-            return 0
-        return int(self._images.held if self.video else self._images.nbytes)
+        return int(getattr(self._images, "held" if self.video else "nbytes", 0))
 
     def close(self) -> None:
         """Close the file that is open; harmless when called twice."""
@@ -242,21 +237,18 @@ def _columns(file: Path, names: Sequence[str]) -> FloatArray:
 
 
 def _info(path: Path) -> Any:
-    try:
+    with explained(path / INFO, "LeRobot's layout"):
         info = read_json(path / INFO, "it describes no LeRobot dataset")
         version = str(info["codebase_version"])
-        sound = all(isinstance(f, dict) for f in info["features"].values()) and info["fps"] > 0
-        int(info["total_frames"])
-    except (LogDamagedError, ValueError, KeyError, TypeError, AttributeError):
-        sound, version = False, "v3"
-    if not version.startswith("v3"):
-        raise UsageError(
-            f"{path} is a LeRobot dataset {version}, v3.0 is read: convert it with LeRobot's "
-            "convert_dataset_v21_to_v30"
-        )
-    if not sound:
-        raise LogDamagedError(f"{path / INFO}: it describes no LeRobot dataset")
-    return info
+        if not version.startswith("v3"):
+            raise UsageError(
+                f"{path} is a LeRobot dataset {version}, v3.0 is read: convert it with LeRobot's "
+                "convert_dataset_v21_to_v30"
+            )
+        dicts = all(isinstance(feature, dict) for feature in info["features"].values())
+        if not (dicts and info["fps"] > 0 and int(info["total_frames"]) >= 0):
+            raise LogDamagedError(f"{path / INFO}: it describes no LeRobot dataset")
+        return info
 
 
 def _episodes(path: Path, columns: Sequence[str]) -> list[dict[str, Any]]:

@@ -78,13 +78,9 @@ def choose_topics(
     chosen = [topic for topic in readable if not topics or fits_topic(topic, topics)]
     if not chosen or (not topics and len(chosen) > 1):
         raise NoTopicError(f"{path}: {_why_none(readable, others, options)}")
-    for topic in chosen:
-        if len(readable[topic]) > 1:
-            listed = ", ".join(f"{kind.schema} in {kind.encoding}" for kind in readable[topic])
-            raise UsageError(
-                f"{path}: {topic} holds messages of several kinds, which are no one stream: "
-                f"{listed}"
-            )
+    if mixed := next((topic for topic in chosen if len(readable[topic]) > 1), None):
+        listed = ", ".join(f"{kind.schema} in {kind.encoding}" for kind in readable[mixed])
+        raise UsageError(f"{path}: {mixed} holds messages of several kinds: {listed}")
     return [(topic, *next(iter(readable[topic].values()))) for topic in chosen]
 
 
@@ -189,7 +185,7 @@ class _Video:
         """Return the images as a stream; a UsageError if none can be decoded."""
         messages = self._messages
         rows = range(messages.count)
-        first = next((row for row in rows if self._begins(row)), messages.count)
+        self._first = first = next((row for row in rows if self._begins(row)), messages.count)
         if first == messages.count:
             why = "each picture of its video needs earlier ones"
             try:
@@ -197,7 +193,6 @@ class _Video:
             except (MalformedImage, MalformedRecord) as error:
                 why = str(error)
             raise UsageError(f"{messages.path}: {messages.topic}: {why}")
-        self._first = first
         stamp = messages.stamp
         lost = f"{messages.path}: {first} pictures that need earlier ones are left out"
         video = replace(

@@ -65,16 +65,12 @@ def streams(
         raise UsageError(f"{path}: it has no column of numbers with rows, but {kinds}")
     with limited(path, "PyArrow", remedy="take fewer columns, with --field"):
         columns = [_column(path, table, name) for name in fields]
-    # A row of a CSV file is named by its line, from 1, of Parquet by its number, from 0.
-    stream = number_stream(
-        path,
-        path.stem,
-        dict(zip(fields, columns, strict=True)),
-        times,
-        options,
-        lambda row: f"{path}: line {row + 2}" if csv else f"{path}: row {row}",
-    )
-    return [stream]
+    numbers = dict(zip(fields, columns, strict=True))
+
+    def where(row: int) -> str:  # by its line of CSV, from 1, or its row of Parquet, from 0
+        return f"{path}: line {row + 2}" if csv else f"{path}: row {row}"
+
+    return [number_stream(path, path.stem, numbers, times, options, where)]
 
 
 def number_stream(
@@ -138,19 +134,12 @@ def number_stream(
 
 def table_channels(path: Path) -> list[ChannelFacts]:
     """Return the columns of a table; raises as `streams`."""
-    table, kind = _read(path), path.suffix[1:]
-    remark = f"{path}: a table has no checksums, changed numbers would go unnoticed"
-    return [
-        ChannelFacts(
-            name,
-            kind,
-            str(column.type),
-            len(column) - column.null_count,
-            images=False,
-            remarks=(remark,),
-        )
-        for name, column in zip(table.column_names, table.columns, strict=True)
-    ]
+    table, kind, facts = _read(path), path.suffix[1:], []
+    remarks = (f"{path}: a table has no checksums, changed numbers would go unnoticed",)
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        about = kind, str(column.type), len(column) - column.null_count
+        facts.append(ChannelFacts(name, *about, images=False, remarks=remarks))
+    return facts
 
 
 def _read(path: Path) -> Any:
@@ -185,8 +174,7 @@ def _read_csv(path: Path, numbers: Sequence[str] = ()) -> Any:
         path: the file.
         numbers: names of columns that must be of numbers.
     """
-    import pyarrow
-    from pyarrow import csv
+    from pyarrow import csv, float64
 
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         names = re.sub(r'"[^"]*"', "", file.readline(64 * 1024))
@@ -197,7 +185,7 @@ def _read_csv(path: Path, numbers: Sequence[str] = ()) -> Any:
         csv.ParseOptions(delimiter=separator),
         csv.ConvertOptions(
             null_values=[*csv.ConvertOptions().null_values, *_MISSING],
-            column_types=dict.fromkeys(numbers, pyarrow.float64()),
+            column_types=dict.fromkeys(numbers, float64()),
         ),
     )
 
@@ -237,7 +225,7 @@ def _column(path: Path, table: Any, name: str) -> FloatArray:
     if first not in table.column_names:
         raise _no_column(path, table, name)
     if first == name and _is_numeric(table[name]):
-        return _floats(table[name])[:, None]
+        return np.array(table[name].cast("float64", safe=False))[:, None]
     try:
         values = table[first].to_pylist()
         rows = [None if value is None else field.numbers({first: value}) for value in values]
@@ -249,13 +237,6 @@ def _column(path: Path, table: Any, name: str) -> FloatArray:
         raise UsageError(f"{path}: {name} holds {counts} numbers in a row: choose a part of it")
     (size,) = sizes
     return np.array([[np.nan] * size if row is None else row for row in rows], np.float64)
-
-
-def _floats(column: Any) -> FloatArray:
-    import pyarrow
-
-    numbers: FloatArray = column.cast(pyarrow.float64(), safe=False).to_numpy()
-    return numbers
 
 
 def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, str]:
@@ -273,9 +254,11 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, 
     column, scale = table[name], UNITS[unit]
     if kinds.is_timestamp(column.type):
         with limited(path, "PyArrow"):
-            column = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast(pyarrow.int64())
+            column = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast("int64")
         scale = 1
-    rough = _floats(column) * scale if _is_numeric(column) else np.full(len(column), np.nan)
+    rough = np.full(len(column), np.nan)
+    if _is_numeric(column):
+        rough = column.cast("float64", safe=False).to_numpy() * scale
     known = np.isfinite(rough)
     if not known.any() or (rough[known] < 0).any() or (rough[known] >= LAST_NS).any():
         raise UsageError(
@@ -286,7 +269,7 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, 
     if kinds.is_floating(column.type):
         exact = np.round(np.where(known, rough, -1.0)).astype(np.int64)
     else:
-        exact = column.cast(pyarrow.int64(), safe=False).fill_null(-1).to_numpy() * np.int64(scale)
+        exact = column.cast("int64", safe=False).fill_null(-1).to_numpy() * np.int64(scale)
     return np.where(known, exact, -1), name
 
 

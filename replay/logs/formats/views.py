@@ -50,7 +50,7 @@ def streams(views: Sequence[ViewFile], *, salvage: bool = False) -> list[LogStre
         UsageError: the files are of several recordings.
         LogDamagedError: the files contradict each other.
     """
-    return [_stream(parts) for parts in arrange(views, salvage=salvage)]
+    return [_stream(parts) for parts in _arrange(views, salvage=salvage)]
 
 
 def _stream(parts: Sequence[ViewFile]) -> LogStream:
@@ -83,7 +83,7 @@ def _stream(parts: Sequence[ViewFile]) -> LogStream:
     )
 
 
-def arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
+def _arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
     """Return views by stream index, each as its parts by first frame; raises as `streams`."""
     by_view: dict[tuple[int, str], list[ViewFile]] = {}
     for view in views:
