@@ -31,6 +31,8 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn": ("SOURCE", "cdmisfa learn --help"),
     "record icub": ("-o",),
     # options that would do nothing
+    "learn oscillatory --loop --salvage": ("is no log: --loop and --salvage are for logs",),
+    "record gym:Pendulum-v1 -o x --view a": ("is a live stream: --view is for scenes",),
     "convert LOGS --set learner.nu=1 -o x": ("--set takes keys input.* here, not learner.*",),
     "view RUN --topic /a --save v.rrd": ("is a run: --topic is for logs",),
     "learn REC --set scene.seed=9": ("scene.seed " + VAIN,),

@@ -23,6 +23,9 @@ from cdmisfa.cli.options import quiet
 from cdmisfa.cli.printing import Stderr, line
 from cdmisfa.core.errors import CdmisfaError
 
+# Commands by their heading on the help page: module in `cdmisfa.cli.commands`, first sentence.
+#
+# The sentence repeats the first line of the command's docstring, which --help does not import.
 HELP = {
     "Record": {
         "record": ("record", "Record a simulated scene or live cameras, one MCAP file per view."),
@@ -60,10 +63,6 @@ HELP = {
         "doctor": ("doctor", "Check which required and optional software is installed.")
     },
 }
-"""Commands by their heading on the help page: module in `cdmisfa.cli.commands`, first sentence.
-
-The sentence repeats the first line of the command's docstring, which --help does not import.
-"""
 
 COMMANDS = {name: command for commands in HELP.values() for name, command in commands.items()}
 

@@ -14,8 +14,8 @@ from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
+# Seconds after which an interrupt that was dropped is sent again.
 _AGAIN = 0.02
-"""Seconds after which an interrupt that was dropped is sent again."""
 
 
 class Stop:

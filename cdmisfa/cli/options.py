@@ -29,11 +29,11 @@ class LocalPath(click.Path):
         return super().convert(value, param, ctx)
 
 
+# Type of paths that are written, and of those that are read but cannot be URLs.
 LOCAL = LocalPath(path_type=Path)
-"""Type of paths that are written, and of those that are read but cannot be URLs."""
 
+# Type of paths, URLs and other words that name a source; a shell completes them as files.
 WORD = click.Path(readable=False)
-"""Type of paths, URLs and other words that name a source; a shell completes them as files."""
 
 
 def out(help: str, *, required: bool = False) -> Decorator:
@@ -82,6 +82,8 @@ def parse_seconds(text: str) -> float:
     return hours * 3600 + minutes * 60 + seconds
 
 
+# Options by the names of `InputOptions`; `settings` are the keys `input.*` of commands that have
+# no other keys.
 INPUTS = {
     "topics": click.option(
         "--topic",
@@ -144,8 +146,6 @@ INPUTS = {
         help="Set a configuration key input.*, as input.fit=pad. Repeatable.",
     ),
 }
-"""Options by the names of `InputOptions`; `settings` are the keys `input.*` of commands that have
-no other keys."""
 
 ALL_INPUTS = ("topics", "fields", "size", "rate", "start", "end", "align", "color")
 
@@ -234,6 +234,7 @@ def _set_quiet(ctx: click.Context, param: click.Parameter, value: bool) -> None:
     Stderr.quiet = Stderr.quiet or value
 
 
+# `-q`, before the command or after it.
 quiet = click.option(
     "-q",
     "--quiet",
@@ -242,4 +243,3 @@ quiet = click.option(
     callback=_set_quiet,
     help="Print nothing on stderr but errors.",
 )
-"""`-q`, before the command or after it."""

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from cdmisfa.experiments.run_folder import RunResult
     from replay.integrity.learned import ModuleInfo
 
+# Version of the JSON documents; rises when a key changes its meaning or goes away.
 SCHEMA = 1
-"""Version of the JSON documents; rises when a key changes its meaning or goes away."""
 
 
 class Stderr:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
 
+# Seconds between two updates of the bar: a block may take only microseconds.
 TICK = 0.1
-"""Seconds between two updates of the bar: a block may take only microseconds."""
 
 GIGABYTE = 10**9
 

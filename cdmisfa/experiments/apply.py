@@ -41,17 +41,17 @@ from replay.runs.run import Run
 from replay.storage.identity import file_sha256
 from replay.stored import StoredSource, centre_as
 
+# Standard deviations of a module's slowness within which it knows a block, as its learner says.
 KNOWN_WITHIN: Final = 2.0
-"""Standard deviations of a module's slowness within which it knows a block, as its learner says."""
 
+# Frames over which the variance is taken that decides whether a module is alive.
 WINDOW: Final = 2000
-"""Frames over which the variance is taken that decides whether a module is alive."""
 
+# Approximate bytes of frames and outputs of a log that are read at once.
 READ_BYTES: Final = 2**22
-"""Approximate bytes of frames and outputs of a log that are read at once."""
 
+# Consecutive frames within a block of the clock, and the outputs (n, R) on them.
 Part = tuple[Block, FloatArray]
-"""Consecutive frames within a block of the clock, and the outputs (n, R) on them."""
 
 
 class Application:

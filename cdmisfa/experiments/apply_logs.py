@@ -35,17 +35,17 @@ from replay.corpus.finding import INDEX
 from replay.corpus.index import IndexedLog, index_logs, indexed_logs, is_index
 from replay.export.applied import AppliedSink, written
 
+# Folder of the state of the logs; programs that read data sets skip names with an underscore.
 STORE: Final = "_applied"
-"""Folder of the state of the logs; programs that read data sets skip names with an underscore."""
 
+# File in it that states which modules were applied, and with which options.
 REQUEST: Final = "apply.json"
-"""File in it that states which modules were applied, and with which options."""
 
+# Modules of this package that decide the bytes of the files.
 COMPUTED: Final = ("cdmisfa/modules", "cdmisfa/experiments/apply", "replay/export/applied")
-"""Modules of this package that decide the bytes of the files."""
 
+# Most letters of a log's name that become part of a file's name.
 _LONGEST: Final = 48
-"""Most letters of a log's name that become part of a file's name."""
 
 
 @dataclass(frozen=True, slots=True)

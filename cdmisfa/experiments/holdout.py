@@ -17,15 +17,15 @@ from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.modules import Module
 from replay.stored import StoredSource
 
+# Frames that are in memory at once.
 PIECE = 256
-"""Frames that are in memory at once."""
 
 
+# Default share of a camera log that is held out.
 HOLDOUT = 0.1
-"""Default share of a camera log that is held out."""
 
+# Fewest frames that estimate the slowness of an output; of a shorter share none are held out.
 FEWEST = 200
-"""Fewest frames that estimate the slowness of an output; of a shorter share none are held out."""
 
 
 class _StoppedError(Exception):

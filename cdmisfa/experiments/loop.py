@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 INTERRUPTED: Final = "interrupted"
 EXHAUSTED: Final = "log_exhausted"
 
+# Why a run ended, in words.
 ENDINGS: Mapping[str, str] = {
     "max_modules": "as many modules as asked for were learned",
     "max_iterations": "the asked number of iterations is over",
@@ -24,13 +25,12 @@ ENDINGS: Mapping[str, str] = {
     EXHAUSTED: "there were no more frames",
     INTERRUPTED: "it was interrupted",
 }
-"""Why a run ended, in words."""
 
+# Default iterations between two keyframes, a compromise of log size and time to resume.
 EVERY = 100
-"""Default iterations between two keyframes, a compromise of log size and time to resume."""
 
+# A keyframe waits until the log has grown by this many times the size of the one before.
 SHARE = 5
-"""A keyframe waits until the log has grown by this many times the size of the one before."""
 
 
 def learn_blocks(

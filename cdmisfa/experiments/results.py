@@ -20,24 +20,24 @@ from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.experiments.store import DONE, FAILED, ROWS, read_rows
 from replay.runs.folders import read_request
 
+# 95 % quantile of the chi-square distribution with one degree of freedom.
 CHI_SQUARE_95 = 3.841458820694124
-"""95 % quantile of the chi-square distribution with one degree of freedom."""
 
+# 97.5 % quantile of the normal distribution: 95 % lie within this.
 NORMAL_95 = 1.959963984540054
-"""97.5 % quantile of the normal distribution: 95 % lie within this."""
 
+# 97.5 % quantiles of Student's t distribution, from one degree of freedom on.
 STUDENT_95 = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
     2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086,
     2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
 )  # fmt: skip
-"""97.5 % quantiles of Student's t distribution, from one degree of freedom on."""
 
+# Largest slope a logistic fit may have, per unit of x.
 STEEPEST = 1e4
-"""Largest slope a logistic fit may have, per unit of x."""
 
+# Smallest slope a logistic fit may have.
 FLATTEST = 1e-2
-"""Smallest slope a logistic fit may have."""
 
 
 @dataclass(frozen=True, slots=True)

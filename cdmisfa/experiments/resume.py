@@ -36,11 +36,11 @@ from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.provenance import changed_files, stated_source
 from replay.stored import StoredSource
 
+# Facts that a source must have in common with the one that a run learned from.
 SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
-"""Facts that a source must have in common with the one that a run learned from."""
 
+# Keys that a fork must not change: the meaning of the learner's memory depends on them.
 FIXED = ("learner.algorithm", "learner.expansion", "learner.tau")
-"""Keys that a fork must not change: the meaning of the learner's memory depends on them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,25 +41,25 @@ from replay.runs.provenance import final_record
 from replay.runs.writer import RunWriter
 from replay.stored import StoredSource
 
+# Key of a manifest: the command that started the run, which may differ when it is resumed.
 COMMAND = "command"
-"""Key of a manifest: the command that started the run, which may differ when it is resumed."""
 
+# Key of a manifest: the run and iteration that a fork continues, and its settings before.
 FORK = "fork"
-"""Key of a manifest: the run and iteration that a fork continues, and its settings before."""
 
+# Options of a command that decide how logs are opened.
 OPENING = ("loop", "salvage", "episodes")
-"""Options of a command that decide how logs are opened."""
 
+# Options of a command that are stored with its run.
 OPTIONS = (
     *("seed", "preset", "settings", "algorithm"),
     *OPENING,
     *INPUTS,
     *("max_iterations", "max_modules"),
 )
-"""Options of a command that are stored with its run."""
 
+# The earlier log of a run that is being resumed, until the new one holds its iterations.
 SET_ASIDE = "run.before.mcap.partial"
-"""The earlier log of a run that is being resumed, until the new one holds its iterations."""
 
 
 def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:

@@ -44,8 +44,8 @@ from replay.runs.log import RunHeader, read_header
 from replay.runs.provenance import comparable, has_whole_hashes, stated_source
 from replay.runs.writer import RunWriter
 
+# Called with the bytes of the source that were hashed and with all, while a run waits for that.
 Hashing = Callable[[int, int], None]
-"""Called with the bytes of the source that were hashed and with all, while a run waits for that."""
 
 
 def _ignore(done: int, size: int) -> None:

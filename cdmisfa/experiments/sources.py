@@ -213,17 +213,19 @@ def open_source(
         CdmisfaError: there is no such source or setting, or a log is damaged.
     """
     given = Layers.read(preset, settings)
+    live = all(is_live(str(word)) for word in words)
+    options = [f"--{name}" for name in ("loop", "salvage", "episodes") if how.get(name)]
+    if options and (live or is_scene(words)):
+        raise UsageError(f"{words[0]} is no log: {are_for(options, 'logs')}")
     if is_scene(words):
-        if how.get("episodes"):
-            raise UsageError(f"{words[0]} is a scene: --episodes is for logs")
         scene = configure(str(words[0]), given, seed, inputs)
         return scene.open_scene(), scene
     inputs = read_inputs(inputs, given)
     source: FrameSource
-    if all(is_live(str(word)) for word in words):
-        live = list(map(str, words))
-        refuse_stored(live, inputs)
-        source = open_live(live, inputs, seed=seed, say=say)
+    if live:
+        addresses = list(map(str, words))
+        refuse_stored(addresses, inputs)
+        source = open_live(addresses, inputs, seed=seed, say=say)
     else:
         source = open_logs(words, inputs=inputs, **how)
     try:

@@ -23,13 +23,13 @@ from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, par
 from cdmisfa.experiments.documents import writing
 from recorder.log.files import held, make_folder, refuse_named_as_file, refuse_special, to_disk
 
+# The file of the rows in a folder.
 ROWS = "rows.jsonl"
-"""The file of the rows in a folder."""
 
 DONE, FAILED = "done", "failed"
 
+# A finished trial: its `id`, `status`, `point`, `seed`, `code`, and `result` or `error`.
 Row = dict[str, Any]
-"""A finished trial: its `id`, `status`, `point`, `seed`, `code`, and `result` or `error`."""
 
 
 @cache

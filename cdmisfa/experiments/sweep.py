@@ -36,8 +36,8 @@ from recorder.images.options import InputOptions
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.runs.folders import REQUEST
 
+# Keys of a run's result that a trial's row has elsewhere, or not at all.
 UNKEPT = ("schema", "run", "source", "seed", "signals_sha256", "undecided")
-"""Keys of a run's result that a trial's row has elsewhere, or not at all."""
 
 
 def sweep(

@@ -24,8 +24,8 @@ from cdmisfa.experiments.loop import ending
 from cdmisfa.modules import Module
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
 
+# Iterations between two returns to Python.
 CHUNK = 512
-"""Iterations between two returns to Python."""
 
 
 @dataclass(frozen=True, slots=True)

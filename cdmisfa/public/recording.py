@@ -19,12 +19,12 @@ from cdmisfa.experiments.sources import open_logs
 from recorder.images.options import InputOptions
 from replay.inputs import open_arrays
 
+# A source for `learn`: arrays, tables, mappings of these by names of streams, paths and URLs of
+# logs, names of scenes, words of live streams, or an open source.
 Given: TypeAlias = Any
-"""A source for `learn`: arrays, tables, mappings of these by names of streams, paths and URLs of
-logs, names of scenes, words of live streams, or an open source."""
 
+# Pixels of the height of a view in a notebook.
 HEIGHT = 600
-"""Pixels of the height of a view in a notebook."""
 
 
 def as_words(given: Given) -> tuple[str, ...]:

@@ -21,8 +21,8 @@ from cdmisfa.public.recording import Recording, as_words, view
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
 from replay.runs.run import read_outline
 
+# Signals of one number an iteration.
 SCALARS = tuple(signal.name for signal in SIGNALS.values() if not signal.dims)
-"""Signals of one number an iteration."""
 
 
 class UnknownSignalError(UsageError, KeyError):

@@ -25,17 +25,17 @@ from replay.following import fits
 
 SCENE, PRESET = "icub", "icub-real"
 
+# Scene that needs no simulator.
 STAND_IN = "oscillatory"
-"""Scene that needs no simulator."""
 
+# Length of the stretch on which live and recorded signals are compared.
 CHECKED_ITERATIONS = 200
-"""Length of the stretch on which live and recorded signals are compared."""
 
+# Frames on which a module's output is compared with the object's true position.
 SCORED_FRAMES = 4000
-"""Frames on which a module's output is compared with the object's true position."""
 
+# Opens a stage by its title and the unit that it counts; reports to a `cli.progress.Bar`.
 Stage = Callable[[str, str], AbstractContextManager[Any]]
-"""Opens a stage by its title and the unit that it counts; reports to a `cli.progress.Bar`."""
 
 
 def demo(

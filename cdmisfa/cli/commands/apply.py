@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from cdmisfa.experiments.apply_logs import AppliedLogs
     from recorder.images.options import InputOptions
 
+# Number of warnings and of failed logs that are printed.
 MOST_LINES = 20
-"""Number of warnings and of failed logs that are printed."""
 
 FILE_FORMS = ("parquet", "csv", "mcap", "rrd")
 STDOUT = "stdout"

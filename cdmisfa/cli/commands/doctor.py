@@ -17,6 +17,7 @@ from cdmisfa.core.errors import CdmisfaError
 
 REQUIRED = ("cdmisfa", "numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow")
 
+# Optional dependencies by the name of the extra: its modules, and what needs them.
 EXTRAS = {
     "video": (("av",), "videos and cameras: learn, record, convert; export --to mp4"),
     "gym": (("gymnasium",), "gym: streams of simulated tasks; WatchEnv"),
@@ -29,7 +30,6 @@ EXTRAS = {
     "river": (("river",), "OnlineSFA, a transformer of river"),
     "dask": (("distributed",), "--scheduler of sweep, apply and reproduce"),
 }
-"""Optional dependencies by the name of the extra: its modules, and what needs them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from replay.corpus.index import Indexed
     from replay.integrity.report import ChannelInfo, LogReport, SizeInfo
 
+# Number of streams of a run that `info` names.
 MOST_STREAMS = 8
-"""Number of streams of a run that `info` names."""
 
 
 @click.command("info")

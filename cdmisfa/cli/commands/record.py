@@ -13,14 +13,14 @@ import click
 from cdmisfa.cli import options, printing
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.progress import Bar, bar
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError, are_for
 
 if TYPE_CHECKING:
     from recorder.images.options import InputOptions
     from recorder.recording import ViewRecording
 
+# What recordings of external logs and of live streams state in place of their scene.
 NO_SCENES = ("foreign", "cameras", "gym")
-"""What recordings of external logs and of live streams state in place of their scene."""
 
 
 @click.command("record")
@@ -85,6 +85,9 @@ def record_command(
 
     limit = parse_split(split) if split else None
     if any(map(is_live, source)):
+        given = {"--view": views, "--jobs": jobs > 1, "--resume": resume}
+        if options := [name for name, value in given.items() if value]:
+            raise UsageError(f"{source[0]} is a live stream: {are_for(options, 'scenes')}")
         return _record_live(
             source, out, inputs, preset, settings, seed or 0, frames, limit, force, as_json
         )

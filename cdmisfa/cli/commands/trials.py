@@ -18,8 +18,8 @@ from cdmisfa.cli.progress import Bar, bar, resumable_bar
 if TYPE_CHECKING:
     from recorder.images.options import InputOptions
 
+# Number of seeds of a sweep, so that a typing error does not fill the memory.
 MOST_SEEDS = 1_000_000
-"""Number of seeds of a sweep, so that a typing error does not fill the memory."""
 
 
 @click.command("sweep")

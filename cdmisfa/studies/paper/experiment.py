@@ -17,8 +17,8 @@ from cdmisfa.modules import Module
 
 Settings = Mapping[str, Any]
 
+# A trial's row, in plain values, and its arrays: curves for the figures.
 Output = tuple[dict[str, Any], Mapping[str, NDArray[Any]]]
-"""A trial's row, in plain values, and its arrays: curves for the figures."""
 
 
 @dataclass(frozen=True, slots=True)

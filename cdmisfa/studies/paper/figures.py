@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Okabe and Ito's colours, which colour-blind readers can tell apart; one for each stream.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's colours, which colour-blind readers can tell apart; one for each stream."""
 
 STREAM_NAMES = ("$s_1$", "$s_2$", "$s_3$")
 
+# A signal over iterations, (N, ...) a trial.
 Curves = Sequence[NDArray[Any]]
-"""A signal over iterations, (N, ...) a trial."""
 
 
 def new_figure(rows: int, columns: int, **subplots: Any) -> tuple[Figure, Any]:

@@ -41,29 +41,28 @@ from recorder.world.icub.config import IcubConfig
 from replay.inputs import open_recording
 from replay.logs.source import LoggedSource
 
+# Stream and policy of both modules, as the paper gives them.
 OPTIMAL = ((0, "011"), (2, "110"))
-"""Stream and policy of both modules, as the paper gives them."""
 
+# The second module is saved near 1160; the rest shows that no third one is.
 ITERATIONS = 1400
-"""The second module is saved near 1160; the rest shows that no third one is."""
 
+# Frames before a module is frozen whose output is drawn (paper).
 DRAWN = 200
-"""Frames before a module is frozen whose output is drawn (paper)."""
 
+# What each module should encode.
 OBJECTS = ("object1_y", "object3_y")
-"""What each module should encode."""
 
+# Frames after those learned from on which modules are judged: 16 times the walk's half range.
 HELD_OUT = 4000
-"""Frames after those learned from on which modules are judged: 16 times the walk's half range."""
 
+# |r| with the position of an object, on held-out frames, from which on a module follows it.
 FOLLOWS = 0.9
-"""|r| with the position of an object, on held-out frames, from which on a module follows it."""
 
+# Algorithm and 1.0's threshold of the clustering error: that of decision 0014, and a looser one.
+#
+# 1.0 gets the head's positions as labels.
 LEARNERS = (("2.0", 0.1), ("1.0", 0.1), ("1.0", 0.6))
-"""Algorithm and 1.0's threshold of the clustering error: that of decision 0014, and a looser one.
-
-1.0 gets the head's positions as labels.
-"""
 
 
 class Icub(Experiment):

@@ -24,29 +24,29 @@ from cdmisfa.studies.paper.experiment import (
     paper_config,
 )
 
+# The paper's values of epsilon^c.
 CHANGES = (1.0, 0.96, 0.93, 0.9, 0.86, 0.83, 0.8, 0.76, 0.73, 0.7, 0.6, 0.5, 0.3, 0.1)
-"""The paper's values of epsilon^c."""
 
 QUICK_CHANGES = (1.0, 0.86, 0.8, 0.7, 0.3)
 
+# Table 1: the paper's epsilon^d.
 SIGMAS = {0.008: 0.8933, 0.003: 0.8775, 0.0009: 0.7211, 0.0001: 0.6517, 0.0: 0.6483}
-"""Table 1: the paper's epsilon^d."""
 
 NUS = {0.02: 0.78, 0.03: 0.80, 0.04: 0.79, 0.05: 0.81}
+
+# Table 2: the paper's epsilon^d.
 TAUS: Mapping[float, float] = {10: 0.98, 30: 0.81, 50: 0.83, 100: 0.80}
-"""Table 2: the paper's epsilon^d."""
 
 COLUMNS: Mapping[str, Mapping[float, float]] = {"sigma": SIGMAS, "nu": NUS, "tau": TAUS}
 QUICK_COLUMNS = {"sigma": {sigma: SIGMAS[sigma] for sigma in (0.008, 0.0009, 0.0)}}
 
+# Multiplier of epsilon throughout; the text leaves it open, decision 0013.
 DECAY = 0.998
-"""Multiplier of epsilon throughout; the text leaves it open, decision 0013."""
 
+# Rewarded blocks before a change from which on one can speak of following it.
+#
+# With fewer the agent had hardly an optimum to leave.
 REWARDED = 30
-"""Rewarded blocks before a change from which on one can speak of following it.
-
-With fewer the agent had hardly an optimum to leave.
-"""
 
 CONTRADICTION = (
     "The paper's tables contradict each other: sigma = 0.0009, nu = 0.05 and tau = 100 are one "
@@ -57,11 +57,11 @@ CONTRADICTION = (
 
 OLD, NEW = "101", "011"
 
+# The values of sigma that the paper shows a figure of.
 PICTURED = (0.0001, 0.008)
-"""The values of sigma that the paper shows a figure of."""
 
+# Marker, its size and dashes of each stream, which stay apart where they lie on each other.
 STYLES = (("o", 7, "-"), ("s", 5, (0, (4, 2))), ("^", 3, (0, (1, 1.5))))
-"""Marker, its size and dashes of each stream, which stay apart where they lie on each other."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,11 +35,11 @@ MAX_ITERATIONS = 10_000
 
 ALGORITHMS = ("1.0", "2.0")
 
+# About 200 of exploration and 1000 after epsilon is set to 0.
 ITERATIONS = 1200
-"""About 200 of exploration and 1000 after epsilon is set to 0."""
 
+# Thresholds under which no module is saved, so that the policy alone is on trial.
 NEVER = {"delta": 1e-12, "roc_error": 0.0}
-"""Thresholds under which no module is saved, so that the policy alone is on trial."""
 
 
 def slowness_on(module: Module) -> float:
@@ -75,8 +75,8 @@ class Oscillatory(Experiment):
     """Three modules in the order of difficulty."""
 
     title = "Oscillatory streams"
+    # Stream and policy of each module, as the paper gives them.
     optimal = ((0, "011"), (1, "101"), (2, "110"))
-    """Stream and policy of each module, as the paper gives them."""
 
     def run(self, settings: Settings) -> Output:
         """Learn until three modules are saved."""
@@ -140,10 +140,10 @@ class FiveStreams(Experiment):
     """The paper's example of five streams: the third is the easiest, the first the next."""
 
     title = "Five streams"
+    # The paper names no streams; the last two are as hard as the second.
     streams = ("x2", "x3", "x1", "x3", "x3")
-    """The paper names no streams; the last two are as hard as the second."""
+    # Stream and policy of the first two modules, as the paper's example gives them.
     optimal = ((2, "11011"), (0, "01111"))
-    """Stream and policy of the first two modules, as the paper's example gives them."""
 
     def run(self, settings: Settings) -> Output:
         """Learn until nothing is left."""

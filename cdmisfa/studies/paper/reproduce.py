@@ -31,6 +31,7 @@ from cdmisfa.studies.paper.icub import Icub, make_recording
 from cdmisfa.studies.paper.nonstationary import NonStationary
 from cdmisfa.studies.paper.oscillatory import FiveStreams, Oscillatory, Stability
 
+# The experiments, in the paper's order.
 EXPERIMENTS: Mapping[str, Experiment] = {
     "oscillatory": Oscillatory(),
     "five": FiveStreams(),
@@ -38,10 +39,9 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "nonstationary": NonStationary(),
     "icub": Icub(),
 }
-"""The experiments, in the paper's order."""
 
+# Seed of an experiment's first trials: no reading was chosen on these, see docs/decisions.
 FIRST_SEED = 28_000
-"""Seed of an experiment's first trials: no reading was chosen on these, see docs/decisions."""
 
 
 def load(name: str) -> Experiment:
@@ -159,8 +159,8 @@ def check_claims(document: Mapping[str, Any]) -> None:
 
 HEAD = ("quantity", "paper", "ours", "SD", "95 % interval", "n")
 
+# Words for whether a statement came out.
 VERDICTS = {True: "yes", False: "**no**", None: "*not judged*"}
-"""Words for whether a statement came out."""
 
 
 def markdown_tables(document: Mapping[str, Any]) -> str:
