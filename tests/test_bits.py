@@ -47,7 +47,8 @@ def assert_same_bits(
     if reason := lacking(compiler, flags, runner):
         pytest.skip(reason)
     source, program = folder / "all.c", folder / "selftest"
-    source.write_text("".join(f'#include "{n}"\n' for n in ("lanes.h", *FILES, "selftest.c")))
+    names = "lanes.h", *(f"{name}.c" for name in (*FILES, "selftest"))
+    source.write_text("".join(f'#include "{name}"\n' for name in names))
     places = ["-I", ROOT / "cdmisfa" / "kernels", "-I", ROOT / "tests"]
     said = [flag for flag in FLAGS if not flag.startswith(("-O", "-g"))]
     command = [*compiler, *said, "-Werror", *flags, *places, source, "-o", program, "-lm"]

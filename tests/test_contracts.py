@@ -20,7 +20,7 @@ from cdmisfa.agents.progress.attention import ProgressConfig
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
-from cdmisfa.core.signals import SIGNALS, values
+from cdmisfa.core.signals import SIGNALS
 from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.recursive import RecursiveFeature
 from recorder.cameras.readers import Camera
@@ -128,6 +128,6 @@ def test_signals_that_are_not_said_do_not_exist() -> None:
     record = signals_of_block(block, source.spec, 7, outputs=2, modules=3, reward=0.5)
     assert (record.iteration, record.t, record.stream, record.reward) == (7, 0, 1, 0.5)
     assert record.y_frozen.shape == (3, 5, 2)
-    floats = [array for signal, array in values(record) if signal.dtype == "float64"]
+    floats = [np.asarray(getattr(record, s.name)) for s in SIGNALS.values() if s.dtype == "float64"]
     assert sum(np.isfinite(array).all() for array in floats if array.size) == 1
     assert {field.name for field in dataclasses.fields(record)} == set(SIGNALS)

@@ -18,7 +18,7 @@ from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import overwrite
-from cdmisfa.core.signals import BlockSignals, SignalsHash, values
+from cdmisfa.core.signals import SIGNALS, BlockSignals, SignalsHash
 from recorder.world.oscillatory import OscillatorySource
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
@@ -80,7 +80,8 @@ def test_signals_have_the_documented_shapes(whole: Trial) -> None:
     modules = 0
     for k, record in enumerate(whole.signals):
         sizes = {"T": config.tau, "J": config.outputs, "M": modules, "S": n, "A": 2}
-        for signal, value in values(record):
+        for signal in SIGNALS.values():
+            value = np.asarray(getattr(record, signal.name))
             assert value.shape == tuple(sizes[d] for d in signal.dims), (k, signal.name)
         assert (record.iteration, record.t) == (k, k * config.tau)
         assert record.log_time == whole.learner.spec.time_ns(record.t)
@@ -152,7 +153,8 @@ def test_a_module_never_changes_once_frozen() -> None:
 
 def test_nobody_can_reach_the_learner_through_what_it_gave_away() -> None:
     def vandal(record: BlockSignals, learner: CuriousLearner) -> None:
-        for _, value in values(record):
+        for name in SIGNALS:
+            value = np.asarray(getattr(record, name))
             if value.ndim and value.flags.writeable:
                 value[...] = 0
         learner.phi[...] = 7

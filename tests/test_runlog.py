@@ -16,9 +16,9 @@ from run_data import IMAGE, VECTOR, parts_of, read_signals, rows_of, run_of, sig
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SIGNALS, canonical_bytes
+from cdmisfa.public.run import Run
 from replay.runs.codec import decode_matrices, decode_signals, encode_matrix, encode_signals
 from replay.runs.log import read_header
-from replay.runs.run import Run
 
 
 @given(

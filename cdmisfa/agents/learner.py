@@ -87,8 +87,11 @@ class CuriousLearner:
         self.agent = new_agent(config, n_streams, first)
         self.out = np.zeros(1, OUTCOME)
         self._agent = as_struct(self.agent, self.rules, self.out)
-        self._no_interest = freeze(np.full(n_streams, np.nan))
-        self._no_state = freeze(np.full(n_streams, NO_STATE))
+        # Signals of the progress learner, which this one does not have.
+        scalars = ("change", "tested", "fitted", "learning_error", "typical", "regret")
+        self._of_progress: dict[str, Any] = dict.fromkeys(scalars, math.nan)
+        self._of_progress["interest"] = freeze(np.full(n_streams, np.nan))
+        self._of_progress["state"] = freeze(np.full(n_streams, NO_STATE))
         self._freeze()
         self.abstraction = self._new_abstraction()
 
@@ -261,18 +264,11 @@ class CuriousLearner:
             band_mean=self.frozen.band_mean.copy(),
             band_sd=self.frozen.band_sd.copy(),
             roc_error_frozen=roc_error_frozen,
-            change=math.nan,
-            tested=math.nan,
-            fitted=math.nan,
-            learning_error=math.nan,
-            interest=self._no_interest,
-            state=self._no_state,
-            typical=math.nan,
-            regret=math.nan,
             R=agent.dense / (scale or 1.0),
             Q=kernels.action_values(self._agent),
             policy=agent.policy.copy(),
             **out,
+            **self._of_progress,
         )
 
     def save_abstraction(self) -> None:

@@ -369,9 +369,7 @@ def _words_of(hint: Any) -> str:
 
 
 def _boolean(value: Any) -> bool:
-    if isinstance(value, bool):
-        return value
-    return {"true": True, "false": False}[value.lower() if isinstance(value, str) else ""]
+    return {"true": True, "false": False}[str(value).lower()]
 
 
 def _whole(value: Any) -> int:

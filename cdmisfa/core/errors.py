@@ -25,10 +25,6 @@ class UsageError(CdmisfaError):
     exit_code = 2
 
 
-class TooSmallError(UsageError):
-    """An image is smaller than a frame; commands that have --size name it, too."""
-
-
 class LogDamagedError(CdmisfaError):
     """A log that is not what its format, its checksums or its own index say."""
 

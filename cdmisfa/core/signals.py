@@ -13,7 +13,7 @@ import dataclasses
 import hashlib
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
@@ -21,7 +21,6 @@ from operator import attrgetter, itemgetter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 
@@ -229,12 +228,6 @@ def _described(field: dataclasses.Field[Any]) -> Signal:
 
 # The description of every signal, in the record's order.
 SIGNALS: Mapping[str, Signal] = {f.name: _described(f) for f in dataclasses.fields(BlockSignals)}
-
-
-def values(signals: BlockSignals) -> Iterator[tuple[Signal, NDArray[Any]]]:
-    """Each signal with its value as an array of the documented type and number of dimensions."""
-    for signal in SIGNALS.values():
-        yield signal, np.asarray(getattr(signals, signal.name), dtype=signal.dtype)
 
 
 class SignalsHash:

@@ -12,15 +12,8 @@ HERE = Path("cdmisfa/kernels")
 
 # All are one translation unit, so that nothing of them is visible outside.
 FILES = (
-    "elementary.c",
-    "projection.c",
-    "incsfa.c",
-    "gram.c",
-    "eigen.c",
-    "recursive.c",
-    "gate.c",
-    "agent.c",
-    "frames.c",
+    *("elementary", "projection", "incsfa", "gram", "eigen"),
+    *("recursive", "gate", "agent", "frames"),
 )
 
 # No more multiply-adds than are written, and `sqrt` as an instruction.
@@ -43,7 +36,7 @@ def module(name: str, *flags: str) -> FFI:
     ffi.cdef(header)
     ffi.set_source(
         f"cdmisfa.kernels.{name}",
-        "\n".join(['#include "lanes.h"', *(f'#include "{file}"' for file in FILES)]),
+        "\n".join(['#include "lanes.h"', *(f'#include "{file}.c"' for file in FILES)]),
         py_limited_api=True,
         include_dirs=[str(HERE)],
         depends=[str(file) for file in sorted(HERE.glob("*.[ch]"))],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,8 @@ from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.resume import Recomputation
 from cdmisfa.public.recording import Recording, as_words, view
-from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, read_batches
+from replay.runs.columns import whole_signals
+from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, RunHeader, read_batches, read_columns
 from replay.runs.run import read_outline
 
 # Signals of one number an iteration.
@@ -38,18 +39,21 @@ class Signals(Described, Mapping[str, "NDArray[Any]"]):
     missing values are null. `cdmisfa.SIGNALS` explains each signal.
     """
 
-    def __init__(self, log: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-        self._log, self._arrays = log, arrays
+    def __init__(self, log: Path, header: RunHeader) -> None:
+        self._log, self._header = log, header
+        self._arrays: dict[str, NDArray[Any]] = {}
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        _refuse_unknown(name, self._arrays)
+        _refuse_unknown(name)
+        if name not in self._arrays:
+            self._arrays |= whole_signals(read_columns(self._log, self._header), [name])
         return self._arrays[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._arrays)
+        return iter(SIGNALS)
 
     def __len__(self) -> int:
-        return len(self._arrays)
+        return len(SIGNALS)
 
     def _facts(self) -> Mapping[str, Any]:
         return {"run": self._log.parent, "signals": ", ".join(self)}
@@ -67,7 +71,7 @@ class Signals(Described, Mapping[str, "NDArray[Any]"]):
         from replay.export.tables import signals_table
 
         for name in names:
-            _refuse_unknown(name, SIGNALS)
+            _refuse_unknown(name)
         return signals_table(self._log, names or SCALARS)
 
     def to_pandas(self, *names: str) -> Any:
@@ -82,9 +86,9 @@ class Signals(Described, Mapping[str, "NDArray[Any]"]):
         return polars.from_arrow(self.to_arrow(*names))
 
 
-def _refuse_unknown(name: str, known: Collection[str]) -> None:
-    if name not in known:
-        raise UnknownSignalError(f"no signal {name!r}: {did_you_mean(str(name), known)}")
+def _refuse_unknown(name: str) -> None:
+    if name not in SIGNALS:
+        raise UnknownSignalError(f"no signal {name!r}: {did_you_mean(str(name), SIGNALS)}")
 
 
 class Run(Described, replay.runs.run.Run):
@@ -107,7 +111,7 @@ class Run(Described, replay.runs.run.Run):
 
     def __init__(self, path: str | Path) -> None:
         super().__init__(path)
-        self.signals: Signals = Signals(self.log, self.signals)
+        self.signals = Signals(self.log, self.header)
         self._learned_from: Any = ()
 
     @property

@@ -46,9 +46,9 @@ class Framing:
         """Turn an image, (height, width[, 3]), or the numbers of a message into a frame.
 
         Raises:
-            TooSmallError: the image is smaller than a frame, as the first one is. Images of
-                another size than the first may be smaller: they are enlarged.
-            UsageError: the message has another count of numbers.
+            UsageError: the image is smaller than a frame, as the first one is. Images of
+                another size than the first may be smaller: they are enlarged. Or the message has
+                another count of numbers.
         """
         if not self.first:
             if image.shape != self.size:
@@ -158,7 +158,7 @@ def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> 
         enlarge: accept a smaller image, too.
 
     Raises:
-        TooSmallError: the image is smaller.
+        UsageError: the image is smaller.
     """
     if image.shape == size:
         return image

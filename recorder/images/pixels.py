@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
-from cdmisfa.core.errors import LogDamagedError, TooSmallError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import Depth
 
 # Content of one message: a gray image, (height, width) uint8, or one in colours, (height, width,
@@ -173,12 +173,12 @@ def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) 
         enlarge: repeat the pixels of a smaller image instead of rejecting it.
 
     Raises:
-        TooSmallError: the image is smaller.
+        UsageError: the image is smaller.
     """
     if image.shape == (height, width):
         return image
     if not enlarge and (image.shape[0] < height or image.shape[1] < width):
-        raise TooSmallError(
+        raise UsageError(
             f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
             "choose larger images"
         )

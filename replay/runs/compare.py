@@ -24,9 +24,6 @@ MAX_VALUES = 4
 # Letters of a setting that are printed.
 MAX_LETTERS = 60
 
-# Named keys of those that only one run has: two learners may have dozens.
-MAX_KEYS = 5
-
 IDENTICAL = "identical, bit for bit"
 
 HEAD = ("run", "seed", "iterations", "modules", "against the first run")
@@ -265,17 +262,10 @@ class Row:
 
     def explanation(self) -> str:
         """Return the settings and versions that may explain the difference, a line each."""
-        lines, words, only = [], [], []
-        for key, *values in self.settings:
-            if None in values:
-                only.append(key)
-            else:
-                words.append(f"{key} {' against '.join(map(_short, values))}")
-        if only:
-            more = f" and {len(only) - MAX_KEYS} more" if len(only) > MAX_KEYS else ""
-            words.append(f"only one run states {', '.join(only[:MAX_KEYS])}{more}")
-        if words:
-            lines.append(f"{self.name} has other settings: {'; '.join(words)}")
+        lines = []
+        if self.settings:
+            settings = (f"{k} {_short(a)} against {_short(b)}" for k, a, b in self.settings)
+            lines.append(f"{self.name} has other settings: {'; '.join(settings)}")
         if self.versions:
             versions = "; ".join(self.versions)
             lines.append(f"{self.name} has other versions, which may explain it: {versions}")

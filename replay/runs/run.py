@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from cdmisfa.modules import Module
-from replay.runs.columns import Blocks, SignalColumns, has_values, whole_signals
+from replay.runs.columns import Blocks, SignalColumns, has_values
 from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.modules import load_modules
@@ -42,7 +42,6 @@ class Run:
     def __init__(self, path: str | Path) -> None:
         self.log = run_log(Path(path))
         self.header: RunHeader = read_header(self.log)
-        self.signals: Mapping[str, NDArray[Any]] = _Signals(self.log, self.header)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -69,28 +68,6 @@ class Run:
             replace(module, stream=names[module.stream_index], frame_shape=shape)
             for module in modules
         )
-
-
-class _Signals(Mapping[str, "NDArray[Any]"]):
-    """Signals of a run by name, (iterations, *dims) each; NaN for modules not yet learned."""
-
-    def __init__(self, log: Path, header: RunHeader) -> None:
-        self._log = log
-        self._header = header
-        self._read: dict[str, NDArray[Any]] = {}
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        if name not in SIGNALS:
-            raise KeyError(name)
-        if name not in self._read:
-            self._read |= whole_signals(read_columns(self._log, self._header), [name])
-        return self._read[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(SIGNALS)
-
-    def __len__(self) -> int:
-        return len(SIGNALS)
 
 
 @dataclass(frozen=True, slots=True)
