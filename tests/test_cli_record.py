@@ -75,9 +75,9 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
         )
     again = ("record", "--resume", "-o", folder)
     for wrong, what in (
-        (("--seed", 8), "begun with --seed 7, not --seed 8"),
+        (("--seed", 8), "its seed is '7', now it is '8'"),
         (("--split", "4s"), "begun with --split 5s, not --split 4s"),
-        (("icub",), "begun with oscillatory, not icub"),
+        (("icub",), "is of another recording"),
     ):
         if wrong == ("icub",):
             pytest.importorskip("pybullet")

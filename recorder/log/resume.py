@@ -150,16 +150,11 @@ def resume_views(
     start = read_start(folder)
     limit = min((start.split[view] for view in views if view in start.split), default=None)
     split = limit if split is None else split
-    for option, before, now in (
-        ("", start.scene or None, recording.kind),
-        ("--seed ", start.seed, recording.seed),
-        ("--split ", limit and f"{limit:g}s", split and f"{split:g}s"),
-    ):
-        if before not in (None, now):
-            raise UsageError(
-                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
-                "same, or overwrite with --force"
-            )
+    if limit not in (None, split):
+        raise UsageError(
+            f"{folder} was begun with --split {limit:g}s, not --split {split:g}s: go on with the "
+            "same, or overwrite with --force"
+        )
     earlier = {
         view: {path: frames_held(path, view, gaps=recording.gaps) for path in logs}
         for view, logs in view_logs(folder, views).items()

@@ -216,7 +216,6 @@ class Attachment:
     create_time: int
     offset: int
     size: int
-    crc: int
 
 
 @dataclass(frozen=True, slots=True)

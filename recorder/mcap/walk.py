@@ -274,7 +274,12 @@ class LogStructure:
             self._last_chunk = Segment.of_chunk(self._at, head).within(content + length)
             self.segments.append(self._last_chunk)
         elif opcode == Opcode.METADATA:
-            self._take_metadata(self._definition(content, length))
+            if self._metadata_bytes + length > MAX_DEFINITION:
+                raise MalformedRecord(f"metadata takes more than {MAX_DEFINITION} bytes")
+            self._metadata_bytes += length
+            fields = Fields(self.file.read(content, length), "metadata")
+            self.metadata.append(Metadata.read(fields))
+            self._inside = content + fields.count
         elif opcode == Opcode.ATTACHMENT:
             self._attachment(content, length)
         elif opcode == Opcode.HEADER:
@@ -322,14 +327,6 @@ class LogStructure:
             self.segments.append(self._loose)
             self._loose = None
 
-    def _take_metadata(self, content: bytes) -> None:
-        self._metadata_bytes += len(content)
-        if self._metadata_bytes > MAX_DEFINITION:
-            raise MalformedRecord(f"metadata takes more than {MAX_DEFINITION} bytes")
-        fields = Fields(content, "metadata")
-        self.metadata.append(Metadata.read(fields))
-        self._inside = self._at + RECORD_HEADER.size + fields.count
-
     def _attachment(self, content: int, length: int) -> None:
         fields = Fields(self.file.read(content, min(length, _BEFORE_DATA)), "an attachment")
         log_time, create_time = fields.read8(), fields.read8()
@@ -344,7 +341,7 @@ class LogStructure:
             self._damaged(f"attachment {name[:80]!r}", "its CRC does not match: damaged")
             return
         times = log_time, create_time
-        self._attachments.append(Attachment(name, media_type, *times, data, size, crc))
+        self._attachments.append(Attachment(name, media_type, *times, data, size))
 
     # The end of the file
 
