@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, Self
 
-from cdmisfa.core.blocks import Block, ForwardSource, FrameSource, check_request, take_unbroken
+from cdmisfa.core.blocks import Block, ForwardSource, FrameSource, check_request
 from cdmisfa.core.errors import LogExhaustedError
 from recorder.config import RecordConfig
 from recorder.log.files import folder_here, prepared_folder, refuse_existing
@@ -83,10 +83,6 @@ class RecordedWhileWatched(ForwardSource):
     def stop(self, stop: Callable[[], bool]) -> None:
         if hasattr(self._source, "stop"):
             self._source.stop = stop
-
-    def take(self, stream: int, n: int) -> Block:
-        """See `FrameSource`; what the other streams show meanwhile is recorded, too."""
-        return take_unbroken(self, stream, n)
 
     def take_all(self, n: int) -> tuple[Block, ...]:
         """See `FrameSource`; recorded before it is given."""

@@ -24,8 +24,7 @@ from cdmisfa.core.signals import SIGNALS
 from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.recursive import RecursiveFeature
 from recorder.cameras.readers import Camera
-from recorder.cameras.words import CAMERAS
-from recorder.images.options import InputOptions
+from recorder.cameras.video import VideoCamera
 from recorder.images.pixels import Shown
 from recorder.world.oscillatory import OscillatorySource
 
@@ -71,14 +70,12 @@ class TestVideo(CameraContract):
         pytest.importorskip("av")
 
     def open(self) -> Camera:
-        return CAMERAS["av"]("av:lavfi:testsrc=rate=100:size=64x48", "bars", InputOptions())
+        return VideoCamera("av:lavfi:testsrc=rate=100:size=64x48", "bars")
 
 
 class TestColours(TestVideo):
     def open(self) -> Camera:
-        return CAMERAS["av"](
-            "av:lavfi:testsrc=rate=100:size=64x48", "bars", InputOptions(color=True)
-        )
+        return VideoCamera("av:lavfi:testsrc=rate=100:size=64x48", "bars", color=True)
 
 
 class Readings:

@@ -291,7 +291,7 @@ def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
     assert cdmisfa("info", str(tmp_path / "rec"), "--json").json["complete"] is False
     refused = cdmisfa("record", "-o", str(tmp_path / "rec"), "--resume")
     assert refused.code == 2
-    assert "is of no scene" in refused.err
+    assert "a recording of live streams cannot be resumed" in refused.err
     cdmisfa("recover", str(tmp_path / "rec"), "-o", str(tmp_path / "saved"))
     with open_recording(tmp_path / "saved") as source:
         assert source.frames > 0

@@ -228,6 +228,17 @@ class ForwardSource(Described, FrameSource):
         """Global counter of the next frame."""
         return self._t
 
+    def take(self, stream: int, n: int) -> Block:
+        """Return the next n frames of a stream that follow one another without a gap.
+
+        What the other streams show meanwhile is passed over.
+
+        Raises:
+            LogExhaustedError: the source ends before.
+            ValueError: no such stream, or n < 1.
+        """
+        return take_unbroken(self, stream, n)
+
     def close(self) -> None:
         """Nothing to let go of."""
 

@@ -27,7 +27,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError
 from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
-from recorder.cameras.words import is_live, open_live, refuse_stored
+from recorder.cameras.words import is_live, open_live
 from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
 from replay.export.applied import Applied, AppliedSink
@@ -115,7 +115,6 @@ class Application:
         """
         inputs = inputs or InputOptions()
         if any(map(is_live, words)):
-            refuse_stored(words, inputs)
             source = open_live(words, self._with_recipe(inputs), say=say)
         elif is_scene(words):
             source = configure(words[0], inputs=inputs).open_scene()

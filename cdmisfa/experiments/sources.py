@@ -12,7 +12,7 @@ from cdmisfa.agents.learners import LEARNERS, learner_class
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import Layers, LearnerConfig, build, load_preset, section_table
 from cdmisfa.core.errors import UsageError, are_for, did_you_mean
-from recorder.cameras.words import CAMERAS, is_live, open_live, refuse_stored
+from recorder.cameras.words import CAMERAS, is_live, open_live
 from recorder.config import RecordConfig, SceneConfig
 from recorder.images.options import InputConfig, InputOptions
 from recorder.world.scenes import SCENES, open_scene
@@ -223,9 +223,7 @@ def open_source(
     inputs = read_inputs(inputs, given)
     source: FrameSource
     if live:
-        addresses = list(map(str, words))
-        refuse_stored(addresses, inputs)
-        source = open_live(addresses, inputs, seed=seed, say=say)
+        source = open_live(list(map(str, words)), inputs, seed=seed, say=say)
     else:
         source = open_logs(words, inputs=inputs, **how)
     try:

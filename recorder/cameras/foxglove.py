@@ -73,9 +73,7 @@ class FoxgloveCamera:
         try:
             import websockets.sync.client as client
         except ImportError:
-            raise UsageError(
-                f"{self._where} needs websockets: pip install 'cdmisfa[foxglove]'"
-            ) from None
+            raise UsageError(f"{self._where} needs pip install 'cdmisfa[foxglove]'") from None
         self._client = client
 
     def images(self) -> Iterator[tuple[int, Shown]]:
@@ -96,8 +94,7 @@ class FoxgloveCamera:
             wanted = [{"id": _SUBSCRIPTION, "channelId": number}]
             subscribe = json.dumps({"op": "subscribe", "subscriptions": wanted})
             connection.send(subscribe)
-            tries = _TRIES
-            steady = Steady()
+            tries, steady = _TRIES, Steady()
             video = decode if isinstance(decode, VideoPackets) else None
             for message in connection:
                 if isinstance(message, str):

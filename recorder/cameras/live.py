@@ -9,18 +9,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 from typing import Any, Final
 
 import numpy as np
 
-from cdmisfa.core.blocks import (
-    Block,
-    ForwardSource,
-    SourceSpec,
-    check_request,
-    freeze,
-    take_unbroken,
-)
+from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.cameras.readers import CameraState, Readers, Stamped
@@ -184,15 +178,6 @@ class LiveSource(ForwardSource):
         streams = zip(self._spec.streams, self._streams, strict=True)
         return {name: {**stream.counts, "lost": stream.state.lost} for name, stream in streams}
 
-    def take(self, stream: int, n: int) -> Block:
-        """Return the next n frames of a stream that follow one another without a gap.
-
-        Raises:
-            LogExhaustedError: a camera ended before.
-            ValueError: no such stream, or n < 1.
-        """
-        return take_unbroken(self, stream, n)
-
     def take_all(self, n: int) -> tuple[Block, ...]:
         """Return the frames of all streams at the next n ticks, a block for each stretch.
 
@@ -204,11 +189,14 @@ class LiveSource(ForwardSource):
         while len(self._ahead) < n:
             self._ahead.append(self._next_tick())
         rows = [self._ahead.popleft() for _ in range(n)]
-        blocks = [
-            block
-            for stream, column in enumerate(zip(*rows, strict=True))
-            for block in _stretches(stream, self._t, column)
-        ]
+        blocks: list[Block] = []
+        for stream, column in enumerate(zip(*rows, strict=True)):
+            shown = enumerate(column, self._t)
+            for is_gap, stretch in groupby(shown, lambda tick: tick[1] is None):
+                if not is_gap:
+                    ticks, images = zip(*stretch, strict=True)
+                    empty = freeze(np.empty((len(images), 0)))
+                    blocks.append(Block(stream, ticks[0], freeze(np.stack(images)), empty))
         self._t += n
         return tuple(blocks)
 
@@ -278,17 +266,3 @@ def _measured_rate(images: Sequence[Stamped]) -> float:
     if not len(steps) or np.median(steps) <= 0:
         raise UsageError("the first camera states no rate: set one with --rate")
     return float(f"{NANOSECONDS / float(np.median(steps)):.3g}")
-
-
-def _stretches(stream: int, t: int, column: Sequence[Shown | None]) -> list[Block]:
-    """Return the unbroken stretches of a stream from tick t on."""
-    blocks: list[Block] = []
-    run: list[Shown] = []
-    for at, image in enumerate([*column, None]):
-        if image is not None:
-            run.append(image)
-        elif run:
-            empty = freeze(np.empty((len(run), 0)))
-            blocks.append(Block(stream, t + at - len(run), freeze(np.stack(run)), empty))
-            run = []
-    return blocks

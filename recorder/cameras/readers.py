@@ -250,13 +250,10 @@ class Readers:
             state.away = True
             waits = self._on_loss == "wait"
             alone = all(other.away or other.over for other in self.states)
-            if (
-                not state.started
-                or state.camera.finite
-                or self._on_loss == "end"
-                or (waits and alone)
-            ):
-                self._end(state, why)
+            ends = state.camera.finite or self._on_loss == "end" or (waits and alone)
+            if ends or not state.started:
+                state.over = why
+                self._news.set()
                 return
             if waits:
                 self._say(f"{why}: the other cameras continue without it")
@@ -291,15 +288,12 @@ class Readers:
             self._say(f"{name} shows images again")
         return True
 
-    def _end(self, state: CameraState, why: str) -> None:
-        state.over = why
-        self._news.set()
-
     def _handle_stall(self, state: CameraState) -> None:
         reported, state.silent = state.silent, True
         why = f"{state.camera.name}: no image for {self._stall / NANOSECONDS:g} s"
         if self._on_loss == "end":
-            self._end(state, why)
+            state.over = why
+            self._news.set()
         elif not reported:
             self._say(f"{why}: {'waiting' if self._on_loss == 'wait' else 'reconnecting'}")
         if self._on_loss == "reconnect":

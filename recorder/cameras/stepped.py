@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from cdmisfa.core.arrays import ByteArray, FloatArray, as_array
+from cdmisfa.core.arrays import FloatArray, as_array
 from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
@@ -48,11 +48,6 @@ class SteppedSource(ForwardSource):
     def __init__(self, spec: SourceSpec, steps: Iterator[Step]) -> None:
         self._spec, self._steps = spec, steps
         self._ahead: list[Step] = []
-
-    def take(self, stream: int, n: int) -> Block:
-        """See `FrameSource`."""
-        check_request(self._spec, stream, n)
-        return self.take_all(n)[stream]
 
     def take_all(self, n: int) -> tuple[Block, ...]:
         """See `FrameSource`."""
@@ -215,8 +210,9 @@ class GymSource(SteppedSource):
             spaces += [(e.action_space, a) for e, a in zip(environments, actions, strict=True)]
             numbers = [np.ravel(values) for space, values in spaces if _count(space)]
             images = [np.asarray(e.render()) for e in environments]
-            frames = images if color else [gray_picture(image) for image in images]
-            yield frames, np.concatenate([*numbers, begins]).astype(np.float64)
+            if not color:
+                images = [np.asarray(Image.fromarray(image).convert("L")) for image in images]
+            yield images, np.concatenate([*numbers, begins]).astype(np.float64)
 
     def describe(self) -> Mapping[str, Any]:
         """Return the environments, their seed, and how they were played."""
@@ -257,12 +253,11 @@ def play(
             begins = True
 
 
-def make_environment(task: str, **options: Any) -> Any:
+def make_environment(task: str) -> Any:
     """Make an environment of Gymnasium that renders.
 
     Args:
         task: its id.
-        options: its own.
 
     Raises:
         UsageError: Gymnasium is missing, or there is no such environment.
@@ -270,19 +265,12 @@ def make_environment(task: str, **options: Any) -> Any:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs no screen
     try:
         import gymnasium
-    except ImportError:
-        raise UsageError(
-            f"gym:{task} needs gymnasium, which is missing: pip install 'cdmisfa[gym]'"
-        ) from None
-    try:
-        return gymnasium.make(task, render_mode="rgb_array", **options)
+
+        return gymnasium.make(task, render_mode="rgb_array")
+    except ImportError as error:
+        raise UsageError(f"gym:{task} needs pip install 'cdmisfa[gym]': {error}") from None
     except Exception as error:  # whatever an environment raises
         raise UsageError(f"gym:{task} cannot be made: {one_line(error)}") from None
-
-
-def gray_picture(seen: Any) -> ByteArray:
-    """Convert a colour image, (height, width, 3), to gray, (height, width) uint8."""
-    return np.asarray(Image.fromarray(seen).convert("L"))
 
 
 def _count(space: Any) -> int:

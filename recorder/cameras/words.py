@@ -16,26 +16,8 @@ from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, InputOptions
 _STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
 
 
-def _foxglove(word: str, name: str, options: InputOptions) -> Any:
-    from recorder.cameras.foxglove import FoxgloveCamera
-
-    host, path = _host_and_path(word)
-    return FoxgloveCamera(host, path, name, options)
-
-
-def _video(word: str, name: str, options: InputOptions) -> Any:
-    from recorder.cameras.video import VideoCamera
-
-    return VideoCamera(word, name, color=options.color is True)
-
-
-# By what its word begins with, the function that opens a `Camera`.
-CAMERAS: Final[dict[str, Callable[..., Any]]] = {
-    "foxglove": _foxglove,
-    **dict.fromkeys(
-        ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp"), _video
-    ),
-}
+# What the words of cameras begin with: `FoxgloveCamera` opens the first, `VideoCamera` the others.
+CAMERAS = ["foxglove", "camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp"]
 
 
 def is_live(word: str) -> bool:
@@ -44,23 +26,6 @@ def is_live(word: str) -> bool:
     if scheme.lower() in ("http", "https"):
         return re.split("[?#]", rest)[0].lower().endswith(_STREAMED)
     return bool(colon) and scheme.lower() in ("gym", *CAMERAS)
-
-
-def refuse_stored(words: Sequence[str], options: InputOptions) -> None:
-    """Reject words that name no live stream, and options for logs.
-
-    Raises:
-        UsageError: there is one.
-    """
-    if stored := [word for word in words if not is_live(word)]:
-        raise UsageError(
-            f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
-            "and logs apart"
-        )
-    of_logs = options.named(("topics", "start", "end", "align", "centre", "holdout"))
-    of_logs += ["--color auto"] if options.color == "auto" else []
-    if of_logs:
-        raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
 
 
 def open_live(
@@ -79,19 +44,27 @@ def open_live(
         say: receives a line when a camera's state changes.
 
     Raises:
-        UsageError: a word names nothing, a package is missing, or a camera cannot be opened.
+        UsageError: a word names no live stream, an option is for logs, a
+            package is missing, or a camera cannot be opened.
     """
     from recorder.cameras.live import LiveSource
     from recorder.cameras.readers import CameraFrames, Readers
 
+    if stored := [word for word in words if not is_live(word)]:
+        raise UsageError(
+            f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
+            "and logs apart"
+        )
+    of_logs = options.named(("topics", "start", "end", "align", "centre", "holdout"))
+    of_logs += ["--color auto"] if options.color == "auto" else []
+    if of_logs:
+        raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
     names = live_names(words)
     schemes = [word.partition(":")[0].lower() for word in words]
-    messages = [scheme == "foxglove" for scheme in schemes]
-    refused = options.named(("fields",) if not all(messages) else ())
-    refused += options.named(("range",) if not any(messages) else ())
-    if refused:
-        word = words[messages.index(False)]
-        raise UsageError(f"{word} shows images: {are_for(refused, 'messages of foxglove://')}")
+    of_messages = options.named(("fields", "range"))
+    if of_messages and "foxglove" not in schemes:
+        refusal = are_for(of_messages, "messages of foxglove://")
+        raise UsageError(f"{words[0]} shows images: {refusal}")
     color = options.color is True
     if "gym" in schemes:
         from recorder.cameras.stepped import GymSource
@@ -103,10 +76,7 @@ def open_live(
         tasks = [word.partition(":")[2] for word in words]
         how: dict[str, Any] = {"size": options.size, "fit": options.fit, "fps": options.rate}
         return GymSource(tasks, names=names, seed=seed, color=color, **how)
-    cameras = [
-        CAMERAS[scheme](word, name, options)
-        for scheme, word, name in zip(schemes, words, names, strict=True)
-    ]
+    cameras = [_camera(word, name, options) for word, name in zip(words, names, strict=True)]
     about: dict[str, Any] = {
         "cameras": [dict(camera.describe()) for camera in cameras],
         "recipe": "; ".join(dict.fromkeys(camera.recipe for camera in cameras)),
@@ -121,6 +91,16 @@ def open_live(
     frames = CameraFrames(names, options.size, options.fit, color=color, say=say)
     readers = Readers(cameras, frames.frame, on_loss=options.lost, stall=options.stall, say=say)
     return LiveSource(readers, names, about, rate=options.rate, hold=options.hold)
+
+
+def _camera(word: str, name: str, options: InputOptions) -> Any:
+    if not word.lower().startswith("foxglove:"):
+        from recorder.cameras.video import VideoCamera
+
+        return VideoCamera(word, name, color=options.color is True)
+    from recorder.cameras.foxglove import FoxgloveCamera
+
+    return FoxgloveCamera(*_host_and_path(word), name, options)
 
 
 def live_names(words: Sequence[str]) -> tuple[str, ...]:

@@ -284,11 +284,10 @@ def packed_picture(schema: str, encoding: str, data: Data) -> bytes | None:
 
 def message_decoder(kind: MessageKind) -> Opened | None:
     """Return the decoder of whole messages; None if their encoding or definition is unknown."""
-    if kind.encoding == "json":
-        return partial(_opened, kind.schema, parse_json)
-    if kind.encoding == "protobuf":
-        return _protobuf(kind)
-    return _ros(kind) if kind.encoding in ("cdr", "ros1") else None
+    decode: Opened | None = parse_json if kind.encoding == "json" else None
+    if kind.encoding in ("protobuf", "cdr", "ros1"):
+        decode = _protobuf(kind) if kind.encoding == "protobuf" else _ros(kind)
+    return decode and partial(_opened, kind.schema, decode)
 
 
 def _opened(schema: str, decode: Opened, data: bytes) -> Any:
@@ -300,17 +299,17 @@ def _opened(schema: str, decode: Opened, data: bytes) -> Any:
         raise MalformedImage(f"a message is no {schema} ({one_line(error)})") from None
 
 
-def _protobuf(kind: MessageKind) -> Opened | None:
+def _protobuf(kind: MessageKind) -> Any:
     if kind.schema in _FOXGLOVE:
-        return partial(_opened, kind.schema, _FOXGLOVE[kind.schema][0].FromString)
+        return _FOXGLOVE[kind.schema][0].FromString
     try:
         pool = descriptor_pool.DescriptorPool()
         for file in descriptor_pb2.FileDescriptorSet.FromString(kind.definition).file:
             pool.Add(file)
-        parsed = message_factory.GetMessageClass(pool.FindMessageTypeByName(kind.schema))
+        stated = pool.FindMessageTypeByName(kind.schema)
+        return message_factory.GetMessageClass(stated).FromString
     except Exception:  # protobuf raises anything on broken definitions
         return None
-    return partial(_opened, kind.schema, parsed.FromString)
 
 
 def _ros(kind: MessageKind) -> Opened:
@@ -338,7 +337,7 @@ def _ros(kind: MessageKind) -> Opened:
             store.register(types)
         return store.deserialize_ros1 if ros1 else store.deserialize_cdr
 
-    return partial(_opened, name, lambda data: deserializer()(data, name))
+    return lambda data: deserializer()(data, name)
 
 
 def stamp_of(kind: MessageKind) -> Stamp | None:

@@ -85,13 +85,10 @@ class OpenScene:
     def table(self) -> dict[str, Any]:
         """Return the scene's configuration as recordings state it.
 
-        Recordings of the first two scenes state the keys of both, to keep their bytes.
+        Recordings state the keys of both scenes, to keep their bytes.
         """
-        first = (IcubConfig, OscillatoryConfig)
-        table: dict[str, Any] = {}
-        for config in first if type(self.config) in first else ():
-            table |= section_table(config())
-        return table | section_table(self.config)
+        configs = IcubConfig(), OscillatoryConfig(), self.config
+        return {key: value for config in configs for key, value in section_table(config).items()}
 
 
 _OPEN: MutableMapping[FrameSource, OpenScene] = WeakKeyDictionary()

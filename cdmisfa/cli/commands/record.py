@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from recorder.images.options import InputOptions
     from recorder.recording import ViewRecording
 
-# What recordings of external logs and of live streams state in place of their scene.
-NO_SCENES = ("foreign", "cameras", "gym")
-
 
 @click.command("record")
 @click.argument("source", nargs=-1, type=options.WORD)
@@ -95,9 +92,11 @@ def record_command(
         command = f"cdmisfa convert {shlex.join(source)} -o REC"
         raise UsageError(f"{source[0]} is a log, no scene: write it as a recording with {command}")
     start = read_start(out) if resume else RecordingStart()
-    if start.scene in NO_SCENES:
+    if start.scene in ("cameras", "gym"):
+        raise UsageError(f"{out}: a recording of live streams cannot be resumed")
+    if start.scene == "foreign":
         command = f"cdmisfa convert SOURCE -o {printing.quoted(out)} --resume"
-        raise UsageError(f"{out} is of no scene: live streams cannot go back; {command}")
+        raise UsageError(f"{out} is a conversion: resume it with {command}")
     scene = " ".join(source) or start.scene
     if not scene and resume and not (frames or split) and (files := recorded(out)):
         printing.status(f"{out} is complete: nothing was left to record")
