@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from cdmisfa.core.arrays import FloatArray, as_array
+from cdmisfa.core.arrays import ByteArray, FloatArray, as_array
 from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
@@ -211,7 +211,7 @@ class GymSource(SteppedSource):
             numbers = [np.ravel(values) for space, values in spaces if _count(space)]
             images = [np.asarray(e.render()) for e in environments]
             if not color:
-                images = [np.asarray(Image.fromarray(image).convert("L")) for image in images]
+                images = [gray_picture(image) for image in images]
             yield images, np.concatenate([*numbers, begins]).astype(np.float64)
 
     def describe(self) -> Mapping[str, Any]:
@@ -253,11 +253,12 @@ def play(
             begins = True
 
 
-def make_environment(task: str) -> Any:
+def make_environment(task: str, **options: Any) -> Any:
     """Make an environment of Gymnasium that renders.
 
     Args:
         task: its id.
+        options: its own.
 
     Raises:
         UsageError: Gymnasium is missing, or there is no such environment.
@@ -266,11 +267,16 @@ def make_environment(task: str) -> Any:
     try:
         import gymnasium
 
-        return gymnasium.make(task, render_mode="rgb_array")
+        return gymnasium.make(task, render_mode="rgb_array", **options)
     except ImportError as error:
         raise UsageError(f"gym:{task} needs pip install 'cdmisfa[gym]': {error}") from None
     except Exception as error:  # whatever an environment raises
         raise UsageError(f"gym:{task} cannot be made: {one_line(error)}") from None
+
+
+def gray_picture(seen: Any) -> ByteArray:
+    """Convert a colour image, (height, width, 3), to gray, (height, width) uint8."""
+    return np.asarray(Image.fromarray(seen).convert("L"))
 
 
 def _count(space: Any) -> int:
