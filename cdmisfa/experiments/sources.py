@@ -157,7 +157,7 @@ def _filled(kind: str, settings: Layers, default: str | None) -> Configuration:
     if tables is None:
         algorithm = algorithm or default
         named = getattr(learner_class(algorithm), "preset", None) if algorithm else None
-        tables = load_preset(named or SCENES[kind].preset)
+        tables = load_preset(named or kind)
         if algorithm and algorithm not in LEARNERS:
             tables["learner"] = {}  # the preset's keys are not those of a user's learner
         settings = replace(settings, preset=tables)

@@ -141,10 +141,9 @@ class FoxgloveCamera:
             if topic in decoders:
                 return int(channels[topic]["id"]), decoders[topic]
             if topic in channels:
-                lacks = "is no image: its numbers are taken with --field"
-                lacks = "has no fields" if self._options.fields else lacks
                 kind = channels[topic].get("schemaName")
-                raise CdmisfaError(f"{self._where}{topic} holds {kind}, which {lacks}")
+                lacks = "no fields" if self._options.fields else "no images: use --field"
+                raise CdmisfaError(f"{self._where}{topic} is {kind}, with {lacks}")
         wanted = "messages with fields" if self._options.fields else "images"
         what = f"has no topic {self._topic}" if self._topic else "has not one such topic"
         known = ", ".join(sorted(decoders)) or "nothing"

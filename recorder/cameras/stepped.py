@@ -131,7 +131,7 @@ class GymSource(SteppedSource):
     observation, of the action that follows it, and whether an episode begins with it.
 
     Args:
-        tasks: the environments' ids, or environments made with `render_mode="rgb_array"`.
+        tasks: a list of the environments' ids, or environments made with `render_mode="rgb_array"`.
         names: of the streams; by default the ids.
         size: (height, width) of a frame; by default `default_size` of the first's images.
         fit: how images of another aspect ratio become frames: see `fitted`.
@@ -158,8 +158,6 @@ class GymSource(SteppedSource):
         hold: int = 1,
         color: bool = False,
     ) -> None:
-        if not tasks or isinstance(tasks, str):
-            raise UsageError(f'tasks {tasks!r} given: give a list, as ["CartPole-v1"]')
         self._environments = environments = [
             make_environment(task) if isinstance(task, str) else task for task in tasks
         ]

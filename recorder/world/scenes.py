@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, MutableMapping
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
-from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
+from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, SeekableSource
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, Registry, UsageError
 from recorder.config import RecordConfig, SceneConfig
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 # Opens a scene's source by its configuration and the clock of the frames.
 #
 # Worker processes import the function: it must not be local.
-Opener = Callable[[Any, RecordConfig], SeekableSource]
+Opener = Callable[[Any, RecordConfig], ClockedSource]
 
 
 # Stream, first frame and number of frames of a block.
@@ -39,22 +38,20 @@ _AHEAD = 3
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A simulated world.
+    """A simulated world; its default preset has its name.
 
     Attributes:
         config: class of its configuration (keys `scene.*`).
         open: opens its source.
-        preset: name of its default preset, or a .toml file.
         packages: packages on whose versions its frames depend.
     """
 
     config: type[SceneConfig]
     open: Opener
-    preset: str
     packages: tuple[str, ...] = ()
 
 
-def _open_oscillatory(config: OscillatoryConfig, record: RecordConfig) -> SeekableSource:
+def _open_oscillatory(config: OscillatoryConfig, record: RecordConfig) -> ClockedSource:
     return OscillatorySource(config.streams, fps=record.fps, start_ns=record.start_ns)
 
 
@@ -62,8 +59,8 @@ def _open_oscillatory(config: OscillatoryConfig, record: RecordConfig) -> Seekab
 SCENES: Registry[Scene] = Registry(
     "scene",
     {
-        "icub": Scene(IcubConfig, IcubSource, "icub", ("pybullet", "icub-models")),
-        "oscillatory": Scene(OscillatoryConfig, _open_oscillatory, "oscillatory"),
+        "icub": Scene(IcubConfig, IcubSource, ("pybullet", "icub-models")),
+        "oscillatory": Scene(OscillatoryConfig, _open_oscillatory),
     },
 )
 
@@ -91,9 +88,6 @@ class OpenScene:
         return {key: value for config in configs for key, value in section_table(config).items()}
 
 
-_OPEN: MutableMapping[FrameSource, OpenScene] = WeakKeyDictionary()
-
-
 def open_scene(
     name: str, config: SceneConfig | None = None, record: RecordConfig | None = None
 ) -> SeekableSource:
@@ -111,16 +105,13 @@ def open_scene(
     config = config or SCENES[name].config()
     scene = OpenScene(name, replace(config, seed=config.seed or 0), record or RecordConfig())
     source = SCENES[name].open(scene.config, scene.record)
-    _OPEN[source] = scene
+    source.opened = scene
     return source
 
 
 def scene_of(source: FrameSource) -> OpenScene | None:
     """Return what `open_scene` opened a source from; None for any other source."""
-    try:
-        return _OPEN.get(source)
-    except TypeError:  # a class without weak references
-        return None
+    return getattr(source, "opened", None)
 
 
 def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:

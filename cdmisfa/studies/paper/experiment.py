@@ -132,6 +132,11 @@ def groups(trials: Sequence[Trial], *keys: str) -> dict[tuple[Any, ...], list[Tr
     return groups_by_key
 
 
+def of_all(good: int, n: int) -> str:
+    """Return how many of n trials did what they should, bold where some did not."""
+    return f"{good} of {n}" if good == n else f"**{good} of {n}**"
+
+
 def mean_text(values: ArrayLike, digits: int) -> str:
     """Return mean and SD as a table has them; "-" where there is no value."""
     result = summary(values)

@@ -33,6 +33,7 @@ from cdmisfa.studies.paper.experiment import (
     learned_order,
     mean_text,
     module_row,
+    of_all,
     paper_config,
 )
 from cdmisfa.studies.paper.oscillatory import GAIN, gains, stay_rewards
@@ -90,9 +91,7 @@ class Icub(Experiment):
         rows = []
         for (algorithm, error), group in by_learner.items():
             row = ["2.0" if algorithm == "2.0" else f"1.0, threshold {error:g}"]
-            for good in (in_order(group), follow_both(group)):
-                share = f"{good} of {len(group)}"
-                row.append(share if good == len(group) else f"**{share}**")
+            row += [of_all(count(group), len(group)) for count in (in_order, follow_both)]
             row += [mean_text([best(t.row, number) for t in group], 3) for number in (0, 1)]
             saved = [t.row["saved_at"] for t in group]
             row += [mean_text([at[k] for at in saved if len(at) > k], 0) for k in (0, 1)]
@@ -215,21 +214,31 @@ class RewardCurves(Sink):
 def learn_curves(source: LoggedSource, config: LearnerConfig, seed: int) -> Output:
     """Learn from a recording; return a trial's row, curves, and each module's last outputs."""
     curves = RewardCurves(config.tau, source.spec.truth)
-    frames = source.frames - HELD_OUT
+    row = learn_and_judge(source, config, seed, source.frames - HELD_OUT, curves)
+    row |= stay_rewards(curves.arrays, config)
+    source.seek(0)
+    shown = [source.take(view, 1).frames[0] for view in range(len(source.spec.streams))]
+    return row, {**curves.arrays, "shown": np.stack(shown)}
+
+
+def learn_and_judge(
+    source: SeekableSource, config: Any, seed: int, frames: int, *sinks: Sink
+) -> dict[str, Any]:
+    """Learn up to a frame, or for `ITERATIONS`; return a row that judges modules on what follows.
+
+    Raises:
+        LogExhaustedError: there are not enough frames for a block.
+    """
     learner = open_learner(config, source.spec, seed)
     iterations = min(ITERATIONS, frames // learner.tau)
     if iterations < 1:
         raise LogExhaustedError(f"too few frames: {HELD_OUT} are held out, record more than these")
-    learn_blocks(source, learner, [curves], max_iterations=iterations, max_modules=iterations)
-    row = {
+    learn_blocks(source, learner, sinks, max_iterations=iterations, max_modules=iterations)
+    return {
         **module_row(learner.modules),
         "iterations": learner.iteration,
         "follows": [follows(module, source, frames) for module in learner.modules],
-        **stay_rewards(curves.arrays, config),
     }
-    source.seek(0)
-    shown = [source.take(view, 1).frames[0] for view in range(len(source.spec.streams))]
-    return row, {**curves.arrays, "shown": np.stack(shown)}
 
 
 def follows(module: Module, source: SeekableSource, first: int) -> list[float]:

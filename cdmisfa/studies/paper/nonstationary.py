@@ -178,9 +178,7 @@ def point_of_no_return(trials: Sequence[Trial]) -> float:
 
 def _turn(trials: Sequence[Trial], limit: float) -> Turn:
     value, seeds = point_of_no_return(trials), sorted({t.settings["seed"] for t in trials})
-    without = [
-        point_of_no_return([t for t in trials if t.settings["seed"] != seed]) for seed in seeds
-    ]
+    without = [point_of_no_return([t for t in trials if t.settings["seed"] != s]) for s in seeds]
     of_seeds = value + (len(seeds) - 1) * (np.mean(without) - np.array(without))
     neither = sum(t.row["policy"] not in (OLD, NEW) for t in trials)
     return Turn(value, of_seeds, sum(map(_is_new, trials)), neither, len(trials), limit)
@@ -195,10 +193,9 @@ def _claim_about_changes(
 ) -> None:
     """Claim that changes are followed early, and not late, and where the others end."""
     smallest = min(value for key, value in turns if key == "sigma")
-    changes = groups(judged, "key", "value", "epsilon_c")
-    largest = max(c for key, value, c in changes if (key, value) == ("sigma", smallest))
-    early = changes["sigma", smallest, largest]
-    last = min(t.settings["epsilon_c"] for t in judged)
+    changes = {t.settings["epsilon_c"] for t in judged}
+    largest, last = max(changes), min(changes)
+    early = groups(judged, "key", "value", "epsilon_c")["sigma", smallest, largest]
     late = groups(judged, "key", "epsilon_c")["sigma", last]
     followed, kept = sum(map(_is_new, early)), sum(not _is_new(t) for t in late)
     findings.claim(
@@ -233,20 +230,17 @@ def _claim_about_order(findings: Findings, turns: Mapping[tuple[str, float], Tur
         if len(of_key) < 2:
             continue
         against = of_key[reference]
-        differ = {
-            v: mean_interval(turn.of_seeds - against.of_seeds)
-            for v, turn in of_key.items()
-            if v != reference
-        }
+        others = {v: turn.of_seeds for v, turn in of_key.items() if v != reference}
+        differ = {v: mean_interval(seeds - against.of_seeds) for v, seeds in others.items()}
         words = ", ".join(f"{v:g}: {low:+.3f} .. {high:+.3f}" for v, (low, high) in differ.items())
         same: bool | None = all(low <= 0 <= high for low, high in differ.values())
         if same and any(turn.rank > turn.limit for turn in of_key.values()):
             same = None  # where one of them lies cannot be judged
         findings.claim(claim, same, f"against {reference:g}, 95 % intervals: {words}")
     if "tau" in columns:
-        shortest, *others = columns["tau"].values()
+        shortest, *longer = columns["tau"].values()
         words = ", ".join(map(str, columns["tau"].values()))
-        higher = shortest.rank > max(turn.rank for turn in others)
+        higher = shortest.rank > max(turn.rank for turn in longer)
         findings.claim("epsilon^d is higher at tau = 10", higher, words)
 
 

@@ -58,14 +58,17 @@ def view_matrix(place: FloatArray, target: FloatArray) -> Matrix:
 def perspective(vertical_fov: float, aspect: float, near: float, far: float) -> Matrix:
     """Return the projection matrix of a camera, column by column; degrees and metres."""
     scale = 1.0 / math.tan(math.radians(vertical_fov) / 2)
+    return _projection(scale / aspect, scale, near, far)
+
+
+def _projection(across: float, up: float, near: float, far: float) -> Matrix:
     depth = near - far
-    columns = (
-        (scale / aspect, 0.0, 0.0, 0.0),
-        (0.0, scale, 0.0, 0.0),
-        (0.0, 0.0, (near + far) / depth, -1.0),
-        (0.0, 0.0, 2 * near * far / depth, 0.0),
+    return (
+        *(across, 0.0, 0.0, 0.0),
+        *(0.0, up, 0.0, 0.0),
+        *(0.0, 0.0, (near + far) / depth, -1.0),
+        *(0.0, 0.0, 2 * near * far / depth, 0.0),
     )
-    return tuple(value for column in columns for value in column)
 
 
 def grey(colours: ByteArray) -> ByteArray:
@@ -80,14 +83,7 @@ def from_afar(half: float) -> Matrix:
 
     The renderer knows no camera without perspective.
     """
-    scale = AFAR / half
-    near, far = AFAR - 5.0, AFAR + 5.0
-    return (
-        *(scale, 0.0, 0.0, 0.0),
-        *(0.0, scale, 0.0, 0.0),
-        *(0.0, 0.0, (near + far) / (near - far), -1.0),
-        *(0.0, 0.0, 2 * near * far / (near - far), 0.0),
-    )
+    return _projection(AFAR / half, AFAR / half, AFAR - 5.0, AFAR + 5.0)
 
 
 # Metres from which light is as good as parallel.

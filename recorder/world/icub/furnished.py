@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.eyes import Matrix, eye_matrix, grey, metres, perspective, rays
+from recorder.world.icub.eyes import Matrix, eye_matrix, grey, metres, perspective, rays, seen_from
 from recorder.world.icub.lens import SAMPLES, Lens
 from recorder.world.icub.room import room_of
 from recorder.world.icub.shadows import LAMP, TEXEL, ObjectShadow, RoomShadows
@@ -78,9 +78,8 @@ class FurnishedEyes:
         eyes, self._channels = scene.eyes, 3 if scene.color else 1
         self.shape = eyes.height, 2 * eyes.width * self._channels
         self._size = eyes.height * SAMPLES, eyes.width * SAMPLES
-        self._projection = perspective(
-            eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far
-        )
+        aspect = eyes.width / eyes.height
+        self._projection = perspective(eyes.vertical_fov, aspect, eyes.near, eyes.far)
         self._focal = self._size[0] / 2 / math.tan(math.radians(eyes.vertical_fov) / 2)
         self._lens = Lens(scene)
         room = room_of(scene)
@@ -139,10 +138,7 @@ class FurnishedEyes:
 
     def _part(self, view: Matrix, middle: tuple[float, float, float], radius: float) -> Part | None:
         """Return the rows and columns of the pixels that a ball may cover, or None."""
-        x, y, z = (
-            view[i] * middle[0] + view[4 + i] * middle[1] + view[8 + i] * middle[2] + view[12 + i]
-            for i in range(3)
-        )
+        x, y, z = seen_from(view, np.array(middle)).tolist()
         if -z <= radius + self._scene.eyes.near:
             return None
         part = []

@@ -61,12 +61,8 @@ def quaternion(yaw: float, pitch: float) -> tuple[float, float, float, float]:
     a, b = math.radians(yaw) / 2, math.radians(pitch) / 2
     across, along = math.sin(b), math.cos(b)
     # + 0.0 removes the sign of a zero, which recordings of a level head never had.
-    return (
-        across * math.sin(a) + 0.0,
-        across * math.cos(a) + 0.0,
-        along * math.sin(a),
-        along * math.cos(a),
-    )
+    sin, cos = math.sin(a), math.cos(a)
+    return across * sin + 0.0, across * cos + 0.0, along * sin, along * cos
 
 
 def turn_frames(degrees: float, transit: float) -> int:

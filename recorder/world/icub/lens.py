@@ -62,9 +62,7 @@ class Lens:
         total: Any = rays[:, ::SAMPLES].astype(np.uint16)
         for i in range(1, SAMPLES):
             total += rays[:, i::SAMPLES]
-        total = (
-            sum(total[:, :, :, i::SAMPLES] for i in range(1, SAMPLES)) + total[:, :, :, ::SAMPLES]
-        )
+        total = sum(total[:, :, :, i::SAMPLES] for i in range(SAMPLES))
         if self._scene.blur:
             total = _spread(_spread(total, 1), 3)
         image = total * self._gain

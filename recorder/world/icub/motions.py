@@ -141,16 +141,10 @@ class PhysicalMotions:
         table = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=(3.0, 3.0, 0.1))
         body = bullet.createMultiBody(0, table, basePosition=(0, 0, self._top - 0.1))
         bullet.changeDynamics(body, -1, lateralFriction=_OF_TABLE)
+        can = {"radius": cylinder.radius, "height": cylinder.height}
         shapes: tuple[tuple[Any, float], ...] = (
             ({"shapeType": bullet.GEOM_BOX, "halfExtents": (box.half_size,) * 3}, box.half_size),
-            (
-                {
-                    "shapeType": bullet.GEOM_CYLINDER,
-                    "radius": cylinder.radius,
-                    "height": cylinder.height,
-                },
-                cylinder.height / 2,
-            ),
+            ({"shapeType": bullet.GEOM_CYLINDER, **can}, cylinder.height / 2),
             ({"shapeType": bullet.GEOM_SPHERE, "radius": ball.radius}, ball.radius),
         )
         starts = self._targets.positions(0, 1)[0].tolist()

@@ -9,7 +9,7 @@ import itertools
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -35,16 +35,12 @@ _STEPS = np.array(
 
 @dataclass(slots=True)
 class Mesh:
-    """A mesh as Bullet takes it: triangles by their corners, each with normal and texture."""
+    """A mesh as Bullet's `createVisualShape` takes it: triangles by their corners."""
 
     vertices: list[list[float]] = field(default_factory=list)
     normals: list[list[float]] = field(default_factory=list)
     uvs: list[list[float]] = field(default_factory=list)
     indices: list[int] = field(default_factory=list)
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the arguments of `createVisualShape`."""
-        return asdict(self)
 
 
 def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) -> Mesh:
@@ -176,10 +172,8 @@ def room_of(scene: IcubConfig) -> Room:
         table["colour"] = scene.table.colour
     pieces = [table, *(_legs(document["legs"], low, high) if scene.room else ())]
     pieces += document["piece"] if scene.room else []
-    return Room(
-        tuple(_box(piece, textured=scene.texture) for piece in pieces),
-        _objects(scene, document["objects"]),
-    )
+    boxes = tuple(_box(piece, textured=scene.texture) for piece in pieces)
+    return Room(boxes, _objects(scene, document["objects"]))
 
 
 @cache
@@ -191,8 +185,7 @@ def _document() -> dict[str, Any]:
 def painted(name: str) -> Place:
     """Return the colour of the textured "table", "box", "cylinder" or "ball"."""
     document = _document()
-    piece = document["table"] if name == "table" else document["objects"][name]
-    red, green, blue = piece["colour"]
+    red, green, blue = {"table": document["table"], **document["objects"]}[name]["colour"]
     return red, green, blue
 
 

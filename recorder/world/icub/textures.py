@@ -51,9 +51,8 @@ def _steps(n: int) -> tuple[NDArray[np.int64], Pixels]:
 def wood(base: Colour, seed: int, boards: int) -> Pixels:
     """Draw boards beside one another, their fibres along the rows: tone, grain and joints."""
     at = np.arange(SIDE) * boards // SIDE
-    fibres = (
-        0.5 * cloud(3, 170, seed) + 0.3 * cloud(9, 256, seed + 1) + 0.35 * cloud(2, 23, seed + 2)
-    )
+    fibres = 0.5 * cloud(3, 170, seed) + 0.3 * cloud(9, 256, seed + 1)
+    fibres += 0.35 * cloud(2, 23, seed + 2)
     value = 0.7 + 0.36 * fibres + 0.2 * hashed(1, boards, seed + 3)[0][at]
     joint = np.arange(SIDE) * boards % SIDE < 3 * boards
     value[:, joint] *= 0.62
@@ -71,9 +70,8 @@ def tiles(base: Colour, seed: int, across: int) -> Pixels:
 
 def plaster(base: Colour, seed: int, bumps: int) -> Pixels:
     """Draw a wall, slightly uneven."""
-    return _painted(
-        base, 0.88 + 0.06 * cloud(bumps, bumps, seed) + 0.08 * cloud(120, 120, seed + 1)
-    )
+    value = 0.88 + 0.06 * cloud(bumps, bumps, seed) + 0.08 * cloud(120, 120, seed + 1)
+    return _painted(base, value)
 
 
 def die(base: Colour, seed: int, spots: int) -> Pixels:

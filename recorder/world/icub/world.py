@@ -13,6 +13,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -82,10 +83,8 @@ class World:
         for body, height, (x, y, *pose) in zip(
             self._objects, self._heights, positions.tolist(), strict=True
         ):
-            if pose:
-                self._move(body, (x, -y, pose[0]), ornObj=pose[1:])
-            else:
-                self._move(body, (x, -y, height))
+            z, *turn = pose or (height, *_UPRIGHT)
+            self._move(body, (x, -y, z), ornObj=turn)
 
     def hide_table(self) -> None:
         """Move the table out of sight for good."""
@@ -137,7 +136,7 @@ class World:
             bullet.GEOM_MESH,
             rgbaColor=colour,
             specularColor=(piece.gloss,) * 3,
-            **piece.mesh.arguments(),
+            **asdict(piece.mesh),
         )
         body: int = bullet.createMultiBody(0, baseVisualShapeIndex=visual)
         self._move(body, piece.centre)
@@ -212,14 +211,10 @@ class World:
         half = (scene.table.half_size, scene.table.half_size, scene.table.thickness / 2)
         self._table = self._body(bullet.GEOM_BOX, scene.table.colour, halfExtents=half)
         self._move(self._table, (0.0, 0.0, top - scene.table.thickness / 2))
+        can = {"radius": cylinder.radius, "length": cylinder.height}
         self._objects = [
             self._body(bullet.GEOM_BOX, (box.grey,) * 3, halfExtents=(box.half_size,) * 3),
-            self._body(
-                bullet.GEOM_CYLINDER,
-                (cylinder.grey,) * 3,
-                radius=cylinder.radius,
-                length=cylinder.height,
-            ),
+            self._body(bullet.GEOM_CYLINDER, (cylinder.grey,) * 3, **can),
             self._body(bullet.GEOM_SPHERE, (sphere.grey,) * 3, radius=sphere.radius),
         ]
         for body in self._objects:  # until they are placed
