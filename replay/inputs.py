@@ -126,8 +126,8 @@ def open_recording(
                 broken[0] if broken else NoRecordingError(f"{named[0]}: no frame was recorded yet")
             )
         streams = views.streams(files, salvage=salvage)
-        source = LoggedSource(streams, loop=loop, opened=failed.pop_all())
-    return _without(source, [f"{error}: this log is left out" for error in broken])
+        left_out = [f"{error}: this log is left out" for error in broken]
+        return LoggedSource(streams, loop=loop, opened=failed.pop_all(), left_out=left_out)
 
 
 def open_external(
@@ -159,8 +159,8 @@ def open_external(
     with ExitStack() as failed:
         logs = OpenLogs(files, inputs, failed, salvage=salvage)
         streams = logs.streams if inputs.align == "index" else join_parts(logs.streams)
-        source = LoggedSource(streams, inputs, **how, logs=logs.logs, opened=failed.pop_all())
-    return _without(source, logs.left_out)
+        how |= {"logs": logs.logs, "left_out": logs.left_out, "opened": failed.pop_all()}
+        return LoggedSource(streams, inputs, **how)
 
 
 def open_arrays(
@@ -185,13 +185,6 @@ def _with_color(
         color = shows_hue(shown)
     source = opened(replace(inputs, color=color))
     source.notes = (CHOSEN[color],)
-    return source
-
-
-def _without(source: LoggedSource, left_out: Sequence[str]) -> LoggedSource:
-    """A source with a warning for each log that was left out."""
-    source.left_out = tuple(left_out)
-    source.warnings = (*left_out, *source.warnings)
     return source
 
 

@@ -278,9 +278,11 @@ def open_logs(
     how: Any = {"loop": loop, "salvage": salvage}
     source: StoredSource | None = None
     if episodes or may_be_corpus(words):
-        from replay.corpus.episodes import open_episodes
+        from replay.corpus.episodes import EpisodeSource
+        from replay.corpus.index import logs_of_corpus
 
-        source = open_episodes(words, episodes and paths, inputs, told=told, **how)
+        if logs := logs_of_corpus(words) or ([[path] for path in paths] if episodes else None):
+            source = EpisodeSource(logs, inputs, told=told, **how)
     source = source or open_log(paths, inputs, **how)
     source.centre = inputs.centre
     return source

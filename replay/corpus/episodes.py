@@ -6,14 +6,12 @@ import bisect
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, TypeVar
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.names import counted
 from recorder.images.options import InputOptions
-from replay.corpus.index import logs_of_corpus
 from replay.corpus.logs import Episode, Log, are_alike, by_numbers, episode_of, names_of, sampled
 from replay.inputs import open_log
 from replay.logs.formats.lerobot import PAUSE
@@ -34,31 +32,6 @@ Taken = TypeVar("Taken")
 
 Progress = Callable[[float, float | None], None]
 """Called with the number of logs that were opened, and of all logs."""
-
-
-def open_episodes(
-    words: Sequence[str | Path],
-    paths: Sequence[Path] | Literal[False],
-    inputs: InputOptions | None = None,
-    **how: Any,
-) -> EpisodeSource | None:
-    """Open the logs of an index, or each path by itself, as episodes.
-
-    Args:
-        words: the words of the command line.
-        paths: the paths that the words name, if each is an episode.
-        inputs: see `EpisodeSource`.
-        how: see `EpisodeSource`.
-
-    Returns:
-        None if the words name no index and no paths are given.
-
-    Raises:
-        UsageError: an index holds no logs, or as for `EpisodeSource`.
-        LogDamagedError: the same.
-    """
-    logs = logs_of_corpus(words) or ([[path] for path in paths] if paths else None)
-    return None if logs is None else EpisodeSource(logs, inputs, **how)
 
 
 class EpisodeSource(StoredSource):

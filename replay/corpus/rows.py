@@ -95,17 +95,11 @@ def read_rows(logs: Sequence[ListedLog], deep: bool) -> tuple[pa.Table, list[str
             report = failed(log.file, error)
             streams = [{"crc": report.crc, "state": report.state}]
             problem = report.problems[0].what
-        shared = {
-            "path": log.path,
-            "log": log.path,
-            "bytes": log.bytes,
-            "changed": log.changed,
-            "deep": deep,
-        }
+        shared = {"path": log.path, "log": log.path, "bytes": log.bytes, "changed": log.changed}
         for number, stream in enumerate(streams or [{"state": "not read"}]):
             problems = "; ".join(filter(None, (problem, stream.get("problem"))))
-            row = {**shared, **stream, "number": number, "problem": _shortened(problems) or None}
-            rows.append(row)
+            about = {"number": number, "deep": deep, "problem": _shortened(problems) or None}
+            rows.append(shared | stream | about)
     return pa.Table.from_pylist(rows, SCHEMA), gone
 
 

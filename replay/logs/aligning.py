@@ -69,13 +69,12 @@ def _rate(streams: Sequence[LogStream]) -> float:
     timed = next((stream for stream in streams if stream.times is not None), streams[0])
     step = float("nan") if timed.times is None else clocks.step_of(timed.times)
     if not (step > 0 and (timed.read is None or 1 / step <= RECORDED_FPS[1])):
-        remedy = "set one with --rate"
-        if timed.read is not None:
-            remedy += (
-                ", or name the column of its times, and what they count (s, ms, us, ns), with "
-                "--set input.time=COLUMN:s"
-            )
-        raise UsageError(f"{timed.path} tells no rate: {remedy}")
+        column = (
+            ", or name the column of its times, and what they count (s, ms, us, ns), with "
+            "--set input.time=COLUMN:s"
+        )
+        hint = column if timed.read is not None else ""
+        raise UsageError(f"{timed.path} tells no rate: set one with --rate{hint}")
     return float(f"{1 / step:.6g}")
 
 

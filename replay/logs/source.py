@@ -47,6 +47,7 @@ class LoggedSource(StoredSource):
         salvage: show for a broken image the last whole one before it, else the first of all.
         logs: the external logs, MCAP files with their readers.
         opened: the files, which are closed with the source, or if it cannot be made.
+        left_out: a line for each log that could not be read.
 
     Attributes:
         streams: the streams.
@@ -73,6 +74,7 @@ class LoggedSource(StoredSource):
         salvage: bool = False,
         logs: Sequence[tuple[Path, LogReader | None]] = (),
         opened: ExitStack | None = None,
+        left_out: Sequence[str] = (),
     ) -> None:
         self.streams, self._options = list(streams), options or InputOptions()
         self._loop, self._salvage = loop, salvage
@@ -93,7 +95,8 @@ class LoggedSource(StoredSource):
         except BaseException:
             self.close()
             raise
-        self.warnings = tuple(dict.fromkeys(self._warnings()))
+        self.left_out = tuple(left_out)
+        self.warnings = (*left_out, *dict.fromkeys(self._warnings()))
 
     def _open(self) -> None:
         """Put the streams on one clock, and find out how an image becomes a frame."""

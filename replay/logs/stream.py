@@ -212,8 +212,8 @@ def explained(path: object, program: str, remedy: str = "") -> Iterator[None]:
         raise
     except MemoryError:
         limit = f"{BUDGET >> 20} MiB of memory for it, the limit"
-        line = f"{path}: {program} takes more than {limit}"
-        raise UnreadableError(f"{line}: {remedy}" if remedy else line) from None
+        hint = f": {remedy}" if remedy else ""
+        raise UnreadableError(f"{path}: {program} takes more than {limit}{hint}") from None
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise UnreadableError(f"{path}: {program} cannot read it ({reason})") from None

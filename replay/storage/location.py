@@ -63,8 +63,6 @@ def _copied(address: str) -> Path:
         raise UsageError(f"{scheme}:// is not read: use one of {', '.join(SCHEMES)}, or a path")
     key = hashlib.sha256(address.encode()).hexdigest()[:16]
     parts = [part for part in place.split("/") if part not in ("", ".", "..")]
-    if len(parts) < 2:
-        raise UsageError(f"{shown} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
     target = _folder().joinpath(key, scheme, *parts)
     try:
         _copy(scheme, address, target)

@@ -108,14 +108,9 @@ def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
             large = sum(member.file_size for member in stored.zip.infolist()) > BUDGET
             arrays = {} if large else {name: stored[name] for name in stored.files}
     except NOT_ARRAYS as error:
-        pickled = "pickle" in str(error)
-        why = "it holds Python objects, or something else" if pickled else one_line(error)
-        raise LogDamagedError(f"{path} is no file of NumPy's arrays ({why})") from error
+        raise LogDamagedError(f"{path} is no file of NumPy's arrays: {one_line(error)}") from error
     if large:
-        raise UsageError(
-            f"{path}: its arrays have more than {BUDGET >> 20} MiB: save each as .npy, which is "
-            "not read whole"
-        )
+        raise UsageError(f"{path}: more than {BUDGET >> 20} MiB of arrays: save each as .npy")
     if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise LogDamagedError(f"{path} is no file of NumPy's arrays: it holds none")
     return arrays
@@ -170,18 +165,16 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
         hint = "; np.moveaxis(x, 1, -1) moves colours last" if array.ndim == 4 else ""
         raise UsageError(f"{name}: an array {array.shape} of {array.dtype}: {_FORMS}{hint}")
     high = 1 if array.dtype.kind == "f" else 255
-    if array.dtype.kind == "f":
-        finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
-        if not finite.all():
-            raise UsageError(
-                f"{name}: row {int(np.argmin(finite))}, counted from 0, holds NaN or infinity, as "
-                f"{int((~finite).sum())} of {len(array)} rows do: leave them out or fill them"
-            )
+    finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
+    if not finite.all():
+        row, count = int(np.argmin(finite)), int((~finite).sum())
+        raise UsageError(
+            f"{name}: row {row}, counted from 0, holds NaN or infinity, {count} of {len(array)} do"
+        )
     scaled = array.dtype in (np.uint8, np.uint16, np.bool_)
     if images and not scaled and not 0 <= array.min() <= array.max() <= high:
         raise UsageError(
             f"{name}: pictures of {array.dtype} hold {array.min():g} to {array.max():g}: scale "
-            f"them to 0 to {high:g}, or give uint8; other numbers are rows, as "
-            "x.reshape(len(x), -1)"
+            f"them to 0 to {high}, or give rows of numbers, as x.reshape(len(x), -1)"
         )
     return array.astype(array.dtype.newbyteorder("="), copy=False)

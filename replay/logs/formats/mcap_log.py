@@ -118,10 +118,8 @@ class Messages:
         if table is None:
             raise MalformedRecord("it is damaged")
         if number != self._now[0]:
-            self._now, self._bytes = (
-                (number, _rows_of(table, self._channels[reader])),
-                table.data.nbytes,
-            )
+            self._now = number, _rows_of(table, self._channels[reader])
+            self._bytes = table.data.nbytes
         own, place = self._now[1], int(self._row_in[row])
         if place >= len(own) or int(table.log_time[own[place]]) != int(self.times[row]):
             raise MalformedRecord("its chunk holds other messages than the summary names")

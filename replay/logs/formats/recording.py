@@ -313,13 +313,10 @@ class _ChannelRows:
         wrong = np.flatnonzero(~exact | (steps < 1 if self._may_lack else steps != 1))
         if len(wrong):
             at = int(wrong[0])
-            remedy = "cdmisfa verify lists missing frames, cdmisfa learn --salvage leaves them out"
-            if self._reader.salvage:
-                remedy = "save what can be read with cdmisfa recover, and learn from that"
             raise LogDamagedError(
                 f"{self._reader.path}: {self._channel.topic}: after frame "
                 f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
-                f"{frames[at]}: frames are missing or doubled; {remedy}"
+                f"{frames[at]}: frames are missing or doubled; run cdmisfa recover"
             )
         edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
         for low, high in itertools.pairwise(edges):
