@@ -193,11 +193,7 @@ _FORMATS = {("u1", 0): "mono8", ("u2", 0): "mono16", ("u1", 3): "rgb8", ("u1", 4
 
 _DISTANCES = {"u2": "16UC1", "f4": "32FC1", "f8": "32FC1"}
 
-_IMAGES = (
-    "give (n, height, width) of uint8 or uint16, (n, height, width, 3) or 4 of uint8, or these of "
-    "bool, floats of 0 to 1, integers of 0 to 255, or a list of such images, or of the bytes of "
-    "JPEG or PNG files"
-)
+_IMAGES = "give uint8 of (n, height, width) or (n, height, width, 3), or floats of 0 to 1"
 
 
 @dataclass(frozen=True, slots=True)

@@ -354,10 +354,8 @@ def stamp_of(kind: MessageKind) -> Stamp | None:
 
 
 def _stamp(message: Any) -> int:
-    for path in (("header", "stamp"), ("timestamp",), ("stamp",)):
-        value = message
-        for name in path:
-            value = _member(value, name)
+    header = _member(_member(message, "header"), "stamp")
+    for value in (header, _member(message, "timestamp"), _member(message, "stamp")):
         seconds, nanos = _member(value, *_SECONDS), _member(value, *_NANOS, default=0)
         if isinstance(seconds, int) and isinstance(nanos, int):
             return seconds * NANOSECONDS + nanos

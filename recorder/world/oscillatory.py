@@ -11,7 +11,7 @@ import numpy as np
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError, Registry
 from cdmisfa.kernels import cos, sin
 from recorder.config import SceneConfig, check_view_names
 
@@ -52,7 +52,9 @@ def zero(theta: FloatArray) -> FloatArray:
 
 
 _Signal = Callable[[FloatArray], FloatArray]
-STREAMS: Mapping[str, _Signal] = {"x1": x1, "x2": x2, "x3": x3, "zero": zero}
+STREAMS: Registry[_Signal] = Registry(
+    "oscillatory stream", {"x1": x1, "x2": x2, "x3": x3, "zero": zero}
+)
 
 
 def one_period(name: str) -> FloatArray:
@@ -63,8 +65,6 @@ def one_period(name: str) -> FloatArray:
     Raises:
         UsageError: no such stream.
     """
-    if name not in STREAMS:
-        raise UsageError(f"no oscillatory stream {name!r}: there are {', '.join(STREAMS)}")
     theta = 2 * np.pi * np.arange(PERIOD) / PERIOD
     return freeze(np.ascontiguousarray(STREAMS[name](theta)))
 
