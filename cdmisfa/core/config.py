@@ -368,10 +368,6 @@ def _words_of(hint: Any) -> str:
     return _SCALARS[hint][0]
 
 
-def _boolean(value: Any) -> bool:
-    return {"true": True, "false": False}[str(value).lower()]
-
-
 def _whole(value: Any) -> int:
     number = int(value) if isinstance(value, str) else index(value)
     if isinstance(value, bool) or abs(number) > LARGEST:
@@ -394,7 +390,7 @@ def _text(value: Any) -> str:
 
 # For each type of a key: its words in errors, and its conversion from a value or text.
 _SCALARS: Mapping[Any, tuple[str, Callable[[Any], Any]]] = {
-    bool: ("true or false", _boolean),
+    bool: ("true or false", lambda value: {"true": True, "false": False}[str(value).lower()]),
     int: ("a whole number", _whole),
     float: ("a number", _number),
     str: ("a text", _text),

@@ -7,7 +7,6 @@ length instead: its values take up to twenty times as much memory.
 from __future__ import annotations
 
 import contextlib
-import errno
 import gc
 import json
 import os
@@ -124,9 +123,7 @@ def check_regular(path: Path, limit: int | None = None) -> None:
         UsageError: so it is.
     """
     try:
-        _check(path, limit)
-        if not os.access(path, os.R_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        os.close(open_regular(path, limit))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
 
@@ -138,7 +135,11 @@ def open_regular(path: Path, limit: int | None = None) -> int:
         OSError: it cannot be opened.
         UsageError: it is no regular file, or has more bytes.
     """
-    _check(path, limit)  # opening alone does something to some devices
+    status = os.stat(path)  # opening alone does something to some devices
+    if not stat.S_ISREG(status.st_mode):
+        raise UsageError(f"{path}: no regular file")
+    if limit is not None and status.st_size > limit:
+        raise UsageError(f"{path}: {status.st_size} bytes, above the limit of {limit}")
     return os.open(path, os.O_RDONLY | os.O_NONBLOCK)
 
 
@@ -181,12 +182,3 @@ def read_json(path: Path, remedy: str, *, most: int = MAX_JSON) -> Any:
         return parse_json(data, most)
     except ValueError as error:
         raise LogDamagedError(f"{path} is damaged: {remedy}") from error
-
-
-def _check(path: Path, limit: int | None) -> None:
-    status = os.stat(path)
-    problem = "" if stat.S_ISREG(status.st_mode) else "no regular file"
-    if limit is not None and status.st_size > limit:
-        problem = problem or f"{status.st_size} bytes, above the limit of {limit}"
-    if problem:
-        raise UsageError(f"{path}: {problem}")

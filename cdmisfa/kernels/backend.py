@@ -24,12 +24,11 @@ def compiler() -> str | None:
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
     """What else must be installed to build a wheel."""
-    return [*build_meta.get_requires_for_build_wheel(config_settings), *_lacking()]
+    needed: list[str] = build_meta.get_requires_for_build_wheel(config_settings)
+    return needed if compiler() else [*needed, ZIG]
 
 
-def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
-    """What else must be installed to use the checkout itself."""
-    return [*build_meta.get_requires_for_build_editable(config_settings), *_lacking()]
+get_requires_for_build_editable = get_requires_for_build_wheel
 
 
 def build_wheel(*args: Any, **options: Any) -> str:
@@ -42,10 +41,6 @@ def build_editable(*args: Any, **options: Any) -> str:
     """Build the kernels in the checkout, and a wheel that points to it."""
     _choose_compiler()
     return str(build_meta.build_editable(*args, **options))
-
-
-def _lacking() -> list[str]:
-    return [] if compiler() else [ZIG]
 
 
 def _choose_compiler() -> None:

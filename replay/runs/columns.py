@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,8 @@ def padded(signal: Signal, values: NDArray[Any], modules: int) -> NDArray[Any]:
 
 def columns_of_records(records: Sequence[BlockSignals]) -> Iterator[SignalColumns]:
     """Yield records as arrays, a new piece wherever a shape changes."""
-    for _, group in groupby(records, key=shapes_of):
+    arrays = attrgetter(*(s.name for s in SIGNALS.values() if s.dims))
+    for _, group in groupby(records, key=lambda r: [array.shape for array in arrays(r)]):
         same = list(group)
         yield SignalColumns(
             {
@@ -139,16 +141,8 @@ def columns_of_records(records: Sequence[BlockSignals]) -> Iterator[SignalColumn
         )
 
 
-def shapes_of(signals: BlockSignals) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of a record's arrays, in the record's order."""
-    return tuple([getattr(signals, name).shape for name in _ARRAYS])
-
-
 def _concatenated(signal: Signal, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     if not parts:
         return np.empty((0,) * (1 + len(signal.dims)), dtype=signal.dtype)
     most = max(part.shape[1] for part in parts) if signal.dims else 0
     return np.concatenate([padded(signal, part, most) for part in parts])
-
-
-_ARRAYS = tuple(s.name for s in SIGNALS.values() if s.dims)

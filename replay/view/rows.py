@@ -256,7 +256,8 @@ class Rows:
         if not waiting.rows:
             return
         frames, iterations, values = (
-            _joined(column) for column in zip(*waiting.parts, strict=True)
+            parts[0] if len(parts) == 1 or parts[0] is None else np.concatenate(parts)
+            for parts in zip(*waiting.parts, strict=True)
         )
         waiting.parts, waiting.rows, waiting.bytes = [], 0, 0
         if waiting.encode is scalar_columns:
@@ -276,10 +277,6 @@ class Rows:
         for piece in (slice(i, i + rows) for i in range(0, len(values), rows)):
             at = frames[piece], None if iterations is None else iterations[piece]
             self.send(path, at, waiting.encode(values[piece]))
-
-
-def _joined(parts: Sequence[Any]) -> Any:
-    return parts[0] if len(parts) == 1 or parts[0] is None else np.concatenate(parts)
 
 
 def _ended_at_gaps(

@@ -114,7 +114,10 @@ class Candidate:
         self.errors[-1] = self.error
         self._reference_age += 1
         if self._reference_age >= self.test_window:
-            self._look_back()
+            if self._reference.any():
+                self.regret = log_ratio(self.sfa.compare(self._reference).slowness, self.fitted)
+            self._reference[:] = self.sfa.phi[0]
+            self._reference_age = 0
 
     def _test(self, frames: NDArray[Any], gap: bool) -> None:
         """Take in the outputs on a block and their steps from frame to frame.
@@ -134,12 +137,6 @@ class Candidate:
         self._phi[:], self._last[:] = phi, y[-1] + offset
         now = np.stack([y.mean(axis=0), (y * y).mean(axis=0), (steps * steps).mean(axis=0)])
         self._moments += rate * (now - self._moments)
-
-    def _look_back(self) -> None:
-        if self._reference.any():
-            self.regret = log_ratio(self.sfa.compare(self._reference).slowness, self.fitted)
-        self._reference[:] = self.sfa.phi[0]
-        self._reference_age = 0
 
     @property
     def alive(self) -> bool:

@@ -174,6 +174,7 @@ class ProgressLearner:
         interests, explored = self._choose(self._rng.random(2))
         tested, gained = candidate.tested, error - candidate.error
         frozen = y_frozen.reshape(len(block), count, self._n_outputs).transpose(1, 0, 2)
+        slowness = [kernels.instantaneous_slowness(y) for y in frozen]
         shape = (count, self._n_outputs)
         signals: dict[str, Any] = {
             "novel": novel and candidate.alive,
@@ -184,8 +185,8 @@ class ProgressLearner:
             "y_frozen": np.ascontiguousarray(frozen),
             "eta": tested,
             "eta_inst": kernels.instantaneous_slowness(candidate.y),
-            "eta_inst_frozen": _stacked([kernels.instantaneous_slowness(y) for y in frozen], shape),
-            "band_mean": _stacked([module.eta for module in self.modules[:count]], shape),
+            "eta_inst_frozen": np.array(slowness).reshape(shape),
+            "band_mean": np.array([module.eta for module in self.modules[:count]]).reshape(shape),
             "curiosity": gained,
             "reward": gained,
             "R": np.empty((0, 2, 0)),
@@ -367,7 +368,3 @@ class ProgressLearner:
             counts["stay"] = 0
             counts["stream"], explored = self.rule(situation)
         return interest(situation), explored
-
-
-def _stacked(rows: list[FloatArray], shape: tuple[int, int]) -> FloatArray:
-    return np.array(rows).reshape(shape)
