@@ -206,13 +206,11 @@ def is_recording(words: Sequence[str]) -> bool:
         LogDamagedError: a log is damaged.
     """
     places = locations(words)
-    if any(map(only_external, places)):
-        return False
-    try:
-        open_recording(places).close()
-    except NoRecordingError:
-        return False
-    return True
+    if not any(map(only_external, places)):
+        with contextlib.suppress(NoRecordingError):
+            open_recording(places).close()
+            return True
+    return False
 
 
 def refuse_what_is_no_log(paths: Sequence[Path]) -> None:

@@ -84,14 +84,14 @@ def test_few_pictures_are_held_and_each_is_decoded_once(
 ) -> None:
     monkeypatch.setattr(ahead, "CORES", 3)
     waiting: list[int] = []
-    begin = ahead.DecodingAhead._begin
+    begin = ahead.Images._begin
 
-    def counted(self: ahead.DecodingAhead) -> None:
+    def counted(self: ahead.Images) -> None:
         before = len(self._pending)
         begin(self)
         waiting.extend(range(before + 1, len(self._pending) + 1))
 
-    monkeypatch.setattr(ahead.DecodingAhead, "_begin", counted)
+    monkeypatch.setattr(ahead.Images, "_begin", counted)
     frames, _, _ = shown(write(tmp_path / "log.mcap"))
     assert (sum(map(len, frames)), len(waiting)) == (COUNT, COUNT - 1)
     assert max(waiting) <= 2 * 3
@@ -135,9 +135,9 @@ def test_whatever_is_asked_for_next_frames_and_errors_are_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: tuple[int, ...]
 ) -> None:
     log, held = two(tmp_path / "log.mcap", *broken), []
-    pop = ahead.DecodingAhead.pop
+    pop = ahead.Images.pop
     monkeypatch.setattr(
-        ahead.DecodingAhead,
+        ahead.Images,
         "pop",
         lambda self, place: (held.append(len(self._pending)), pop(self, place))[1],
     )

@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from cdmisfa.core.arrays import IntArray
-from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
+from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS, times_of
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import stream_name, stream_names
 from recorder.images.options import InputOptions
@@ -42,7 +43,10 @@ def align(
     """
     arrays = all(stream.encoding == "numpy" for stream in streams)
     fps = options.rate or (FPS if arrays else _rate(streams))
-    streams = [stream.at_rate(fps) for stream in streams]
+    streams = [
+        replace(s, times=times_of(np.arange(s.count), fps, s.begins)) if s.times is None else s
+        for s in streams
+    ]
     if options.start or options.end is not None:
         zero = min(int(_times(stream)[0]) for stream in streams)
         streams = [_excerpt(stream, options, zero) for stream in streams]

@@ -72,12 +72,10 @@ def hue_varies(frames: NDArray[Any]) -> bool:
     hue = cells[[0, 2]] - grey
     along = (hue * grey).sum(axis=1) / np.maximum((grey * grey).sum(axis=0), 1e-9)
     hue -= along.clip(-_MOST_RATIO, _MOST_RATIO)[:, None] * grey
-    lasting = _lasting(hue) / len(grey.T)
-    varies = max(
-        _SHARE * _lasting(grey) / len(grey.T),
-        _LASTING * (hue * hue).mean(axis=1).sum() / len(grey.T),
-    )
-    return bool(lasting >= max(varies, _LEAST))
+    count = len(grey.T)
+    of_brightness = _SHARE * _lasting(grey) / count
+    of_hue = _LASTING * (hue * hue).mean(axis=1).sum() / count
+    return bool(_lasting(hue) / count >= max(of_brightness, of_hue, _LEAST))
 
 
 def _lasting(x: NDArray[np.float64]) -> float:

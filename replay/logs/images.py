@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,21 +24,25 @@ CORES: Final = thread_count()
 Place = tuple[int, int]
 
 
-class DecodingAhead:
-    """Images of streams that threads decode; with one thread there are none.
+class Images:
+    """The images of streams, one by one; every error of a row is raised here, with its name.
 
-    No more than two a thread are held, images that no thread can decode among them.
+    Threads decode images ahead; with one thread there are none. No more than two a thread are held,
+    images that no thread can decode among them.
 
     Args:
         streams: the streams.
         color: whether images are decoded in their colours.
+        salvage: show for a broken image the last whole one before it, else the first of all.
     """
 
-    def __init__(self, streams: Sequence[LogStream], *, color: bool) -> None:
-        self._streams, self._color = streams, color
+    def __init__(self, streams: Sequence[LogStream], *, color: bool, salvage: bool) -> None:
+        self._streams, self._color, self._salvage = streams, color, salvage
         self._threads = ThreadPoolExecutor(CORES)
         self._pending: dict[Place, Future[ByteArray] | None] = {}
         self._coming: Iterator[Place] = iter(())
+        self._whole: dict[int, tuple[int, Shown]] = {}
+        self._broken: dict[int, dict[int, LogDamagedError]] = {}
 
     def expect(self, places: Iterable[Place]) -> None:
         """Announce the rows that are asked for next, in this order; others are forgotten."""
@@ -65,13 +70,10 @@ class DecodingAhead:
 
     def _decode(self, number: int, row: int) -> Future[ByteArray] | None:
         """Fetch a row in this thread, and let another decode it; None for other images."""
-        stream = self._streams[number]
-        if stream.picture is None:
-            return None
-        try:
-            data = stream.taken(row, stream.picture)
-        except CdmisfaError:  # the caller shall see it
-            return None
+        stream, data = self._streams[number], None
+        if stream.picture is not None:
+            with contextlib.suppress(CdmisfaError):  # the caller shall see it
+                data = stream.taken(row, stream.picture)
         if data is None:
             return None
         return self._threads.submit(compressed_image, data, color=self._color, most=AT_ONCE)
@@ -79,23 +81,6 @@ class DecodingAhead:
     def _forget(self, place: Place) -> None:
         if (coming := self._pending.pop(place)) is not None:
             coming.cancel()
-
-
-class Images:
-    """The images of streams, one by one; every error of a row is raised here, with its name.
-
-    Args:
-        streams: the streams.
-        color: whether images are decoded in their colours.
-        salvage: show for a broken image the last whole one before it, else the first of all.
-    """
-
-    def __init__(self, streams: Sequence[LogStream], *, color: bool, salvage: bool) -> None:
-        self._streams, self._salvage = streams, salvage
-        self._ahead = DecodingAhead(streams, color=color)
-        self._whole: dict[int, tuple[int, Shown]] = {}
-        self._broken: dict[int, dict[int, LogDamagedError]] = {}
-        self.expect, self.close = self._ahead.expect, self._ahead.close
 
     def image(self, stream: int, row: int) -> Shown:
         """Read an image of a stream.
@@ -116,7 +101,7 @@ class Images:
             raise UsageError(f"{name(row)}: {error}") from None
 
     def _decoded(self, stream: int, row: int) -> Shown:
-        image = self._ahead.pop((stream, row))
+        image = self.pop((stream, row))
         return self._streams[stream].image(row) if image is None else image
 
     def _whole_image(self, stream: int, row: int) -> Shown:

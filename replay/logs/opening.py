@@ -114,27 +114,25 @@ class OpenLogs:
         self.logs: list[tuple[Path, LogReader | None]] = []
         patterns = any(letter in topic for topic in topics for letter in "*?[")
         in_turn = len(topics) == len(files) > 1 and not patterns
-        broken: dict[Path, LogDamagedError] = {}
+        broken: list[LogDamagedError] = []
         refused: list[NoTopicError] = []
         for i, file in enumerate(files):
             chosen = replace(options, topics=topics[i : i + 1]) if in_turn else options
             try:
                 streams = FORMATS[log_format(file)](file, chosen, opened, salvage=salvage)
+                self.streams += streams
+                self.logs.append((file, streams[0].reader))
             except NoTopicError as error:
                 if in_turn or len(files) == 1 or not topics:
                     raise
                 refused.append(error)
-                continue
             except LogDamagedError as error:
                 if not salvage or len(files) == 1:
                     raise
-                broken[file] = error
-                continue
-            self.streams += streams
-            self.logs.append((file, streams[0].reader))
-        self.left_out = [f"{error}: this log is left out" for error in broken.values()]
+                broken.append(error)
+        self.left_out = [f"{error}: this log is left out" for error in broken]
         if not self.streams:
-            raise refused[0] if refused else next(iter(broken.values()))
+            raise [*refused, *broken][0]
         if topics and not in_turn:
             for topic in topics:
                 if not any(fits_topic(stream.topic, [topic]) for stream in self.streams):

@@ -78,7 +78,6 @@ class LoggedSource(StoredSource):
     ) -> None:
         self.streams, self._options = list(streams), options or InputOptions()
         self._loop, self._salvage = loop, salvage
-        self._paths = list(dict.fromkeys(stream.path for stream in streams))
         self._log_list, self._opened = logs, opened or ExitStack()
         self.recorded, self.color = bool(streams[0].views), self._options.color is True
         self.in_memory = any(stream.digest for stream in streams)
@@ -132,10 +131,10 @@ class LoggedSource(StoredSource):
         self.pauses = dict(zip(names, clock.gaps, strict=True))
         self.alignment: dict[str, dict[str, int]] = {}
         if self.to_judge:
-            left_out = clock.gaps if self.gaps else [[] for _ in names]
-            each = zip(names, self.streams, clock.rows, left_out, strict=True)
+            each = zip(names, self.streams, clock.rows, clock.gaps, strict=True)
             for name, stream, rows, gaps in each:
-                self.alignment[name] = clocks.counts(stream.count, rows, gaps)
+                left_out = gaps if self.gaps else ()
+                self.alignment[name] = clocks.counts(stream.count, rows, left_out)
 
     # Frames
 
@@ -227,9 +226,8 @@ class LoggedSource(StoredSource):
             yield from stream.warnings
         clock = self._clock
         if self.recorded:
-            ends = {
-                view.ranges[-1][1] for view in (s.views[-1] for s in self.streams) if view.ranges
-            }
+            lasts = [stream.views[-1].ranges for stream in self.streams]
+            ends = {ranges[-1][1] for ranges in lasts if ranges}
             end = int(clock.rows[0][-1]) + 1
             if not self.gaps and len(ends) > 1:
                 yield (
@@ -304,7 +302,7 @@ class LoggedSource(StoredSource):
 
     def _name(self) -> str:
         if not self.recorded:
-            return str(self._paths[0])
+            return str(self.streams[0].path)
         files = [view.path for stream in self.streams for view in stream.views]
         return str(files[0]) if len(files) == 1 else min(str(path.parent) for path in files)
 

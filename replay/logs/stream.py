@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
-from cdmisfa.core.clock import times_of
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.options import RECIPE
@@ -133,12 +132,6 @@ class LogStream:
             return self.where(row)
         at = f" at {self.times[row]} ns" if self.times is not None else ""
         return f"{self.path}: {self.topic}{at}"
-
-    def at_rate(self, fps: float) -> LogStream:
-        """The stream, with times at an even rate if it has none."""
-        if self.times is not None:
-            return self
-        return replace(self, times=times_of(np.arange(self.count), fps, self.begins))
 
     def part(self, rows: IntArray, times: IntArray | None) -> LogStream:
         """Some rows of the stream, at the times given."""

@@ -202,12 +202,11 @@ def is_dataset(path: Path) -> bool:
 
 def dataset_channels(path: Path) -> list[ChannelFacts]:
     """Return the features of a dataset, one value a frame."""
-    info = _info(path)
-    facts = []
+    info, facts = _info(path), []
     for name, feature in info["features"].items():
         kind, shape = feature.get("dtype"), "x".join(map(str, feature.get("shape", ())))
-        frames = int(info["total_frames"])
-        facts.append(ChannelFacts(name, str(kind), shape, frames, images=kind in _IMAGES))
+        about = str(kind), shape, int(info["total_frames"])
+        facts.append(ChannelFacts(name, *about, images=kind in _IMAGES))
     return facts
 
 
