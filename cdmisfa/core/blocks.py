@@ -253,13 +253,10 @@ class ForwardSource(Described, FrameSource):
 
 
 class ClockedSource(ForwardSource, SeekableSource):
-    """A source of which any frame can be shown again, and so needs `take` and `describe` alone.
+    """A source of which any frame can be shown again, and so needs `take` and `describe` alone."""
 
-    Attributes:
-        opened: the arguments with which `open_scene` opened it.
-    """
-
-    opened: Any = None
+    # The arguments with which `open_scene` opened it.
+    _scene_opened: Any = None
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t; see `SeekableSource.seek`."""

@@ -105,13 +105,13 @@ def open_scene(
     config = config or SCENES[name].config()
     scene = OpenScene(name, replace(config, seed=config.seed or 0), record or RecordConfig())
     source = SCENES[name].open(scene.config, scene.record)
-    source.opened = scene
+    source._scene_opened = scene
     return source
 
 
 def scene_of(source: FrameSource) -> OpenScene | None:
     """Return what `open_scene` opened a source from; None for any other source."""
-    return getattr(source, "opened", None)
+    return getattr(source, "_scene_opened", None)
 
 
 def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:

@@ -92,11 +92,7 @@ def record_command(
         command = f"cdmisfa convert {shlex.join(source)} -o REC"
         raise UsageError(f"{source[0]} is a log, no scene: write it as a recording with {command}")
     start = read_start(out) if resume else RecordingStart()
-    if start.scene in ("cameras", "gym"):
-        raise UsageError(f"{out}: a recording of live streams cannot be resumed")
-    if start.scene == "foreign":
-        command = f"cdmisfa convert SOURCE -o {printing.quoted(out)} --resume"
-        raise UsageError(f"{out} is a conversion: resume it with {command}")
+    _check_resumable(out, start.scene)
     scene = " ".join(source) or start.scene
     if not scene and resume and not (frames or split) and (files := recorded(out)):
         printing.status(f"{out} is complete: nothing was left to record")
@@ -121,6 +117,15 @@ def record_command(
             force=force,
         )
     return _print_recording(out, files, as_json)
+
+
+def _check_resumable(out: Path, scene: str) -> None:
+    """Reject recordings that state no scene but where their frames came from."""
+    if scene in ("cameras", "gym"):
+        raise UsageError(f"{out}: a recording of live streams cannot be resumed")
+    if scene == "foreign":
+        command = f"cdmisfa convert SOURCE -o {printing.quoted(out)} --resume"
+        raise UsageError(f"{out} is a conversion: resume it with {command}")
 
 
 def _record_live(
