@@ -134,10 +134,7 @@ def open_window(view: Path, frame: int | None = None) -> None:
         CdmisfaError: there is no display, or the viewer ends with an error.
     """
     if not has_display():
-        raise CdmisfaError(
-            "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
-            "--screenshot"
-        )
+        raise CdmisfaError("there is no display: use --web, --save or --screenshot")
     port = str(free_port())
     with Program("--port", port, str(view)) as viewer:
         if frame is not None:

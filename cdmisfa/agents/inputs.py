@@ -33,10 +33,8 @@ def count_inputs(expansion: str, spec: SourceSpec) -> int:
     values = math.prod(spec.frame_shape)
     inputs = expanded_size(expansion, values)
     if inputs > MAX_INPUTS:
-        raise UsageError(
-            f"learner.expansion {expansion} makes {inputs:,} inputs of {values:,}, "
-            f"more than {MAX_INPUTS:,}: set learner.expansion=none or take smaller frames"
-        )
+        made = f"learner.expansion {expansion} makes {inputs:,} inputs of {values:,}"
+        raise UsageError(f"{made}, more than {MAX_INPUTS:,}: take smaller frames")
     return inputs
 
 
@@ -66,10 +64,8 @@ def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[An
     ):
         finite = np.isfinite(frames).all()
         what = f"larger than {LARGEST_VALUE:g}" if finite else "no finite number"
-        raise CdmisfaError(
-            f"stream {spec.streams[stream]} holds a value that is {what} "
-            f"in frames {block.t} to {block.t + tau - 1}: learn from frames without it"
-        )
+        where = f"in frames {block.t} to {block.t + tau - 1}"
+        raise CdmisfaError(f"stream {spec.streams[stream]} holds a value that is {what} {where}")
     return frames.reshape(tau, -1)
 
 

@@ -73,10 +73,8 @@ class CuriousLearner:
         self.events: tuple[str, ...] = ()
         self._n_inputs = inputs = count_inputs(config.expansion, spec)
         if config.components > inputs:
-            raise UsageError(
-                f"learner.components is {config.components}, more than the {inputs} inputs: "
-                f"set learner.components={inputs}, or less"
-            )
+            most = f"more than the {inputs} inputs"
+            raise UsageError(f"learner.components is {config.components}, {most}")
         self.scale = PIXEL if spec.dtype == "uint8" else 1.0
         self.policy_rng = np.random.Generator(
             np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,)))

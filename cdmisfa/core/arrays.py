@@ -60,10 +60,7 @@ def without_table(given: Any, name: str = "frames") -> Any:
                 column = column.cast("float64")
         values: NDArray[Any] = column.to_numpy()
         if values.dtype.kind not in "biuf":
-            raise UsageError(
-                f"{name}: the column {key} is of type {kind}, no numbers: choose the columns of "
-                "numbers"
-            )
+            raise UsageError(f"{name}: the column {key} is of type {kind}, no numbers")
         columns.append(values)
     return np.column_stack(columns) if columns else np.empty((len(table), 0))
 
@@ -123,11 +120,8 @@ def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
     array = frames if type(frames) is np.ndarray else as_array(frames)
     fits = array.ndim == 2 and size in (None, array.shape[1])
     if array.dtype not in _TYPES or not fits:
-        wanted = "values" if size is None else size
-        raise UsageError(
-            f"frames of {array.dtype} {array.shape} given: give uint8 pixels or float64 values, "
-            f"(n, {wanted})"
-        )
+        wanted = f"uint8 pixels or float64 values, (n, {'values' if size is None else size})"
+        raise UsageError(f"frames of {array.dtype} {array.shape} given: give {wanted}")
     flags = array.flags
     if not (flags.c_contiguous and flags.aligned):
         array = array.copy(order="C")

@@ -9,7 +9,6 @@ that does not exist with the nearest one that does.
 from __future__ import annotations
 
 import contextlib
-import copy
 import dataclasses
 import math
 import reprlib
@@ -18,7 +17,7 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from importlib import resources
 from operator import index
 from pathlib import Path
@@ -220,17 +219,13 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
     else:
         raise UsageError(f"no preset {name[:40]!r}: {did_you_mean(name, presets())}")
     try:
-        document = copy.deepcopy(_parsed(data.decode("utf-8").replace("\r\n", "\n")))
+        document = tomllib.loads(data.decode("utf-8").replace("\r\n", "\n"))
         for section, table in document.items():
             if not isinstance(table, dict):
                 raise ValueError(f"{shown(section)} is outside of any [section]")
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{name}: no preset, which is TOML: {error}") from None
     return document
-
-
-# Every trial of a sweep reads the same preset.
-_parsed = lru_cache(tomllib.loads)
 
 
 def shown(value: Any) -> str:
@@ -250,9 +245,7 @@ def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
         path, equals, value = word.partition("=")
         section, dot, name = path.strip().partition(".")
         if not (equals and section and dot and name):
-            raise UsageError(
-                f"--set {shown(word)}: write it as section.key=value, as learner.nu=0.02"
-            )
+            raise UsageError(f"--set {shown(word)}: write section.key=value, as learner.nu=0.02")
         sections.setdefault(section, {})[name] = value.strip()
     return sections
 

@@ -118,10 +118,8 @@ def workers(jobs: int) -> Iterator[Submit]:
         try:
             yield submit
         except BrokenProcessPool as error:
-            raise WorkersError(
-                "a worker process was killed, by somebody or for lack of memory: repeat the "
-                "command, what is finished is kept"
-            ) from error
+            why = "a worker process was killed: repeat the command, what is finished is kept"
+            raise WorkersError(why) from error
         finally:
             pool.shutdown(kill_workers=True)
 
@@ -199,9 +197,8 @@ def _dask_workers(scheduler: str) -> Iterator[Submit]:
     try:
         distributed: Any = importlib.import_module("distributed")
     except ImportError as error:
-        raise UsageError(
-            "--scheduler needs a package that is not installed: pip install 'cdmisfa[dask]'"
-        ) from error
+        why = "--scheduler needs a package that is missing: pip install 'cdmisfa[dask]'"
+        raise UsageError(why) from error
     # Else it logs a traceback of every lost connection; the errors that matter are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
@@ -211,13 +208,10 @@ def _dask_workers(scheduler: str) -> Iterator[Submit]:
             stack.enter_context(contextlib.closing(client))
             client.wait_for_workers(1, timeout=CONNECT_SECONDS)
         except (OSError, TimeoutError, ValueError) as error:
-            raise WorkersError(
-                f"no dask scheduler with workers answers at {scheduler}: {one_line(error)}"
-            ) from error
+            why = f"no dask scheduler with workers answers at {scheduler}: {one_line(error)}"
+            raise WorkersError(why) from error
         try:
             yield client.get_executor(pure=False).submit
         except (distributed.KilledWorker, CancelledError) as error:
-            raise WorkersError(
-                f"the dask cluster lost its workers or its scheduler ({one_line(error)}): what is "
-                "finished is kept, their logs say why"
-            ) from error
+            why = f"the dask cluster was lost, what is finished is kept: {one_line(error)}"
+            raise WorkersError(why) from error

@@ -112,17 +112,12 @@ def header_in(reader: LogReader) -> RunHeader:
     found = next((r.metadata for r in reader.metadata if r.name == RUN_METADATA), None)
     if found is None:
         raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
-    text = found.get("schema", "")
-    schema = int(text) if text.isascii() and text.isdigit() and len(text) < 10 else 0
-    if schema < 1:  # asked first: all else may look different in another version
-        raise LogDamagedError(
-            f"{log}: its metadata {RUN_METADATA} is broken (schema {text[:20]!r})"
-        )
-    if schema != SCHEMA_VERSION:
-        raise UsageError(
-            f"{log} was written with version {schema} of the signals, and this cdmisfa reads "
-            f"version {SCHEMA_VERSION}: read it with the cdmisfa that wrote it"
-        )
+    schema = found.get("schema", "")[:20]
+    if not (schema.isascii() and schema.isdigit() and 0 < int(schema) < 10**9):
+        raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken (schema {schema!r})")
+    if int(schema) != SCHEMA_VERSION:  # asked first: all else may look different in it
+        written = f"{log} was written with version {schema} of the signals"
+        raise UsageError(f"{written}: read it with the cdmisfa that wrote it")
     try:
         spec = parse_json(found["spec"])
         for name in ("streams", "frame_shape", "truth"):

@@ -60,10 +60,7 @@ BODY = "body"
 # Prefix of the meshes' names in the models.
 PACKAGE = "package://iCub/"
 
-PRESET = (
-    "the recording that it learned from is not where it was: the table, the eyes and the sizes of "
-    "the objects are those of the scene's preset"
-)
+PRESET = "the recording that it learned from is not where it was: the scene is that of its preset"
 
 
 def world_of_run(
