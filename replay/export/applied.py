@@ -195,7 +195,15 @@ def _log_sink(
             for at, frame in zip(times, block.frames, strict=True)
         ]
         for i, (_, outputs) in enumerate(columns_of(modules)):
-            rows = zip(times, _encoded(applied, i, outputs), strict=True)
+            values = {
+                "y": applied.y[:, outputs],
+                "slowness": applied.slowness[outputs],
+                "alive": applied.alive[i],
+                "novelty": applied.novelty[i],
+                "frame": block.t + np.arange(len(block)),
+            }
+            encoded = _layout(outputs.stop - outputs.start).write(len(block), values)
+            rows = zip(times, encoded, strict=True)
             messages += [(topics[s][i], at, row, at, 0) for at, row in rows]
         log.write_all(messages)
 
@@ -205,18 +213,6 @@ def _log_sink(
         log.abandon()
         raise
     log.finish()
-
-
-def _encoded(applied: Applied, module: int, outputs: slice) -> list[bytes]:
-    """Return the message `cdmisfa.ModuleOutput` of a module for each frame of a block."""
-    values = {
-        "y": applied.y[:, outputs],
-        "slowness": applied.slowness[outputs],
-        "alive": applied.alive[module],
-        "novelty": applied.novelty[module],
-        "frame": applied.block.t + np.arange(len(applied.block)),
-    }
-    return _layout(outputs.stop - outputs.start).write(len(applied.block), values)
 
 
 @cache

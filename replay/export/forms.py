@@ -19,9 +19,6 @@ from replay.logs.source import LoggedSource
 # Forms of the signals of a run, and forms of frames.
 FORMS: Final = (*TABLES, "images", "mp4", "lerobot")
 
-# Attributes that must be equal in the logs that become one dataset.
-EQUAL: Final = ("streams", "frame_shape", "dtype", "truth", "fps")
-
 # Endings of exported files: `force` replaces a folder only if it holds no others.
 WRITTEN: Final = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
 
@@ -76,7 +73,10 @@ def export(
         refuse_taken(out, force=force)
     else:
         refuse_existing(out, force=force, goes_on=False)
-        _refuse_other_files(out)
+        for file in out.rglob("*"):
+            if not file.is_dir() and file.suffix not in WRITTEN:
+                other = f"{out} holds other files, such as {file.relative_to(out)}"
+                raise UsageError(f"{other}: export into a new folder")
     logs = _opened(paths, form, inputs, about, single=single)
     with contextlib.closing(logs), atomic_write(out) as place:
         if form == "lerobot":
@@ -109,18 +109,10 @@ def _opened(
                 why = "holds no images: its frames are numbers"
             elif single and len(spec.streams) > 1:
                 why = f"has {len(spec.streams)} streams: name a folder for their videos"
-            for name in EQUAL:
+            for name in ("streams", "frame_shape", "dtype", "truth", "fps"):
                 if (a := getattr(first, name)) != (b := getattr(spec, name)):
                     why = f"has the {name} {b}, not {a} as {paths[0]}: export it separately"
             if why:
                 raise UsageError(f"{log[0]} {why}")
             about(source)
             yield source
-
-
-def _refuse_other_files(folder: Path) -> None:
-    """Refuse to replace a folder with files that no export wrote."""
-    for file in folder.rglob("*"):
-        if not file.is_dir() and file.suffix not in WRITTEN:
-            other = f"{folder} holds other files, such as {file.relative_to(folder)}"
-            raise UsageError(f"{other}: export into a new folder")

@@ -34,8 +34,8 @@ LOSSY = {"crf": "18", "preset": "medium"}
 # x264's lossless mode.
 EXACT = {"qp": "0", "preset": "medium"}
 
-# Chroma of gray.
-NEUTRAL = 128
+# Frames of a dataset from one key frame to the next, as in LeRobot: training reads single frames.
+KEY_EVERY = 2
 
 # FFmpeg's AVCOL_RANGE_JPEG: luma from 0 to 255.
 FULL_RANGE = 2
@@ -102,7 +102,6 @@ def write_video(
     file: Path,
     *,
     lossless: bool,
-    key_every: int = 0,
     spans: Sequence[Span] | None = None,
 ) -> int:
     """Write one stream as a video at the frame rate of its source, and return its frames.
@@ -115,8 +114,8 @@ def write_video(
         stream: number of the stream.
         file: the new file.
         lossless: keep every value.
-        key_every: frames from one key frame to the next; 0 leaves that to x264.
-        spans: write these frames without pauses; by default all, each at its time.
+        spans: write these frames for a dataset, without pauses and with a key frame every
+            `KEY_EVERY`; by default all, each at its time.
 
     Raises:
         UsageError: PyAV is not installed.
@@ -131,7 +130,7 @@ def write_video(
         **source.scene(),
     }
     rate = Fraction(spec.fps).limit_denominator(1001)
-    options = {**(EXACT if lossless else LOSSY), **({"g": str(key_every)} if key_every else {})}
+    options = (EXACT if lossless else LOSSY) | ({"g": str(KEY_EVERY)} if spans else {})
     try:
         with av.open(str(file), "w", format="mp4") as container:
             container.metadata["comment"] = json.dumps(comment)
@@ -158,7 +157,7 @@ def _video_frames(
     height, width = source.spec.frame_shape
     kind = pixel_format(source.spec.frame_shape)
     shape = (3, height, width) if kind == "yuv444p" else (height * 3 // 2, width)
-    planes = np.full(shape, NEUTRAL, dtype=np.uint8)
+    planes = np.full(shape, 128, dtype=np.uint8)  # 128 is the chroma of gray
     luma = planes[0] if planes.ndim == 3 else planes[:height]
     for block in pieces(source, stream, spans):
         for t, frame in enumerate(block.frames, start=block.t):

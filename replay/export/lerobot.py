@@ -26,14 +26,10 @@ from replay.export.frames import pieces, pixel_format, shared_spans, write_video
 from replay.logs.source import LoggedSource
 from replay.stored import Span
 
-VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 
 # LeRobot's limit for files in a folder. Each log is one video a stream; numbers are one table.
 FILES = 1000
-
-# Frames from one key frame to the next, as in LeRobot: training reads single frames.
-KEY_EVERY = 2
 
 # LeRobot's names of actions, of the state of a robot or an agent, and of other ground truth.
 ACTIONS, STATE, WORLD = "action", "observation.state", "observation.environment_state"
@@ -91,11 +87,12 @@ def write_dataset(
                 }
                 for i, (begin, end) in enumerate(itertools.pairwise(ends))
             ]
-            for stream, key in enumerate(_video_keys(source.spec)):
+            views = stream_names(source.spec.streams) if source.spec.images else []
+            for stream, view in enumerate(views):
+                key = f"observation.images.{view}"
                 features[key] = _video_feature(source.spec.frame_shape, fps)
                 file = _path(folder / "videos" / key, log, "mp4")
-                how: dict[str, Any] = {"lossless": lossless, "key_every": KEY_EVERY}
-                write_video(source, stream, file, spans=spans, **how)
+                write_video(source, stream, file, lossless=lossless, spans=spans)
                 for row, span in zip(rows, spans, strict=True):
                     row |= _file_number(f"videos/{key}", log)
                     for edge in ("from", "to"):
@@ -184,10 +181,6 @@ def _feature(values: NDArray[Any], names: list[str] | None) -> dict[str, Any]:
     return {"dtype": str(values.dtype), "shape": list(values.shape[1:]) or [1], "names": names}
 
 
-def _video_keys(spec: SourceSpec) -> list[str]:
-    return [f"observation.images.{n}" for n in stream_names(spec.streams)] if spec.images else []
-
-
 def _video_feature(shape: tuple[int, ...], fps: int) -> dict[str, Any]:
     height, width = shape
     return {
@@ -241,10 +234,17 @@ def _write_meta(
             row |= {f"stats/{key}/{name}": value.tolist() for name, value in values.items()}
         row |= _file_number("meta/episodes", 0)
     pq.write_table(pa.Table.from_pylist(episodes), _path(meta / "episodes", 0, "parquet"))
-    pq.write_table(_tasks(tasks), meta / "tasks.parquet")
+    # The table of tasks is as pandas writes it: the text is the index of the row.
+    index = "__index_level_0__"
+    kind = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    columns = [{"name": None, "field_name": index, **kind}]
+    pandas = {"index_columns": [index], "column_indexes": [], "columns": columns}
+    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks)})
+    table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+    pq.write_table(table, meta / "tasks.parquet")
     videos = any(feature["dtype"] == "video" for feature in features.values())
     info = {
-        "codebase_version": VERSION,
+        "codebase_version": "v3.0",
         "robot_type": None,
         "total_episodes": len(episodes),
         "total_frames": episodes[-1]["dataset_to_index"],
@@ -262,16 +262,6 @@ def _write_meta(
     whole = {key: aggregated([episode[key] for episode in stats]) for key in features}
     lists = {key: {n: v.tolist() for n, v in values.items()} for key, values in whole.items()}
     (meta / "stats.json").write_text(json.dumps(lists, indent=4), "utf-8")
-
-
-def _tasks(tasks: Mapping[str, int]) -> pa.Table:
-    """Return the table of tasks as pandas writes it: the text is the index of the row."""
-    index = "__index_level_0__"
-    kind = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-    columns = [{"name": None, "field_name": index, **kind}]
-    pandas = {"index_columns": [index], "column_indexes": [], "columns": columns}
-    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks)})
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
 def number_stats(values: NDArray[Any]) -> Stats:

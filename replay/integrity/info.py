@@ -173,16 +173,11 @@ def describe_reader(reader: LogReader, *, decode: bool | None = None) -> LogRepo
     counts = count_decoded(reader) if decode else _count_by_index(reader)
     report = report_on(reader, counts)
     if not decode:
-        return replace(report, crc="unchecked", state=_unchecked(report.state))
+        report = replace(report, crc="unchecked")
     # Chunks may be whole and the images of other writers in them broken: only verify decodes these.
     images = any(schema.name in SCHEMAS for schema in reader.schemas.values())
-    if report.kind == "foreign" and images:
-        return replace(report, state=_unchecked(report.state))
-    return report
-
-
-def _unchecked(state: State) -> State:
-    return "unchecked" if state == "whole" else state
+    unchecked = not decode or (report.kind == "foreign" and images)
+    return replace(report, state="unchecked") if unchecked and report.state == "whole" else report
 
 
 def report_on(reader: LogReader, counts: Mapping[int, ChannelCount]) -> LogReport:
@@ -193,9 +188,8 @@ def report_on(reader: LogReader, counts: Mapping[int, ChannelCount]) -> LogRepor
         undefined = Channel(number, f"(channel {number}, never defined)", "", {}, 0)
         channel = reader.channels.get(number, undefined)
         schema = reader.schemas.get(channel.schema_id)
-        kind = schema.name if schema else ""
-        entry = (channel.topic, channel.message_encoding, kind, count.messages)
-        channels.append(ChannelInfo(*entry, count.start, count.end, name))
+        entry = (channel.topic, channel.message_encoding, schema.name if schema else "")
+        channels.append(ChannelInfo(*entry, count.messages, count.start, count.end, name))
     segments = reader.segments
     metadata = {m.name: m.metadata for m in reader.metadata}
     state: State = "damaged" if reader.problems else "cut short" if reader.missing else "whole"

@@ -70,45 +70,38 @@ def run_facts(place: Path, channels: Sequence[ChannelInfo]) -> dict[str, Any]:
     if result.get("ended") is not None:
         facts["ended"] = str(result["ended"])
     with contextlib.suppress(*_NO_SENSE):
-        facts["held_out"] = _held_out(result["held_out"])
+        stated = result["held_out"]
+        facts["held_out"] = {
+            **{key: [int(t) for t in stated[key]][:2] for key in ("frames", "fitted")},
+            "modules": [
+                {"module": int(entry["module"]), "stream": str(entry["stream"])}
+                | {
+                    key: [math.nan if v is None else float(v) for v in entry[key]]
+                    for key in ("slowness", "of_batch")
+                }
+                for entry in stated["modules"]
+            ],
+        }
     outcomes: list[Mapping[str, Any]] = []
     with contextlib.suppress(*_NO_SENSE):
         for stated in result["streams"]:
-            outcomes.append(_outcome(stated))
+            outcomes.append(
+                {
+                    "stream": str(stated["stream"]),
+                    "state": STATES[STATES.index(stated["state"])],  # refuses an unknown state
+                    "module": None if stated["module"] is None else int(stated["module"]),
+                    "blocks": int(stated["blocks"]),
+                    "slowness": None if stated["slowness"] is None else float(stated["slowness"]),
+                    "why": str(stated["why"]),
+                }
+            )
     with contextlib.suppress(CdmisfaError, TypeError, ValueError):
         header = read_header(folder)
-        algorithm, tau = (header.setting("learner", key) for key in ("algorithm", "tau"))
-        count = sum(c.messages for c in channels if c.topic == SIGNALS_TOPIC)
         facts["run"] = {
-            "algorithm": str(algorithm),
+            "algorithm": str(header.setting("learner", "algorithm")),
             "streams": header.spec.streams,
-            "tau": int(tau),
-            "iterations": count,
+            "tau": int(header.setting("learner", "tau")),
+            "iterations": sum(c.messages for c in channels if c.topic == SIGNALS_TOPIC),
             "outcomes": outcomes,
         }
     return facts
-
-
-def _held_out(stated: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the slowness of modules on held-out frames, as a result states it."""
-    numbers = ("slowness", "of_batch")
-    return {
-        **{key: [int(t) for t in stated[key]][:2] for key in ("frames", "fitted")},
-        "modules": [
-            {"module": int(entry["module"]), "stream": str(entry["stream"])}
-            | {key: [math.nan if v is None else float(v) for v in entry[key]] for key in numbers}
-            for entry in stated["modules"]
-        ],
-    }
-
-
-def _outcome(stated: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the outcome of a stream, as a result states it; a state that is none is refused."""
-    return {
-        "stream": str(stated["stream"]),
-        "state": STATES[STATES.index(stated["state"])],
-        "module": None if stated["module"] is None else int(stated["module"]),
-        "blocks": int(stated["blocks"]),
-        "slowness": None if stated["slowness"] is None else float(stated["slowness"]),
-        "why": str(stated["why"]),
-    }

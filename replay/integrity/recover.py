@@ -27,11 +27,6 @@ from replay.logs.opening import only_external
 from replay.storage.location import location
 from replay.storage.opening import log_files
 
-# Most channels of a chunk whose indexes are repaired: each is compared with each.
-_MOST_CHANNELS: Final = 64
-# Share of equal bytes at which bytes are taken for a damaged copy of an index; chance gives 1/256,
-# and more for the zeros of small numbers.
-_ALIKE: Final = 0.5
 # Most bytes that are repaired, because they are held in memory.
 _MOST_BYTES: Final = 64 * 1024 * 1024
 
@@ -119,8 +114,8 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
             store = repair(reader)
             repaired = [Problem(f"{src}: {p.where}", p.what) for p in store.repaired]
             reader = stack.enter_context(LogReader(store, salvage=True))
-        content = reader.channels or reader.metadata or reader.attachments
-        if alone and reader.missing and not content:  # in a folder, other logs may hold something
+        empty = not (reader.channels or reader.metadata or reader.attachments)
+        if alone and reader.missing and empty:  # in a folder, other logs may hold something
             raise LogDamagedError(f"{src}: nothing in it can be saved, and nothing was written")
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
@@ -272,7 +267,8 @@ def _indexes(store: Store, chunk: Segment, end: int, table: MessageTable) -> byt
     The order is not known: the index that is most like the bytes at a place was there.
     """
     left = [table.index(number) for number in np.unique(table.channel).tolist()]
-    if len(left) > _MOST_CHANNELS or sum(map(len, left)) > end - chunk.data_end:
+    # Each of the channels is compared with each, so only up to 64 are repaired.
+    if len(left) > 64 or sum(map(len, left)) > end - chunk.data_end:
         return b""
     made = b""
     while left:
@@ -280,7 +276,8 @@ def _indexes(store: Store, chunk: Segment, end: int, table: MessageTable) -> byt
         indexes = [np.frombuffer(index, np.uint8) for index in left]
         alike = [float((there[: len(i)] == i[: len(there)]).mean()) for i in indexes]
         best = int(np.argmax(alike))
-        if alike[best] < _ALIKE and not chunk.stated:
+        # Chance makes 1/256 of the bytes equal, and more for the zeros of small numbers.
+        if alike[best] < 0.5 and not chunk.stated:
             return b""  # a chunk without indexes, as far as anything tells
         made += left.pop(best)
     return made

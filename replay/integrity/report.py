@@ -157,9 +157,7 @@ class LogReport:
 
 
 def combined(
-    path: str,
-    reports: Sequence[LogReport],
-    problems: Iterable[Problem] = (),
+    path: str, reports: Sequence[LogReport], problems: Iterable[Problem] = ()
 ) -> LogReport:
     """Return one report on the files of several reports.
 

@@ -233,7 +233,17 @@ class _RunContent(_Content):
             yield Problem(str(facts), "is missing, empty or no JSON")
         elif facts_sha256(self._document) != self._final.get("facts_sha256"):
             yield Problem(str(facts), "states something else than the run's final record")
-        yield from _check_modules(self._folder / MODULES_FILE, self._final.get("modules_sha256"))
+        modules, stated = self._folder / MODULES_FILE, self._final.get("modules_sha256")
+        try:
+            if not modules.is_file():
+                yield Problem(str(modules), "is missing")
+            elif hashlib.sha256(read_regular(modules, MAX_BYTES)).hexdigest() != stated:
+                what = "holds something else than the run's final record states"
+                yield Problem(str(modules), what)
+            else:
+                load_modules(modules)
+        except CdmisfaError as error:
+            yield as_problem(modules, error)
         view = self._folder / VIEW_FILE
         if self._final.get("view") == json.dumps(True) and not view.is_file():
             yield Problem(str(view), f"is missing; {view_again(self._folder)}")
@@ -260,18 +270,6 @@ def view_again(run: Path) -> str:
     return f"make it again with {shlex.join(command)}"
 
 
-def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
-    try:
-        if not path.is_file():
-            yield Problem(str(path), "is missing")
-        elif hashlib.sha256(read_regular(path, MAX_BYTES)).hexdigest() != stated:
-            yield Problem(str(path), "holds something else than the run's final record states")
-        else:
-            load_modules(path)
-    except CdmisfaError as error:
-        yield as_problem(path, error)
-
-
 def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Problem]:
     """Yield missing frames and views of a recording, of which one file was checked or all."""
     folder = str(contents[0].path.parent)
@@ -286,7 +284,14 @@ def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Probl
         if content.error is not None:
             yield as_problem(content.path, content.error)
     if not alone:
-        yield from _missing_views(folder, views)
+        facts = [view.facts for view in views]
+        streams = {name for stated in facts for name in stated.streams if name}
+        for name in sorted(streams - {stated.view for stated in facts}):
+            yield Problem(folder, f"the view {name!r} of the recording has no file")
+        count = max((stated.stream_count for stated in facts), default=0)
+        if absent := set(range(count)) - {stated.stream_index for stated in facts}:
+            what = f"of the recording's views 0 to {count - 1} {len(absent)} have no file"
+            yield Problem(folder, f"{what}, the first is {min(absent)}")
     if any(content.error is not None for content in contents):
         return
     try:
@@ -299,18 +304,6 @@ def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Probl
         if end > min(ends.values()):
             what = f"the view {name!r} ends before frame {end}, another before "
             yield Problem(folder, f"{what}{min(ends.values())}")
-
-
-def _missing_views(folder: str, views: list[ViewFile]) -> Iterator[Problem]:
-    """Yield the views of a recording that have no file, by their names or, if many, numbers."""
-    facts = [view.facts for view in views]
-    streams = {name for stated in facts for name in stated.streams if name}
-    for name in sorted(streams - {stated.view for stated in facts}):
-        yield Problem(folder, f"the view {name!r} of the recording has no file")
-    count = max((stated.stream_count for stated in facts), default=0)
-    if absent := set(range(count)) - {stated.stream_index for stated in facts}:
-        what = f"of the recording's views 0 to {count - 1} {len(absent)} have no file, the first is"
-        yield Problem(folder, f"{what} {min(absent)}")
 
 
 # Camera logs

@@ -37,9 +37,6 @@ CURVES = {
 # Those of them that fall over several powers of ten.
 LOGARITHMIC = ("learning_error", "eta_dot", "tested")
 
-# Runs whose timelines are drawn: more make the page too large.
-TIMELINES = 24
-
 
 def report_of_run(path: Path, reproducible: str = "not examined", again: str = "") -> str:
     """Return the page of a run.
@@ -84,7 +81,8 @@ def report_of_runs(paths: Sequence[Path], title: str) -> str:
             "curves": [plot for plot in plots if plot is not None],
             "timelines": [
                 (row.name, timeline(row.outline), command("report", path))
-                for path, row in zip(paths[:TIMELINES], rows, strict=False)
+                # More timelines would make the page too large.
+                for path, row in zip(paths[:24], rows, strict=False)
                 if row.outline.iterations
             ],
             "compare": command("compare", *paths, "--save", "both.rrd") if len(paths) < 5 else "",

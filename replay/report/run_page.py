@@ -58,6 +58,10 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
     """Return the variables of run.html; see `report_of_run`."""
     outline, rules = run.outline, measurements_of(run.outline)
     frames: dict[str, dict[str, Any]] = {}
+    ended = str(run.result.get("ended", "interrupted")).replace("_", " ")
+    for event in run.events if run.result else ():
+        if event.text.startswith("ended: "):
+            ended = event.text.removeprefix("ended: ")
     pointed = "timeline" if run.watched.columns else ""
     lanes = timeline(outline, pointed) if outline.iterations else None
     if lanes is not None and pointed:
@@ -71,7 +75,7 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         "run": run,
         "outline": outline,
         "reproducible": reproducible,
-        "ended": _ended(run),
+        "ended": ended,
         "attention": sorted(
             zip(outline.visits.tolist(), run.spec.streams, strict=True), key=lambda row: -row[0]
         ),
@@ -92,13 +96,6 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         "view": command("view", run.path),
         "frames": frames,
     }
-
-
-def _ended(run: RunData) -> str:
-    texts = [event.text for event in run.events if event.text.startswith("ended: ")]
-    if run.result and texts:
-        return texts[-1].removeprefix("ended: ")
-    return str(run.result.get("ended", "interrupted")).replace("_", " ")
 
 
 def _lead(run: RunData) -> str:
