@@ -147,9 +147,8 @@ def _describe_external(place: Path, most: int) -> LogReport:
     if most and kind == "pictures":
         broken = broken_images(image_files(place), most)
     crc: Crc = "absent" if broken is None else "bad" if broken else "ok"
-    state: State = "damaged" if broken else "unchecked" if broken is None else "whole"
-    if kind == "arrays":  # whole if they can be loaded
-        state = "whole"
+    unchecked = broken is None and kind != "arrays"  # arrays are whole if they can be loaded
+    state: State = "damaged" if broken else "unchecked" if unchecked else "whole"
     files = [place] if place.is_file() else place.rglob("*")
     return LogReport(
         path=str(place),

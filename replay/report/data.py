@@ -59,10 +59,8 @@ class ModuleData:
         self.frozen, self._spec = frozen, spec
         self.stream = OwnStream(frozen, spec)
         self.outputs, self.frames = Thinned(MOST_OUTPUTS), Thinned(frames)
-        self.recent: tuple[NDArray[Any], NDArray[Any]] = (
-            np.empty(0, np.int64),
-            np.empty((0, len(frozen.eta))),
-        )
+        outputs = np.empty((0, len(frozen.eta)))
+        self.recent: tuple[NDArray[Any], NDArray[Any]] = np.empty(0, np.int64), outputs
 
     def add(self, batch: Batch) -> None:
         """Take the next batch of the log in."""
@@ -74,10 +72,8 @@ class ModuleData:
                 truth[known] = values[row[known]]
             self.outputs.add(t, y, truth)
             self.frames.add(t, frames, y[:, 0])
-            self.recent = (
-                np.concatenate([self.recent[0], t])[-RECENT:],
-                np.concatenate([self.recent[1], y])[-RECENT:],
-            )
+            old_t, old_y = self.recent
+            self.recent = np.append(old_t, t)[-RECENT:], np.concatenate([old_y, y])[-RECENT:]
 
     def fits(self) -> list[Fit]:
         """Return which true quantities the first output follows, the best first."""

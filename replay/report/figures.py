@@ -281,11 +281,6 @@ def sheet(images: Sequence[NDArray[np.uint8]], columns: int, gap: int = 0) -> ND
     return whole
 
 
-def weights_image(weights: FloatArray) -> str:
-    """Return weights as an image: blue below 0, white at 0, orange above."""
-    return data_uri(shade(reduced(weights, WEIGHTS)))
-
-
 def saliency_image(saliency: FloatArray, mean: FloatArray) -> str:
     """Return saliency in blue and orange over the mean image in gray."""
     values = reduced(saliency, WEIGHTS)

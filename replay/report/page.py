@@ -34,9 +34,6 @@ CURVES = {
     "epsilon": "Probability of a random action ε",
 }
 
-# Those of them that fall over several powers of ten.
-LOGARITHMIC = ("learning_error", "eta_dot", "tested")
-
 
 def report_of_run(path: Path, reproducible: str = "not examined", again: str = "") -> str:
     """Return the page of a run.
@@ -67,9 +64,8 @@ def report_of_runs(paths: Sequence[Path], title: str) -> str:
     """
     rows = side_by_side(paths)
     outlines = [row.outline for row in rows]
-    plots = [
-        curves(name, outlines, about, log=name in LOGARITHMIC) for name, about in CURVES.items()
-    ]
+    powers = ("learning_error", "eta_dot", "tested")  # these fall over several powers of ten
+    plots = [curves(name, outlines, about, log=name in powers) for name, about in CURVES.items()]
     return _rendered(
         {
             "kind": "runs",

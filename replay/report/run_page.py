@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.signals import STATES
+from replay.palette import shade
 from replay.report.data import ModuleData, RunData
 from replay.report.figures import (
     FRAME,
     THUMBNAIL,
+    WEIGHTS,
     bars,
     colour_class,
     data_uri,
@@ -28,7 +30,6 @@ from replay.report.figures import (
     sheet,
     timeline,
     truth_plot,
-    weights_image,
 )
 from replay.report.measurements import Measurement, attempts, measurements_of
 
@@ -40,13 +41,6 @@ SECTIONS = 12
 
 # Files of a source that are listed; run.json lists all.
 MOST_FILES = 100
-
-# Slowness on new frames over that on frames learned from, from which a table marks it: a module
-# that has learned accidents of its frames is slower on them than on others.
-OVERFITTED = 1.25
-
-# Correlation from which a table marks two modules as alike: `SAME` of the progress learner.
-ALIKE = 0.8
 
 
 def command(*words: object) -> str:
@@ -187,12 +181,10 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
         "frames": module.stream.count,
         "fits": fits,
         "overfitting": _overfitting(run, frozen.iteration),
-        "overfitted": OVERFITTED,
         "alike": max(
             ((module.correlation(m), m.frozen.index) for m in run.modules if m is not module),
             default=(0.0, 0),
         ),
-        "most_alike": ALIKE,
         "after": 0,
         "plot": None,
         "truth": truth_plot(module, fits[0]) if fits else None,
@@ -240,7 +232,8 @@ def _weights(module: ModuleData, *, images: bool) -> dict[str, Any]:
     if images and weights is not None and saliency is not None:
         return {
             "bars": None,
-            "weights": weights_image(weights),
+            # Blue below 0, white at 0, orange above.
+            "weights": data_uri(shade(reduced(weights, WEIGHTS))),
             "saliency": saliency_image(saliency, stream.mean) if stream.count else "",
         }
     kind = "expanded inputs" if weights is None else "numbers of a frame"
