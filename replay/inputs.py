@@ -109,7 +109,7 @@ def open_recording(
     files: list[ViewFile] = []
     broken: list[LogDamagedError] = []
     with ExitStack() as failed:
-        for path in log_files(named):
+        for path in [file for place in named for file in log_files(place)]:
             if views.only_begun(path):
                 continue
             try:

@@ -14,33 +14,28 @@ from recorder.mcap.store import PARTIAL
 from replay.storage.location import location
 
 
-def log_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """List the MCAP files of folders, and files that are named.
+def log_files(path: str | Path) -> list[Path]:
+    """List the MCAP files of a folder; of a file itself.
 
     In a folder a `.partial` counts where the finished file is not there.
 
     Raises:
         UsageError: there is none.
     """
-    if isinstance(paths, str | Path):
-        paths = [paths]
-    files: list[Path] = []
-    for path in map(location, paths):
-        if path.is_dir():
-            whole = sorted(path.glob("*.mcap"))
-            cut = sorted(path.glob(f"*.mcap{PARTIAL}"))
-            logs = whole + [p for p in cut if p.with_suffix("") not in whole]
-            if not logs:
-                raise UsageError(
-                    f"{path}: no log in this folder; {KINDS}; record or learn first, or name each "
-                    "video, bag, table or folder of pictures in it, or cdmisfa index all of them"
-                )
-            files += logs
-        elif path.exists():
-            files.append(path)
-        else:
-            raise no_such(path)
-    return files
+    path = location(path)
+    if not path.exists():
+        raise no_such(path)
+    if not path.is_dir():
+        return [path]
+    whole = sorted(path.glob("*.mcap"))
+    cut = sorted(path.glob(f"*.mcap{PARTIAL}"))
+    logs = whole + [p for p in cut if p.with_suffix("") not in whole]
+    if not logs:
+        raise UsageError(
+            f"{path}: no log in this folder; {KINDS}; record or learn first, or name each "
+            "video, bag, table or folder of pictures in it, or cdmisfa index all of them"
+        )
+    return logs
 
 
 def no_such(path: Path, words: Iterable[str] = (), remedy: str = "") -> UsageError:

@@ -105,12 +105,12 @@ def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
         if path.suffix.lower() == ".npy":
             return {path.stem: np.lib.format.open_memmap(path, mode="r")}
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            large = sum(member.file_size for member in stored.zip.infolist()) > BUDGET
-            arrays = {} if large else {name: stored[name] for name in stored.files}
-    except NOT_ARRAYS as error:
-        raise LogDamagedError(f"{path} is no file of NumPy's arrays: {one_line(error)}") from error
-    if large:
-        raise UsageError(f"{path}: more than {BUDGET >> 20} MiB of arrays: save each as .npy")
+            if sum(member.file_size for member in stored.zip.infolist()) > BUDGET:
+                raise UsageError(f"{path}: more than {BUDGET >> 20} MiB of arrays: save it as .npy")
+            arrays = {name: stored[name] for name in stored.files}
+    except NOT_ARRAYS as error:  # NumPy would advise to run what the file holds
+        why = "Python objects, or something else" if "pickle" in str(error) else one_line(error)
+        raise LogDamagedError(f"{path} is no file of NumPy's arrays: {why}") from error
     if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise LogDamagedError(f"{path} is no file of NumPy's arrays: it holds none")
     return arrays

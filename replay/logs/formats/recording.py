@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.message import DecodeError
 from mcap.records import Channel
 from numpy.typing import NDArray
 
@@ -38,6 +37,7 @@ from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Segment
 from replay.logs.clock import intersection
+from replay.logs.stream import explained
 from replay.stored import Span
 
 
@@ -164,16 +164,11 @@ class ViewFile:
         if frames.layout is not None or not frames.ranges:
             return
         if facts.spec.images:
-            try:
+            with explained(self.path, "protobuf"):
                 image = RawImage.FromString(frames.payload(frames.ranges[0].start))
-            except DecodeError:
-                image = RawImage()
             stated = image.height, image.width, image.step, image.encoding
             if stated != (*facts.frame_shape, facts.frame_shape[1], IMAGE_ENCODING):
-                raise LogDamagedError(
-                    f"{self.path}: its frames are {image.height}x{image.width} in "
-                    f"{image.encoding!r}, its metadata says {facts.frame_shape} in mono8"
-                )
+                raise LogDamagedError(f"{self.path}: its frames are not as its metadata states")
             payload = image_payload(image.height, image.width, image.frame_id)
         else:
             frames.payload(frames.ranges[0].start)

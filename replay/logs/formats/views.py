@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 from foxglove_schemas_protobuf import PoseInFrame_pb2
-from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
@@ -21,7 +20,7 @@ from recorder.log.messages import POSE_TOPIC
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import PARTIAL
 from replay.logs.formats.recording import ViewFile
-from replay.logs.stream import LogStream, Rows
+from replay.logs.stream import LogStream, Rows, explained
 
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
 
@@ -143,9 +142,7 @@ def first_pose(reader: LogReader) -> HeadPose | None:
     entry = next(reader.messages({POSE_TOPIC}), None)
     if entry is None:
         return None
-    try:
+    with explained(f"{reader.path} {POSE_TOPIC}", "protobuf"):
         pose = PoseInFrame_pb2.PoseInFrame.FromString(entry.data).pose
-    except DecodeError as error:
-        raise LogDamagedError(f"{reader.path} {POSE_TOPIC}: not a foxglove.PoseInFrame") from error
     place, turn = pose.position, pose.orientation
     return HeadPose((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
