@@ -105,8 +105,7 @@ class RecordedWhileWatched(ForwardSource):
         """Finish the files."""
         for stream, view in enumerate(self.spec.streams):
             if counts := self.alignment.get(view):
-                counted = {name: str(count) for name, count in counts.items()}
-                self._logs.add_metadata(stream, COUNTS, counted)
+                self._logs.add_metadata(stream, COUNTS, {k: str(n) for k, n in counts.items()})
         self.files = self._logs.finish()
 
     def close(self) -> None:

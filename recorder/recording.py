@@ -198,16 +198,9 @@ class ViewLogs:
                 earlier = set_log_aside(place)
                 if place.complete:
                     continue
-                self._logs[streams.index(view)] = log = ViewLog(
-                    folder,
-                    view,
-                    recording,
-                    settings,
-                    pose=pose_of.get(view),
-                    split=split,
-                    parts=self._parts[view],
-                    first=place.first,
-                )
+                pose, parts = pose_of.get(view), self._parts[view]
+                log = ViewLog(folder, view, recording, settings, pose, split, parts, place.first)
+                self._logs[streams.index(view)] = log
                 if earlier is not None:
                     log.copy(earlier, place.stop)
         except BaseException:
@@ -316,10 +309,6 @@ def recording_spec(
         gaps = bool(getattr(source, "gaps", False))
         return RecordingSpec(stated["kind"], known, spec, {"source": stated}, gaps=gaps)
     clock = replace(settings, fps=spec.fps, start_ns=spec.start_ns)
-    return RecordingSpec(
-        scene.name,
-        scene.config.seed or 0,
-        spec,
-        {"scene": scene.table(), "record": section_table(clock)},
-        SCENES[scene.name].packages,
-    )
+    config = {"scene": scene.table(), "record": section_table(clock)}
+    seed, packages = scene.config.seed or 0, SCENES[scene.name].packages
+    return RecordingSpec(scene.name, seed, spec, config, packages)

@@ -234,7 +234,18 @@ class ForwardSource(Described, FrameSource):
             LogExhaustedError: the source ends before.
             ValueError: no such stream, or n < 1.
         """
-        return take_unbroken(self, stream, n)
+        check_request(self.spec, stream, n)
+        run: list[Block] = []
+        held = 0
+        while held < n:
+            for block in self.take_all(n - held):
+                if block.stream != stream:
+                    continue
+                if run and run[-1].t + len(run[-1]) != block.t:
+                    run, held = [], 0
+                run.append(block)
+                held += len(block)
+        return _as_one(run)
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -318,32 +329,6 @@ def check_request(spec: SourceSpec, stream: int, n: int) -> None:
         raise ValueError(f"stream {stream} does not exist: there are {len(spec.streams)}")
     if n < 1:
         raise ValueError(f"a block has at least one frame, not {n}")
-
-
-def take_unbroken(source: FrameSource, stream: int, n: int) -> Block:
-    """The next n frames of a stream that follow one another, from what all streams show.
-
-    Args:
-        source: its `take_all` is used; moves to behind the block.
-        stream: the index of the stream.
-        n: how many.
-
-    Raises:
-        LogExhaustedError: the source ends before.
-        ValueError: no such stream, or n < 1.
-    """
-    check_request(source.spec, stream, n)
-    run: list[Block] = []
-    held = 0
-    while held < n:
-        for block in source.take_all(n - held):
-            if block.stream != stream:
-                continue
-            if run and run[-1].t + len(run[-1]) != block.t:
-                run, held = [], 0
-            run.append(block)
-            held += len(block)
-    return _as_one(run)
 
 
 def unbroken(blocks: Iterable[Block]) -> list[Block]:

@@ -28,7 +28,6 @@ from cdmisfa.core.untrusted import read_regular
 
 T = TypeVar("T")
 
-LN_2 = 0.6931471805599453
 
 # Largest whole number of a key: what a signed integer of 64 bits holds.
 LARGEST = 2**63 - 1
@@ -194,7 +193,7 @@ class LearnerConfig(Section):
         """
         if self.beta is not None:
             return self.beta
-        return self.nu * LN_2 / (2.0 * max(n_streams - 1, 1))
+        return self.nu * math.log(2) / (2.0 * max(n_streams - 1, 1))
 
 
 _hints: Any = cache(typing.get_type_hints)

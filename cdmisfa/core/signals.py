@@ -178,14 +178,12 @@ class BlockSignals:
     tested: float = _signal(
         "η_test",
         "Slowness of the candidate on frames before it learned from them; progress learner only.",
-        "",
-        "1/frame",
+        unit="1/frame",
     )
     fitted: float = _signal(
         "η_fit",
         "Slowness of the candidate on what it learned from; progress learner only.",
-        "",
-        "1/frame",
+        unit="1/frame",
     )
     learning_error: float = _signal(
         "e", "Learning error of the candidate, c + |ln(η_test / η_fit)|; progress learner only."
@@ -206,8 +204,7 @@ class BlockSignals:
         "η_typ",
         "Slowness of the stream's typical direction, beside which the candidate is slow or not; "
         "progress learner only.",
-        "",
-        "1/frame",
+        unit="1/frame",
     )
     regret: float = _signal(
         "",

@@ -38,10 +38,7 @@ def printable(text: str) -> str:
 
     Controls, line breaks and marks that turn text around are written as in a Python string.
     """
-    if text.isprintable():
-        return text
-    letters = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return "".join(letters)
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextlib.contextmanager

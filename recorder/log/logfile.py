@@ -198,15 +198,8 @@ class LogFile(McapWriter):
         """Whether the file was finished or abandoned."""
         return self._stream.closed
 
-    def write(
-        self,
-        channel: int,
-        log_time: int,
-        data: bytes,
-        sequence: int = 0,
-        publish_time: int | None = None,
-    ) -> None:
-        """Write a message.
+    def write(self, channel: int, log_time: int, data: bytes, sequence: int = 0) -> None:
+        """Write a message that was published at its log time.
 
         Once `flush_ns` of log time have passed since the chunk began, it is flushed first.
 
@@ -215,10 +208,8 @@ class LogFile(McapWriter):
             log_time: nanoseconds.
             data: the encoded message.
             sequence: the publisher's counter.
-            publish_time: nanoseconds; by default the log time.
         """
-        published = log_time if publish_time is None else publish_time
-        self.write_all(((channel, log_time, data, published, sequence),))
+        self.write_all(((channel, log_time, data, log_time, sequence),))
 
     def write_all(self, messages: Sequence[tuple[int, int, bytes, int, int]]) -> None:
         """Write messages that are flushed together, at least one.

@@ -149,16 +149,9 @@ class ImageEncoder(Encoder):
     def __init__(self, height: int, width: int, frame_id: str) -> None:
         payload = image_payload(height, width, frame_id)
         self._size = payload.size
-        super().__init__(
-            RawImage_pb2.RawImage(
-                width=width,
-                height=height,
-                step=width,
-                encoding=IMAGE_ENCODING,
-                frame_id=frame_id,
-                data=bytes(payload.size),
-            )
-        )
+        image = RawImage_pb2.RawImage(width=width, height=height, step=width, frame_id=frame_id)
+        image.encoding, image.data = IMAGE_ENCODING, bytes(payload.size)
+        super().__init__(image)
         blank = self._message.SerializeToString()
         end = len(blank) - payload.tail
         # All but its time and its pixels is the same in every message of the view, and protobuf
@@ -211,17 +204,13 @@ class TruthEncoder(Encoder):
                 f"not {', '.join(map(repr, names))[:200]}"
             )
         # Explicit presence: a zero is written too, so that every message has the same layout.
+        double: Any = {"type": _FIELD.TYPE_DOUBLE, "label": _FIELD.LABEL_OPTIONAL}
         fields = [
-            _FIELD(
-                name=name,
-                number=_FIRST_TRUTH_FIELD + i,
-                type=_FIELD.TYPE_DOUBLE,
-                label=_FIELD.LABEL_OPTIONAL,
-                proto3_optional=True,
-                oneof_index=i,
-            )
+            _FIELD(name=name, number=i + _FIRST_TRUTH_FIELD, oneof_index=i, **double)
             for i, name in enumerate(names)
         ]
+        for field in fields:
+            field.proto3_optional = True
         super().__init__(_message("GroundTruth", fields))
 
     def __call__(self, time_ns: int, values: FloatArray) -> bytes:
@@ -345,20 +334,13 @@ def descriptor_set(descriptor: Any) -> bytes:
 
 def _message(name: str, fields: Sequence[Any]) -> Any:
     """Make an empty message of package cdmisfa: a timestamp as field 1, then the fields."""
+    imports = [timestamp_pb2.DESCRIPTOR.name]
     file = descriptor_pb2.FileDescriptorProto(
-        name=f"cdmisfa/{name}.proto",
-        package="cdmisfa",
-        syntax="proto3",
-        dependency=[timestamp_pb2.DESCRIPTOR.name],
+        name=f"cdmisfa/{name}.proto", package="cdmisfa", syntax="proto3", dependency=imports
     )
     message = file.message_type.add(name=name)
-    message.field.add(
-        name="timestamp",
-        number=1,
-        type=_FIELD.TYPE_MESSAGE,
-        label=_FIELD.LABEL_OPTIONAL,
-        type_name=".google.protobuf.Timestamp",
-    )
+    time = message.field.add(name="timestamp", number=1, type_name=".google.protobuf.Timestamp")
+    time.type, time.label = _FIELD.TYPE_MESSAGE, _FIELD.LABEL_OPTIONAL
     message.field.extend(fields)
     for field in fields:
         if field.proto3_optional:

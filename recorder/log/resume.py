@@ -224,7 +224,13 @@ def _resume_view(
         log = max(attempts, key=lambda p: files[p].stop_from(first), default=path)
         stop = files[log].stop_from(first) if attempts else first
         if stop > first:
-            _refuse_other(log, recording.metadata(view, first))
+            found = _recording_metadata(log) or {}
+            for key, value in recording.metadata(view, first).record().items():
+                if found.get(key) != value:
+                    raise UsageError(
+                        f"{log} cannot be continued: its {key} is {found.get(key)!r}, now it is "
+                        f"{value!r}; use the same command and versions, or overwrite with --force"
+                    )
         follows = any(files[p].end or p.suffix == ".mcap" for p in later)
         if stop > first and log == path and (follows or stop == frames or ended):
             parts.append((path, files[path].frames))
@@ -243,17 +249,6 @@ def _resume_view(
         if stop > first:
             return ViewResume(path, tuple(parts), first, log, stop, (*stale, *later))
         return ViewResume(path, tuple(parts), first, stale=(*stale, *attempts, *later))
-
-
-def _refuse_other(path: Path, stated: ViewMetadata) -> None:
-    """Refuse to resume a log that states something else."""
-    found = _recording_metadata(path) or {}
-    for key, value in stated.record().items():
-        if found.get(key) != value:
-            raise UsageError(
-                f"{path} cannot be continued: its {key} is {found.get(key)!r}, now it is "
-                f"{value!r}; use the same command and versions, or overwrite with --force"
-            )
 
 
 def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:

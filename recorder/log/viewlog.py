@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from cdmisfa.core.blocks import Block, HeadPose
 from cdmisfa.core.errors import LogDamagedError
@@ -70,7 +70,6 @@ class ViewLog:
         view: str,
         recording: RecordingSpec,
         settings: RecordConfig,
-        *,
         pose: HeadPose | None = None,
         split: float | None = None,
         parts: list[tuple[Path, int]] | None = None,
@@ -105,9 +104,11 @@ class ViewLog:
         for t, (frame, truth) in enumerate(zip(block.frames, block.truth, strict=True), block.t):
             if self._length is not None and self.t - self._first >= self._length:
                 self._begin_next_part()
-            self.t = t
-            self._write_frame(frame, truth)
-            self.t += 1
+            time, begins = self._spec.time_ns(t), t % self._second == 0 or t == self._first
+            for topic in (*self._still, *self._moving) if begins else self._moving:
+                data = self._encoders[topic](time, frame if topic == self._topic else truth)
+                self._file.write(self._channels[topic], time, data, t)
+            self.t = t + 1
             self._frames += 1
 
     def copy(self, path: Path, stop: int) -> None:
@@ -176,13 +177,6 @@ class ViewLog:
         finally:
             full.finish()
         aside_path(full.path).unlink(missing_ok=True)
-
-    def _write_frame(self, frame: Any, truth: Any) -> None:
-        time = self._spec.time_ns(self.t)
-        begins = self.t % self._second == 0 or self.t == self._first
-        for topic in (*self._still, *self._moving) if begins else self._moving:
-            data = self._encoders[topic](time, frame if topic == self._topic else truth)
-            self._file.write(self._channels[topic], time, data, self.t)
 
 
 def _encoders(view: str, recording: RecordingSpec, pose: HeadPose | None) -> dict[str, Encoder]:

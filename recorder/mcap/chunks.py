@@ -100,12 +100,8 @@ class MessageTable:
     def index(self, channel: int) -> bytes:
         """Return the message index of a channel: time and place of each message, in file order."""
         rows = self.channel == channel
-        pairs = np.stack(
-            [self.log_time[rows], self.at[rows] - MESSAGE_HEADER.size],
-            1,
-            dtype="<u8",
-            casting="unsafe",
-        )
+        columns = self.log_time[rows], self.at[rows] - MESSAGE_HEADER.size
+        pairs = np.stack(columns, 1, dtype="<u8", casting="unsafe")
         head = INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, pairs.nbytes + 6, channel, pairs.nbytes)
         return head + pairs.tobytes()
 

@@ -210,7 +210,7 @@ class LogStructure:
         """Read the next record; return whether the file does not end there."""
         head = self.file.peek(self._at, RECORD_HEADER.size) if self._at < limit else b""
         if len(head) < RECORD_HEADER.size or self._at + RECORD_HEADER.size > limit:
-            return self._cut("the end of the file and its index are missing", limit)
+            return self._cut("the end of the file and its index are missing")
         opcode, length = RECORD_HEADER.unpack(head)
         content = self._at + RECORD_HEADER.size
         end = content + length
@@ -218,7 +218,7 @@ class LogStructure:
             # Some file systems leave zeros where data did not reach the disk before a power cut.
             rest = self.file.blocks(self._at, self.file.size)
             if self._limit is None and not any(map(any, rest)):
-                return self._cut(f"from byte {self._at} on there are only zeros", limit)
+                return self._cut(f"from byte {self._at} on there are only zeros")
             raise MalformedRecord("no record (opcode 0)")
         inner = inner_end(self.file, opcode, content) if self.salvage else None
         if inner is not None and inner < end and is_record(self.file, inner, limit):
@@ -230,8 +230,7 @@ class LogStructure:
                 self.torn = cut_chunk(self.file, content, length, limit)
             return self._cut(
                 f"the file ends within a record at byte {self._at}, {limit - self._at} bytes of it "
-                "are there",
-                limit,
+                "are there"
             )
         if self._at == len(MAGIC) and opcode != Opcode.HEADER:
             raise MalformedRecord("the file does not begin with a header record")
@@ -345,13 +344,9 @@ class LogStructure:
 
     # The end of the file
 
-    def _cut(self, what: str, limit: int) -> bool:
+    def _cut(self, what: str) -> bool:
         if self._limit is not None:
-            raise MalformedRecord(
-                "a record runs into the summary"
-                if self._at < limit
-                else "the data section has no end record"
-            )
+            raise MalformedRecord("the data section has no end record before the summary")
         self.missing = f"cut short: {what}"
         if self.torn is not None and self.torn.crc and not self.salvage:
             self.missing += "; recover can save part of the last chunk, unverified"

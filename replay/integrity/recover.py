@@ -169,7 +169,7 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, ChannelCount], int
         unverified += len(table) if segment.cut and segment.crc else 0
         for number, sequence, log_time, published, data in table.rows():
             if number in written:
-                log.write(written[number], log_time, data, sequence, published)
+                log.write_all([(written[number], log_time, data, published, sequence)])
         for number in kept.keys() & np.unique(table.channel).tolist():
             kept[number].add(table.log_time[table.channel == number])
     return kept, unverified
