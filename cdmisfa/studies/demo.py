@@ -117,7 +117,8 @@ def demo(
 def _opened(
     word: str | Path, preset: str | None, seed: int
 ) -> AbstractContextManager[SeekableSource]:
-    return contextlib.closing(open_source([word], preset=preset, seed=seed, loop=True)[0])
+    loops = isinstance(word, Path)  # a scene has no end
+    return contextlib.closing(open_source([word], preset=preset, seed=seed, loop=loops)[0])
 
 
 def followed_by(module: Module, source: SeekableSource) -> dict[str, Any]:
