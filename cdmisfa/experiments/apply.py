@@ -237,15 +237,11 @@ def _reads(
         tau: frames of a block.
         frames: end after this many.
     """
-    end = None if frames is None else source.t + frames
-    if source.spec.length is not None:
-        whole = source.t + source.spec.length
-        end = whole if end is None else min(whole, end)
-    while end is None or source.t < end:
-        n = step - source.t % step
-        n = n if end is None else min(n, end - source.t)
+    counts = [n for n in (frames, source.spec.length) if n is not None]
+    end = source.t + min(counts, default=math.inf)
+    while source.t < end:
         try:
-            yield source.take_all(n)
+            yield source.take_all(int(min(step - source.t % step, end - source.t)))
         except LogExhaustedError:
             yield _read_rest(source)
             return

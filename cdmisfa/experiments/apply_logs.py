@@ -130,14 +130,15 @@ def apply_to_logs(
         root = _earlier_root(folder, request, force=force) or _common_root(words, out)
         trials = []
         for name, log in _find_logs(words, folder / INDEX, root, out, indexing, where):
-            file = _file_name(name, form)
+            file = stream_name(name)[:_LONGEST]
+            if file != name:  # other logs may have the same beginning
+                file += f"-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
+            file = f"{file}.{form}"
             files = [f if "://" in f else os.path.normpath(f) for f in log.files]
             call = partial(apply_to_log, application, name, files, parts / file, options, frames)
             depends = [name, log.states, application.identity, chosen]
-            trial = make_trial(
-                call, *depends, point={"log": name}, modules=COMPUTED, log=out / file
-            )
-            trials.append(trial)
+            how: Any = {"point": {"log": name}, "modules": COMPUTED, "log": out / file}
+            trials.append(make_trial(call, *depends, **how))
 
         def begin(missing: Sequence[Trial]) -> None:
             write_json(folder / REQUEST, {**request, "root": relative_path(root, folder)})
@@ -229,10 +230,9 @@ def _common_root(words: Sequence[str], out: Path) -> str:
     folders = []
     for word in words:
         if "://" not in word:
-            magic = None if os.path.exists(word) else re.search(r"[*?[]", word)
+            if not os.path.exists(word) and (magic := re.search(r"[*?[]", word)):
+                word = os.path.dirname(word[: magic.start()])
             path = os.path.abspath(word)
-            if magic is not None:
-                path = os.path.abspath(os.path.dirname(word[: magic.start()]))
             folders.append(path if os.path.isdir(path) else os.path.dirname(path))
     return os.path.commonpath(folders) if folders else str(out)
 
@@ -263,14 +263,6 @@ def _find_logs(
     if not found:
         raise UsageError(f"{' '.join(words)}: there is no log")
     return sorted(found.items())
-
-
-def _file_name(log: str, form: str) -> str:
-    """Return a name of a file that no other log has, and that every program accepts."""
-    name = stream_name(log)[:_LONGEST]
-    if name != log:
-        name += f"-{hashlib.sha256(log.encode()).hexdigest()[:12]}"
-    return f"{name}.{form}"
 
 
 def _outcome(row: Mapping[str, Any], out: Path | None) -> dict[str, Any]:

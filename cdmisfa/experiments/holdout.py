@@ -96,10 +96,8 @@ def judged(
         for stream in sorted({module.stream_index for module in modules}):
             ours = [module for module in modules if module.stream_index == stream]
             pieces = functools.partial(_pieces, source, ours[0], stop)
-            outputs = len(ours[0].phi)
-            phi, mean, _ = batch_outputs(
-                pieces(*fitted), fitted[1] - fitted[0], components, outputs
-            )
+            count, outputs = fitted[1] - fitted[0], len(ours[0].phi)
+            phi, mean, _ = batch_outputs(pieces(*fitted), count, components, outputs)
             weights = [(module.phi, module.mean) for module in ours]
             *slow, of_batch = following_slowness(pieces(*judged_on), [*weights, (phi, mean)])
             for module, slowness in zip(ours, slow, strict=True):

@@ -37,20 +37,17 @@ def write_report(
         out, force = run_log(paths[0]).parent / REPORT_FILE, True
     refuse_unless(out, "a report is an HTML page", ".html", ".htm")
     refuse_taken(out, force=force)
-    page = _page(paths)
-    with atomic_write(out) as partial:
-        partial.write_text(page, encoding="utf-8")
-    return out
-
-
-def _page(paths: list[Path]) -> str:
     from replay.report.page import report_of_run, report_of_runs
 
     if len(paths) > 1:
-        return report_of_runs(paths, f"{len(paths)} runs compared")
-    if found := runs_in(paths[0]):
-        return report_of_runs(found, f"{paths[0].resolve().name}: {len(found)} runs")
-    return report_of_run(paths[0], _reproducible(paths[0]), command_again(paths[0]))
+        page = report_of_runs(paths, f"{len(paths)} runs compared")
+    elif found := runs_in(paths[0]):
+        page = report_of_runs(found, f"{paths[0].resolve().name}: {len(found)} runs")
+    else:
+        page = report_of_run(paths[0], _reproducible(paths[0]), command_again(paths[0]))
+    with atomic_write(out) as partial:
+        partial.write_text(page, encoding="utf-8")
+    return out
 
 
 def _reproducible(run: Path) -> str:

@@ -211,15 +211,9 @@ def _point(point: Mapping[str, Any], rows: Sequence[Mapping[str, Any] | None]) -
         measures[f"iteration_{k + 1}"] = summary([m["iteration"] for m in saved])
         measures[f"eta_{k + 1}"] = summary([m["eta"][0] for m in saved])
     orders = Counter(" ".join(m["stream"] for m in r["modules"]) for r in found)
-    return PointResult(
-        point=point,
-        trials=len(rows),
-        done=len(found),
-        failed=sum(row is not None and row["status"] == FAILED for row in rows),
-        missing=sum(row is None for row in rows),
-        measures=measures,
-        orders=dict(orders.most_common()),
-    )
+    failed = sum(row is not None and row["status"] == FAILED for row in rows)
+    counts = len(rows), len(found), failed, rows.count(None)
+    return PointResult(point, *counts, measures, dict(orders.most_common()))
 
 
 def varied(points: Sequence[PointResult]) -> dict[str, list[Any]]:

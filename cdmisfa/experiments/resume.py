@@ -198,18 +198,12 @@ class Recomputation:
     @property
     def source(self) -> SeekableSource:
         """What the run learned from, at frame `t`; opened when it is first needed."""
-        if self._source is None:
-            self._source = self._open()
-            self._source.seek(self.t)
-        return self._source
-
-    def _open(self) -> SeekableSource:
-        given = self._given
-        if isinstance(given, SeekableSource):
-            source = given
-        else:
+        if self._source is not None:
+            return self._source
+        source = self._given
+        if not isinstance(source, SeekableSource):
             try:
-                source = open_source_of(self.log.parent, given)
+                source = open_source_of(self.log.parent, source)
             except UsageError as error:
                 raise UsageError(
                     f"{error} (after {self.learner.iteration} iterations, which the log holds, the "
@@ -225,6 +219,8 @@ class Recomputation:
         held_out = self.header.manifest["source"].get("held_out", 0)
         if held_out and isinstance(source, StoredSource):
             source.hold_out(held_out)
+        self._source = source
+        source.seek(self.t)
         return source
 
     def steps(self, count: int) -> Iterator[BlockSignals]:

@@ -148,19 +148,15 @@ def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
         return open_scene(first, build(SCENES[first].config, "scene", scene), record)
     keys = config.get("input", {})
     chosen = {name: options[name] for name in INPUTS if name in options}
-    if words != named and not options.get("episodes") and _are_recording(words):
-        chosen, keys = {}, {name: keys[name] for name in OF_EVERY_SOURCE if name in keys}
+    if words != named and not options.get("episodes"):
+        from replay.corpus.finding import may_be_corpus  # loads pyarrow, which no scene needs
+        from replay.inputs import is_recording
+
+        if not may_be_corpus(words) and is_recording(words):  # its frames were made before
+            chosen, keys = {}, {name: keys[name] for name in OF_EVERY_SOURCE if name in keys}
     inputs = InputOptions(**chosen).configured(keys)
     opening: Any = {name: bool(options.get(name)) for name in OPENING}
     return open_logs(words, inputs=inputs, **opening)
-
-
-def _are_recording(words: Sequence[str]) -> bool:
-    """Return whether words name a recording, whose frames were made when it was recorded."""
-    from replay.corpus.finding import may_be_corpus  # loads pyarrow, which no scene needs
-    from replay.inputs import is_recording
-
-    return not may_be_corpus(words) and is_recording(words)
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,12 +265,11 @@ def opened_log(
         if others := [path for path in logs_in(folder) if path not in logs]:
             raise UsageError(f"{others[0]} is of no run: choose another folder")
         stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE, REPORT_FILE)]
-        if resumed:
-            with writing(folder):
-                os.replace(log_to_resume(folder), logs[0])
-        else:  # the logs first, so that a kill leaves nothing that looks like a run
-            stale = [*logs, *stale]
         with writing(folder):
+            if resumed:
+                os.replace(log_to_resume(folder), logs[0])
+            else:  # the logs first, so that a kill leaves nothing that looks like a run
+                stale = [*logs, *stale]
             refuse_special(*stale)
             for path in stale:
                 path.unlink(missing_ok=True)
@@ -284,9 +279,8 @@ def opened_log(
         except BaseException as error:
             log.abandon()
             if isinstance(error, KeyboardInterrupt):
-                how = "cameras cannot go back: start another"
-                if isinstance(source, SeekableSource):
-                    how = "go on with --resume"
+                seekable = isinstance(source, SeekableSource)
+                how = "go on with --resume" if seekable else "cameras cannot go back: start another"
                 raise KeyboardInterrupt(f"{folder} is not finished: {how}") from None
             raise
 
@@ -314,9 +308,8 @@ def write_results(
         "platform": machine(),
         "result": result.as_json(),
     }
-    for key in (COMMAND, FORK, ARITHMETIC, "versions"):
-        if key in manifest:
-            document[key] = manifest[key]
+    optional = (COMMAND, FORK, ARITHMETIC, "versions")
+    document |= {key: manifest[key] for key in optional if key in manifest}
     write_json(folder / RUN_JSON, document)
     log.close(final_record(folder, document, result.signals_sha256, view=view))
     if view:

@@ -40,16 +40,12 @@ from recorder.log.files import folder_here, partial_path
 from replay.runs.compare import differences
 from replay.runs.folders import RUN_FILE, run_log
 from replay.runs.keyframes import read_keyframe
-from replay.runs.log import RunHeader, read_header
+from replay.runs.log import read_header
 from replay.runs.provenance import comparable, has_whole_hashes, stated_source
 from replay.runs.writer import RunWriter
 
 # Called with the bytes of the source that were hashed and with all, while a run waits for that.
 Hashing = Callable[[int, int], None]
-
-
-def _ignore(done: int, size: int) -> None:
-    """Report nothing."""
 
 
 class Session:
@@ -78,7 +74,7 @@ class Session:
         command: Mapping[str, Any] | None = None,
         force: bool = False,
         resume: bool = False,
-        hashing: Hashing = _ignore,
+        hashing: Hashing = lambda done, size: None,
     ) -> None:
         """Prepare to start or resume a run; nothing is written before `learn`.
 
@@ -138,17 +134,6 @@ class Session:
             self.manifest["source"] = description(source, told=self.hashing)
         if header.forked_at is not None:
             self.manifest[FORK] = header.manifest[FORK]
-        self._refuse_difference(log, header)
-        keyframe = read_keyframe(log)
-        if (0 if keyframe is None else keyframe.iteration) < (header.forked_at or 0):
-            raise UsageError(f"{folder} was cut before its fork: fork again with --force")
-        if keyframe is not None:
-            restore(self.learner, keyframe, source.spec)
-            source.seek(keyframe.t)
-            self.keyframe = keyframe
-
-    def _refuse_difference(self, log: Path, header: RunHeader) -> None:
-        """Refuse to resume with another configuration, seed or source."""
         as_json = json.loads(json.dumps(self.manifest))  # lists for tuples, as the log has them
         source_then, source_now = comparable(stated_source(log), as_json["source"])
         spec_then, spec_now = map(dataclasses.asdict, (header.spec, self.source.spec))
@@ -159,9 +144,16 @@ class Session:
             # another learner has other keys, so its name explains all of them
             key = "learner.algorithm" if "learner.algorithm" in found else next(iter(found))
             raise UsageError(
-                f"{log.parent} was made with {key} = {found[key][0]}, not {found[key][1]}: resume "
+                f"{folder} was made with {key} = {found[key][0]}, not {found[key][1]}: resume "
                 "with the same settings, or choose another folder"
             )
+        keyframe = read_keyframe(log)
+        if (0 if keyframe is None else keyframe.iteration) < (header.forked_at or 0):
+            raise UsageError(f"{folder} was cut before its fork: fork again with --force")
+        if keyframe is not None:
+            restore(self.learner, keyframe, source.spec)
+            source.seek(keyframe.t)
+            self.keyframe = keyframe
 
     @classmethod
     @contextlib.contextmanager
@@ -263,14 +255,9 @@ class Session:
         all_sinks: list[Sink] = [digest]
         with contextlib.ExitStack() as opened:
             if self.folder is not None:
+                how = {"force": self._force, "resumed": self._resumed}
                 log = opened.enter_context(
-                    opened_log(
-                        self.folder,
-                        self.source,
-                        self.manifest,
-                        force=self._force,
-                        resumed=self._resumed,
-                    )
+                    opened_log(self.folder, self.source, self.manifest, **how)
                 )
                 state = Keyframes(log, self.source, self.learner, self._versions, keyframes)
                 all_sinks += [log, state]

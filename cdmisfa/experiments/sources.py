@@ -165,10 +165,9 @@ def _filled(kind: str, settings: Layers, default: str | None) -> Configuration:
         if section not in SECTIONS:
             raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
     algorithm = algorithm or tables.get("learner", {}).get("algorithm") or LearnerConfig().algorithm
-    named_learner = {"algorithm": algorithm}
     keys = learner_class(algorithm).configuration
     return Configuration(
-        learner=build(keys, "learner", *settings.section("learner"), named_learner),
+        learner=build(keys, "learner", *settings.section("learner"), {"algorithm": algorithm}),
         scene=build(SCENES[kind].config, "scene", *settings.section("scene")),
         record=build(RecordConfig, "record", *settings.section("record")),
     )

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import inspect
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -45,10 +45,6 @@ def sweep(
     folder: str | Path,
     *,
     grid: Mapping[str, Sequence[Any]] | None = None,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    retry_failed: bool = False,
-    progress: Callable[[int, int, int], None] = lambda finished, failed, total: None,
     **how: Any,
 ) -> SweepReport:
     """Run every trial of a grid that is not finished yet.
@@ -57,11 +53,8 @@ def sweep(
         source: see `plan`, as for `grid` and the further arguments.
         folder: the folder of the rows; made where it does not exist.
         grid: values to try, by configuration key.
-        jobs: see `run_trials`, as for `scheduler`, `retry_failed` and `progress`.
-        scheduler: address of a dask scheduler.
-        retry_failed: compute failed trials again.
-        progress: called with the trials finished, failed, and asked for.
-        how: further arguments of `plan`.
+        how: further arguments of `plan`, and `jobs`, `scheduler`, `retry_failed` and `progress`
+            of `run_trials`.
 
     Raises:
         UsageError: a wrong key, value or source, found before any trial starts.
@@ -69,6 +62,8 @@ def sweep(
     """
     folder, grid = Path(folder).resolve(), grid or {}
     words = (source,) if isinstance(source, str | Path) else tuple(source)
+    names = ("jobs", "scheduler", "retry_failed", "progress")
+    where = {name: how.pop(name) for name in names if name in how}
     trials = plan(source, grid=grid, **how)
     request = {
         "schema": 1,
@@ -77,15 +72,11 @@ def sweep(
         "seeds": sorted({trial.seed for trial in trials}),
         "trials": [{"id": trial.id, "point": dict(trial.point)} for trial in trials],
     }
-    return run_trials(
-        trials,
-        folder,
-        jobs=jobs,
-        scheduler=scheduler,
-        retry_failed=retry_failed,
-        begin=lambda missing: write_json(folder / REQUEST, request),
-        progress=progress,
-    )
+
+    def begin(missing: Sequence[Trial]) -> None:
+        write_json(folder / REQUEST, request)
+
+    return run_trials(trials, folder, begin=begin, **where)
 
 
 def plan(

@@ -113,16 +113,17 @@ def run_trial(
             uniforms = learner.policy_rng.random((CHUNK, 3))
         left = CHUNK if max_iterations is None else max_iterations - learner.iteration
         drawn = uniforms[:left]
-        pending = swap is not None and swapped < 0
         record = _records(len(drawn), config.outputs, len(streams)) if curves else {}
-        below = swap.below if swap is not None and pending else -1.0
+        below = swap.below if swap is not None and swapped < 0 else -1.0
         done = learner.repeat(frames, x, drawn, below, _as_struct(record))
         uniforms = uniforms[done:]
         if curves:
-            parts.append(_named(record, done))
+            kept = {name: array[:done] for name, array in record.items()}
+            outcome = kept.pop("outcome")
+            parts.append({name: outcome[name] for name in OUTCOME.names or ()} | kept)
         if learner.out["saved"][0]:
             learner.save_abstraction()
-        elif swap is not None and pending and learner.epsilon < swap.below:
+        elif swap is not None and learner.epsilon < below:
             tables[swap.stream] = one_period(swap.name)
             frames, x = _expand(config, tables)
             swapped = learner.iteration
@@ -165,9 +166,3 @@ def _as_struct(record: Mapping[str, NDArray[Any]]) -> kernels.Struct | None:
         for name, array in record.items()
     }
     return kernels.Struct("curves", {}, arrays) if record else None
-
-
-def _named(record: Mapping[str, NDArray[Any]], done: int) -> dict[str, NDArray[Any]]:
-    outcome = record["outcome"][:done]
-    named = {name: outcome[name] for name in OUTCOME.names or ()}
-    return named | {name: record[name][:done] for name in ("eta_dot", "R", "Q", "policy")}

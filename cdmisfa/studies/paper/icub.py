@@ -212,33 +212,28 @@ class RewardCurves(Sink):
 
 
 def learn_curves(source: LoggedSource, config: LearnerConfig, seed: int) -> Output:
-    """Learn from a recording; return a trial's row, curves, and each module's last outputs."""
-    curves = RewardCurves(config.tau, source.spec.truth)
-    row = learn_and_judge(source, config, seed, source.frames - HELD_OUT, curves)
-    row |= stay_rewards(curves.arrays, config)
-    source.seek(0)
-    shown = [source.take(view, 1).frames[0] for view in range(len(source.spec.streams))]
-    return row, {**curves.arrays, "shown": np.stack(shown)}
+    """Learn from a recording; return a trial's row, curves, and each module's last outputs.
 
-
-def learn_and_judge(
-    source: SeekableSource, config: Any, seed: int, frames: int, *sinks: Sink
-) -> dict[str, Any]:
-    """Learn up to a frame, or for `ITERATIONS`; return a row that judges modules on what follows.
+    The last `HELD_OUT` frames judge the modules.
 
     Raises:
-        LogExhaustedError: there are not enough frames for a block.
+        LogExhaustedError: the recording has not enough frames for a block.
     """
-    learner = open_learner(config, source.spec, seed)
+    curves = RewardCurves(config.tau, source.spec.truth)
+    learner, frames = open_learner(config, source.spec, seed), source.frames - HELD_OUT
     iterations = min(ITERATIONS, frames // learner.tau)
     if iterations < 1:
         raise LogExhaustedError(f"too few frames: {HELD_OUT} are held out, record more than these")
-    learn_blocks(source, learner, sinks, max_iterations=iterations, max_modules=iterations)
-    return {
+    learn_blocks(source, learner, [curves], max_iterations=iterations, max_modules=iterations)
+    row = {
         **module_row(learner.modules),
         "iterations": learner.iteration,
         "follows": [follows(module, source, frames) for module in learner.modules],
+        **stay_rewards(curves.arrays, config),
     }
+    source.seek(0)
+    shown = [source.take(view, 1).frames[0] for view in range(len(source.spec.streams))]
+    return row, {**curves.arrays, "shown": np.stack(shown)}
 
 
 def follows(module: Module, source: SeekableSource, first: int) -> list[float]:

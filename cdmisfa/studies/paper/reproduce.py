@@ -108,19 +108,18 @@ def reproduce(
     finished = [_finished(folder, rows[task.id]) for task in tasks]
     findings = Findings()
     experiment.evaluate(finished, findings)
-    document: dict[str, Any] = plain(
-        {
-            "schema": 2,
-            "experiment": name,
-            "title": experiment.title,
-            "quick": quick,
-            "trials": len(finished),
-            **findings.as_json(),
-            "figures": [figure.name for figure in experiment.draw(finished, folder)],
-            "code": code(),
-            "versions": versions(),
-        }
-    )
+    values = {
+        "schema": 2,
+        "experiment": name,
+        "title": experiment.title,
+        "quick": quick,
+        "trials": len(finished),
+        **findings.as_json(),
+        "figures": [figure.name for figure in experiment.draw(finished, folder)],
+        "code": code(),
+        "versions": versions(),
+    }
+    document: dict[str, Any] = plain(values)
     write_json(folder / "results.json", document)
     return document
 
