@@ -213,9 +213,6 @@ def open_source(
     """
     given = Layers.read(preset, settings)
     live = all(is_live(str(word)) for word in words)
-    options = [f"--{name}" for name in ("loop", "salvage", "episodes") if how.get(name)]
-    if options and (live or is_scene(words)):
-        raise UsageError(f"{words[0]} is no log: {are_for(options, 'logs')}")
     if is_scene(words):
         scene = configure(str(words[0]), given, seed, inputs)
         return scene.open_scene(), scene

@@ -13,7 +13,7 @@ import click
 from cdmisfa.cli import options, printing
 from cdmisfa.cli.interrupts import Stop
 from cdmisfa.cli.progress import RunProgress, bar, learning
-from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
+from cdmisfa.core.errors import LogDamagedError, UsageError, are_for, one_line
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
@@ -169,7 +169,7 @@ def _opened(
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """Open a source, and print what there is to know of it before and after it is read."""
     from cdmisfa.experiments.holdout import hold_out
-    from cdmisfa.experiments.sources import open_source
+    from cdmisfa.experiments.sources import is_scene, open_source
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
 
@@ -179,6 +179,10 @@ def _opened(
             "--record is for live streams, and --resume for all others: live streams cannot go "
             "back, learn from a recording of them"
         )
+    given = {"--loop": loop, "--salvage": salvage, "--episodes": episodes}
+    unused = [name for name, value in given.items() if value]
+    if unused and (live or is_scene(words)):
+        raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
     for folder in filter(None, (out, record_to) if live else ()):
         refuse_existing(folder, force=force, goes_on=False)
     with bar("opening", "logs") as shown:
