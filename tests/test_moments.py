@@ -196,7 +196,7 @@ def test_a_keyframe_that_lies_is_found_out(
         state = a_bit(keyframe.state) if keyframe.iteration == 20 else keyframe.state
         return encode_keyframe(dataclasses.replace(keyframe, state=state))
 
-    monkeypatch.setattr("replay.runs.writer.encode_keyframe", kept)
+    monkeypatch.setattr("replay.runs.keyframes.encode_keyframe", kept)
     keyframes_every(10)
     told = (*words("2.0"), *LEARN, "--max-iterations", 30)
     assert cdmisfa("learn", "oscillatory", *told, "-o", tmp_path / "run").code == 0

@@ -16,9 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from cdmisfa.core.config import Layers
 from cdmisfa.experiments.session import run
-from cdmisfa.experiments.sources import configure, open_source
+from cdmisfa.experiments.sources import Layers, configure, open_source
 
 ROOT = Path(__file__).parents[1]
 

@@ -17,10 +17,9 @@ from benchmarks.arena.judging import judge, run_learner
 from benchmarks.arena.rules import RULES, Attentive
 from benchmarks.arena.streams import GROUPS, SETS, ArenaSource
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.core.config import Layers
 from cdmisfa.experiments.documents import plain, versions, write_json
 from cdmisfa.experiments.results import mean_interval, summary
-from cdmisfa.experiments.sources import configure
+from cdmisfa.experiments.sources import Layers, configure
 
 LEARNERS = {
     "progress": "progress learner.attention=novel",

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.paper import Table, study
-from cdmisfa.core.config import Layers, load_preset
-from cdmisfa.experiments.sources import configure
+from cdmisfa.core.config import load_preset
+from cdmisfa.experiments.sources import Layers, configure
 from cdmisfa.studies.paper import icub
 from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_text, of_all
 

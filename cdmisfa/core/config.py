@@ -249,32 +249,6 @@ def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
     return sections
 
 
-@dataclass(frozen=True, slots=True)
-class Layers:
-    """Values of a preset and of `--set` words, by section and key.
-
-    Attributes:
-        preset: sections of the preset; None if none was named.
-        words: sections of the words, which win over the preset.
-    """
-
-    preset: Mapping[str, Mapping[str, Any]] | None = None
-    words: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-
-    @classmethod
-    def read(cls, preset: str | None = None, words: Iterable[str] = ()) -> Layers:
-        """Read a preset, by its name or as a .toml file, and `section.key=value` words.
-
-        Raises:
-            UsageError: see `load_preset` and `parse_settings`.
-        """
-        return cls(None if preset is None else load_preset(preset), parse_settings(words))
-
-    def section(self, name: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-        """Return the values of a section, for `build`: those of the preset, then the words."""
-        return (self.preset or {}).get(name, {}), self.words.get(name, {})
-
-
 def build(cls: type[T], prefix: str, *layers: Mapping[str, Any], base: T | None = None) -> T:
     """Fill a section's dataclass from layers of values, the last one winning.
 

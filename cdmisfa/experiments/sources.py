@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS, learner_class
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
-from cdmisfa.core.config import Layers, LearnerConfig, build, load_preset, section_table
+from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_settings, section_table
 from cdmisfa.core.errors import UsageError, are_for, did_you_mean
 from recorder.cameras.words import CAMERAS, is_live, open_live
 from recorder.config import RecordConfig, SceneConfig
@@ -70,6 +70,32 @@ class Configuration:
         if self.inputs is not None and (self.streams or self.inputs.config != InputConfig()):
             tables["input"] = section_table(self.inputs.config)
         return tables
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """Values of a preset and of `--set` words, by section and key.
+
+    Attributes:
+        preset: sections of the preset; None if none was named.
+        words: sections of the words, which win over the preset.
+    """
+
+    preset: Mapping[str, Mapping[str, Any]] | None = None
+    words: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, preset: str | None = None, words: Sequence[str] = ()) -> Layers:
+        """Read a preset, by its name or as a .toml file, and `section.key=value` words.
+
+        Raises:
+            UsageError: see `load_preset` and `parse_settings`.
+        """
+        return cls(None if preset is None else load_preset(preset), parse_settings(words))
+
+    def section(self, name: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        """Return the values of a section, for `build`: those of the preset, then the words."""
+        return (self.preset or {}).get(name, {}), self.words.get(name, {})
 
 
 NO_LAYERS = Layers()

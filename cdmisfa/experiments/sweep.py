@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any, cast
 
 from cdmisfa.agents.learners import LEARNERS, learner_class
-from cdmisfa.core.config import Layers, section_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.run_folder import module_table, with_recipes
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import (
     Configuration,
+    Layers,
     configure,
     configure_for,
     is_scene,

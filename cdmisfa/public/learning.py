@@ -11,12 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.blocks import FrameSource, description
-from cdmisfa.core.config import Layers
 from cdmisfa.core.learning import Sink
 from cdmisfa.experiments.holdout import hold_out
 from cdmisfa.experiments.run_folder import command_of
 from cdmisfa.experiments.session import run as run_to_its_end
-from cdmisfa.experiments.sources import Configuration, configure_for, open_source, read_inputs
+from cdmisfa.experiments.sources import (
+    Configuration,
+    Layers,
+    configure_for,
+    open_source,
+    read_inputs,
+)
 from cdmisfa.public.recording import Given, Recording, as_words
 from cdmisfa.public.run import Run
 from recorder.images.options import OPTIONS, Centre, InputOptions

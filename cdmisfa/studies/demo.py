@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.blocks import SeekableSource
-from cdmisfa.core.config import Layers
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.reports import write_report
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
-from cdmisfa.experiments.sources import configure, open_source
+from cdmisfa.experiments.sources import Layers, configure, open_source
 from cdmisfa.modules import Module
 from replay.following import fits
 

@@ -27,10 +27,9 @@ from test_bags import ros1_bag, ros2_database
 from test_modules import learned, with_width
 
 from cdmisfa.core.blocks import Block
-from cdmisfa.core.config import Layers
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Keyframe
-from cdmisfa.experiments.sources import configure
+from cdmisfa.experiments.sources import Layers, configure
 from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import IMAGES
 from recorder.images.videos import VideoPackets

@@ -72,8 +72,7 @@ def record_command(
     Or SOURCE is one or several live streams: camera:/dev/video0, rtsp://, http://.../x.mjpg,
     tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. For existing logs see cdmisfa convert.
     """
-    from cdmisfa.core.config import Layers
-    from cdmisfa.experiments.sources import configure
+    from cdmisfa.experiments.sources import Layers, configure
     from recorder.cameras.words import is_live
     from recorder.config import parse_split
     from recorder.log.manifest import RecordingStart, read_start
