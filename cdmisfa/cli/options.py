@@ -41,11 +41,6 @@ def out(help: str, *, required: bool = False) -> Decorator:
     return click.option("-o", "--out", type=LOCAL, required=required, help=help)
 
 
-def path(name: str, metavar: str, help: str) -> Decorator:
-    """Return an option for a path on this machine."""
-    return click.option(name, type=LOCAL, metavar=metavar, help=help)
-
-
 def log_argument(name: str) -> Decorator:
     """Return an argument of one or more paths, URLs or patterns, passed as existing paths."""
 

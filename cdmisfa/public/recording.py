@@ -23,9 +23,6 @@ from replay.inputs import open_arrays
 # logs, names of scenes, words of live streams, or an open source.
 Given: TypeAlias = Any
 
-# Pixels of the height of a view in a notebook.
-HEIGHT = 600
-
 
 def as_words(given: Given) -> tuple[str, ...]:
     """Return the words of paths, patterns or names; () of arrays."""
@@ -179,7 +176,7 @@ def view(
         return
     file = _until_exit.enter_context(view_of(paths[0], **how))
     _, address = _until_exit.enter_context(served(file))
-    ipython.display.display(ipython.display.IFrame(address, "100%", HEIGHT))
+    ipython.display.display(ipython.display.IFrame(address, "100%", height=600))
 
 
 _until_exit = contextlib.ExitStack()

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.apply import Application, Totals
     from cdmisfa.experiments.apply_logs import AppliedLogs
-    from recorder.images.options import InputOptions
 
 # Number of warnings and of failed logs that are printed.
 MOST_LINES = 20
@@ -57,14 +56,12 @@ def apply_command(
     out: Path | None,
     to: str | None,
     frames: int | None,
-    loop: bool,
-    salvage: bool,
-    inputs: InputOptions,
     jobs: int,
     scheduler: str | None,
     retry_failed: bool,
     force: bool,
     as_json: bool,
+    **how: Any,
 ) -> int:
     """Compute the features that a run learned on other logs or cameras.
 
@@ -92,16 +89,14 @@ def apply_command(
                 source,
                 out,
                 form=to or FILE_FORMS[0],
-                inputs=inputs,
                 frames=frames,
-                loop=loop,
-                salvage=salvage,
                 jobs=jobs,
                 scheduler=scheduler,
                 retry_failed=retry_failed,
                 force=force,
                 indexing=shown.update,
                 progress=shown.trials,
+                **how,
             )
         _print_applied_logs(run, applied, as_json)
         return applied.exit_code
@@ -116,7 +111,7 @@ def apply_command(
             f"-o is a file {', '.join(f'.{form}' for form in FILE_FORMS)} for one log or live "
             "stream, or a folder for several logs; --to names the format of files in a folder"
         )
-    return _apply_to_each(run, logs, out, inputs, frames, loop, salvage, to == STDOUT, as_json)
+    return _apply_to_each(run, logs, out, frames, to == STDOUT, as_json, **how)
 
 
 def _logs(source: Sequence[str]) -> list[list[str]]:
@@ -145,14 +140,15 @@ def _apply_to_each(
     run: Path,
     logs: Sequence[Sequence[str]],
     out: Path | None,
-    inputs: InputOptions,
     frames: int | None,
-    loop: bool,
-    salvage: bool,
     as_lines: bool,
     as_json: bool,
+    **how: Any,
 ) -> int:
-    """Apply modules to one log after the other and print the results; return the exit code."""
+    """Apply modules to one log after the other and print the results; return the exit code.
+
+    Further arguments are those of `Application.open`.
+    """
     from cdmisfa.experiments.apply import Application
 
     application = Application(run)
@@ -160,9 +156,7 @@ def _apply_to_each(
     code = 0
     with stoppable() as stop:
         for words in logs:
-            opened = application.open(
-                words, inputs, loop=loop, salvage=salvage, say=printing.status
-            )
+            opened = application.open(words, say=printing.status, **how)
             with contextlib.closing(opened) as source:
                 totals = _apply(application, source, out, frames, stop, as_lines)
             error = None if totals.damaged is None else str(totals.damaged)

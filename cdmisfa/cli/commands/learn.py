@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -57,24 +57,22 @@ if TYPE_CHECKING:
 @click.pass_context
 def learn_command(
     ctx: click.Context,
+    /,
     source: tuple[str, ...],
     out: Path | None,
     seed: int,
-    preset: str | None,
     settings: tuple[str, ...],
     algorithm: str | None,
     max_iterations: int | None,
     max_modules: int | None,
-    loop: bool,
     resume: bool,
-    salvage: bool,
     live_view: bool,
     no_rerun: bool,
-    episodes: bool,
     record_to: Path | None,
     inputs: InputOptions,
     force: bool,
     as_json: bool,
+    **how: Any,
 ) -> int:
     """Learn slow features from a scene, a recording, logs or live cameras.
 
@@ -104,14 +102,9 @@ def learn_command(
     if algorithm is not None:
         settings = (*settings, f"learner.algorithm={algorithm}")
     live = any(map(is_live, source))
+    how |= {"inputs": inputs, "settings": settings, "seed": seed, "resumed": resume}
     with (
-        _opened(
-            *(source, inputs, preset, settings, seed, out, record_to, force),
-            loop=loop,
-            salvage=salvage,
-            episodes=episodes,
-            resumed=resume,
-        ) as (frames, configuration),
+        _opened(source, out, record_to, force, **how) as (frames, configuration),
         learning(frames.spec, max_iterations) as (stop, progress),
     ):
         color = getattr(frames, "color", inputs.color)  # the choice of auto is kept
@@ -153,52 +146,27 @@ def _learn_as_started(ctx: click.Context, run: Path | None) -> int:
 
 @contextlib.contextmanager
 def _opened(
-    words: Sequence[str],
-    inputs: InputOptions,
-    preset: str | None,
-    settings: Sequence[str],
-    seed: int,
-    out: Path | None,
-    record_to: Path | None,
-    force: bool,
-    *,
-    loop: bool,
-    salvage: bool,
-    episodes: bool,
-    resumed: bool,
+    words: Sequence[str], out: Path | None, record_to: Path | None, force: bool, **how: Any
 ) -> Iterator[tuple[FrameSource, Configuration]]:
-    """Open a source, and print what there is to know of it before and after it is read."""
+    """Open a source with arguments of `open_source`; print notes before and after it is read."""
     from cdmisfa.experiments.holdout import hold_out
     from cdmisfa.experiments.sources import is_scene, open_source
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
 
     live = any(map(is_live, words))
-    if (live and resumed) or (record_to is not None and not live):
+    if (live and how["resumed"]) or (record_to is not None and not live):
         raise UsageError(
             "--record is for live streams, and --resume for all others: live streams cannot go "
             "back, learn from a recording of them"
         )
-    given = {"--loop": loop, "--salvage": salvage, "--episodes": episodes}
-    unused = [name for name, value in given.items() if value]
+    unused = [f"--{name}" for name in ("loop", "salvage", "episodes") if how[name]]
     if unused and (live or is_scene(words)):
         raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
     for folder in filter(None, (out, record_to) if live else ()):
         refuse_existing(folder, force=force, goes_on=False)
     with bar("opening", "logs") as shown:
-        frames, configuration = open_source(
-            words,
-            inputs=inputs,
-            preset=preset,
-            settings=settings,
-            seed=seed,
-            loop=loop,
-            salvage=salvage,
-            episodes=episodes,
-            resumed=resumed,
-            told=shown.update,
-            say=printing.status,
-        )
+        frames, configuration = open_source(words, told=shown.update, say=printing.status, **how)
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.closing(frames))
         if not live:
@@ -278,14 +246,11 @@ def fork_command(
     run: Path,
     iteration: int,
     out: Path,
-    settings: tuple[str, ...],
-    seed: int | None,
     max_iterations: int | None,
     max_modules: int | None,
-    source: tuple[str, ...],
     no_rerun: bool,
-    force: bool,
     as_json: bool,
+    **how: Any,
 ) -> int:
     """Continue a run from an earlier iteration with other settings.
 
@@ -294,22 +259,10 @@ def fork_command(
     """
     from cdmisfa.experiments.session import Session
 
-    limits: dict[str, int] = {}
-    if max_iterations is not None:
-        limits["max_iterations"] = max_iterations
-    if max_modules is not None:
-        limits["max_modules"] = max_modules
+    given = {"max_iterations": max_iterations, "max_modules": max_modules}
+    limits = {name: limit for name, limit in given.items() if limit is not None}
     with (
-        Session.fork(
-            run,
-            iteration,
-            out,
-            settings=settings,
-            seed=seed,
-            source=source,
-            limits=limits,
-            force=force,
-        ) as session,
+        Session.fork(run, iteration, out, limits=limits, **how) as session,
         learning(session.source.spec, max_iterations) as (stop, progress),
     ):
         result = _learned(session, stop, progress, rerun=not no_rerun)

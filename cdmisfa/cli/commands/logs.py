@@ -17,7 +17,6 @@ from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.names import counted, lasting
 
 if TYPE_CHECKING:
-    from recorder.images.options import InputOptions
     from replay.corpus.index import Indexed
     from replay.integrity.report import ChannelInfo, LogReport, SizeInfo
 
@@ -216,10 +215,8 @@ def export_command(
     form: str | None,
     out: Path,
     lossless: bool,
-    task: str | None,
-    inputs: InputOptions,
-    force: bool,
     as_json: bool,
+    **how: Any,
 ) -> None:
     """Export signals as a table, or images as PNG, MP4 or LeRobot dataset.
 
@@ -232,16 +229,7 @@ def export_command(
     from replay.export.tables import CSV_LEAVES_OUT, TABLES
 
     form = form or out.suffix.removeprefix(".")
-    rows = export(
-        path,
-        out,
-        form,
-        inputs=inputs,
-        lossless=lossless,
-        task=task,
-        force=force,
-        about=printing.source,
-    )
+    rows = export(path, out, form, lossless=lossless, about=printing.source, **how)
     if form == "csv":
         printing.status(f"CSV leaves out {' and '.join(CSV_LEAVES_OUT)}: Parquet and npz hold them")
     videos = out.is_file() or next(out.rglob("*.mp4"), None) is not None

@@ -6,7 +6,7 @@ import contextlib
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -84,9 +84,8 @@ def record_command(
         given = {"--view": views, "--jobs": jobs > 1, "--resume": resume}
         if options := [name for name, value in given.items() if value]:
             raise UsageError(f"{source[0]} is a live stream: {are_for(options, 'scenes')}")
-        return _record_live(
-            source, out, inputs, preset, settings, seed or 0, frames, limit, force, as_json
-        )
+        how = {"inputs": inputs, "preset": preset, "settings": settings, "seed": seed or 0}
+        return _record_live(source, out, frames, limit, force, as_json, **how)
     if any(w not in SCENES and (Path(w).exists() or set("*?:") & set(w)) for w in source):
         command = f"cdmisfa convert {shlex.join(source)} -o REC"
         raise UsageError(f"{source[0]} is a log, no scene: write it as a recording with {command}")
@@ -130,25 +129,23 @@ def _check_resumable(out: Path, scene: str) -> None:
 def _record_live(
     words: Sequence[str],
     out: Path,
-    inputs: InputOptions,
-    preset: str | None,
-    settings: Sequence[str],
-    seed: int,
     frames: int | None,
     split: float | None,
     force: bool,
     as_json: bool,
+    **how: Any,
 ) -> int:
-    """Record live streams until there are enough frames, they end, or Ctrl-C."""
+    """Record live streams until there are enough frames, they end, or Ctrl-C.
+
+    Further arguments are those of `open_source`.
+    """
     from cdmisfa.experiments.sources import open_source
     from recorder.live import RecordedWhileWatched, record_watched
     from recorder.log.files import refuse_existing
     from recorder.recording import DEFAULT_FRAMES
 
     refuse_existing(out, force=force, goes_on=False)
-    source, configuration = open_source(
-        words, inputs=inputs, preset=preset, settings=settings, seed=seed, say=printing.status
-    )
+    source, configuration = open_source(words, say=printing.status, **how)
     notice = "finishing the recording; again to stop at once\n"
     with contextlib.closing(source), stoppable(notice) as stop:
         frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)

@@ -8,15 +8,12 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
 from cdmisfa.cli import options, printing
 from cdmisfa.cli.progress import Bar, bar, resumable_bar
-
-if TYPE_CHECKING:
-    from recorder.images.options import InputOptions
 
 # Number of seeds of a sweep, so that a typing error does not fill the memory.
 MOST_SEEDS = 1_000_000
@@ -56,16 +53,8 @@ def sweep_command(
     out: Path,
     grid: tuple[str, ...],
     seeds: str,
-    preset: str | None,
-    settings: tuple[str, ...],
-    max_iterations: int | None,
-    max_modules: int | None,
-    loop: bool,
-    inputs: InputOptions,
-    jobs: int,
-    scheduler: str | None,
-    retry_failed: bool,
     as_json: bool,
+    **how: Any,
 ) -> int:
     """Learn from one source many times: a grid of settings and seeds.
 
@@ -76,22 +65,7 @@ def sweep_command(
 
     values, numbers = parse_grid(grid), parse_seeds(seeds)
     with resumable_bar(out, "sweep", "trials") as shown:
-        report = sweep(
-            source,
-            out,
-            grid=values,
-            seeds=numbers,
-            preset=preset,
-            settings=settings,
-            max_iterations=max_iterations,
-            max_modules=max_modules,
-            loop=loop,
-            inputs=inputs,
-            jobs=jobs,
-            scheduler=scheduler,
-            retry_failed=retry_failed,
-            progress=shown.trials,
-        )
+        report = sweep(source, out, grid=values, seeds=numbers, progress=shown.trials, **how)
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if as_json:
         printing.document(
@@ -180,12 +154,9 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
 def reproduce_command(
     name: str,
     out: Path | None,
-    trials: int | None,
-    jobs: int,
-    scheduler: str | None,
     recording: Path | None,
-    quick: bool,
     as_json: bool,
+    **how: Any,
 ) -> None:
     """Reproduce an experiment of the CD-MISFA paper.
 
@@ -210,12 +181,9 @@ def reproduce_command(
             document = reproduce(
                 experiment,
                 root / experiment,
-                trials=trials,
-                jobs=jobs,
-                scheduler=scheduler,
                 recording=recording,
-                quick=quick,
                 progress=shown.update,
+                **how,
             )
         documents.append(document)
     if as_json:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from cdmisfa.cli import options, printing
 from cdmisfa.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from recorder.images.options import InputOptions
 
 
 @click.command("view")
@@ -48,11 +45,9 @@ def view_command(
     web: bool,
     screenshot: Path | None,
     at: str | None,
-    tab: str | None,
     port: int | None,
-    every: int,
-    inputs: InputOptions,
     force: bool,
+    **content: Any,
 ) -> None:
     """Show a run, recording or log in the Rerun viewer, or save the view.
 
@@ -74,13 +69,7 @@ def view_command(
         refuse_taken(screenshot, force=force)
     from replay.view.build import build_view, view_of
 
-    content: Any = {
-        "tab": tab,
-        "every": every,
-        "inputs": inputs,
-        "beside": beside,
-        "about": printing.source,
-    }
+    content |= {"beside": beside, "about": printing.source}
     if save is not None:
         build_view(path, save, force=force, **content)
         printing.status(f"view {save}")
