@@ -29,9 +29,6 @@ from cdmisfa.core.untrusted import read_regular
 T = TypeVar("T")
 
 
-# Largest whole number of a key: what a signed integer of 64 bits holds.
-LARGEST = 2**63 - 1
-
 # More whitening components than this would take minutes a frame.
 MAX_COMPONENTS = 1000
 
@@ -336,7 +333,7 @@ def _words_of(hint: Any) -> str:
 
 def _whole(value: Any) -> int:
     number = int(value) if isinstance(value, str) else index(value)
-    if isinstance(value, bool) or abs(number) > LARGEST:
+    if isinstance(value, bool) or abs(number) >= 2**63:  # signed integers of 64 bits
         raise ValueError
     return number
 

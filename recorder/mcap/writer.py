@@ -14,23 +14,9 @@ from typing import Any, Final
 
 import lz4.frame
 import zstandard
+from mcap import records as mcap
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 
 from recorder.config import Compression
 from recorder.mcap.records import INDEX_HEADER, MAGIC, MESSAGE_HEADER, chunk_head, crc32
@@ -74,11 +60,11 @@ class McapWriter:
         self._out = out
         self._chunk_size = chunk_size
         self._compression, self._compress = _COMPRESS[compression]
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
-        self._chunks: list[ChunkIndex] = []
-        self._attachments: list[AttachmentIndex] = []
-        self._metadata: list[MetadataIndex] = []
+        self._schemas: list[mcap.Schema] = []
+        self._channels: list[mcap.Channel] = []
+        self._chunks: list[mcap.ChunkIndex] = []
+        self._attachments: list[mcap.AttachmentIndex] = []
+        self._metadata: list[mcap.MetadataIndex] = []
         self._counts: dict[int, int] = {}
         # Only grow: memory that is used again is in the cache. One takes the next chunk while the
         # other is compressed.
@@ -90,7 +76,7 @@ class McapWriter:
         self._index: dict[int, list[int]] = {}
         self._crc = 0
         self._append(MAGIC)
-        self._append(_encoded(Header(profile, library)))
+        self._append(_encoded(mcap.Header(profile, library)))
 
     @property
     def size(self) -> int:
@@ -103,7 +89,7 @@ class McapWriter:
         for known in self._schemas:
             if (known.name, known.encoding, known.data) == (name, encoding, data):
                 return known.id
-        schema = Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
+        schema = mcap.Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
         self._schemas.append(schema)
         self._define(schema)
         return schema.id
@@ -118,7 +104,7 @@ class McapWriter:
     ) -> int:
         """Define a channel of messages on a topic, and return its id; schema 0 is none."""
         number, facts = len(self._channels) + 1, dict(metadata or {})
-        channel = Channel(number, topic, encoding, facts, schema)
+        channel = mcap.Channel(number, topic, encoding, facts, schema)
         self._channels.append(channel)
         self._define(channel)
         return channel.id
@@ -147,8 +133,8 @@ class McapWriter:
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a named map of texts at once, outside the chunks."""
         self.settle()
-        data = _encoded(Metadata(name=name, metadata=dict(values)))
-        self._metadata.append(MetadataIndex(offset=self._out.tell(), length=len(data), name=name))
+        data = _encoded(mcap.Metadata(name=name, metadata=dict(values)))
+        self._metadata.append(mcap.MetadataIndex(self._out.tell(), len(data), name))
         self._append(data)
         self._out.flush()
 
@@ -157,9 +143,9 @@ class McapWriter:
     ) -> None:
         """Write a named file at once, outside the chunks; times in nanoseconds."""
         self.settle()
-        stored = _encoded(Attachment(create_time, log_time, name, media_type, data))
+        stored = _encoded(mcap.Attachment(create_time, log_time, name, media_type, data))
         place, times = (self._out.tell(), len(stored)), (log_time, create_time)
-        self._attachments.append(AttachmentIndex(*place, *times, len(data), name, media_type))
+        self._attachments.append(mcap.AttachmentIndex(*place, *times, len(data), name, media_type))
         self._append(stored)
         self._out.flush()
 
@@ -186,9 +172,9 @@ class McapWriter:
         """End the chunk in progress and append the summary."""
         self.end_chunk()
         self.settle()
-        self._append(_encoded(DataEnd(self._crc)))
+        self._append(_encoded(mcap.DataEnd(self._crc)))
         start = at = self._out.tell()
-        statistics = Statistics(
+        statistics = mcap.Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
@@ -199,7 +185,7 @@ class McapWriter:
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
-        groups: list[tuple[Opcode, Iterable[McapRecord]]] = [
+        groups: list[tuple[Opcode, Iterable[mcap.McapRecord]]] = [
             (Opcode.SCHEMA, self._schemas),
             (Opcode.CHANNEL, self._channels),
             (Opcode.STATISTICS, [statistics]),
@@ -211,11 +197,11 @@ class McapWriter:
         for opcode, records in groups:
             part = _encoded(*records)
             parts.append(part)
-            offsets.append(SummaryOffset(opcode, at, len(part)))
+            offsets.append(mcap.SummaryOffset(opcode, at, len(part)))
             at += len(part)
         summary = b"".join(parts) + _encoded(*offsets)
         crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, at), crc32(summary))
-        self._append(summary + _encoded(Footer(start, at, crc)) + MAGIC)
+        self._append(summary + _encoded(mcap.Footer(start, at, crc)) + MAGIC)
 
     def _append_chunk(self, buffer: memoryview, size: int, index: dict[int, list[int]]) -> None:
         """Append a chunk with its message indexes.
@@ -244,7 +230,7 @@ class McapWriter:
             self._counts[channel] = self._counts.get(channel, 0) + len(pairs) // 2
         self._append(b"".join(parts))
         self._chunks.append(
-            ChunkIndex(
+            mcap.ChunkIndex(
                 chunk_length=chunk,
                 chunk_start_offset=offset,
                 compression=self._compression,
@@ -257,7 +243,7 @@ class McapWriter:
             )
         )
 
-    def _define(self, record: McapRecord) -> None:
+    def _define(self, record: mcap.McapRecord) -> None:
         data = _encoded(record)
         stop = self._size + len(data)
         if stop > len(self._records):
@@ -280,7 +266,7 @@ class McapWriter:
         self._out.write(data)
 
 
-def _encoded(*records: McapRecord) -> bytes:
+def _encoded(*records: mcap.McapRecord) -> bytes:
     builder: Any = RecordBuilder()
     for record in records:
         record.write(builder)
