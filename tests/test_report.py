@@ -207,7 +207,7 @@ def test_learning_does_not_fail_with_its_report(
     def broken(*_: object) -> str:
         raise ZeroDivisionError("no page today")
 
-    monkeypatch.setattr(reports, "_page", broken)
+    monkeypatch.setattr(reports, "_reproducible", broken)
     done = cdmisfa("learn", "oscillatory", "--max-iterations", 5, "--no-rerun", "-o", tmp_path)
     assert done.code == 0
     assert "has no report (no page today)" in done.err
