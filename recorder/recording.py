@@ -121,12 +121,13 @@ def record(
     if frames is not None and not 1 <= frames <= (length or frames):
         most = "" if length is None else f", and no more than the {length} that there are"
         raise UsageError(f"--frames is {frames}: record at least one{most}")
-    if force and resume:
-        raise UsageError("--force starts anew and --resume goes on: use one of them")
     if not resume:
         refuse_existing(folder, force=force)
-    elif not holds_recording(folder):
-        raise UsageError(f"{folder} holds no recording to go on with: choose another folder")
+    elif force or not holds_recording(folder):
+        raise UsageError(
+            f"{folder} holds no recording to go on with, or --force is given: choose another "
+            "folder, or leave out --force or --resume"
+        )
     recording = recording_spec(source, settings, scene)
     streams = recording.spec.streams
     if unknown := [view for view in views or () if view not in streams]:

@@ -158,12 +158,3 @@ def test_a_recording_shows_its_world(tmp_path, monkeypatch):
     assert not [entity for entity in View(tmp_path / "r.rrd").names if "watching" in entity]
     said = [text for (text,) in rows["/events"]["TextLog:text"]]
     assert any("icub-models" in text for text in said)
-
-
-def test_the_robot_s_body_is_shown(tmp_path):
-    write_run(tmp_path / "run.mcap", SCENE, 3, source=LIVE)
-    build_view(tmp_path, tmp_path / "run.rrd")
-    entities = View(tmp_path / "run.rrd").names
-    assert {r"\/" in e for e in entities} == {False}  # a part that was to be two
-    parts = {e.split("/")[2] for e in entities if e.startswith("/scene/")}
-    assert {"body", "joints", "neck", "stands", "box"} <= parts

@@ -111,15 +111,12 @@ def _checked(spec: SourceSpec, rows: Iterable[Sequence[NDArray[Any]]]) -> Iterat
     for t, row in enumerate(rows):
         for name, frame in zip(spec.streams, row, strict=True):
             alike = frame.shape == spec.frame_shape and str(frame.dtype) == spec.dtype
-            if not alike or (spec.dtype, frame.ndim) not in (("uint8", 2), ("float64", 1)):
+            plain = (spec.dtype, frame.ndim) in (("uint8", 2), ("float64", 1))
+            if not alike or not plain or not np.isfinite(frame).all():
                 raise UsageError(
-                    f"{name} shows {frame.dtype} of shape {frame.shape}: give frames (height, "
-                    "width) of uint8 or (I,) of float64, of one size and type for all streams"
-                )
-            if frame.ndim == 1 and not np.isfinite(frame).all():
-                raise UsageError(
-                    f"{name}: frame {t}, counted from 0, holds what is no finite number (NaN or "
-                    "infinity): leave it out or fill it in"
+                    f"{name} shows {frame.dtype} of shape {frame.shape} at frame {t}, counted from "
+                    "0: give frames (height, width) of uint8 or (I,) of finite float64, of one "
+                    "size and type for all streams"
                 )
         yield row, np.empty(0)
 
@@ -266,10 +263,9 @@ def make_environment(task: str, **options: Any) -> Any:
         import gymnasium
 
         return gymnasium.make(task, render_mode="rgb_array", **options)
-    except ImportError as error:
-        raise UsageError(f"gym:{task} needs pip install 'cdmisfa[gym]': {error}") from None
     except Exception as error:  # whatever an environment raises
-        raise UsageError(f"gym:{task} cannot be made: {one_line(error)}") from None
+        remedy = ": pip install 'cdmisfa[gym]'" if isinstance(error, ImportError) else ""
+        raise UsageError(f"gym:{task} cannot be made: {one_line(error)}{remedy}") from None
 
 
 def gray_picture(seen: Any) -> ByteArray:

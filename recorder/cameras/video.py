@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections.abc import Iterator, Mapping
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.arrays import ByteArray
-from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from cdmisfa.core.errors import CdmisfaError, one_line
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.cameras.live import Steady
 from recorder.images.options import VIDEO_RECIPE
@@ -58,8 +57,6 @@ class VideoCamera:
         head, _, rest = word.partition(":")
         form, _, address = rest.partition(":")
         if head == "camera":
-            if not os.path.exists(rest):
-                raise UsageError(f"{rest}: there is no such device")
             self._form, self._address = "v4l2" if rest.startswith("/dev/video") else None, rest
         elif head == "av":
             stated = address and not address.startswith("//") and form in self._av.formats_available

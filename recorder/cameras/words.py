@@ -57,14 +57,12 @@ def open_live(
         )
     of_logs = options.named(("topics", "start", "end", "align", "centre", "holdout"))
     of_logs += ["--color auto"] if options.color == "auto" else []
+    schemes = [word.partition(":")[0].lower() for word in words]
+    if "foxglove" not in schemes:
+        of_logs += options.named(("fields", "range"))
     if of_logs:
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
     names = live_names(words)
-    schemes = [word.partition(":")[0].lower() for word in words]
-    of_messages = options.named(("fields", "range"))
-    if of_messages and "foxglove" not in schemes:
-        refusal = are_for(of_messages, "messages of foxglove://")
-        raise UsageError(f"{words[0]} shows images: {refusal}")
     color = options.color is True
     if "gym" in schemes:
         from recorder.cameras.stepped import GymSource

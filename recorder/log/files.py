@@ -203,10 +203,7 @@ def held(folder: Path) -> Iterator[None]:
     Raises:
         UsageError: another process holds it, or there is no such folder.
     """
-    try:
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise UsageError(f"{folder} is no folder that can be opened: {error.strerror}") from error
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
