@@ -186,7 +186,8 @@ def _write_recording(
         about(source)
         first, count, spec = source.t, source.frames, source.spec
         ours = source.recorded
-        scenery = scenery_of_recording(paths[0]) if ours else None
+        files = [view.path for stream in source.streams for view in stream.views]
+        scenery = scenery_of_recording(files) if ours else None
         rows = Rows(recording, spec)
         world = None if scenery is None else SceneView(rows, scenery, every)
         for note in (*source.warnings, *(world.notes if world is not None else ())):

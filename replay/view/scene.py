@@ -102,24 +102,23 @@ def _learned_from(header: RunHeader, folder: Path, sha256: str) -> Scenery | Non
     named = _table(header.manifest.get("command")).get("source")
     for name in named if isinstance(named, list) else []:
         with contextlib.suppress(CdmisfaError, OSError, ValueError):
-            if scenery := scenery_of_recording(folder / str(name), sha256=sha256):
+            if scenery := scenery_of_recording(log_files(folder / str(name)), sha256):
                 return scenery
     return None
 
 
-def scenery_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
+def scenery_of_recording(files: Sequence[Path], sha256: str | None = None) -> Scenery | None:
     """Return the scenery of a recording, None of other scenes and recordings.
 
     Args:
-        path: of the recording.
+        files: files of the recording.
         sha256: the checksum that its configuration must have.
 
     Raises:
-        UsageError: there is no such recording.
-        LogDamagedError: it cannot be read.
+        LogDamagedError: a file cannot be read.
     """
     data, pose = b"{}", None
-    for file in log_files(path):  # the first has it, unless they are many
+    for file in files:  # the first has it, unless they are many
         with LogReader(file) as reader:
             if entries := [entry for entry in reader.attachments if entry.name == CONFIG_NAME]:
                 data, pose = bytes(reader.attachment_data(entries[0])), first_pose(reader)
