@@ -33,7 +33,10 @@ def agent_steps(n: int, blocks: int) -> Callable[[], int]:
 
     def call() -> int:
         for b in range(blocks):
-            kernels.think(agent, xi[b % 997], y, 3 * b, draws[b % 997])
+            changes, uniforms = (a[b % 997] for a in (xi, draws))
+            arrays = (kernels.pointer("xi", changes, (3,)), kernels.pointer("y", y, (3, 1)))
+            draw = kernels.pointer("uniforms", uniforms, (3,))
+            kernels.check(kernels.lib.think(agent.pointer, *arrays, 3 * b, draw), "the agent")
         return blocks
 
     return call

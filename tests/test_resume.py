@@ -18,7 +18,7 @@ from waiting import running, wait_for
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import Keyframes
@@ -338,3 +338,14 @@ class TestWithoutItsSource:
         refused = cdmisfa("learn", "--resume", "-o", tmp_path / "run")
         assert (refused.code, "does not state its source" in refused.err) == (2, True)
         assert cdmisfa("learn", "--resume", "-o", tmp_path / "none").code == 2
+
+
+def test_a_damaged_log_is_refused_before_anything_is_replaced(tmp_path: Path) -> None:
+    go(OscillatorySource(), tmp_path, 60, force=True)
+    data = bytearray((tmp_path / "run.mcap").read_bytes())
+    data[len(data) // 4] ^= 255
+    (tmp_path / "run.mcap").write_bytes(data)
+    before = contents(tmp_path)
+    with pytest.raises(LogDamagedError):
+        go(OscillatorySource(), tmp_path, 90, resume=True)
+    assert contents(tmp_path) == before

@@ -27,14 +27,6 @@ def test_two_levels_with_much_data_have_the_closed_form_fit() -> None:
     assert fit == pytest.approx(-low / (high - low), abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("x", "yes"),
-    [([0.2, 0.9], [False, False]), ([0.2, 0.9], [True, True]), ([0.5, 0.5], [False, True])],
-)
-def test_answers_that_do_not_turn_have_no_midpoint(x: list[float], yes: list[bool]) -> None:
-    assert math.isnan(statistics.logistic_midpoint(x, yes))
-
-
 def test_wilson_interval_has_the_textbook_values() -> None:
     assert statistics.wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
     assert statistics.wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)

@@ -37,6 +37,7 @@ from cdmisfa.experiments.run_folder import (
     write_results,
 )
 from recorder.log.files import folder_here, partial_path
+from recorder.mcap.reader import LogReader
 from replay.runs.compare import differences
 from replay.runs.folders import RUN_FILE, run_log
 from replay.runs.keyframes import read_keyframe
@@ -253,6 +254,13 @@ class Session:
         """
         digest, log = Digest(), None
         all_sinks: list[Sink] = [digest]
+        if self._resumed and self.before is not None and self.keyframe is not None:
+            # Damage must be found before anything of the earlier run is replaced.
+            end = self.source.spec.time_ns(self.keyframe.t)
+            with LogReader(self.before) as earlier:
+                for _, table in earlier.tables():
+                    if len(table.log_time) and table.log_time[0] >= end:
+                        break
         with contextlib.ExitStack() as opened:
             if self.folder is not None:
                 how = {"force": self._force, "resumed": self._resumed}
