@@ -242,7 +242,7 @@ def test_a_finished_recording_is_made_longer_and_never_shorter(oscillatory, tmp_
     ("options", "words"),
     [
         ({"views": ["left"]}, "no view 'left': name one of x1, x2, x3"),
-        ({"force": True, "resume": True}, "one of them"),
+        ({"force": True, "resume": True}, "leave out --force"),
         ({"settings": RecordConfig(fps=25)}, r"x3\.mcap cannot be continued: its fps is '50\.0'"),
         ({}, r"x2\.mcap is there, but not frame 0 of x2"),
     ],
