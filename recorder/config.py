@@ -13,8 +13,8 @@ from cdmisfa.core.clock import RECORDED_FPS, START_NS
 from cdmisfa.core.config import Section, key
 from cdmisfa.core.errors import UsageError
 
+# Compression of the chunks of a log.
 Compression = Literal["zstd", "lz4", "none"]
-"""Compression of the chunks of a log."""
 
 
 @dataclass(frozen=True, slots=True)

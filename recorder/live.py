@@ -16,8 +16,8 @@ from recorder.log.resume import begin_view, other_recordings
 from recorder.recording import ViewLogs, ViewRecording, recording_spec
 from recorder.world.scenes import BLOCK
 
+# Name of the metadata record that counts used and dropped images of a live stream.
 COUNTS: Final = "cdmisfa.live"
-"""Name of the metadata record that counts used and dropped images of a live stream."""
 
 
 class RecordedWhileWatched(ForwardSource):

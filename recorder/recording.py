@@ -39,8 +39,8 @@ from recorder.world.scenes import (
 
 _FILE_NAME = re.compile(r"[\w-][\w.-]*")
 
+# Frames of each view if the source does not end and no number is given.
 DEFAULT_FRAMES: Final = 1000
-"""Frames of each view if the source does not end and no number is given."""
 
 
 @dataclass(frozen=True, slots=True)

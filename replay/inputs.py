@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import InputOptions
@@ -28,6 +28,8 @@ from replay.storage.opening import log_files, natural_order, no_such, starts_as_
 
 # Called with logs that were opened to be shown, to print what they are.
 About = Callable[[LoggedSource], None]
+
+Source = TypeVar("Source")
 
 
 def open_log(
@@ -70,23 +72,28 @@ def open_to_look(
     """
     inputs = inputs or InputOptions()
     refuse_what_is_no_log(paths)
-    chosen = bool(inputs.topics or inputs.fields)
     source = None
-    if not (chosen or any(map(only_external, paths))):
+    if not (inputs.topics or inputs.fields or any(map(only_external, paths))):
         with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
             source = open_recording(paths, salvage=salvage)
     if source is None:
-        inputs = inputs if chosen else replace(inputs, topics=ALL)
-        try:
-            source = open_external(paths, inputs, salvage=salvage)
-        except UnequalError:
-            source = open_external(paths, replace(inputs, align="time"), salvage=salvage)
+        source = with_every_topic(lambda how: open_external(paths, how, salvage=salvage), inputs)
     try:
         source.describe_at_once()
     except BaseException:
         source.close()
         raise
     return source
+
+
+def with_every_topic(opened: Callable[[InputOptions], Source], inputs: InputOptions) -> Source:
+    """Open external logs with all their topics unless some are chosen, by time if rates differ."""
+    if not (inputs.topics or inputs.fields):
+        inputs = replace(inputs, topics=ALL)
+    try:
+        return opened(inputs)
+    except UnequalError:
+        return opened(replace(inputs, align="time"))
 
 
 def open_recording(

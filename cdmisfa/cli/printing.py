@@ -16,7 +16,7 @@ from cdmisfa.core.untrusted import printable
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.run_folder import RunResult
-    from replay.integrity.learned import ModuleInfo
+    from replay.integrity.report import ModuleInfo
 
 # Version of the JSON documents; rises when a key changes its meaning or goes away.
 SCHEMA = 1
@@ -141,7 +141,7 @@ def result(run: RunResult, *, as_json: bool) -> None:
     """Print the result of a run that has ended."""
     from cdmisfa.core.names import counted
     from cdmisfa.experiments.loop import ENDINGS
-    from replay.integrity.learned import ModuleInfo
+    from replay.integrity.report import ModuleInfo
 
     if as_json:
         json_document(run.as_json())

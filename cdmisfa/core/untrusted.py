@@ -119,8 +119,13 @@ def check_regular(path: Path, limit: int | None = None) -> None:
     Raises:
         UsageError: so it is.
     """
+    os.close(_number_of(path, limit))
+
+
+def _number_of(path: Path, limit: int | None) -> int:
+    """Open a file as `open_regular`; a file that cannot be opened is a UsageError."""
     try:
-        os.close(open_regular(path, limit))
+        return open_regular(path, limit)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
 
@@ -143,9 +148,9 @@ def open_regular(path: Path, limit: int | None = None) -> int:
 @contextlib.contextmanager
 def opened_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
     """Open a regular file to be read; raises as `read_regular` does, in the body, too."""
-    check_regular(path, limit)
+    number = _number_of(path, limit)
     try:
-        with open(open_regular(path, limit), "rb") as file:
+        with open(number, "rb") as file:
             yield file
     except OSError as error:
         raise LogDamagedError(f"{path} cannot be read: {error.strerror or error}") from error

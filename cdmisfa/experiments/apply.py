@@ -31,11 +31,10 @@ from recorder.cameras.words import is_live, open_live
 from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
 from replay.export.applied import Applied, AppliedSink
-from replay.inputs import locations, open_recording
-from replay.logs.aligning import UnequalError
+from replay.inputs import locations, open_recording, with_every_topic
 from replay.logs.formats.recording import NoRecordingError
 from replay.logs.formats.views import SeveralRecordingsError
-from replay.logs.opening import ALL, only_external
+from replay.logs.opening import only_external
 from replay.runs.folders import MODULES_FILE
 from replay.runs.run import Run
 from replay.storage.identity import file_sha256
@@ -144,13 +143,9 @@ class Application:
                 if recorded.spec.frame_shape == self.recipe.shape or not recorded.spec.images:
                     return recorded
                 recorded.close()
-        inputs = self._with_recipe(inputs)
-        if not inputs.topics and not inputs.fields:
-            inputs = replace(inputs, topics=ALL)
-        try:
-            return open_logs(words, inputs=inputs, **how)
-        except UnequalError:
-            return open_logs(words, inputs=replace(inputs, align="time"), **how)
+        return with_every_topic(
+            lambda inputs: open_logs(words, inputs=inputs, **how), self._with_recipe(inputs)
+        )
 
     def to(
         self,

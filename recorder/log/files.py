@@ -20,11 +20,10 @@ from typing import Final
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 
+# File that says how a recording was started; gone when every view is finished.
+#
+# It is beside the logs, because these hold the same bytes whatever length was wanted first.
 RECORDING: Final = "recording.json"
-"""File that says how a recording was started; gone when every view is finished.
-
-It is beside the logs, because these hold the same bytes whatever length was wanted first.
-"""
 
 # Endings of names that are always taken for files, never for folders.
 _OF_FILES = frozenset({".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"})

@@ -20,11 +20,10 @@ from recorder.log.files import partial_path, refuse_taken, to_disk
 from recorder.mcap.store import OPEN_FILES
 from recorder.mcap.writer import McapWriter
 
+# Log time after which the chunk in progress is handed to the operating system, by default.
+#
+# A run's log flushes by wall time (`replay/runs/writer.py`).
 FLUSH_NS: Final = 1_000_000_000
-"""Log time after which the chunk in progress is handed to the operating system, by default.
-
-A run's log flushes by wall time (`replay/runs/writer.py`).
-"""
 
 
 class AppendOnlyFile:

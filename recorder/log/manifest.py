@@ -31,17 +31,17 @@ MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
 MAX_FRAMES: Final = 2**33
 
+# Streams that every file of a recording names; of more each names its own, so that all together do
+# not grow with their square.
 MOST_NAMED: Final = 100
-"""Streams that every file of a recording names; of more each names its own, so that all together
-do not grow with their square."""
 
+# Packages whose versions every file states.
 PACKAGES: Final = ("cdmisfa", "numpy", "zstandard")
-"""Packages whose versions every file states."""
 
 _VERSION = "version_"
 
+# Keys that a file has only if they are not their default, which most recordings have.
 _AT_NEED = ("gaps", "stream_count")
-"""Keys that a file has only if they are not their default, which most recordings have."""
 
 
 @dataclass(frozen=True, slots=True)

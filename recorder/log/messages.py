@@ -39,11 +39,11 @@ from recorder.log.scenery import (
     turned,
 )
 
+# Name of the metadata record that says what a recording is.
 RECORDING_METADATA = "cdmisfa.recording"
-"""Name of the metadata record that says what a recording is."""
 
+# Rises whenever a channel, a message or a metadata key changes its meaning.
 SCHEMA_VERSION = 1
-"""Rises whenever a channel, a message or a metadata key changes its meaning."""
 
 TRUTH_TOPIC = "/truth"
 POSE_TOPIC = "/head_pose"
@@ -52,17 +52,17 @@ OBJECTS_TOPIC = "/scene"
 
 SIDES = ("left_eye", "right_eye")
 
+# Message and schema encoding of every channel.
 ENCODING = "protobuf"
-"""Message and schema encoding of every channel."""
 
+# Pixel format of image views: one byte of grey.
 IMAGE_ENCODING = "mono8"
-"""Pixel format of image views: one byte of grey."""
 IMAGE_SCHEMA = "foxglove.RawImage"
 VECTOR_SCHEMA = "cdmisfa.Vector"
 TRUTH_SCHEMA = "cdmisfa.GroundTruth"
 
+# Most columns of ground truth: their tags then take at most two bytes.
 MAX_TRUTH = 1000
-"""Most columns of ground truth: their tags then take at most two bytes."""
 
 _FIRST_TRUTH_FIELD = 2
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")

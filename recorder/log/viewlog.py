@@ -34,10 +34,11 @@ from recorder.log.messages import (
 from recorder.log.resume import messages
 from recorder.log.scenery import scenery_of
 
+# Name of the attachment with the configuration of what was recorded.
 CONFIG_NAME: Final = "config.json"
-"""Name of the attachment with the configuration of what was recorded."""
+
+# Name of the coordinate frame of the robot's root.
 ROOT_FRAME: Final = "root"
-"""Name of the coordinate frame of the robot's root."""
 
 
 class ViewLog:

@@ -37,8 +37,8 @@ from recorder.mcap.records import (
 )
 from recorder.mcap.store import Store
 
+# The message indexes of a chunk: channel, and (n, 2) log time and place of each message.
 Pairs = list[tuple[int, NDArray[np.uint64]]]
-"""The message indexes of a chunk: channel, and (n, 2) log time and place of each message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +145,8 @@ def walked_table(
     return MessageTable(data, messages), definitions, times
 
 
+# The end of a problem with an index that contradicts its chunk, which costs no message.
 UNUSED: Final = "(the index is not used)"
-"""The end of a problem with an index that contradicts its chunk, which costs no message."""
 
 # Decoded chunks that are kept, one at least: few, because reading moves forward, and memory that is
 # used again is still in the CPU's cache.

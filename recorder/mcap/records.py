@@ -46,12 +46,12 @@ class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with 
     """A record contradicts the format; the reader adds file and place."""
 
 
+# The formats that are read, for errors; docs/how-to/logs.md says more.
 KINDS: Final = (
     "logs are .mcap, .bag and .db3 files, videos (.mp4, .m4v, .mov, .mkv, .webm, .avi, .wmv, .mpg, "
     ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, LeRobot datasets, and arrays "
     "(.npy, .npz)"
 )
-"""The formats that are read, for errors; docs/how-to/logs.md says more."""
 
 
 def no_log(path: Path) -> CdmisfaError:
@@ -111,8 +111,8 @@ def chunk_head(start: int, end: int, size: int, crc: int, compression: str, stor
     return head + struct.pack(f"<I{len(name)}sQ", len(name), name, stored)
 
 
+# Takes (where, what) of a damage: raises, or notes it where damage is left out.
 Refuse = Callable[[str, str], None]
-"""Takes (where, what) of a damage: raises, or notes it where damage is left out."""
 
 
 @dataclass(slots=True)

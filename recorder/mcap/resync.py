@@ -27,8 +27,9 @@ _CHUNK: Final = re.compile(
 # The length that some writers state in a chunk until they have finished it.
 _OPEN_LENGTH: Final = 2**64 - 1
 _BLOCK: Final = 1 << 20
+
+# Bytes that blocks share, more than the pattern and the stored bytes' length take.
 _OVERLAP: Final = 64
-"""Bytes that blocks share, more than the pattern and the stored bytes' length take."""
 
 
 def is_record(file: Store, at: int, stop: int) -> bool:

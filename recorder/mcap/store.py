@@ -14,11 +14,12 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import open_regular
 from recorder.mcap.records import crc32
 
+# Ending of a file that is being written, or whose writing was cut short.
 PARTIAL: Final = ".partial"
-"""Ending of a file that is being written, or whose writing was cut short."""
+
+# Files of recordings that stay open at once; a recording in parts has thousands, and a process may
+# have 256 files open on some systems.
 OPEN_FILES = 24
-"""Files of recordings that stay open at once; a recording in parts has thousands, and a process may
-have 256 files open on some systems."""
 
 # Bytes read ahead for short reads: where they follow one another, and at a place far from the last.
 _PEEK: Final = 4096

@@ -19,19 +19,19 @@ from replay.logs.source import LoggedSource
 from replay.storage.identity import Identity
 from replay.stored import Span, StoredSource
 
+# Number of warnings of a kind, as of logs that are left out, that are printed.
 MOST_LINES: Final = 5
-"""Number of warnings of a kind, as of logs that are left out, that are printed."""
 
+# Episodes of one source, which the files of a run list.
 MOST_EPISODES: Final = 20_000
-"""Episodes of one source, which the files of a run list."""
 
+# What the description of a source states of how images became frames, the same for all logs.
 _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "time", "stamp")
-"""What the description of a source states of how images became frames, the same for all logs."""
 
 Taken = TypeVar("Taken")
 
+# Called with the number of logs that were opened, and of all logs.
 Progress = Callable[[float, float | None], None]
-"""Called with the number of logs that were opened, and of all logs."""
 
 
 class EpisodeSource(StoredSource):

@@ -15,8 +15,8 @@ from replay.logs.opening import ENDINGS, log_format
 from replay.runs.folders import RUN_FILE
 from replay.storage.location import is_url
 
+# Name of the index file in the folder that it indexes.
 INDEX: Final = "corpus.parquet"
-"""Name of the index file in the folder that it indexes."""
 
 _LOGS: Final = frozenset((".mcap", *ENDINGS))
 _RUN: Final = frozenset((RUN_FILE, RUN_FILE + PARTIAL))

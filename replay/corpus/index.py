@@ -24,18 +24,18 @@ from replay.corpus.rows import MARK, SCHEMA, VERSION, read_rows
 from replay.storage.location import is_url, location
 from replay.storage.opening import no_such
 
+# Logs that a process reads at a time.
 BATCH: Final = 32
-"""Logs that a process reads at a time."""
 
+# Logs with a problem that `index` prints, so that they fit on a screen.
 MOST_PROBLEMS: Final = 20
-"""Logs with a problem that `index` prints, so that they fit on a screen."""
 
+# Logs after which the index is written, so that a kill loses no more than these.
 SAVED_EVERY: Final = 5000
-"""Logs after which the index is written, so that a kill loses no more than these."""
 
+# What all views of one recording state alike.
 _SHARED: Final = ("scene", "seed", "config_sha256", "start_ns", "fps", "frame_shape", "dtype",
                   "truth")  # fmt: skip
-"""What all views of one recording state alike."""
 
 
 @dataclass(slots=True)

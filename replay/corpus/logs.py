@@ -19,11 +19,11 @@ from replay.storage.identity import Identity
 from replay.storage.opening import natural_order
 from replay.stored import Span
 
+# A log with at most this many bytes is hashed as a whole when it is opened first.
 SMALL: Final = 1 << 20
-"""A log with at most this many bytes is hashed as a whole when it is opened first."""
 
+# What is opened as one: a log, or the files of a recording's views.
 Log = Sequence[Path]
-"""What is opened as one: a log, or the files of a recording's views."""
 
 
 @dataclass(slots=True)

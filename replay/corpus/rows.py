@@ -24,20 +24,21 @@ from replay.logs.opening import identity_of, image_topics, only_external, open_s
 from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import is_url, location
 
+# Rises whenever a column changes its meaning.
 VERSION: Final = 2
-"""Rises whenever a column changes its meaning."""
 
+# Key of the Parquet file's metadata that holds the version.
 MARK: Final = b"cdmisfa.corpus"
-"""Key of the Parquet file's metadata that holds the version."""
 
+# Letters of a configuration in the index.
 MOST_TEXT: Final = 64 * 1024
-"""Letters of a configuration in the index."""
 
+# Letters of a problem in the index.
 MOST_LETTERS: Final = 500
-"""Letters of a problem in the index."""
 
 _WORD: Final = pa.dictionary(pa.int32(), pa.string())
 
+# Columns of the index; docs/how-to/corpus.md says what each is.
 SCHEMA: Final = pa.schema(
     [
         ("path", pa.string()),
@@ -67,7 +68,6 @@ SCHEMA: Final = pa.schema(
     ],
     metadata={MARK: str(VERSION).encode()},
 )
-"""Columns of the index; docs/how-to/corpus.md says what each is."""
 
 
 def read_rows(logs: Sequence[ListedLog], deep: bool) -> tuple[pa.Table, list[str]]:

@@ -37,8 +37,8 @@ from replay.logs.opening import channels_of, log_format, only_external
 from replay.runs.folders import RUN_METADATA
 from replay.storage.opening import log_files
 
+# Bytes of a log, decompressed or not, that `info` decodes; it reads the index of larger logs.
 CHECK_BYTES: Final = 1024 * 1024 * 1024
-"""Bytes of a log, decompressed or not, that `info` decodes; it reads the index of larger logs."""
 
 Times = NDArray[np.uint64]
 Result = TypeVar("Result")

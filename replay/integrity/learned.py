@@ -8,45 +8,18 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.signals import STATES
-from cdmisfa.modules import Module
-from replay.integrity.report import ChannelInfo
+from replay.integrity.report import ChannelInfo, ModuleInfo
 from replay.runs.folders import RUN_FILE, read_run_json, run_log
 from replay.runs.log import SIGNALS_TOPIC, read_header
 from replay.runs.modules import load_modules
 
+# Errors of reading fields of a document whose structure is unknown.
 _NO_SENSE: Final = (LookupError, TypeError, ValueError, AttributeError)
-"""Errors of reading fields of a document whose structure is unknown."""
-
-
-@dataclass(frozen=True, slots=True)
-class ModuleInfo:
-    """A module: the slowness of each output, and 1 or 0 where it is known to be slow or not.
-
-    Attributes:
-        iteration: at whose end it was saved.
-        policy: that led to it; of each stream 0 to stay and 1 to switch.
-    """
-
-    index: int
-    stream: str
-    slowness: tuple[float, ...]
-    slow: tuple[int, ...]
-    iteration: int
-    policy: tuple[int, ...]
-
-    @classmethod
-    def of(cls, module: Module) -> ModuleInfo:
-        """Return a module in short."""
-        slowness, slow, policy = (
-            tuple(m.tolist()) for m in (module.eta, module.slow, module.policy)
-        )
-        return cls(module.index, module.stream, slowness, slow, module.iteration, policy)
 
 
 def run_facts(place: Path, channels: Sequence[ChannelInfo]) -> dict[str, Any]:

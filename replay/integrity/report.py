@@ -12,16 +12,18 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.mcap.records import Problem
 
 if TYPE_CHECKING:
-    from replay.integrity.learned import ModuleInfo
+    from cdmisfa.modules import Module
 
+# Rises whenever a key of the JSON of info, verify or recover changes its meaning.
 SCHEMA: Final = 1
-"""Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
 
 Kind = Literal["recording", "run", "foreign"]
 Crc = Literal["ok", "absent", "bad", "unchecked"]
-State = Literal["whole", "unchecked", "not read", "cut short", "damaged"]
-"""Unchecked: no problem was found, but not everything was read. Not read: not a readable log."""
 
+# Unchecked: no problem was found, but not everything was read. Not read: not a readable log.
+State = Literal["whole", "unchecked", "not read", "cut short", "damaged"]
+
+# Exit code of `info` and `verify` for each state; the best state is first.
 EXIT_CODES: Final[Mapping[State, int]] = {
     "whole": 0,
     "unchecked": 0,
@@ -29,10 +31,9 @@ EXIT_CODES: Final[Mapping[State, int]] = {
     "cut short": LogDamagedError.exit_code,
     "damaged": LogDamagedError.exit_code,
 }
-"""Exit code of `info` and `verify` for each state; the best state is first."""
 
+# The best state of checksums is first.
 _CRCS: Final[tuple[Crc, ...]] = ("ok", "absent", "unchecked", "bad")
-"""The best state of checksums is first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,31 @@ class SizeInfo:
             self.decompressed + other.decompressed,
             dict(Counter(self.compression) + Counter(other.compression)),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class ModuleInfo:
+    """A module: the slowness of each output, and 1 or 0 where it is known to be slow or not.
+
+    Attributes:
+        iteration: at whose end it was saved.
+        policy: that led to it; of each stream 0 to stay and 1 to switch.
+    """
+
+    index: int
+    stream: str
+    slowness: tuple[float, ...]
+    slow: tuple[int, ...]
+    iteration: int
+    policy: tuple[int, ...]
+
+    @classmethod
+    def of(cls, module: Module) -> ModuleInfo:
+        """Return a module in short."""
+        slowness, slow, policy = (
+            tuple(m.tolist()) for m in (module.eta, module.slow, module.policy)
+        )
+        return cls(module.index, module.stream, slowness, slow, module.iteration, policy)
 
 
 @dataclass(frozen=True, slots=True)
