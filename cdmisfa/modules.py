@@ -171,7 +171,7 @@ class Module(Described):
 
 
 def columns_of(modules: Sequence[Module]) -> Iterator[tuple[Module, slice]]:
-    """Each module with its columns among the outputs of all."""
+    """Yield each module with its columns among the outputs of all."""
     ends = accumulate((len(module.phi) for module in modules), initial=0)
     for module, (low, high) in zip(modules, pairwise(ends), strict=True):
         yield module, slice(low, high)

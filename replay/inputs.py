@@ -196,7 +196,7 @@ def _with_color(
 
 
 def holds_run(path: Path) -> bool:
-    """Whether a folder or a file is a run, and no external log.
+    """Return whether a folder or a file is a run, and no external log.
 
     Raises:
         UsageError: it does not exist.
@@ -206,7 +206,7 @@ def holds_run(path: Path) -> bool:
 
 
 def is_recording(words: Sequence[str]) -> bool:
-    """Whether words name one of our recordings.
+    """Return whether words name one of our recordings.
 
     Raises:
         UsageError: there is no such log.

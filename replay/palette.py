@@ -54,22 +54,22 @@ STEPS = 255
 
 
 def colour(index: int) -> Rgb:
-    """The colour of stream number `index`, from 0."""
+    """Return the colour of stream number `index`, from 0."""
     return CYCLE[index % len(CYCLE)]
 
 
 def pale(index: int) -> Rgb:
-    """The colour of line number `index`, from 0, of those that belong to no stream."""
+    """Return the colour of line number `index`, from 0, of those that belong to no stream."""
     return PALE[index % len(PALE)]
 
 
 def faint(rgb: Rgb) -> Rgba:
-    """A colour through which half of what is behind it shows, be that black or white."""
+    """Return a colour through which half of what is behind it shows, be that black or white."""
     return (*rgb, 0x80)
 
 
 def packed(rgb: Colour) -> int:
-    """A colour as 0xRRGGBBAA."""
+    """Return a colour as 0xRRGGBBAA."""
     red, green, blue, *opacity = rgb
     return red << 24 | green << 16 | blue << 8 | (opacity[0] if opacity else 0xFF)
 

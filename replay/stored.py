@@ -128,7 +128,7 @@ class StoredSource(ClockedSource):
         return blocks
 
     def spans(self, stream: int, start: int, stop: int) -> list[Span]:
-        """The unbroken stretches [low, high) that a stream has of the frames [start, stop)."""
+        """Return the unbroken stretches [low, high) of a stream within the frames [start, stop)."""
         return [*self._spans(stream, start, stop)]
 
     def _spans(self, stream: int, start: int, stop: int) -> Iterable[Span]:
@@ -141,7 +141,7 @@ class StoredSource(ClockedSource):
         return merged((max(low + by, start), min(high + by, stop)) for by, (low, high) in shifted)
 
     def episode(self, stream: int, t: int) -> Span:
-        """The episode [start, stop) of a frame, in the first lap.
+        """Return the episode [start, stop) of a frame, in the first lap.
 
         In a log without episodes of its own it is the stretch between two gaps.
 
@@ -171,23 +171,23 @@ class StoredSource(ClockedSource):
         self._t = t
 
     def pixels(self, stream: int) -> str:
-        """The format of pixels that a stream's messages state, "" if they state none."""
+        """Return the format of pixels that a stream's messages state, "" if they state none."""
         return ""
 
     def scene(self) -> Mapping[str, str]:
-        """The recorded scene, its seed and configuration, if the logs state them."""
+        """Return the recorded scene, its seed and configuration, if the logs state them."""
         return {}
 
     def origin(self) -> Mapping[str, Any]:
-        """The description of the source that was recorded; empty of scenes and external logs."""
+        """Return the description of the recorded source; empty for scenes and external logs."""
         return {}
 
     def salvaged(self) -> list[str]:
-        """A line for each stream of which damaged parts were replaced or left out so far."""
+        """Return a line for each stream of which damaged parts were replaced or left out so far."""
         return []
 
     def describe(self, told: Progress = lambda done, size: None) -> Mapping[str, Any]:
-        """The logs with the SHA-256 of all their bytes, and how they became frames.
+        """Return the logs with the SHA-256 of all their bytes, and how they became frames.
 
         Args:
             told: called with the bytes that were hashed and all bytes, if there are many.
@@ -214,7 +214,7 @@ class StoredSource(ClockedSource):
         return self._with_centre([log.sample() for log in logs])
 
     def identities(self) -> Sequence[Identity]:
-        """The identity of each log that the source is read from."""
+        """Return the identity of each log that the source is read from."""
         if self._identities is None:
             self._identities = self._logs()
         return self._identities
@@ -225,11 +225,11 @@ class StoredSource(ClockedSource):
 
     @abstractmethod
     def _logs(self) -> Sequence[Identity]:
-        """The identity of each log that the source is read from, made now."""
+        """Return the identity of each log that the source is read from, made now."""
 
     @abstractmethod
     def described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-        """The description of the source, with the hash of each log."""
+        """Return the description of the source, with the hash of each log."""
 
     @abstractmethod
     def _block(self, stream: int, t: int, n: int) -> Block:
@@ -237,7 +237,7 @@ class StoredSource(ClockedSource):
 
     @abstractmethod
     def _name(self) -> str:
-        """The name of the source in errors."""
+        """Return the name of the source in errors."""
 
     def _centred(self, stream: int, t: int, n: int) -> Block:
         """Read frames as `_block`; without the mean of their episode if they are centred so."""
@@ -255,7 +255,7 @@ class StoredSource(ClockedSource):
         return replace(block, frames=freeze(frames))
 
     def _mean(self, stream: int, t: int) -> NDArray[Any]:
-        """The mean of the episode of a frame, for which all of it is read."""
+        """Return the mean of the episode of a frame, for which all of it is read."""
         self._means = self._means or {}
         span = self.episode(stream, t)
         known = self._means.get(stream)
@@ -269,7 +269,7 @@ class StoredSource(ClockedSource):
         return known[1]
 
     def _unbroken(self, stream: int, n: int) -> int:
-        """The first of the next n frames of a stream that follow one another."""
+        """Return the first of the next n frames of a stream that follow one another."""
         # Looping, a stretch that holds them is in the rest of this lap or in the next two.
         end = self._t + 3 * self.frames + n if self._loop else self.end
         for low, high in self._spans(stream, self._t, end):
@@ -305,7 +305,7 @@ def centre_as(centre: Centre, source: FrameSource, name: str) -> FrameSource:
 
 
 def outside(gaps: Iterable[Span], first: int, stop: int) -> list[Span]:
-    """The spans of the frames [first, stop) between gaps, which are in their order."""
+    """Return the spans of the frames [first, stop) between gaps, which are in their order."""
     ends = [first, *(end for gap in gaps for end in gap), stop]
     return [(low, high) for low, high in zip(ends[::2], ends[1::2], strict=True) if low < high]
 

@@ -19,7 +19,7 @@ from cdmisfa.modules import Module
 
 
 def _record_type(kind: str) -> np.dtype[np.void]:
-    """The type of arrays of records, as C has them."""
+    """Return the type of arrays of records, as C has them."""
     types = {"int64_t": "i8", "double": "f8", "_Bool": "?"}
     fields = dict(kernels.ffi.typeof(kind).fields)
     layout: Any = {
@@ -88,7 +88,7 @@ class Agent(NamedTuple):
 
 
 def rules(config: LearnerConfig, n_streams: int) -> SimpleNamespace:
-    """The numbers of a configuration that an iteration with n streams needs, by their names."""
+    """Return the values of a configuration that an iteration with n streams needs, by name."""
     beta, tabular = config.reward_beta(n_streams), int(config.algorithm == "1.0")
     names = {name for name, _ in kernels.ffi.typeof("rules").fields} - {"beta", "tabular"}
     values = {name: float(getattr(config, name)) for name in names}
@@ -96,7 +96,7 @@ def rules(config: LearnerConfig, n_streams: int) -> SimpleNamespace:
 
 
 def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent:
-    """An agent that has seen nothing and will watch `first_stream`.
+    """Return an agent that has seen nothing and will watch `first_stream`.
 
     Raises:
         UsageError: more streams than CD-MISFA 1.0's table of rewards is kept for.
@@ -140,7 +140,7 @@ def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
 
 
 def as_struct(agent: Agent, rules: SimpleNamespace, out: NDArray[np.void]) -> kernels.Struct:
-    """An agent as the kernels take it: its arrays, its rules, and where its outcome goes.
+    """Return an agent as the kernels take it: its arrays, its rules, and where its outcome goes.
 
     Args:
         agent: changed in place.
@@ -190,7 +190,7 @@ class Frozen(NamedTuple):
 
 
 def frozen_modules(modules: Sequence[Module], agent: Agent, n_inputs: int) -> Frozen:
-    """The modules of an agent whose abstractions have I = `n_inputs`."""
+    """Return the modules of an agent whose abstractions have I = `n_inputs`."""
     count, outputs = len(modules), len(agent.eta)
     return Frozen(
         phi=np.array([m.phi for m in modules]).reshape(count * outputs, n_inputs),

@@ -170,7 +170,7 @@ class CuriousLearner:
         self.policy_rng.bit_generator.state = dict(state.policy_rng)
 
     def step(self, block: Block) -> BlockSignals:
-        """One iteration: look at tau frames, learn, and decide what to watch next.
+        """Do one iteration: look at tau frames, learn, and choose the next stream.
 
         Args:
             block: tau frames of the stream the learner asked for.
@@ -223,11 +223,11 @@ class CuriousLearner:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Its part of a run's result, as JSON values."""
+        """Return the learner's part of a run's result, as JSON values."""
         return {"final_policy": self.agent.policy.tolist(), "epsilon": self.epsilon}
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """Every array that changes in place, by name."""
+        """Return every array that changes in place, by name."""
         parts: dict[str, Any] = {"agent": self.agent, "abstraction": self.abstraction.state}
         return {
             f"{part}.{name}": array

@@ -118,7 +118,7 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
 
 
 def _ignored() -> set[signal.Signals]:
-    """The signals that nohup ignores."""
+    """Return the signals that nohup ignores."""
     return {n for n in (signal.SIGHUP,) if signal.getsignal(n) == signal.SIG_IGN}
 
 

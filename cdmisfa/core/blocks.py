@@ -47,7 +47,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class SourceSpec:
-    """What every block of a source has in common.
+    """Specification of a source: what all its blocks have in common.
 
     Attributes:
         streams: a name for each stream (the view's name in a recording).
@@ -88,7 +88,7 @@ class SourceSpec:
         return times_of(np.arange(start, stop), self.fps, self.start_ns)
 
     def frames_at(self, times: NDArray[Any]) -> Times:
-        """The frames nearest to log times, (n,) nanoseconds."""
+        """Return the frames nearest to log times, (n,) nanoseconds."""
         return nearest_frames(times, self.fps, self.start_ns)
 
     def facts(self) -> dict[str, Any]:
@@ -118,14 +118,14 @@ class FrameSource(Protocol):
 
     @property
     def spec(self) -> SourceSpec:
-        """What the source delivers."""
+        """Specification of the source's blocks."""
 
     @property
     def t(self) -> int:
         """Global counter of the next frame."""
 
     def take(self, stream: int, n: int) -> Block:
-        """The n frames that `stream` shows at t .. t+n-1; moves t by n.
+        """Return the n frames that `stream` shows at t .. t+n-1; moves t by n.
 
         Raises:
             LogExhaustedError: a recording has fewer than n frames left; t stays.
@@ -133,7 +133,7 @@ class FrameSource(Protocol):
         """
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """What every stream shows in the next n frames, in their order; moves t by n.
+        """Return what every stream shows in the next n frames, in their order; moves t by n.
 
         Raises:
             LogExhaustedError: fewer than n frames are left; t stays.
@@ -141,7 +141,7 @@ class FrameSource(Protocol):
         """
 
     def describe(self) -> Mapping[str, Any]:
-        """What identifies the source, as JSON values: its kind, seed or file hashes.
+        """Return what identifies the source, as JSON values: its kind, seed or file hashes.
 
         Raises:
             LogDamagedError: it was replaced since it was opened, by others or in part.
@@ -163,11 +163,11 @@ class SeekableSource(FrameSource, Protocol):
         """
 
     def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
-        """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
+        """Return the unbroken stretches [low, high) of a stream within the frames [start, stop)."""
         return [(start, stop)]
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """What every stream shows in the next n frames; see `FrameSource`."""
+        """Return what every stream shows in the next n frames; see `FrameSource`."""
         start = self.t
         blocks = []
         for stream in range(len(self.spec.streams)):
@@ -184,7 +184,7 @@ class LongSource(FrameSource, Protocol):
         """See `FrameSource`; tells how many bytes were read and how many there are, if many."""
 
     def describe_at_once(self) -> Mapping[str, Any]:
-        """What `describe` says, with less of each file where reading all of them takes long."""
+        """Return what `describe` returns, with a sample of each file that takes long to read."""
 
 
 class Described:
@@ -217,7 +217,7 @@ class ForwardSource(Described, FrameSource):
 
     @property
     def spec(self) -> SourceSpec:
-        """What the source delivers."""
+        """Specification of the source's blocks."""
         return self._spec
 
     @property
@@ -287,7 +287,7 @@ def turn_to(source: FrameSource, before: int, after: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class HeadPose:
-    """Where the head is in the robot's root frame.
+    """Pose of the head in the robot's root frame.
 
     Attributes:
         position: (x, y, z) of the neck yaw joint, metres.
@@ -304,7 +304,7 @@ def description(
     at_once: bool = False,
     told: Callable[[int, int], None] = lambda done, size: None,
 ) -> dict[str, Any]:
-    """What identifies a source, its kind at least; see `FrameSource.describe`.
+    """Return what identifies a source, its kind at least; see `FrameSource.describe`.
 
     Args:
         source: the source.
@@ -332,7 +332,7 @@ def check_request(spec: SourceSpec, stream: int, n: int) -> None:
 
 
 def unbroken(blocks: Iterable[Block]) -> list[Block]:
-    """The unbroken stretches of streams that were read in pieces.
+    """Return the unbroken stretches of streams that were read in pieces.
 
     Args:
         blocks: those of each stream in order of time.
@@ -347,7 +347,7 @@ def unbroken(blocks: Iterable[Block]) -> list[Block]:
 
 
 def _as_one(run: Sequence[Block]) -> Block:
-    """Blocks of a stream that follow one another, as one."""
+    """Return blocks of a stream that follow one another, as one."""
     if len(run) == 1:
         return run[0]
     frames = freeze(np.concatenate([block.frames for block in run]))

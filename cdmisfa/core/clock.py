@@ -47,7 +47,7 @@ def times_of(frames: NDArray[Any], fps: float, start_ns: int) -> Times:
 
 
 def nearest_frames(times: NDArray[Any], fps: float, start_ns: int) -> Times:
-    """The frames nearest to log times: of `times_of`, at up to 1e8 frames a second, those it took.
+    """Return the frames nearest to log times; the inverse of `times_of` up to 1e8 frames a second.
 
     Args:
         times: (n,) log times, nanoseconds.

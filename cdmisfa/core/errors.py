@@ -46,7 +46,7 @@ class NotReproducedError(CdmisfaError):
 
 
 def are_for(options: Sequence[str], what: str) -> str:
-    """The text "--a and --b are for WHAT", for an error."""
+    """Return the text "--a and --b are for WHAT", for an error."""
     *before, last = options
     return f"{', '.join(before)} and {last} are for {what}" if before else f"{last} is for {what}"
 
@@ -79,7 +79,7 @@ class Registry(dict[str, Entry]):
 
 
 def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """The end of an error about an unknown name: the nearest one, or all there are.
+    """Return the end of an error about an unknown name: the nearest one, or all there are.
 
     Args:
         name: as it was written.

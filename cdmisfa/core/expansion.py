@@ -78,5 +78,5 @@ def expand(kind: str, frames: Any) -> NDArray[Any]:
 
 
 def quadratic(frames: Any) -> NDArray[np.float64]:
-    """All inputs, then all products of two: (x1, x2, x1^2, x1 x2, x2^2) for two inputs."""
+    """Return all inputs, then all products of two: (x1, x2, x1^2, x1 x2, x2^2) for two inputs."""
     return expand("quadratic", frames)

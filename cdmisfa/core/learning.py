@@ -73,7 +73,7 @@ class Learner(Protocol):
 
     @property
     def events(self) -> Sequence[str]:
-        """What the last iteration brought that a person wants to read, one line each."""
+        """Messages about the last iteration, one line each."""
 
     @property
     def phi(self) -> NDArray[np.float64]:
@@ -88,7 +88,7 @@ class Learner(Protocol):
         """Modules after which a run ends by default; None: when it is over."""
 
     def step(self, block: Block) -> BlockSignals:
-        """One iteration: look at tau frames, learn, and decide what to watch next.
+        """Do one iteration: look at tau frames, learn, and choose the next stream.
 
         Raises:
             ValueError: it is not the block that was asked for.
@@ -107,7 +107,7 @@ class Learner(Protocol):
         """
 
     def summary(self) -> Mapping[str, Any]:
-        """Its part of a run's result, as JSON values."""
+        """Return the learner's part of a run's result, as JSON values."""
 
 
 # Key of a run's manifest: `arithmetic_of` its learner.
@@ -130,7 +130,7 @@ class Sink(Protocol):
     """
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """An iteration is over.
+        """Handle a finished iteration.
 
         Args:
             block: the watched block.
@@ -150,7 +150,7 @@ class Sink(Protocol):
         return
 
     def finish(self) -> None:
-        """The run is over, for whatever reason, and was not broken off by an error."""
+        """Handle the end of a run that no error broke off."""
         return
 
 
@@ -169,5 +169,5 @@ def overwrite(current: Mapping[str, NDArray[Any]], stored: Mapping[str, NDArray[
 
 
 def weights_after(signals: BlockSignals, learner: Learner) -> NDArray[np.float64]:
-    """The weights (J, I) that a learner's last iteration ended with, frozen where it saved them."""
+    """Return the weights (J, I) at the end of the last iteration, frozen where it saved them."""
     return learner.modules[-1].phi if signals.saved else learner.phi

@@ -1,4 +1,4 @@
-"""What streams and columns are called, whatever a log calls them; how many, and how long."""
+"""Names of streams and columns made from those in a log; counts and durations in words."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ ACTION, BEGINS, JOINT = "action_", "begins_", "head_"
 
 
 def counted(number: int, what: str, form: str = "") -> str:
-    """How many there are, as 1 block or 2 blocks; the number in such a format, as ','."""
+    """Return how many there are, as 1 block or 2 blocks; the number in such a format, as ','."""
     return f"{number:{form}} {what}{'' if number == 1 else 's'}"
 
 
 def lasting(seconds: float | None) -> str:
-    """A length of time, as 1:02:03; a line where it is not known."""
+    """Return a length of time, as 1:02:03; a line where it is not known."""
     return "-" if seconds is None else str(timedelta(seconds=round(seconds)))
 
 
 def stream_name(said: str) -> str:
-    """The name of a stream, valid as one of a file, from what a log or a camera calls it.
+    """Return the name of a stream, valid as one of a file, from what a log or a camera calls it.
 
     The topic /cam/left is cam_left. A view has its own name also where it is a topic (/view/left)
     or a column of a dataset (observation.images.left). Letters lose their accents, those of other

@@ -83,7 +83,7 @@ def _signal(
     equation: str = "",
     show: Show | None = None,
 ) -> Any:
-    """A field; floats are shown as lines and others as lanes, by default."""
+    """Return a field; floats are shown as lines and others as lanes, by default."""
     facts = {"symbol": symbol, "about": about, "dims": dims, "unit": unit, "equation": equation}
     return dataclasses.field(metadata={**facts, "show": show})
 
@@ -250,7 +250,7 @@ class SignalsHash:
 
 
 def canonical_bytes(signals: BlockSignals) -> bytes:
-    """The bytes that stand for a record wherever runs are compared."""
+    """Return the bytes that stand for a record wherever runs are compared."""
     arrays: list[Any] = list(map(np.ascontiguousarray, _ARRAYS_OF(signals), _ARRAY_TYPES))
     layout = _layout(tuple([array.shape for array in arrays]))
     data = bytearray(b"".join([arrays[i] for i in layout.order]))

@@ -47,7 +47,7 @@ CHUNK = 16 * PIECE
 
 
 class _SlowFeatures(_Estimator):
-    """What both estimators share; a class that derives from it has `_begin`."""
+    """Base class of both estimators; derived classes define `_begin`."""
 
     n_components: int
     n_whitened: int
@@ -193,7 +193,7 @@ class RecursiveSFA(_SlowFeatures):
         return np.array(self._feature.state.spectrum[: self._n_features_out])
 
     def inverse_transform(self, Y: Any) -> FloatArray:
-        """The samples that outputs tell of, with the least mean square error over those learned.
+        """Return the samples with the least mean square error, given their outputs.
 
         Args:
             Y: (n, n_components) outputs.
@@ -302,6 +302,6 @@ class IncSFA(_SlowFeatures):
 
 
 def _chunks(X: Any) -> Iterator[FloatArray]:
-    """Rows as float64, some at a time."""
+    """Yield rows as float64, some at a time."""
     for start in range(0, len(X), CHUNK):
         yield np.ascontiguousarray(X[start : start + CHUNK], np.float64)

@@ -89,7 +89,7 @@ class OnlineSFA(Transformer):  # type: ignore[misc]
         return nan if self._feature is None else self._feature.slowness
 
     def _sample(self, x: Mapping[Any, Any]) -> FloatArray:
-        """The features in their order, NaN where there is no number to learn from."""
+        """Return the features in their order, NaN where there is no number to learn from."""
         values = (x.get(name, nan) for name in self._names)
         return np.array([float(v) if _is_number(v) else nan for v in values])
 

@@ -180,7 +180,7 @@ class Application:
                 return
 
     def _step(self, spec: SourceSpec) -> int:
-        """Frames of a log that are read at once, whole blocks."""
+        """Return frames of a log that are read at once, whole blocks."""
         pixels = math.prod(spec.frame_shape) * np.dtype(spec.dtype).itemsize
         outputs = sum(len(module.phi) for module in self.modules)
         frame_bytes = len(spec.streams) * (pixels + 8 * outputs)

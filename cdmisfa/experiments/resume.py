@@ -197,7 +197,7 @@ class Recomputation:
 
     @property
     def source(self) -> SeekableSource:
-        """What the run learned from, at frame `t`; opened when it is first needed."""
+        """Source that the run learned from, at frame `t`; opened when it is first needed."""
         if self._source is not None:
             return self._source
         source = self._given

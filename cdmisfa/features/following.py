@@ -27,7 +27,7 @@ NOTHING = 1e-10
 
 
 class BatchOutputs(NamedTuple):
-    """What batch SFA finds of frames, fewer of each where the frames vary in fewer directions.
+    """Outputs of batch SFA, fewer where the frames vary in fewer directions.
 
     Attributes:
         phi: (J, I) the slowest outputs as weights of the centred frame.
@@ -41,7 +41,7 @@ class BatchOutputs(NamedTuple):
 
 
 def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) -> BatchOutputs:
-    """The slowest outputs of frames that all count the same, in their leading components.
+    """Return the slowest outputs of frames that all count the same, in their leading components.
 
     That is what `batch_sfa` finds of frames in memory within their leading principal components, up
     to how far the directions that are kept meanwhile, `KEPT` times as many, hold these.

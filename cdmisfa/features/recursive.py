@@ -53,7 +53,7 @@ class RecursiveState(NamedTuple):
 
 
 class Likeness(NamedTuple):
-    """What an output gives of the slowest feature of a stream.
+    """Agreement of an output with the slowest feature of a stream.
 
     Attributes:
         variance: of that output.
@@ -155,7 +155,7 @@ class RecursiveFeature:
         return self.state.mean
 
     def compare(self, phi: FloatArray, frames: NDArray[Any] | None = None) -> Likeness:
-        """What another output gives on what was learned from, which is not kept.
+        """Return what another output gives on what was learned from, which is not kept.
 
         Args:
             phi: (I,) its weights of the centred input.

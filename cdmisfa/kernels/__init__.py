@@ -102,7 +102,7 @@ class Struct:
 
 
 def frames_of(frames: Any, size: int | None = None) -> Struct:
-    """Frames as C takes them; see `as_frames`."""
+    """Return frames as C takes them; see `as_frames`."""
     rows = as_frames(frames, size)
     held = "pixels" if rows.dtype == UINT8 else "values"
     data = _buffer("uint8_t[]" if held == "pixels" else "double[]", rows)
@@ -184,7 +184,7 @@ def outputs(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
 
 
 def mean_output(phi: FloatArray, mean: FloatArray) -> FloatArray:
-    """What phi (J, I) gives out on the mean input (I,), as (J,)."""
+    """Return what phi (J, I) gives out on the mean input (I,), as (J,)."""
     rows, size = phi.shape
     out = np.empty(rows)
     lib.mean_output(
@@ -198,7 +198,7 @@ def mean_output(phi: FloatArray, mean: FloatArray) -> FloatArray:
 
 
 def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
-    """An abstraction as the kernels take it: the arrays of its `State`, and its constants."""
+    """Return an abstraction as the kernels take it: the arrays of its `State`, its constants."""
     (K, size), J = state.v.shape, len(state.w)
     shapes = {
         "mean": (size,),
@@ -310,7 +310,7 @@ def _expect_inputs(agent: Struct, frozen: Struct, feature: Struct, x: Struct) ->
 
 
 def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
-    """A state of recursive SFA as C takes it, to be written to; see `recursive.State`."""
+    """Return a state of recursive SFA as C takes it, to be written to; see `recursive.State`."""
     (size, inputs), outputs = arrays["basis"].shape, len(arrays["weights"])
     components = len(arrays["spectrum"])
     shapes = {
@@ -338,7 +338,7 @@ def recursive_update(state: Struct, frames: Any, gap: bool) -> FloatArray:
 
 
 def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
-    """A (n, k) times B (k, m)."""
+    """Return a (n, k) times B (k, m)."""
     (rows, parts), width = a.shape, b.shape[1]
     first, second = readable("a", a, (rows, parts)), readable("b", b, (parts, width))
     out = np.empty((rows, width))

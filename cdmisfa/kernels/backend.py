@@ -17,13 +17,13 @@ ZIG = "ziglang>=0.13,<0.18"
 
 
 def compiler() -> str | None:
-    """The machine's C compiler: what was asked for, what built Python, or a usual one."""
+    """Return the machine's C compiler: what was asked for, what built Python, or a usual one."""
     names = os.environ.get("CC"), sysconfig.get_config_var("CC"), "cc", "gcc", "clang"
     return next((n for n in names if n and n.strip() and shutil.which(shlex.split(n)[0])), None)
 
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
-    """What else must be installed to build a wheel."""
+    """Return what else must be installed to build a wheel."""
     needed: list[str] = build_meta.get_requires_for_build_wheel(config_settings)
     return needed if compiler() else [*needed, ZIG]
 

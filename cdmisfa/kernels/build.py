@@ -30,7 +30,7 @@ if "ziglang" in os.environ.get("CC", ""):
 
 
 def module(name: str, *flags: str) -> FFI:
-    """The module `cdmisfa.kernels.name`, to be compiled by setuptools."""
+    """Return the module `cdmisfa.kernels.name`, to be compiled by setuptools."""
     header = (HERE / "kernels.h").read_text("utf-8")
     ffi = FFI()
     ffi.cdef(header)

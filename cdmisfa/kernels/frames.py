@@ -50,7 +50,7 @@ def walk_records(data: ByteArray) -> tuple[NDArray[np.void], IntArray, int, tupl
 
 
 def layout(least: int, places: Any, marks: Any, distances: Any, width: int) -> Struct:
-    """Where the payloads of a channel hold their values, for `gather`.
+    """Return where the payloads of a channel hold their values, for `gather`.
 
     Args:
         least: fewest bytes of a payload.

@@ -116,17 +116,17 @@ class Run(Described, replay.runs.run.Run):
 
     @property
     def path(self) -> Path:
-        """Its folder."""
+        """Folder of the run."""
         return self.log.parent
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """Its configuration by sections: `run.config["learner"]["tau"]`."""
+        """Configuration of the run by sections: `run.config["learner"]["tau"]`."""
         return dict(self.header.manifest.get("config", {}))
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
-        """Its events in words: each has `t`, `iteration`, `text` and `level`."""
+        """Events of the run in words: each has `t`, `iteration`, `text` and `level`."""
         batches = read_batches(self.log, self.header, topics=(EVENT_TOPIC,))
         return tuple(event for batch in batches for event in batch.events)
 

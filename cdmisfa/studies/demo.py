@@ -121,7 +121,7 @@ def _opened(
 
 
 def followed_by(module: Module, source: SeekableSource) -> dict[str, Any]:
-    """A module, and what of the truth its first output on its own view follows best."""
+    """Return a module, and what of the truth its first output on its own view follows best."""
     source.seek(0)
     block = source.take(module.stream_index, SCORED_FRAMES)
     y = module.transform(block.frames)[:, 0]

@@ -21,7 +21,7 @@ CAMERAS = ["foxglove", "camera", "av", "http", "https", "rtsp", "rtsps", "rtmp",
 
 
 def is_live(word: str) -> bool:
-    """Whether a word on the command line names a live stream."""
+    """Return whether a word on the command line names a live stream."""
     scheme, colon, rest = word.partition(":")
     if scheme.lower() in ("http", "https"):
         return re.split("[?#]", rest)[0].lower().endswith(_STREAMED)

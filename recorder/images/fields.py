@@ -26,7 +26,7 @@ _Step = str | int | slice
 
 
 def is_path(text: str) -> bool:
-    """Whether a text can be a path to numbers in a message."""
+    """Return whether a text can be a path to numbers in a message."""
     return _PATH.fullmatch(text) is not None
 
 

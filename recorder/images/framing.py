@@ -84,7 +84,7 @@ class Framing:
 
     @property
     def lossy(self) -> str:
-        """What makes images of another aspect ratio fit, in words; "" for the same ratio."""
+        """How images of another aspect ratio are fitted, in words; "" for the same ratio."""
         if not self.first:
             return ""
         if self.fit == "crop":

@@ -71,7 +71,7 @@ def _is_full(frame: Any) -> bool:
 
 
 def _is_planar(frame: Any, *names: str) -> bool:
-    """Whether the planes of a frame have a byte for each pixel, and names of formats."""
+    """Return whether the planes of a frame have a byte for each pixel, and names of formats."""
     form = frame.format
     return bool(form.name.startswith(names) and form.components[0].bits == 8 and form.is_planar)
 
@@ -138,7 +138,7 @@ class VideoPackets:
         self._context: Any = None
 
     def begins(self, message: bytes | memoryview) -> bool:
-        """Whether the image of a message needs none before it.
+        """Return whether the image of a message needs none before it.
 
         Raises:
             MalformedImage: the message is malformed, or its codec is not supported.
@@ -221,7 +221,7 @@ def _codec(stated: str) -> str:
 
 
 def _begins_vp9(data: bytes) -> bool:
-    """Whether a header states a key frame, and no frame that is shown again."""
+    """Return whether a header states a key frame, and no frame that is shown again."""
     head = data[0]
     last = 1 if head >> 4 & 3 == 3 else 2  # the fourth profile has a bit more
     return head >> 6 == 2 and head >> last & 3 == 0

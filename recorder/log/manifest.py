@@ -228,7 +228,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpec:
-    """What is recorded; attempts at one recording agree in it.
+    """Specification of a recording; attempts at one recording agree in it.
 
     Attributes:
         kind: name of what is recorded: a scene's, or the kind of a source.

@@ -96,7 +96,7 @@ def messages(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
 
 @dataclass(frozen=True, slots=True)
 class ViewResume:
-    """Where a view is begun or resumed.
+    """Frame and file at which a view is begun or resumed.
 
     Attributes:
         path: file of the part to write.

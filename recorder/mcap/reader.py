@@ -95,7 +95,7 @@ class LogReader(LogStructure):
 
     @property
     def warnings(self) -> list[str]:
-        """What is missing, was left out or is unproven, a line each that names the file."""
+        """Missing, left out and unproven parts of the file, a line each that names it."""
         problems = [f"{p.where}: {p.what}" for p in self.problems]
         lines = (f"{self.path}: {text}" for text in (self.missing, *problems) if text)
         return [*lines, *self.unproven()]

@@ -190,7 +190,7 @@ class Segment:
 
     @property
     def name(self) -> str:
-        """Its name in errors."""
+        """Name in errors."""
         kind = "chunk" if self.chunked else "messages"
         return f"{kind} at byte {self.offset} (log time {self.start} to {self.end} ns)"
 

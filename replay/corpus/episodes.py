@@ -143,7 +143,7 @@ class EpisodeSource(StoredSource):
         return self._pixels[stream]
 
     def salvaged(self) -> list[str]:
-        """Lines for the logs that turned out to be damaged, and were left out from there on."""
+        """Return a line for each log that is damaged, and was left out from there on."""
         return list(_few(self._lost))
 
     def hold_out(self, count: int) -> None:
@@ -153,7 +153,7 @@ class EpisodeSource(StoredSource):
         super().hold_out(self.frames - self._starts[first] if whole else count)
 
     def episode(self, stream: int, t: int) -> Span:
-        """The log [start, stop) that a frame is of, or the episode of a dataset."""
+        """Return the log [start, stop) that a frame is of, or the episode of a dataset."""
         t %= self.frames
         one = self._episodes[bisect.bisect_right(self._starts, t) - 1]
         if one.many:

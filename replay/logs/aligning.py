@@ -65,7 +65,7 @@ def _times(stream: LogStream) -> IntArray:
 
 
 def _rate(streams: Sequence[LogStream]) -> float:
-    """Rows a second of the first stream that has times.
+    """Return rows a second of the first stream that has times.
 
     Raises:
         UsageError: no stream has times, or they tell no rate that is taken.
@@ -83,7 +83,7 @@ def _rate(streams: Sequence[LogStream]) -> float:
 
 
 def _excerpt(stream: LogStream, options: InputOptions, zero: int) -> LogStream:
-    """A stream between --start and --end, in seconds after the first row of all streams."""
+    """Return a stream between --start and --end, in seconds after the first row of all streams."""
     times = _times(stream)
     low, high = (
         len(times) if at is None else int(np.searchsorted(times, zero + round(at * NANOSECONDS)))
@@ -133,7 +133,7 @@ def join_parts(streams: Sequence[LogStream]) -> list[LogStream]:
 
 
 def names_of(streams: Sequence[LogStream]) -> tuple[str, ...]:
-    """Names of streams by their topics, with the file's and folders' where topics are shared.
+    """Name streams by their topics, and by files and folders where they share a topic.
 
     Raises:
         UsageError: a topic of a log is named twice.
@@ -153,7 +153,7 @@ def names_of(streams: Sequence[LogStream]) -> tuple[str, ...]:
 
 
 def _in_folders(stream: LogStream, folders: int) -> str:
-    """A stream's name with that of its file, and of some of the folders this is in."""
+    """Return a stream's name with that of its file, and of some of the folders this is in."""
     path, name = stream.path, stream_name(stream.topic)
     if name not in (stream_name(path.stem), stream_name(path.resolve().name)):
         name = f"{path.stem}/{name}"

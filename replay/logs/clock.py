@@ -138,7 +138,7 @@ def by_number(views: Iterable[Sequence[Span]], facts: ViewMetadata, name: str) -
 
 
 def intersection(one: Sequence[Span], two: Sequence[Span]) -> list[Span]:
-    """The frames in both of two sorted lists of ranges [start, stop)."""
+    """Return the frames in both of two sorted lists of ranges [start, stop)."""
     result: list[Span] = []
     i = j = 0
     while i < len(one) and j < len(two):
@@ -153,17 +153,17 @@ def intersection(one: Sequence[Span], two: Sequence[Span]) -> list[Span]:
 
 
 def overlap(streams: Sequence[IntArray]) -> tuple[int, int]:
-    """The first and the last time at which every stream has rows; the first may be the later."""
+    """Return the first and last time at which all streams have rows; the first may be later."""
     return max(int(times[0]) for times in streams), min(int(times[-1]) for times in streams)
 
 
 def step_of(times: IntArray) -> float:
-    """The median time between rows, in seconds; NaN of fewer than two."""
+    """Return the median time between rows, in seconds; NaN of fewer than two."""
     return float(np.median(np.diff(times)) / NANOSECONDS) if len(times) > 1 else float("nan")
 
 
 def unlike(first: IntArray, times: IntArray) -> str:
-    """The reason why the i-th rows of two streams do not belong together; "" if they do.
+    """Return the reason why the i-th rows of two streams do not belong together; "" if they do.
 
     They may be apart by half a step of the first stream.
     """
@@ -174,13 +174,13 @@ def unlike(first: IntArray, times: IntArray) -> str:
 
 
 def pauses(times: IntArray) -> IntArray:
-    """The rows before which a stream paused for more than `GAP_STEPS` of its steps."""
+    """Return the rows before which a stream paused for more than `GAP_STEPS` of its steps."""
     step = step_of(times) * NANOSECONDS
     return np.flatnonzero(np.diff(times) > GAP_STEPS * step) + 1 if step > 0 else np.empty(0, int)
 
 
 def missing(times: IntArray) -> IntArray:
-    """How many rows are missing before each row but the first, (n - 1,)."""
+    """Return how many rows are missing before each row but the first, (n - 1,)."""
     step = step_of(times) * NANOSECONDS
     if not step > 0:
         return np.zeros(max(len(times) - 1, 0), int)
@@ -188,7 +188,7 @@ def missing(times: IntArray) -> IntArray:
 
 
 def retimed(times: IntArray, rows: Rows, fps: float) -> str:
-    """A warning if frames by number are not at the times of their rows; else "".
+    """Return a warning if frames by number are not at the times of their rows; else "".
 
     Jitter is allowed, and, where no row is missing, a rate that is known to a hundredth.
 
@@ -211,7 +211,7 @@ def retimed(times: IntArray, rows: Rows, fps: float) -> str:
 
 
 def counts(count: int, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
-    """Counts of a stream's rows, of frames that repeat one, and of rows in no frame.
+    """Return counts of a stream's rows, of frames that repeat one, and of rows in no frame.
 
     Args:
         count: of the rows.
@@ -230,7 +230,7 @@ def counts(count: int, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
 
 
 def gaps_in_words(gaps: Sequence[Span], fps: float) -> str:
-    """How many gaps there are, how long the longest is, and when it begins."""
+    """Return how many gaps there are, how long the longest is, and when it begins."""
     start, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
     many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
     return f"{many} of {(stop - start) / fps:.3g} s after {(start - 1) / fps:.6g} s"

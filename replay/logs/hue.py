@@ -45,7 +45,7 @@ CHOSEN: Final = {
 
 
 def shows_hue(source: StoredSource) -> bool:
-    """Whether frames of a source, which shows colours, are worth it on one of its streams."""
+    """Return whether one stream of a source in colours shows more than it would in gray."""
     for stream in range(len(source.spec.streams)):
         times = range(0, min(source.frames, LOOKED), STEP)
         looked = [block.frames for t in times for block in source.pieces(stream, t, t + 1, 1)]
@@ -55,7 +55,7 @@ def shows_hue(source: StoredSource) -> bool:
 
 
 def hue_varies(frames: NDArray[Any]) -> bool:
-    """Whether hue varies where brightness does not, and lasts, as noise does not.
+    """Return whether hue varies where brightness does not, and lasts, as noise does not.
 
     In each of 8 x 8 cells hue is red and blue less brightness, without what brightness in the
     same cell tells of it, at most `_MOST_RATIO` times itself. Of that, as of brightness, the
@@ -79,12 +79,12 @@ def hue_varies(frames: NDArray[Any]) -> bool:
 
 
 def _lasting(x: NDArray[np.float64]) -> float:
-    """Covariance of frames (..., n, cells) with the next, summed."""
+    """Return the covariance of frames (..., n, cells) with the next, summed."""
     return float((x[..., 1:, :] * x[..., :-1, :]).sum() / (x.shape[-2] - 1))
 
 
 def _in_cells(plane: NDArray[Any]) -> NDArray[np.float64]:
-    """The mean of each cell of pictures (n, height, width), (n, cells)."""
+    """Return the mean of each cell of pictures (n, height, width), (n, cells)."""
     for axis in (1, 2):
         size = plane.shape[axis]
         starts = np.unique(np.arange(_CELLS) * size // _CELLS)

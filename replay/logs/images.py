@@ -105,7 +105,7 @@ class Images:
         return self._streams[stream].image(row) if image is None else image
 
     def _whole_image(self, stream: int, row: int) -> Shown:
-        """The last whole image up to a row, else the first behind it: of the log alone."""
+        """Return the last whole image up to a row, else the first behind it: of the log alone."""
         broken = self._broken.setdefault(stream, {})
         count = self._streams[stream].count
         for near in itertools.chain(range(row, -1, -1), range(row + 1, count)):

@@ -66,7 +66,7 @@ def log_format(path: Path) -> Format:
 
 
 def only_external(path: Path) -> bool:
-    """Whether a path cannot be one of our recordings, by its format."""
+    """Return whether a path cannot be one of our recordings, by its format."""
     return log_format(path) not in ("mcap", "split")
 
 

@@ -160,7 +160,7 @@ class LoggedSource(StoredSource):
         return Block(stream, t, freeze(frames), freeze(truth))
 
     def _frames(self, stream: int, t: int, rows: Rows) -> tuple[NDArray[Any], FloatArray]:
-        """The frames of rows, of which the first is shown at t, and their ground truth."""
+        """Return the frames of rows, of which the first is shown at t, and their ground truth."""
         log, framing = self.streams[stream], self.framings[stream]
         if log.read is not None:
             images, truth = log.read(rows)
@@ -194,7 +194,7 @@ class LoggedSource(StoredSource):
         self._images.expect(place for place in places if place not in shown)
 
     def _frame(self, stream: int, row: int, image: Shown | None = None) -> Shown:
-        """A stream's image as a frame; decoded once if it is repeated."""
+        """Return a stream's image as a frame; decoded once if it is repeated."""
         shown = self._shown.get(stream)
         if shown is not None and shown[0] == row:
             return shown[1]
@@ -268,7 +268,7 @@ class LoggedSource(StoredSource):
             return ""
 
     def coverage(self) -> dict[str, list[Span]]:
-        """The frames that are there of each view of a recording, as ranges [start, stop)."""
+        """Return the frames that are there of each view of a recording, as ranges [start, stop)."""
         return {s.topic: [span for view in s.views for span in view.ranges] for s in self.streams}
 
     def scene(self) -> Mapping[str, str]:
@@ -289,7 +289,7 @@ class LoggedSource(StoredSource):
         return turns_of(self._configured("scene"), indexes)
 
     def _configured(self, section: str) -> Mapping[str, Any]:
-        """A section of the recording's configuration; empty if it has none."""
+        """Return a section of the recording's configuration; empty if it has none."""
         if not self.recorded:
             return {}
         reader = self.streams[0].views[0].reader
@@ -348,7 +348,7 @@ class LoggedSource(StoredSource):
         }
 
     def _chosen(self) -> dict[str, Any]:
-        """The options that changed the frames, as JSON values."""
+        """Return the options that changed the frames, as JSON values."""
         options = self._options
         chosen: dict[str, Any] = {}
         if any(self.pauses.values()):

@@ -127,14 +127,14 @@ class LogStream:
             return function(self.fetch(row))
 
     def name_of(self, row: int) -> str:
-        """How an error names a row."""
+        """Return how an error names a row."""
         if self.where is not None:
             return self.where(row)
         at = f" at {self.times[row]} ns" if self.times is not None else ""
         return f"{self.path}: {self.topic}{at}"
 
     def part(self, rows: IntArray, times: IntArray | None) -> LogStream:
-        """Some rows of the stream, at the times given."""
+        """Return some rows of the stream, at the times given."""
 
         def at(function: Callable[[int], Any]) -> Callable[[int], Any]:
             return lambda row: function(int(rows[row]))
@@ -152,7 +152,7 @@ def check_times(where: object, times: IntArray) -> None:
 
 
 def joined(parts: Sequence[LogStream]) -> LogStream:
-    """Streams with times as one, by time, ties in the order of the streams."""
+    """Return streams with times as one, by time, ties in the order of the streams."""
     times = np.concatenate([part.times for part in parts if part.times is not None])
     order = np.argsort(times, kind="stable")
     of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
@@ -188,7 +188,7 @@ def joined(parts: Sequence[LogStream]) -> LogStream:
 
 
 def picked(array: NDArray[Any], rows: Rows) -> NDArray[Any]:
-    """Some rows of an array; of rows that follow one another without a copy."""
+    """Return some rows of an array; of rows that follow one another without a copy."""
     return array[rows.start : rows.stop] if isinstance(rows, range) else array[rows]
 
 

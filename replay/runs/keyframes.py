@@ -51,7 +51,7 @@ _KEYFRAME, KEYFRAME_DEFINITION = define_message(
 
 
 def read_keyframe(path: Path, last: int | None = None) -> Keyframe | None:
-    """The newest keyframe of a run's log at or before so many iterations, None where there is none.
+    """Return the newest keyframe of a run's log at or before `last` iterations, or None.
 
     Only the chunks that hold keyframes are read. What is no keyframe of this version is passed
     over.
@@ -61,7 +61,7 @@ def read_keyframe(path: Path, last: int | None = None) -> Keyframe | None:
 
 
 def read_keyframes(path: Path, after: int) -> Iterator[Keyframe]:
-    """The keyframes of a run's log after more than so many iterations, in order.
+    """Yield the keyframes of a run's log after more than `after` iterations, in order.
 
     Of two after the same iteration, as where a fork begins, the last one is the run's.
     """
@@ -98,7 +98,7 @@ def _keyframes(
 
 
 def encode_keyframe(keyframe: Keyframe) -> bytes:
-    """A keyframe as the bytes of a message."""
+    """Return a keyframe as the bytes of a message."""
     state, arrays = keyframe.state, arrays_of(keyframe.state)
     facts = {
         "version": KEYFRAME_VERSION,
@@ -116,7 +116,7 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
 
 
 def arrays_of(state: LearnerState) -> dict[str, NDArray[Any]]:
-    """All arrays of a state by name: its own, and one for each field of its modules."""
+    """Return all arrays of a state by name: its own, and one for each field of its modules."""
     names = [field.name for field in dataclasses.fields(Module) if field.name not in _OF_SOURCE]
     return dict(state.arrays) | {
         _MODULES + name: np.array([getattr(m, name) for m in state.modules]) for name in names
@@ -124,7 +124,7 @@ def arrays_of(state: LearnerState) -> dict[str, NDArray[Any]]:
 
 
 def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
-    """The keyframe in the bytes of a message, whose arrays are no larger than these.
+    """Return the keyframe in the bytes of a message, whose arrays are no larger than these.
 
     Raises:
         LogDamagedError: the bytes are not such a message, or one of another version.

@@ -32,7 +32,7 @@ NOT_ARRAYS: Final = (
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a file that `numpy.savez` wrote, by name.
+    """Return the arrays of a file that `numpy.savez` wrote, by name.
 
     Together they are no larger than the file.
 
@@ -56,12 +56,12 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def contents(arrays: Mapping[str, NDArray[Any]]) -> list[tuple[str, Any, tuple[int, ...]]]:
-    """Name, type and shape of each array, as JSON values, for `stored_arrays`."""
+    """Return name, type and shape of each array, as JSON values, for `stored_arrays`."""
     return [(n, np.lib.format.dtype_to_descr(a.dtype), a.shape) for n, a in arrays.items()]
 
 
 def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
-    """Arrays whose bytes lie one after the other and are all of some data.
+    """Return arrays whose bytes lie one after the other and are all of some data.
 
     Args:
         listed: what `contents` says of them, after JSON.
@@ -88,7 +88,7 @@ def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _plain_type(kind: Any) -> np.dtype[Any]:
-    """The type that numpy describes so: numbers or text, or a record of such."""
+    """Return the type that numpy describes so: numbers or text, or a record of such."""
     fields = [("", kind)] if isinstance(kind, str) else [tuple(field) for field in kind]
     if not all(_PLAIN.fullmatch(field[1]) for field in fields):
         raise ValueError(f"{str(kind)[:40]!r} is no plain type")

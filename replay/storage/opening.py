@@ -39,7 +39,7 @@ def log_files(path: str | Path) -> list[Path]:
 
 
 def no_such(path: Path, words: Iterable[str] = (), remedy: str = "") -> UsageError:
-    """The error about a path that does not exist: it names what is written nearly so.
+    """Return the error about a path that does not exist: it names what is written nearly so.
 
     Args:
         path: as it was named.
@@ -54,7 +54,7 @@ def no_such(path: Path, words: Iterable[str] = (), remedy: str = "") -> UsageErr
 
 
 def starts_as_log(path: Path) -> bool:
-    """Whether a file begins as every MCAP file does.
+    """Return whether a file begins as every MCAP file does.
 
     Raises:
         UsageError: it is no regular file, or may not be read.

@@ -172,7 +172,7 @@ class Candidate:
         return learning_error(self.change, float(self.tested[0]), self.fitted)
 
     def recent_errors(self, most: int) -> FloatArray:
-        """The last learning errors, (n,) with n at most `most`, the newest last."""
+        """Return the last learning errors, (n,) with n at most `most`, the newest last."""
         recent = self.errors[-most:]
         return np.asarray(recent[np.isfinite(recent)])
 

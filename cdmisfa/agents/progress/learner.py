@@ -145,7 +145,7 @@ class ProgressLearner:
         self._rng.bit_generator.state = dict(state.policy_rng)
 
     def step(self, block: Block) -> BlockSignals:
-        """One iteration: test on tau frames, learn from them, and decide what to watch next.
+        """Do one iteration: test on tau frames, learn from them, and choose the next stream.
 
         Args:
             block: tau frames of the stream the learner asked for.

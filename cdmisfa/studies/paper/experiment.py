@@ -1,4 +1,4 @@
-"""What an experiment of the paper is, and what its results consist of."""
+"""An experiment of the paper: its settings, trials, tables and findings."""
 
 from __future__ import annotations
 

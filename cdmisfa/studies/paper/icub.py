@@ -73,7 +73,7 @@ class Icub(Experiment):
     sees = True
 
     def conditions(self, quick: bool, recording: Path | None) -> list[Settings]:
-        """Each learner, on one recording."""
+        """Return each learner, on one recording."""
         with contextlib.closing(open_recording(str(recording))) as source:
             about = {"recording": str(recording), "identity": plain(source.describe())}
         return [{**about, "algorithm": a, "roc_error": error} for a, error in LEARNERS]

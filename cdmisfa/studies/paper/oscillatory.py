@@ -94,7 +94,7 @@ class Oscillatory(Experiment):
         return row, {name: curves[name] for name in ("eta_dot", "R", "Q", "policy")}
 
     def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
-        """Every trial must learn x1, x2, x3 in this order with the optimal policies."""
+        """Check that every trial learned x1, x2, x3 in this order with the optimal policies."""
         good, n = sum(learned_order(t.row) == self.optimal for t in trials), len(trials)
         findings.share("trials with order and policies optimal", "20 of 20 (text)", good, n)
         iterations = [t.row["iterations"] for t in trials]
@@ -152,7 +152,7 @@ class FiveStreams(Experiment):
         return module_row(result.modules), {}
 
     def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
-        """Every trial must learn the third stream, then the first, with the example's policies."""
+        """Check that every trial learned the third stream, then the first, with these policies."""
         good, n = sum(learned_order(t.row)[:2] == self.optimal for t in trials), len(trials)
         third = [[self.streams[s] for s in t.row["streams"][2:]] for t in trials]
         findings.share("trials with both policies as in the example", "all (text)", good, n)
@@ -173,7 +173,7 @@ class Stability(Experiment):
     trials = (20, 3)
 
     def conditions(self, quick: bool, recording: Path | None) -> list[Settings]:
-        """Each algorithm."""
+        """Return each algorithm."""
         return [{"algorithm": algorithm} for algorithm in ALGORITHMS]
 
     def run(self, settings: Settings) -> Output:

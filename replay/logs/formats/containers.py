@@ -28,7 +28,7 @@ class Extent(NamedTuple):
 
 
 def extent_of(path: Path) -> Extent:
-    """How far the file of a video goes, by the parts of its container.
+    """Return how far the file of a video goes, by the parts of its container.
 
     Raises:
         UsageError: it is no regular file, or may not be read.
@@ -57,7 +57,7 @@ def _zeros(at: int) -> Extent:
 
 
 def _at(file: BinaryIO, place: int, count: int) -> bytes:
-    """The bytes at a place, zeros for those that the file does not have."""
+    """Return the bytes at a place, zeros for those that the file does not have."""
     file.seek(place)
     return file.read(count).ljust(count, b"\0")
 
@@ -74,7 +74,7 @@ _NO_INDEX: Final = (
 
 
 def _boxes(file: BinaryIO, size: int) -> tuple[set[bytes], Extent]:
-    """The kinds of its boxes that are all there, and how far it goes.
+    """Return the kinds of its boxes that are all there, and how far it goes.
 
     In one piece a file ends with its last box; in fragments, moof, their index mfra ends it.
     """
@@ -101,7 +101,7 @@ _SEGMENT, _CLUSTER = 0x18538067, 0x1F43B675
 
 
 def _elements(file: BinaryIO, size: int) -> Extent:
-    """The segment states its length, if what wrote it could go back; then clusters and blocks."""
+    """Return how far a segment, clusters and blocks go; a live writer states no length."""
     at, end, stated = 0, size, True
     while at < end:
         head = _at(file, at, 12)
@@ -126,7 +126,7 @@ _NAMES: Final = {_SEGMENT: "its segment", _CLUSTER: "a cluster"}
 
 
 def _number(data: bytes, *, keep: bool = True) -> tuple[int, int, bool]:
-    """A number of variable width, that width, and whether it stands for an unknown length.
+    """Return a number of variable width, that width, and whether it stands for an unknown length.
 
     Args:
         data: begins with it.

@@ -145,7 +145,7 @@ class _Camera:
         return np.asarray(self._images.image(stored))
 
     def held(self) -> int:
-        """Bytes of the file that is open."""
+        """Return bytes of the file that is open."""
         return int(getattr(self._images, "held" if self.video else "nbytes", 0))
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ class _Camera:
 
 
 def _numbers(path: Path, options: InputOptions) -> LogStream:
-    """Numbers of a dataset, as observation.state and action, those of each frame one row."""
+    """Return numbers of a dataset, as observation.state and action, those of each frame one row."""
     topic, names, what = path.resolve().name, options.fields, ", ".join(options.fields)
     check_topics(path, topic, options.topics)
     known = features(path)[0]
@@ -196,7 +196,7 @@ def _numbers(path: Path, options: InputOptions) -> LogStream:
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a folder is a LeRobot dataset."""
+    """Return whether a folder is a LeRobot dataset."""
     return (path / INFO).is_file()
 
 
@@ -218,7 +218,7 @@ def features(path: Path) -> tuple[list[str], list[str]]:
 
 
 def _columns(file: Path, names: Sequence[str]) -> FloatArray:
-    """The numbers of each frame in a table, one after the other, (n, I)."""
+    """Return the numbers of each frame in a table, one after the other, (n, I)."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -251,7 +251,7 @@ def _info(path: Path) -> Any:
 
 
 def _episodes(path: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
-    """The rows of the tables of episodes, in their order."""
+    """Return the rows of the tables of episodes, in their order."""
     import pyarrow.parquet as pq
 
     rows: list[dict[str, Any]] = []

@@ -126,7 +126,7 @@ class Messages:
         return table.view(int(own[place]))
 
     def held(self) -> int:
-        """Bytes of the chunk that was read last."""
+        """Return bytes of the chunk that was read last."""
         return self._bytes
 
     def _expect(self, reader: LogReader) -> None:

@@ -36,7 +36,7 @@ class NoTopicError(UsageError):
 
 
 def fits_topic(name: str, topics: Sequence[str]) -> bool:
-    """Whether a name is one of some topics, or matches a pattern among them."""
+    """Return whether a name is one of some topics, or matches a pattern among them."""
     return any(name == topic or fnmatch.fnmatchcase(name, topic) for topic in topics)
 
 

@@ -332,7 +332,7 @@ class _ChannelRows:
         return np.concatenate([p[:, 0] for _, p in self._reader.index(segment, (channel,))])
 
     def _table(self, number: int) -> MessageTable:
-        """A chunk's messages; a LogDamagedError if it is damaged or has other frames."""
+        """Return a chunk's messages; a LogDamagedError if it is damaged or has other frames."""
         segment, path = self.segments[number], self._reader.path
         table = self._reader.table(segment)
         if table is None:

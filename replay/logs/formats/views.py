@@ -110,7 +110,7 @@ def _arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]
 
 
 def _unfit(views: Sequence[ViewFile], view: ViewFile, what: str) -> CdmisfaError:
-    """The error about a file that does not belong to others; of several folders their names."""
+    """Return the error about a file that does not belong to others; it names their folders."""
     folders = list(dict.fromkeys(str(view.path.parent) for view in views))
     if len(folders) < 2:
         return LogDamagedError(f"{view.path}: {what}")
@@ -123,7 +123,7 @@ def _unfit(views: Sequence[ViewFile], view: ViewFile, what: str) -> CdmisfaError
 
 
 def only_begun(path: Path) -> bool:
-    """Whether a file is a further part of which its recorder had written no frame yet."""
+    """Return whether a file is a further part of which its recorder had written no frame yet."""
     if not _FURTHER_PART.fullmatch(path.name):
         return False
     try:
