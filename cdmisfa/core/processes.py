@@ -76,7 +76,7 @@ def run_all(
             yield index, function(task)
         return
     waiting, running = iter(enumerate(tasks)), dict[Future[Result], int]()
-    most = jobs + 1 if scheduler is None else IN_CLUSTER
+    most = jobs if scheduler is None else IN_CLUSTER
     with workers(jobs) if scheduler is None else _dask_workers(scheduler) as submit:
         while True:
             for index, task in itertools.islice(waiting, most - len(running)):
