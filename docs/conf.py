@@ -6,11 +6,8 @@ import dataclasses
 import importlib
 import inspect
 import json
-import os
 import re
 import shutil
-import sys
-import tempfile
 import time
 import urllib.error
 import urllib.request
@@ -22,15 +19,18 @@ from typing import Any
 import cdmisfa
 from cdmisfa.cli import interrupts
 from cdmisfa.core import errors
+from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.documents import markdown
 from replay.viewer import HOST, Program, free_port
+
+SAMPLES = Path(__file__).parents[1] / "sample_logs"
 
 project = "cdmisfa"
 author = copyright = "the maintainers of cdmisfa"
 version = release = metadata.version("cdmisfa")
 
 extensions = [
-    "myst_nb",
+    "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_click",
@@ -44,16 +44,14 @@ smartquotes = False
 highlight_language = "none"
 myst_heading_anchors = 4
 napoleon_use_ivar = True
-nb_merge_streams = True
-nb_execution_mode = "force"
-nb_execution_raise_on_error = True
-nb_execution_timeout = 300
+templates_path = ["templates"]
+copybutton_prompt_text = "$ "
+copybutton_exclude = ".linenos"
+exclude_patterns = ["decisions", "images/README.md"]
 
-# Tutorials run `cdmisfa` as a shell does, in a folder of their own beside the sample logs.
-_folder = tempfile.TemporaryDirectory()
-(Path(_folder.name) / "sample_logs").symlink_to(Path(__file__).parents[1] / "sample_logs")
-os.environ["CDMISFA_TUTORIALS"] = _folder.name
-os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+# Pages of the former outline: they leave with the page that takes their place.
+exclude_patterns += ["tutorials"]
+suppress_warnings = ["toc.not_included", "myst.xref_missing"]
 
 # Rerun's page asks other hosts for fonts, examples and newer versions, and reports to its makers.
 POLICY = "; ".join(
@@ -87,9 +85,9 @@ def words_as_written(*event: Any) -> None:
 
 
 def from_code(app: Any, name: str, text: list[str]) -> None:
-    """README is the first page, and lines such as {{ keys module.Class }} are tables."""
+    """Replace lines such as {{ keys module.Class }} by tables."""
     text[0] = text[0].replace("../README.md)", "index.md)")
-    tables = {"keys": keys, "exit_codes": exit_codes}
+    tables = {"keys": keys, "exit_codes": exit_codes, "signals": signals}
     text[0] = re.sub(
         r"^\{\{ (\w+) ?(.*) \}\}$",
         lambda match: tables[match[1]](*match[2].split()),
@@ -127,6 +125,26 @@ def exit_codes() -> str:
     return markdown(["code", "what it says"], rows)
 
 
+def signals() -> str:
+    """Return the table of the signals that every run records."""
+    columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "about")
+    rows = [[getattr(signal, column) for column in columns] for signal in SIGNALS.values()]
+    return markdown(columns, [[f"`{name}`", *cells] for name, *cells in rows])
+
+
+def link_within_the_site(app: Any, path: Path, page: str, text: list[str]) -> None:
+    """Make links of the files beside docs/, such as README, links of the site."""
+    pages = {
+        "README.md": "/index.md",
+        "CONTRIBUTING.md": "/project/contributing.md",
+        "CHANGELOG.md": "/project/changelog.md",
+        "SECURITY.md": "/evidence/security.md",
+    }
+    text[0] = text[0].replace("](docs/", "](/")
+    for name, address in pages.items():
+        text[0] = text[0].replace(f"]({name}", f"]({address}")
+
+
 def add_the_viewer(app: Any, failure: Exception | None) -> None:
     """Put Rerun's page beside the runs, with a policy by which it asks nobody else."""
     folder = Path(app.outdir) / "_static" / "viewer"
@@ -146,7 +164,7 @@ def add_the_viewer(app: Any, failure: Exception | None) -> None:
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}"><script>{opened}</script>'
     )
     (folder / "index.html").write_text(page.replace("<head>", f"<head>{policy}", 1), "utf-8")
-    run = cdmisfa.learn(_folder.name + "/sample_logs/icub", algorithm="progress", loop=True)
+    run = cdmisfa.learn(SAMPLES / "icub", algorithm="progress", loop=True)
     run.view(folder / "run.rrd")
     run.report(folder / "report.html")
 
@@ -166,4 +184,5 @@ def setup(app: Any) -> None:
     for part in ("description", "arguments", "options", "epilog"):
         app.connect(f"sphinx-click-process-{part}", words_as_written)
     app.connect("source-read", from_code)
+    app.connect("include-read", link_within_the_site)
     app.connect("build-finished", add_the_viewer)

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from conftest import Cdmisfa
 from waiting import python
 
 from cdmisfa.cli.app import COMMANDS
@@ -123,10 +122,3 @@ def test_every_command_is_in_the_readme_or_the_tour() -> None:
         (ROOT / page).read_text("utf-8") for page in ("README.md", "docs/how-to/tour.md")
     )
     assert [name for name in COMMANDS if f"cdmisfa {name}" not in text] == []
-
-
-def test_page_of_signals_is_what_the_command_prints(cdmisfa: Cdmisfa) -> None:
-    page = (ROOT / "docs" / "reference" / "signals.md").read_text("utf-8")
-    assert cdmisfa("signals", "--markdown").out == page, (
-        "make it again: cdmisfa signals --markdown > docs/reference/signals.md"
-    )
