@@ -23,7 +23,7 @@ class SceneConfig(Section):
 
     Attributes:
         kind: name of the scene.
-        seed: of its motions; None is "as the run's seed".
+        seed: seed of the motions in the scene. `auto` uses the seed of the run.
     """
 
     prefix: ClassVar[str] = "scene"
@@ -36,11 +36,11 @@ class RecordConfig(Section):
     """Settings of a recording (keys `record.*`).
 
     Attributes:
-        fps: frames per second of the common clock.
-        start_ns: log time of frame 0, in nanoseconds; never the wall clock, so that a
-            recording is the same bytes every time.
-        compression: of the chunks.
-        chunk_size: most bytes of a chunk before compression.
+        fps: frames per second of the clock that all streams share.
+        start_ns: log time of frame 0 in nanoseconds. It is not the time of day, so that the same
+            command writes the same bytes.
+        compression: compression of the MCAP chunks: `zstd`, `lz4` or `none`.
+        chunk_size: largest size of an MCAP chunk before compression (bytes).
     """
 
     prefix: ClassVar[str] = "record"

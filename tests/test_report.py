@@ -167,7 +167,7 @@ def test_the_report_of_a_killed_or_damaged_run_shows_what_is_readable(
     ):
         text = Page(write_report([folder])).text
         assert problem in text
-        assert "Running share of blocks" in text
+        assert "Recent share of blocks" in text
 
 
 def test_a_run_whose_source_changed_is_not_reproducible(

@@ -120,38 +120,47 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class LearnerConfig(Section):
-    """Configuration of the paper's learners, 2.0 and 1.0 (keys `learner.*`).
+    """Configuration of the paper's learners, CD-MISFA 2.0 and 1.0 (keys `learner.*`).
 
-    The defaults are those of the oscillatory experiment; the presets state the sources of values.
+    The defaults are those of the oscillatory experiment. The presets name the origin of each value.
 
     Attributes:
-        algorithm: `2.0`, or `1.0` for the older CD-MISFA it is compared with.
-        nu: ν, learning rate of the slow features; larger is faster and noisier.
-        tau: τ, frames of one block: the agent decides once a block.
-        sigma: σ, width of the expert reward: how small a change of φ is mastery; 0: none.
-        delta: δ, an abstraction is saved when its slowness changes by less than this (1/frame).
-        beta: β, weight of the expert reward; `auto`: ν ln 2 / (2 (n-1)) for n streams.
-        components: K, principal components kept when whitening; choose with care on images.
-        outputs: J, slow features of one abstraction.
-        expansion: `none`, or `quadratic`: inputs and all their products.
-        epsilon_start: ε, probability of a random action at first; above 1 counts as 1.
-        epsilon_decay: factor of ε in each iteration while it is above `epsilon_knee`.
-        epsilon_knee: below this value of ε the tail begins.
-        epsilon_tail_decay: factor of ε in each iteration of the tail.
+        algorithm: `2.0`, or `1.0` for the older algorithm that the paper compares with.
+        nu: ν, learning rate of the slow features. A larger value learns faster and is noisier.
+        tau: τ, block length in frames. The learner chooses the next stream after each block.
+        sigma: σ, width of the expert reward: a change of the weights φ below this counts as
+            mastered. 0 switches the expert reward off.
+        delta: δ, a module is saved when its slowness changes by less than this in a block
+            (1/frame).
+        beta: β, weight of the expert reward. `auto` is ν ln 2 / (2 (n-1)) for n streams.
+        components: K, number of principal components that are whitened. 6 to 10 work for the
+            iCub images; it must not exceed the number of independent inputs.
+        outputs: J, number of slow features of a module.
+        expansion: `none`, or `quadratic` to add all products of two inputs.
+        epsilon_start: ε at the start: the probability of a random action. Above 1 counts as 1.
+        epsilon_decay: factor by which ε shrinks in each iteration while it is above
+            `epsilon_knee`.
+        epsilon_knee: value of ε below which `epsilon_tail_decay` applies.
+        epsilon_tail_decay: factor by which ε shrinks in each iteration below `epsilon_knee`.
         gamma: γ, discount of future rewards.
-        mean_window: window of the input's running mean (frames).
-        slowness_window: N, of the mean squared derivative and the recent variance (frames).
-        eta_dot_window: w, of the change of slowness, and of `novel_share` (blocks).
-        gate_window: w_g, window of the band in which a module's slowness lies (blocks).
-        warm_up: novel blocks of a new abstraction before rewards begin.
-        min_variance: v_min, least recent variance of an output that may be saved.
-        novel_share: least recent share of novel blocks of the stream before, for a save.
-        patience: iterations without exploration after which a run gives up.
-        alpha: α, 1.0 only: rate of the tabular reward.
-        roc_centres: 1.0 only: cluster centres for each stream.
-        roc_radius: 1.0 only: an output this near to a centre moves it.
-        roc_memory: 1.0 only: blocks over which centres fade.
-        roc_error: 1.0 only: error below which a module is saved, or knows a block.
+        mean_window: window of the running mean of the input (frames).
+        slowness_window: N, window of the mean squared derivative and of the variance of an output
+            (frames).
+        eta_dot_window: w, window of the change of slowness and of `novel_share` (blocks).
+        gate_window: w_g, window of the mean and standard deviation of a module's slowness
+            (blocks).
+        warm_up: number of novel blocks before a new feature earns rewards.
+        min_variance: v_min, smallest variance of an output with which a module is saved. It
+            excludes outputs that are constant, and so look perfectly slow.
+        novel_share: smallest share of recent blocks that were novel and of the same stream as the
+            block before, with which a module is saved.
+        patience: number of iterations without exploration and without a new module after which
+            the run ends.
+        alpha: α, learning rate of the reward table (1.0 only).
+        roc_centres: number of cluster centres for each stream (1.0 only).
+        roc_radius: distance within which an output moves a cluster centre (1.0 only).
+        roc_memory: number of blocks over which a cluster centre is forgotten (1.0 only).
+        roc_error: clustering error below which a module is saved, or explains a block (1.0 only).
     """
 
     prefix: ClassVar[str] = "learner"

@@ -44,7 +44,7 @@ class Signal:
 
     Attributes:
         name: the field's name.
-        symbol: as the paper (or, in brackets, algorithm step) writes it.
+        symbol: the symbol in the paper, or "".
         equation: number of the paper's equation, or "" where it has none.
         unit: physical or natural unit; "1" for a pure number.
         dims: one letter a dimension: T frames of the block (tau), J outputs, M frozen
@@ -93,37 +93,43 @@ class BlockSignals:
     """Every internal signal of one iteration, that is of one block of tau frames.
 
     A signal that does not exist in an iteration (y of a block that was not novel, a
-    reward in the warm-up) is NaN, never a made-up number. `R` has shape (0, 2, 0) when
-    there are more than `DENSE_STREAMS` streams.
+    reward in the warm-up) is NaN. `R` has shape (0, 2, 0) when there are more than
+    `DENSE_STREAMS` streams.
     """
 
-    iteration: int = _signal("k", "Iteration, from 0.", show="hidden")
+    iteration: int = _signal("k", "Number of the iteration, from 0.", show="hidden")
     t: int = _signal(
-        "t", "Global frame counter of the block's first frame.", "", "frames", show="hidden"
+        "t", "Frame number of the first frame of the block.", "", "frames", show="hidden"
     )
-    log_time: int = _signal("", "Log time of the block's first frame.", "", "ns", show="hidden")
-    stream: int = _signal("s", "Stream that was watched, from 0.")
-    module: int = _signal("i", "Abstraction being learned, from 1.")
-    novel: bool = _signal("", "The gate let the block through to the abstraction.")
+    log_time: int = _signal(
+        "", "Log time of the first frame of the block.", "", "ns", show="hidden"
+    )
+    stream: int = _signal("s", "Attended stream, from 0.")
+    module: int = _signal("i", "Number of the module being learned, from 1.")
+    novel: bool = _signal("", "Whether the block is novel, so that the learner learns from it.")
     known_by: int = _signal(
-        "", "Frozen module that knows the block, from 1; 0 none, -1 the block is constant."
+        "", "Module that explains the block, from 1; 0 if none does, -1 if the block is constant."
     )
-    saved: bool = _signal("", "The abstraction was saved at the end of the block.")
+    saved: bool = _signal("", "Whether a module was saved at the end of the block.")
     share: float = _signal(
-        "", "Running share of blocks both novel and of the same stream as before."
+        "", "Recent share of blocks that were novel and of the same stream as the block before."
     )
     novel_blocks: int = _signal(
-        "", "Novel blocks since the abstraction was created.", "", "blocks", show="line"
+        "", "Number of novel blocks since the last module was saved.", "", "blocks", show="line"
     )
     y: FloatArray = _signal(
-        "y", "Output of the adaptive abstraction on the block.", "TJ", equation="1"
+        "y", "Output of the features being learned, on the block.", "TJ", equation="1"
     )
     y_frozen: FloatArray = _signal(
-        "y_i", "Output of each frozen module on the block.", "MTJ", equation="1"
+        "y_i", "Output of each saved module on the block.", "MTJ", equation="1"
     )
     eta: FloatArray = _signal("η", "Slowness of each output.", "J", "1/frame", equation="2")
     eta_dot: FloatArray = _signal(
-        "η̇", "Running mean of the change of slowness; saved below δ.", "J", "1/frame", equation="3"
+        "η̇",
+        "Running mean of the change of slowness; a module is saved when it is below δ.",
+        "J",
+        "1/frame",
+        equation="3",
     )
     variance: FloatArray = _signal("v_r", "Recent variance of each output.", "J")
     eta_inst: FloatArray = _signal(
@@ -133,87 +139,91 @@ class BlockSignals:
     gate_sd: FloatArray = _signal("SD", "Running standard deviation of η^inst.", "J", "1/frame")
     eta_inst_frozen: FloatArray = _signal(
         "η_i^inst",
-        "Slowness of each frozen module's outputs within the block.",
+        "Slowness of the outputs of each saved module within the block.",
         "MJ",
         "1/frame",
         equation="4",
     )
-    band_mean: FloatArray = _signal("m_i", "Centre of each frozen module's band.", "MJ", "1/frame")
+    band_mean: FloatArray = _signal(
+        "m_i", "Mean of η^inst when the module was saved, for each module.", "MJ", "1/frame"
+    )
     band_sd: FloatArray = _signal(
-        "SD_i", "Standard deviation of each frozen module; known within 2 of them.", "MJ", "1/frame"
+        "SD_i",
+        "Standard deviation of η^inst when the module was saved; the module explains a block whose "
+        "η^inst is within m_i ± 2 SD_i.",
+        "MJ",
+        "1/frame",
     )
     roc_error_inst: float = _signal(
         "",
-        "Clustering error of the block: distance of the output from its cluster's centre, "
-        "CD-MISFA 1.0 only.",
+        "Clustering error of the block: distance of the output from the nearest cluster centre "
+        "(CD-MISFA 1.0 only).",
     )
     roc_error: float = _signal(
         "",
-        "Running mean of the clustering error; the abstraction is saved below a threshold, "
-        "CD-MISFA 1.0 only.",
+        "Running mean of the clustering error; a module is saved when it is below a threshold "
+        "(CD-MISFA 1.0 only).",
     )
     roc_error_frozen: FloatArray = _signal(
         "",
-        "Clustering error of each frozen module; known below the threshold, CD-MISFA 1.0 only.",
+        "Clustering error of each saved module; below the threshold the module explains the block "
+        "(CD-MISFA 1.0 only).",
         "M",
     )
-    xi: float = _signal(
-        "⟨ξ⟩", "Mean change of the abstraction's weights over the block.", equation="5"
-    )
-    xi_dot: float = _signal("⟨ξ̇⟩", "Change of ⟨ξ⟩ since the novel block before.", equation="5")
+    xi: float = _signal("⟨ξ⟩", "Mean change of the weights over the block.", equation="5")
+    xi_dot: float = _signal("⟨ξ̇⟩", "Change of ⟨ξ⟩ since the last novel block.", equation="5")
     curiosity: float = _signal("-⟨ξ̇⟩", "Curiosity reward.", equation="5")
     expert: float = _signal("βZ(⟨ξ⟩)", "Expert reward.", equation="5")
     reward: float = _signal("r", "Reward of the last transition.", equation="5")
     R: FloatArray = _signal("R", "Running reward function.", "SAS", equation="6", show="heat")
     Q: FloatArray = _signal("Q", "Action value function.", "SA", show="heat")
-    policy: IntArray = _signal("π", "Policy: 0 stay, 1 switch, for each stream.", "S")
-    epsilon: float = _signal("ε", "Probability (above 1: certainty) of a random action.")
-    explored: bool = _signal("", "The action was drawn at random.")
-    action: int = _signal("a", "Action taken after the block: 0 stay, 1 switch.")
-    next_stream: int = _signal("s'", "Stream watched next.")
+    policy: IntArray = _signal("π", "Policy for each stream: 0 stay, 1 switch.", "S")
+    epsilon: float = _signal("ε", "Probability of a random action; above 1 counts as 1.")
+    explored: bool = _signal("", "Whether the action was chosen at random.")
+    action: int = _signal("a", "Action after the block: 0 stay, 1 switch.")
+    next_stream: int = _signal("s'", "Stream attended next.")
     change: float = _signal(
-        "c",
-        "Mean change of the candidate's outputs with a block, 0 to 1.41; progress learner only.",
+        "c", "Mean change of the candidate's outputs in a block, 0 to 1.41 (progress learner only)."
     )
     tested: float = _signal(
         "η_test",
-        "Slowness of the candidate on frames before it learned from them; progress learner only.",
+        "Slowness of the candidate on frames before it learned from them (progress learner only).",
         unit="1/frame",
     )
     fitted: float = _signal(
         "η_fit",
-        "Slowness of the candidate on what it learned from; progress learner only.",
+        "Slowness of the candidate on frames that it learned from (progress learner only).",
         unit="1/frame",
     )
     learning_error: float = _signal(
-        "e", "Learning error of the candidate, c + |ln(η_test / η_fit)|; progress learner only."
+        "e", "Learning error of the candidate: c + |ln(η_test / η_fit)| (progress learner only)."
     )
     interest: FloatArray = _signal(
         "",
-        "What each stream promises: the recent progress of its learning error, 0 where nothing is "
-        "being learned; progress learner only.",
+        "Recent fall of the learning error of each stream, relative to the error; 0 if the stream "
+        "is not being learned (progress learner only).",
         "S",
     )
     state: IntArray = _signal(
         "",
-        "What has become of each stream: 0 learning, 1 learned, 2 known, 3 given up; -1 of a "
-        "learner that does not say.",
+        "State of each stream: 0 being learned, 1 learned, 2 explained by a module of another "
+        "stream, 3 rejected; -1 if the learner has no states.",
         "S",
     )
     typical: float = _signal(
         "η_typ",
-        "Slowness of the stream's typical direction, beside which the candidate is slow or not; "
-        "progress learner only.",
+        "Median slowness of all features of the stream, with which the candidate is compared "
+        "(progress learner only).",
         unit="1/frame",
     )
     regret: float = _signal(
         "",
-        "Log of the slowness that the candidate of some time ago has now over its own: what it has "
-        "gained since; progress learner only.",
+        "Recent improvement: logarithm of the slowness that an older candidate would have now, "
+        "divided by that of the candidate (progress learner only).",
     )
 
 
-# With more streams than this the signal R is not kept as a dense tensor.
+# With more streams than this the signal R is left out: its size grows with their square.
 DENSE_STREAMS = 64
 
 

@@ -66,21 +66,23 @@ class InputConfig(Section):
     """Rare settings of how external logs and live streams are read (keys `input.*`).
 
     Attributes:
-        fit: an image of another ratio of the sides than `--size` is cut (`crop`), gets black
-            sides (`pad`), or changes its ratio (`stretch`).
-        range: `NEAR,FAR`: distances of depth cameras, in metres, are shown from black to white;
-            numbers are kept within it.
-        time: column of a table's times: dates, or seconds; `stamp:ns` counts in ns, us or ms.
+        fit: how an image of another aspect ratio becomes a frame: cut (`crop`), with black
+            borders (`pad`), or distorted (`stretch`).
+        range: `NEAR,FAR`. Depth images show distances from NEAR (black) to FAR (white), in metres.
+            Numbers below NEAR or above FAR are set to NEAR or FAR.
+        time: column with the times of a table: dates, or seconds. `stamp:ns` reads the column
+            `stamp` in nanoseconds; `us` and `ms` work, too.
         stamp: time of a message: when it was logged (`log`), or the time in its `header`.
-        gaps: where a camera paused for more than ten of its steps, `skip` the pause, so that
-            nothing is learned across it, or `hold` the last image.
-        centre: learn from frames as they are over the `run`, or without the mean of their
-            `episode`: a log, or a stretch between two gaps.
-        holdout: share of an external log, at its end, that the progress learner does not learn
-            from and is judged on; `auto`: 0.1 if the log is long enough.
-        hold: seconds for which an image of a live stream replaces missing ones; then it has a gap.
-        lost: what to do if a live stream stalls or goes away: `reconnect`, `wait`, or `end`.
-        stall: seconds without an image after which a live stream has stalled.
+        gaps: what happens where a camera paused for more than ten frame periods: `skip` leaves a
+            gap, `hold` repeats the last image.
+        centre: what is subtracted from frames before learning: nothing (`run`), or the mean frame
+            of each `episode`, that is of each log, or of each part between two gaps.
+        holdout: share of an external log, at its end, that is not learned from and used to measure
+            the modules of the progress learner. `auto`: 0.1 if the log is long enough.
+        hold: time for which the last image of a live stream replaces missing images, before the
+            stream has a gap (s).
+        lost: reaction to a live stream that stalls or disconnects: `reconnect`, `wait` or `end`.
+        stall: time without an image after which a live stream counts as stalled (s).
     """
 
     prefix: ClassVar[str] = "input"

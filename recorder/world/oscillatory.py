@@ -74,7 +74,7 @@ class OscillatoryConfig(SceneConfig):
     """The oscillatory streams (keys `scene.*`).
 
     Attributes:
-        streams: names from `STREAMS`.
+        streams: names of the streams: any of `x1`, `x2`, `x3` and `zero` (constant).
     """
 
     kind: Literal["oscillatory"] = "oscillatory"

@@ -24,29 +24,33 @@ RECENT = 2 * HALF
 
 @dataclass(frozen=True, slots=True)
 class ProgressConfig(Section):
-    """Configuration of the progress learner; the defaults are those of the preset `cameras`.
+    """Configuration of the progress learner (keys `learner.*`).
 
-    No value depends on the units, the contrast or the noise of a camera.
+    The defaults are those of the preset `cameras`. No value depends on the units, the contrast or
+    the noise of a camera.
 
     Attributes:
         algorithm: `progress`.
-        tau: frames of one block.
-        components: principal components whitened for each stream; twice as many are kept.
-        outputs: slow features of one module; the slowest is judged.
-        expansion: `none`, `quadratic`, or `auto`: quadratic where `components` hold all of it
-            (frames of 4 values), else none.
+        tau: block length in frames.
+        components: number of principal components that are whitened for each stream. The learner
+            tracks twice as many.
+        outputs: number of slow features of a module. Decisions use the slowest one.
+        expansion: `none`, `quadratic` to add all products of two inputs, or `auto`: quadratic if
+            all products fit into `components` (up to 4 values a frame), else none.
         window: exponential window of the statistics of a stream (frames).
-        attention: rule that chooses the stream to watch: `novel`, `progress` or `random`.
-        visit: blocks that a stream being learned is watched at least.
-        explore: probability of any stream at a choice, of the rules that explore.
-        test_frames: window of the tests on frames not yet learned from; at least 20 blocks
-            (frames).
-        settled: mean change of the output with a block, below which it is settled.
-        agreement: most that tested and fitted slowness may differ, |ln| of their ratio.
-        slow: tested slowness over the stream's typical one, below which something in it is slow.
-        even: the same, above which nothing is.
-        looks: how often a stream is tried before it is rejected finally.
-        watch: blocks to watch on when every stream is decided, in case one changes.
+        attention: rule that chooses the next stream: `novel`, `progress` or `random`.
+        visit: smallest number of blocks for which the learner stays with a stream that it learns.
+        explore: probability with which `novel` and `progress` choose a random stream instead.
+        test_frames: window of the tests on frames before they are learned from (frames; at least
+            20 blocks).
+        settled: mean change of the output in a block below which the output has settled.
+        agreement: largest difference between the slowness on new frames and on learned frames, as
+            |ln| of their ratio, with which a module is saved.
+        slow: slowness on new frames, relative to the typical slowness of the stream, below which a
+            feature counts as slow.
+        even: the same ratio, above which the stream is rejected because nothing in it is slow.
+        looks: number of attempts at a stream before its rejection is final.
+        watch: number of blocks to continue after every stream is decided, to notice changes.
     """
 
     prefix: ClassVar[str] = "learner"

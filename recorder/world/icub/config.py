@@ -33,10 +33,10 @@ class TableConfig(Section):
     """The plain table top; wide enough to fill every eye image (keys `scene.table.*`).
 
     Attributes:
-        top: height of its surface in the root frame (m).
-        half_size: from its middle to each side (m).
-        thickness: of the top (m).
-        colour: red, green and blue, 0 to 1.
+        top: height of the table's surface in the root frame of the robot (m).
+        half_size: distance from the middle of the table to each side (m).
+        thickness: thickness of the table top (m).
+        colour: red, green and blue of the table, each from 0 to 1.
     """
 
     prefix: ClassVar[str] = "scene.table"
@@ -54,19 +54,19 @@ class EyesConfig(Section):
     of joints: `yaw` and `pitch` of the neck, to the left and upwards, and `tilt` of the eyes.
 
     Attributes:
-        views: their names.
-        yaw: where the head is turned in each (degrees).
-        tilt: of the eyes (degrees).
-        vertical_fov: field of view (degrees).
-        width: of what one eye sees (pixels); the frame shows both, side by side.
-        height: the same (pixels).
-        forward: of the eyes before the joint (m).
-        up: of the eyes above it (m).
-        half_distance: of the eyes from their middle (m).
-        near: distance from which on bodies are drawn (m).
-        far: distance up to which bodies are drawn (m).
-        light: direction to the light, not zero.
-        pitch: of the neck (degrees).
+        views: names of the views.
+        yaw: angle of the neck to the left in each view (degrees).
+        tilt: angle of the eyes upwards (degrees).
+        vertical_fov: vertical field of view of an eye (degrees).
+        width: width of the image of one eye (pixels). A frame shows both eyes side by side.
+        height: height of the image (pixels).
+        forward: distance of the eyes in front of the neck yaw joint (m).
+        up: height of the eyes above the neck yaw joint (m).
+        half_distance: half the distance between the eyes (m).
+        near: smallest distance at which bodies are drawn (m).
+        far: largest distance at which bodies are drawn (m).
+        light: direction to the light as x, y, z; not all zero.
+        pitch: angle of the neck upwards (degrees).
     """
 
     prefix: ClassVar[str] = "scene.eyes"
@@ -99,11 +99,11 @@ class BoxConfig(Section):
     """Object 1: a box, x uniform, y toggling between two places (keys `scene.object1.*`).
 
     Attributes:
-        half_size: half the length of its edges (m).
-        grey: 0 black, 1 white.
-        x: from and to (m).
-        y: its two places (m).
-        toggle_every: frames between changes of place.
+        half_size: half the length of an edge of the box (m).
+        grey: grey level of the box, from 0 (black) to 1 (white).
+        x: range of x (m).
+        y: the two values of y (m).
+        toggle_every: number of frames between two changes of y.
     """
 
     prefix: ClassVar[str] = "scene.object1"
@@ -119,11 +119,11 @@ class CylinderConfig(Section):
     """Object 2: a cylinder, x and y uniform (keys `scene.object2.*`).
 
     Attributes:
-        radius: (m).
-        height: (m).
-        grey: 0 black, 1 white.
-        x: from and to (m).
-        y: from and to (m).
+        radius: radius of the cylinder (m).
+        height: height of the cylinder (m).
+        grey: grey level of the cylinder, from 0 (black) to 1 (white).
+        x: range of x (m).
+        y: range of y (m).
     """
 
     prefix: ClassVar[str] = "scene.object2"
@@ -139,12 +139,12 @@ class SphereConfig(Section):
     """Object 3: a sphere on a reflecting walk, y slow against x (keys `scene.object3.*`).
 
     Attributes:
-        radius: (m).
-        grey: 0 black, 1 white.
-        x: from and to (m).
-        y: from and to (m).
-        step_x: standard deviation of a step of x, one a frame (m).
-        step_y: the same of y (m).
+        radius: radius of the sphere (m).
+        grey: grey level of the sphere, from 0 (black) to 1 (white).
+        x: range of x (m).
+        y: range of y (m).
+        step_x: standard deviation of the step of x in a frame (m).
+        step_y: standard deviation of the step of y in a frame (m).
     """
 
     prefix: ClassVar[str] = "scene.object3"
@@ -161,22 +161,23 @@ class IcubConfig(SceneConfig):
     """The iCub scene (keys `scene.*`); the plain one, unless one of the last keys is set.
 
     Attributes:
-        robot: a model of the icub-models package.
-        room: the table has edges and legs, and stands in a room with floor, walls and furniture.
-        texture: wood, tiles, plaster and painted objects instead of plain greys.
-        shadow: share of the light that the lamp's shadow takes.
-        arms: the robot's arms rest on the table, and are in its sight.
-        blur: of a pixel over its neighbours, (1, 2, 1) / 4 each way.
+        robot: name of a robot model in the package icub-models.
+        room: whether the table has edges and legs, in a room with floor, walls and furniture.
+        texture: whether surfaces show wood, tiles, plaster and paint instead of plain greys.
+        shadow: share of the light that is missing in a shadow.
+        arms: whether the arms of the robot rest on the table, where the eyes see them.
+        blur: whether each pixel is blurred with its neighbours, by (1, 2, 1) / 4 in each direction.
         vignette: share of the light that is lost in the corners of an image.
-        noise: of the sensor at middle grey, standard deviation in grey levels.
-        color: a frame shows red, green and blue beside one another.
-        physics: objects slide and roll after where they are to be, instead of being put there.
-        transit: degrees that the head turns in a frame: a change of view loses the frames of the
-            turn. Below 0.1 the head jumps.
-        roam: another view, `roam`, is of a head that looks at one of the others for a while, then
-            turns to the next.
-        drift: share by which the light goes up and down, over minutes.
-        exposure: the eyes adapt to the light: all images of a view are as bright in the mean.
+        noise: standard deviation of the sensor noise at middle grey (grey levels).
+        color: whether a frame shows red, green and blue side by side.
+        physics: whether objects slide and roll to their next position instead of jumping there.
+        transit: speed of the head in degrees a frame: frames are lost while it turns to another
+            view. Below 0.1 the head jumps.
+        roam: whether to add the view `roam`, of a head that looks at each of the other views in
+            random order and turns from one to the next.
+        drift: share by which the light gets brighter and darker over minutes.
+        exposure: whether the eyes adapt to the light, so that all images of a view have the same
+            mean brightness.
     """
 
     kind: Literal["icub"] = "icub"
