@@ -70,7 +70,7 @@ def per_file(folder: Path, rounds: int) -> list[object]:
 
     def work(decode: bool) -> Callable[[], int]:
         def call() -> int:
-            with LogReader(log, salvage=True, check="pass" if decode else "chunks") as reader:
+            with LogReader(log, skip_damaged=True, check="pass" if decode else "chunks") as reader:
                 describe_reader(reader, decode=decode)
             return 1
 

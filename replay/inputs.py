@@ -37,7 +37,7 @@ def open_log(
     inputs: InputOptions | None = None,
     *,
     loop: bool = False,
-    salvage: bool = False,
+    skip_damaged: bool = False,
 ) -> LoggedSource:
     """Open one of our recordings, or external logs.
 
@@ -45,7 +45,7 @@ def open_log(
         paths: the folder of a recording or its views' files, or external logs.
         inputs: how images of external logs become frames; with it paths are taken as such.
         loop: begin again at the end.
-        salvage: leave out what is damaged.
+        skip_damaged: leave out what is damaged.
 
     Raises:
         UsageError: no such log, a run, or as for `open_external`.
@@ -55,12 +55,12 @@ def open_log(
     refuse_what_is_no_log(paths)
     if not inputs.external and not any(map(only_external, paths)):
         with contextlib.suppress(NoRecordingError):
-            return open_recording(paths, loop=loop, salvage=salvage)
-    return open_external(paths, inputs, loop=loop, salvage=salvage)
+            return open_recording(paths, loop=loop, skip_damaged=skip_damaged)
+    return open_external(paths, inputs, loop=loop, skip_damaged=skip_damaged)
 
 
 def open_to_look(
-    paths: Sequence[Path], inputs: InputOptions | None = None, *, salvage: bool = False
+    paths: Sequence[Path], inputs: InputOptions | None = None, *, skip_damaged: bool = False
 ) -> LoggedSource:
     """Open logs to view or export them: every topic of images, aligned by time if need be.
 
@@ -75,9 +75,11 @@ def open_to_look(
     source = None
     if not (inputs.topics or inputs.fields or any(map(only_external, paths))):
         with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
-            source = open_recording(paths, salvage=salvage)
+            source = open_recording(paths, skip_damaged=skip_damaged)
     if source is None:
-        source = with_every_topic(lambda how: open_external(paths, how, salvage=salvage), inputs)
+        source = with_every_topic(
+            lambda how: open_external(paths, how, skip_damaged=skip_damaged), inputs
+        )
     try:
         source.describe_at_once()
     except BaseException:
@@ -97,14 +99,14 @@ def with_every_topic(opened: Callable[[InputOptions], Source], inputs: InputOpti
 
 
 def open_recording(
-    paths: str | Path | Sequence[str | Path], *, loop: bool = False, salvage: bool = False
+    paths: str | Path | Sequence[str | Path], *, loop: bool = False, skip_damaged: bool = False
 ) -> LoggedSource:
     """Open the views of a recording.
 
     Args:
         paths: a recording's folder, or the files of its views, finished or `.partial`; or URLs.
         loop: begin again at the end.
-        salvage: leave out, in every view, what is damaged in one of them, and of several files
+        skip_damaged: leave out, in every view, what is damaged in one of them, and of several files
             one that cannot be read.
 
     Raises:
@@ -120,19 +122,19 @@ def open_recording(
             if views.only_begun(path):
                 continue
             try:
-                files.append(ViewFile(path, salvage=salvage))
+                files.append(ViewFile(path, skip_damaged=skip_damaged))
                 failed.callback(files[-1].close)
             except NoRecordingError:
                 raise
             except LogDamagedError as error:
-                if not salvage or len(named) == 1:
+                if not skip_damaged or len(named) == 1:
                     raise
                 broken.append(error)
         if not files:
             raise (
                 broken[0] if broken else NoRecordingError(f"{named[0]}: no frame was recorded yet")
             )
-        streams = views.streams(files, salvage=salvage)
+        streams = views.streams(files, skip_damaged=skip_damaged)
         left_out = [f"{error}: this log is left out" for error in broken]
         return LoggedSource(streams, loop=loop, opened=failed.pop_all(), left_out=left_out)
 
@@ -142,7 +144,7 @@ def open_external(
     inputs: InputOptions | None = None,
     *,
     loop: bool = False,
-    salvage: bool = False,
+    skip_damaged: bool = False,
 ) -> LoggedSource:
     """Open external logs as streams on one clock: images of cameras, or numbers.
 
@@ -151,7 +153,7 @@ def open_external(
             another in time are parts of one stream, unless they are aligned by index.
         inputs: how images become frames.
         loop: begin again at the end.
-        salvage: leave out what is damaged, and broken images; of several logs also one that
+        skip_damaged: leave out what is damaged, and broken images; of several logs also one that
             cannot be read: `left_out` of the source says so, as its warnings do.
 
     Raises:
@@ -159,12 +161,12 @@ def open_external(
         LogDamagedError: a log is damaged.
     """
     inputs = inputs or InputOptions()
-    how: Any = {"loop": loop, "salvage": salvage}
+    how: Any = {"loop": loop, "skip_damaged": skip_damaged}
     if inputs.color == "auto":
         return _with_color(lambda options: open_external(paths, options, **how), inputs)
     files = image_logs([paths] if isinstance(paths, str | Path) else paths)
     with ExitStack() as failed:
-        logs = OpenLogs(files, inputs, failed, salvage=salvage)
+        logs = OpenLogs(files, inputs, failed, skip_damaged=skip_damaged)
         streams = logs.streams if inputs.align == "index" else join_parts(logs.streams)
         how |= {"logs": logs.logs, "left_out": logs.left_out, "opened": failed.pop_all()}
         return LoggedSource(streams, inputs, **how)

@@ -182,7 +182,7 @@ class StoredSource(ClockedSource):
         """Return the description of the recorded source; empty for scenes and external logs."""
         return {}
 
-    def salvaged(self) -> list[str]:
+    def skipped_damage(self) -> list[str]:
         """Return a line for each stream of which damaged parts were replaced or left out so far."""
         return []
 

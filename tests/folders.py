@@ -35,9 +35,9 @@ def external(
     topics: Sequence[str] = (),
     *,
     loop: bool = False,
-    salvage: bool = False,
+    skip_damaged: bool = False,
     **chosen: Any,
 ) -> LoggedSource:
     """External logs, opened with some options."""
     options = InputOptions(topics=tuple(topics), **chosen)
-    return open_external(paths, options, loop=loop, salvage=salvage)
+    return open_external(paths, options, loop=loop, skip_damaged=skip_damaged)

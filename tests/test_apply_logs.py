@@ -259,7 +259,7 @@ def test_a_log_damaged_half_way_is_named_each_time(
         table = pq.read_table(row["out"])
         shown = np.stack(list(pictures(row["frames"])))
         np.testing.assert_array_equal(y(table, "half.mcap"), Run(run).modules[0].transform(shown))
-    assert cdmisfa("apply", run, log, "-o", tmp_path / "w.csv", "--salvage").code == 0
+    assert cdmisfa("apply", run, log, "-o", tmp_path / "w.csv", "--skip-damaged").code == 0
 
 
 def test_the_commands_of_the_page_work(

@@ -159,7 +159,9 @@ class TestRuns:
         assert result == again == resumed
         assert (result["ended"], result["iterations"]) == ("log_exhausted", blocks)
         assert result["undecided"] == ["x1", "x2", "x3"]
-        assert cdmisfa("check", run).code == cdmisfa("at", run, blocks).code == 0
+        assert (
+            cdmisfa("check", run).code == cdmisfa("inspect", run, "--iteration", blocks).code == 0
+        )
         forked = cdmisfa("fork", run, "--iteration", 5, "-o", fork, "--no-rerun", "--json")
         assert (forked.code, forked.json["ended"]) == (0, "log_exhausted")
         info = cdmisfa("info", run)

@@ -31,7 +31,9 @@ CASES: dict[str, tuple[str, ...]] = {
     "learn": ("SOURCE", "cdmisfa learn --help"),
     "record icub": ("-o",),
     # options that would do nothing
-    "learn oscillatory --loop --salvage": ("is no log: --loop and --salvage are for logs",),
+    "learn oscillatory --loop --skip-damaged": (
+        "is no log: --loop and --skip-damaged are for logs",
+    ),
     "record gym:Pendulum-v1 -o x --view a": ("is a live stream: --view is for scenes",),
     "convert LOGS --set learner.nu=1 -o x": ("--set takes keys input.* here, not learner.*",),
     "view RUN --topic /a --save v.rrd": ("is a run: --topic is for logs",),
@@ -46,7 +48,7 @@ CASES: dict[str, tuple[str, ...]] = {
     # a file of another kind is a wrong word and no damage
     **{f"{command} numbers.h5": (NO_MCAP,) for command in ("info", "verify", "check")},
     "view --save out.rrd numbers.h5": (NO_MCAP,),
-    "recover numbers.csv -o out.mcap": ("numbers.csv is no MCAP file", "--salvage"),
+    "recover numbers.csv -o out.mcap": ("numbers.csv is no MCAP file", "--skip-damaged"),
     "learn RUN": (A_RUN,),
     # results are not written to URLs, and a secret in one is not printed
     "learn oscillatory -o s3://lab/x": ("s3://lab/x is a URL: name a path on this machine",),
@@ -56,6 +58,15 @@ CASES: dict[str, tuple[str, ...]] = {
     "sweep gym:Pendulum-v1 --seeds 0 -o s": (
         "record it first, with cdmisfa record gym:Pendulum-v1 -o REC",
     ),
+    # --summary prints the results of a sweep, and computes nothing
+    "sweep oscillatory": ("name the folder of the sweep with -o",),
+    "sweep oscillatory --csv -o s": ("--csv needs --summary",),
+    "sweep taken --summary -o s": ("--summary only prints results: leave out -o",),
+    "sweep taken --summary --seeds 0": ("--summary only prints results: leave out --seeds",),
+    "sweep taken RUN --summary": ("--summary takes the folder of one sweep",),
+    "sweep taken --summary --csv --json": ("choose one of --csv and --json",),
+    "sweep taken --summary": ("taken holds no sweep",),
+    "doctor left.mcap": ("check files with cdmisfa verify left.mcap",),
     # a fork that cannot be
     "fork RUN --iteration 3 -o x --set learner.tau=20": ("learner.tau stays as in the parent",),
     "fork RUN --iteration 16 -o x": ("holds 15 iterations",),

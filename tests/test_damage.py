@@ -303,7 +303,7 @@ def test_one_broken_log_does_not_hide_the_others(cdmisfa: Cdmisfa, tmp_path: Pat
 
 @pytest.mark.parametrize("topics", [(), ("/one", "/bad", "/two")])
 @pytest.mark.parametrize("use", ["learn", "convert"])
-def test_what_cannot_be_read_is_left_out_of_what_is_salvaged(
+def test_what_cannot_be_read_is_left_out_of_the_rest(
     cdmisfa: Cdmisfa, tmp_path: Path, use: str, topics: tuple[str, ...]
 ) -> None:
     one, bad, two = broken_among_whole(tmp_path)
@@ -312,7 +312,7 @@ def test_what_cannot_be_read_is_left_out_of_what_is_salvaged(
     how += ("--set", "learner.tau=10", "--no-rerun") if use == "learn" else ()
     assert cdmisfa(use, one, bad, two, *how).code == 3  # and there is nothing
     assert not (tmp_path / "out").exists()
-    done = cdmisfa(use, one, bad, two, *how, "--salvage")
+    done = cdmisfa(use, one, bad, two, *how, "--skip-damaged")
     assert done.code == 3
     assert f"warning: {bad}: {EMPTY}: this log is left out\n" in done.err
     streams = "streams" if use == "learn" else "views"

@@ -45,34 +45,36 @@ def folder(path: Path, *broken: int) -> Path:
     return path
 
 
-def shown(path: Path, *, salvage: bool = False) -> tuple[list[np.ndarray], list[str], str]:
+def shown(path: Path, *, skip_damaged: bool = False) -> tuple[list[np.ndarray], list[str], str]:
     """The frames in blocks of 7, what is said of broken ones, and the error that ends it."""
     frames: list[np.ndarray] = []
-    with contextlib.closing(external(path, salvage=salvage, rate=25)) as source:
+    with contextlib.closing(external(path, skip_damaged=skip_damaged, rate=25)) as source:
         try:
             for left in range(source.frames, 0, -7):
                 frames.append(source.take(0, min(left, 7)).frames)
         except LogDamagedError as error:
-            return frames, source.salvaged(), str(error)
-        return frames, source.salvaged(), ""
+            return frames, source.skipped_damage(), str(error)
+        return frames, source.skipped_damage(), ""
 
 
 @pytest.mark.parametrize("write", [write, folder])
-@pytest.mark.parametrize(("broken", "salvage"), [((), False), (BROKEN, True), (BROKEN[1:], False)])
+@pytest.mark.parametrize(
+    ("broken", "skip_damaged"), [((), False), (BROKEN, True), (BROKEN[1:], False)]
+)
 def test_threads_change_no_frame_and_no_error(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     write: Callable[..., Path],
     broken: tuple[int, ...],
-    salvage: bool,
+    skip_damaged: bool,
 ) -> None:
     log = write(tmp_path / "log.mcap" if write.__name__ == "write" else tmp_path / "log", *broken)
     found = {}
     for cores in (1, 2, 5):
         monkeypatch.setattr(ahead, "CORES", cores)
-        found[cores] = shown(log, salvage=salvage)
+        found[cores] = shown(log, skip_damaged=skip_damaged)
     frames, said, error = found[1]
-    assert (len(frames) == -(-COUNT // 7)) == (salvage or not broken)
+    assert (len(frames) == -(-COUNT // 7)) == (skip_damaged or not broken)
     for cores in (2, 5):
         assert found[cores][1:] == (said, error)
         assert len(found[cores][0]) == len(frames)

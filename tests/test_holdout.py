@@ -146,16 +146,16 @@ def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -
     (tmp_path / "110.png").write_bytes((tmp_path / "110.png").read_bytes()[:50])
     none, policy = np.zeros(1), np.zeros(0, np.int64)
     learned = Module(1, "log", 0, 0, np.eye(6)[:1], np.zeros(6), none, none, none, policy)
-    for salvage in (False, True):
-        with external(tmp_path, rate=5, salvage=salvage) as source:
+    for skip_damaged in (False, True):
+        with external(tmp_path, rate=5, skip_damaged=skip_damaged) as source:
             source.hold_out(20)
             source.take(0, 100)
             with pytest.raises(LogExhaustedError, match="before 20 held out"):
                 source.take(0, 1)
-            if salvage:
+            if skip_damaged:
                 found = judged(source, [replace(learned, expansion="none")], components=2)
                 assert found is not None
                 assert found["frames"] == [100, 120]
             else:
-                with pytest.raises(LogDamagedError, match=r"110\.png.*--salvage"):
+                with pytest.raises(LogDamagedError, match=r"110\.png.*--skip-damaged"):
                     judged(source, [replace(learned, expansion="none")], components=2)

@@ -216,17 +216,17 @@ def test_without_its_source_a_run_has_its_keyframes(
     told = (*words("2.0"), *LEARN, "--max-iterations", 25)
     assert cdmisfa("learn", log, *told, "-o", run).code == 0
     log.rename(tmp_path / "moved")
-    assert cdmisfa("at", run, 20, "--json").json["t"] == 800
-    gone = cdmisfa("at", run, 21)
+    assert cdmisfa("inspect", run, "--iteration", 20, "--json").json["t"] == 800
+    gone = cdmisfa("inspect", run, "--iteration", 21)
     assert gone.code == 2
     assert len(gone.err.splitlines()) == 1
     assert all(word in gone.err for word in ("no such file", "--source", "20 iterations"))
-    assert cdmisfa("at", run, 21, "--source", tmp_path / "moved").code == 0
+    assert cdmisfa("inspect", run, "--iteration", 21, "--source", tmp_path / "moved").code == 0
 
 
 def test_at_prints_all_of_the_memory(place: Path, cdmisfa: Cdmisfa) -> None:
     run = place / "2.0-live"
-    found = cdmisfa("at", run, 50, "--json").json
+    found = cdmisfa("inspect", run, "--iteration", 50, "--json").json
     learner = Run(run).at(50)
     assert [m["iteration"] for m in found["modules"]] == [8, 42]
     assert found["arrays"].keys() == learner.state.arrays.keys()
@@ -234,7 +234,9 @@ def test_at_prints_all_of_the_memory(place: Path, cdmisfa: Cdmisfa) -> None:
         if not array.dtype.names:
             printed = np.array(found["arrays"][name], float).reshape(array.shape)
             assert np.array_equal(printed, array, equal_nan=True), name
-    assert f"memory: {len(found['arrays'])} arrays, " in cdmisfa("at", run, 50).out
+    assert (
+        f"memory: {len(found['arrays'])} arrays, " in cdmisfa("inspect", run, "--iteration", 50).out
+    )
 
 
 def test_a_fork_goes_on_as_told(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -> None:

@@ -52,7 +52,7 @@ def test_a_run_of_another_arithmetic_is_not_computed_again(
         assert read_header(folder).arithmetic == arithmetic
     for words in (
         ("check", run),
-        ("at", run, 2),
+        ("inspect", run, "--iteration", 2),
         ("fork", run, "--iteration", 0, "-o", tmp_path / "fork"),
     ):
         done = cdmisfa(*words)

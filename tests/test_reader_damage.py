@@ -40,8 +40,8 @@ KINDS: dict[str, bytes] = {
 }
 
 
-def read_all(path: Path, *, salvage: bool = False) -> list[tuple[str, int, bytes]]:
-    with LogReader(path, salvage=salvage) as reader:
+def read_all(path: Path, *, skip_damaged: bool = False) -> list[tuple[str, int, bytes]]:
+    with LogReader(path, skip_damaged=skip_damaged) as reader:
         for attachment in reader.attachments:
             reader.attachment_data(attachment)
         return [(m.channel.topic, m.log_time, m.data) for m in reader.messages()]
@@ -99,8 +99,8 @@ def test_part_of_a_cut_chunk_is_read_when_asked(tmp_path: Path) -> None:
     with LogReader(path) as reader:
         last = reader.segments[-1]
     path.write_bytes(raw[: last.data_offset + last.stored - 10])
-    whole, salvaged = read_all(path), read_all(path, salvage=True)
-    assert len(whole) < len(salvaged) < MESSAGES
+    whole, skipping = read_all(path), read_all(path, skip_damaged=True)
+    assert len(whole) < len(skipping) < MESSAGES
 
 
 @pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
@@ -176,7 +176,7 @@ def test_a_lying_file_is_refused(tmp_path: Path, name: str) -> None:
     path.write_bytes(one_chunk(HOSTILE[name]()))
     with pytest.raises(LogDamagedError, match=r"log\.mcap"):
         read_all(path)
-    assert len(read_all(path, salvage=True)) <= 1
+    assert len(read_all(path, skip_damaged=True)) <= 1
 
 
 @pytest.mark.parametrize("places", [[(5, 0)], [(5, 2**50)], [(6, 42)], [(5, 42), (5, 42)], []])
@@ -198,7 +198,7 @@ def test_a_summary_that_lies_is_refused(tmp_path: Path) -> None:
     path.write_bytes(files.finish(data, index))
     with pytest.raises(LogDamagedError, match="summary"):
         read_all(path)
-    assert len(read_all(path, salvage=True)) == 1
+    assert len(read_all(path, skip_damaged=True)) == 1
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])

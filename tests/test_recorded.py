@@ -165,9 +165,9 @@ def test_damage_stops_and_is_named(copy: Path) -> None:
     assert any("data section" in problem.where for problem in check_log(copy).problems)
 
 
-def test_salvage_leaves_the_damage_out_of_every_view(copy: Path) -> None:
+def test_damage_in_one_view_is_skipped_in_every_view(copy: Path) -> None:
     damage(copy / "x1.mcap")
-    source = open_recording(copy, salvage=True)
+    source = open_recording(copy, skip_damaged=True)
     assert source.frames == FRAMES - 50
     assert any("50 frames" in w for w in source.warnings)
     live = OscillatorySource()
@@ -190,7 +190,7 @@ def test_recover_saves_what_is_readable(copy: Path, tmp_path: Path) -> None:
         ("/truth", FRAMES - 50, 50),
     }
     with (
-        LogReader(copy / "x1.mcap", salvage=True) as old,
+        LogReader(copy / "x1.mcap", skip_damaged=True) as old,
         LogReader(tmp_path / "saved.mcap") as new,
     ):
         assert new.complete

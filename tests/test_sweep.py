@@ -272,7 +272,7 @@ def test_means_and_deviations_are_over_finished_seeds(known: Path) -> None:
 
 def test_results_are_printed_in_every_form(cdmisfa: Cdmisfa, known: Path) -> None:
     def shown(*options: str) -> str:
-        found = cdmisfa("results", known, *options)
+        found = cdmisfa("sweep", known, "--summary", *options)
         assert found.code == 0, found.err
         return found.out
 

@@ -81,7 +81,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seeds", default="0:10", help="FIRST:END")
     parser.add_argument("--set", action="append", default=[], metavar="learner.KEY=VALUE")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("-o", "--out", type=Path, default=Path("arena"), help="folder")
+    parser.add_argument(
+        "-o", "--output", dest="out", type=Path, default=Path("arena"), help="folder"
+    )
     given = parser.parse_args(arguments)
     learners = given.learners.split(",")
     sets = dict.fromkeys(name for word in given.sets for name in GROUPS.get(word, [word]))

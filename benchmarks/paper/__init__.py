@@ -39,7 +39,9 @@ def study(
     parser.add_argument("--trials", type=int, default=trials, help="per condition")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--no-icub", action="store_true", help="leave the iCub out")
-    parser.add_argument("-o", "--out", type=Path, default=Path("reproduction"), metavar="DIR")
+    parser.add_argument(
+        "-o", "--output", dest="out", type=Path, default=Path("reproduction"), metavar="DIR"
+    )
     given = parser.parse_args()
     if given.no_icub:
         conditions = [c for c in conditions if c.get("scene") != "icub"]

@@ -41,13 +41,12 @@ HELP = {
         "view": ("view", "Show a run, recording or log in the Rerun viewer, or save the view."),
         "report": ("view", "Write an HTML report of one run, or of several runs side by side."),
         "info": ("logs", "Show what a log, recording or run contains."),
-        "results": ("trials", "Print mean and standard deviation over the seeds of a sweep."),
         "signals": ("runs", "List the signals that every run records."),
     },
     "Compare and reproduce": {
         "compare": ("runs", "Compare runs: signals bit for bit, results and settings."),
         "check": ("runs", "Learn a run again from its source and compare every signal."),
-        "at": ("runs", "Print the exact state of the learner after K iterations of a run."),
+        "inspect": ("runs", "Print the exact state of the learner after K iterations of a run."),
     },
     "Logs": {
         "verify": ("logs", "Verify that logs are complete: structure, checksums, no lost data."),

@@ -36,9 +36,9 @@ LOCAL = LocalPath(path_type=Path)
 WORD = click.Path(readable=False)
 
 
-def out(help: str, *, required: bool = False) -> Decorator:
+def output(help: str, *, required: bool = False) -> Decorator:
     """Return the option `-o` for the result of a command."""
-    return click.option("-o", "--out", type=LOCAL, required=required, help=help)
+    return click.option("-o", "--output", type=LOCAL, required=required, help=help)
 
 
 def log_argument(name: str) -> Decorator:
@@ -206,7 +206,9 @@ max_modules = click.option(
     "many modules as there are streams.",
 )
 loop = click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
-salvage = click.option("--salvage", is_flag=True, help="Skip damaged parts and images of a log.")
+skip_damaged = click.option(
+    "--skip-damaged", is_flag=True, help="Skip damaged parts and images of a log."
+)
 force = click.option("--force", is_flag=True, help="Overwrite existing results.")
 no_rerun = click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
 retry_failed = click.option(

@@ -122,7 +122,7 @@ def source_changes(frames: FrameSource) -> None:
     """Print damage that showed while a log was read, or the counts of live streams."""
     if not hasattr(frames, "stop"):
         changes = getattr(frames, "changes", {}).values()
-        for text in (*changes, *getattr(frames, "salvaged", list)()):
+        for text in (*changes, *getattr(frames, "skipped_damage", list)()):
             warning(text)
         return
     unit = "images" if frames.spec.images else "messages"

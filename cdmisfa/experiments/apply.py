@@ -96,7 +96,7 @@ class Application:
         inputs: InputOptions | None = None,
         *,
         loop: bool = False,
-        salvage: bool = False,
+        skip_damaged: bool = False,
         say: Callable[[str], None] = lambda line: None,
     ) -> FrameSource:
         """Open a source whose frames are made as the modules' recipe says.
@@ -105,7 +105,7 @@ class Application:
             words: the source, as `cdmisfa learn` takes it.
             inputs: the part of logs that is used; size, fit and colour are the recipe's.
             loop: start again at the end.
-            salvage: skip damaged parts.
+            skip_damaged: skip damaged parts.
             say: called with a line when the state of a camera changes.
 
         Raises:
@@ -118,7 +118,7 @@ class Application:
         elif is_scene(words):
             source = configure(words[0], inputs=inputs).open_scene()
         else:
-            source = self._open_log(words, inputs, loop=loop, salvage=salvage)
+            source = self._open_log(words, inputs, loop=loop, skip_damaged=skip_damaged)
         if source.spec.frame_shape != self.recipe.shape:
             source.close()
             raise UsageError(

@@ -84,7 +84,7 @@ def apply_to_logs(
     inputs: InputOptions | None = None,
     frames: int | None = None,
     loop: bool = False,
-    salvage: bool = False,
+    skip_damaged: bool = False,
     force: bool = False,
     indexing: Callable[[float, float | None], None] = lambda done, total: None,
     **where: Any,
@@ -99,10 +99,10 @@ def apply_to_logs(
         words: folders, patterns, files and URLs of logs, or indices of them.
         out: the folder of the files; a shared one if workers run on other machines.
         form: the ending of the files.
-        inputs: see `Application.open`, as for `loop` and `salvage`.
+        inputs: see `Application.open`, as for `loop` and `skip_damaged`.
         frames: end after this many frames of each stream.
         loop: start a log again at its end.
-        salvage: skip damaged parts.
+        skip_damaged: skip damaged parts.
         force: replace outputs of other modules or options.
         indexing: called with the number of logs that were indexed, and of all.
         where: `jobs`, `scheduler`, `retry_failed` and `progress` of `run_trials`.
@@ -114,7 +114,7 @@ def apply_to_logs(
     """
     application, out = Application(run), Path(out).resolve()
     inputs = inputs or InputOptions()
-    options = {"inputs": inputs, "loop": loop, "salvage": salvage}
+    options = {"inputs": inputs, "loop": loop, "skip_damaged": skip_damaged}
     chosen = plain(options | {"form": form, "frames": frames, "inputs": asdict(inputs)})
     request = {"schema": 1, "modules": application.identity, "options": chosen}
     folder, parts = out / STORE, out / STORE / "parts"
@@ -180,7 +180,7 @@ def apply_to_log(
         ):
             follow(blocks, [sink], totals)
         warnings = [*getattr(source, "warnings", ()), *getattr(source, "changes", {}).values()]
-        warnings += getattr(source, "salvaged", list)()
+        warnings += getattr(source, "skipped_damage", list)()
     with writing(out):
         os.replace(part, out)
         to_disk(out.parent)

@@ -48,7 +48,7 @@ COMMAND = "command"
 FORK = "fork"
 
 # Options of a command that decide how logs are opened.
-OPENING = ("loop", "salvage", "episodes")
+OPENING = ("loop", "skip_damaged", "episodes")
 
 # Options of a command that are stored with its run.
 OPTIONS = (

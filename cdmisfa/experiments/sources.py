@@ -261,7 +261,7 @@ def open_logs(
     words: Sequence[str | Path],
     *,
     loop: bool = False,
-    salvage: bool = False,
+    skip_damaged: bool = False,
     inputs: InputOptions | None = None,
     episodes: bool = False,
     told: Progress = lambda done, total: None,
@@ -271,7 +271,7 @@ def open_logs(
     Args:
         words: paths, URLs or patterns: of a recording, external logs, or an index of many.
         loop: start again at the end.
-        salvage: pass over damaged parts.
+        skip_damaged: pass over damaged parts.
         inputs: how images become frames; given, paths are taken as external logs.
         episodes: each path is an episode of its own; those of an index always are.
         told: called with the number of opened episodes and the total.
@@ -297,7 +297,7 @@ def open_logs(
             if str(path) in SCENES:
                 raise no_such(path, [], "a scene is named alone")
             raise no_such(path, known, f"the scenes are {', '.join(SCENES)}")
-    how: Any = {"loop": loop, "salvage": salvage}
+    how: Any = {"loop": loop, "skip_damaged": skip_damaged}
     source: StoredSource | None = None
     if episodes or may_be_corpus(words):
         from replay.corpus.episodes import EpisodeSource

@@ -157,7 +157,7 @@ def _opened(
         how["settings"] = [*recording.inputs.settings(), *how["settings"]]
         configuration = _configured(frames, how, recording.inputs)
         options: dict[str, Any] = {"loop": logs["loop"] or recording.loop}
-        options |= {"salvage": recording.salvage, "episodes": recording.episodes}
+        options |= {"skip_damaged": recording.skip_damaged, "episodes": recording.episodes}
         for name in recording.inputs.chosen(OPTIONS):
             options[name] = getattr(recording.inputs, name)
         yield frames, configuration, (recording.words, options) if recording.words else None

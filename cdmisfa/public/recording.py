@@ -39,7 +39,7 @@ class Recording(Described):
             mapping of them by the streams' names. Arrays hold numbers, (n,) or (n, values), or
             images, (n, height, width) or (n, height, width, 3), the i-th of all at once.
         loop: start again at the end.
-        salvage: skip damaged parts.
+        skip_damaged: skip damaged parts.
         episodes: each path is an episode, one after the other; the logs of a folder that
             `cdmisfa index` indexed always are.
         options: which streams, and how they become frames: the input options of `cdmisfa learn`,
@@ -59,7 +59,7 @@ class Recording(Described):
         self,
         *given: Given,
         loop: bool = False,
-        salvage: bool = False,
+        skip_damaged: bool = False,
         episodes: bool = False,
         **options: Any,
     ) -> None:
@@ -67,7 +67,7 @@ class Recording(Described):
         if unknown := [name for name in options if name not in known]:
             raise UsageError(f"no option {unknown[0]}: {did_you_mean(unknown[0], known)}")
         self.inputs = InputOptions(**options)
-        self.loop, self.salvage, self.episodes = loop, salvage, episodes
+        self.loop, self.skip_damaged, self.episodes = loop, skip_damaged, episodes
         self.words = as_words(given)
         if not self.words and len(given) != 1:
             raise UsageError("give one array, or several by name: {'left': one, 'right': two}")
@@ -90,7 +90,7 @@ class Recording(Described):
         """
         loop = loop or self.loop
         if self.words:
-            how: dict[str, Any] = {"loop": loop, "salvage": self.salvage}
+            how: dict[str, Any] = {"loop": loop, "skip_damaged": self.skip_damaged}
             return open_logs(self.words, inputs=self.inputs, episodes=self.episodes, **how)
         given = self._given
         streams = given if isinstance(given, Mapping) else {"stream": given}

@@ -328,7 +328,7 @@ def _opened(path: Path) -> LogReader | None:
     """
     with opened_regular(path) as file:
         start = file.read(len(MAGIC))
-    return LogReader(path, salvage=True, check="chunks") if start == MAGIC else None
+    return LogReader(path, skip_damaged=True, check="chunks") if start == MAGIC else None
 
 
 def _recording_metadata(path: Path) -> Mapping[str, str] | None:

@@ -38,7 +38,7 @@ class LogReader(LogStructure):
     """An MCAP file, read by its content and not by what its index claims.
 
     Damage is an error that names the file, the chunk and its time range. With
-    `salvage` the damaged chunk is left out and noted in `problems` instead, and the
+    `skip_damaged` the damaged chunk is left out and noted in `problems` instead, and the
     unverifiable part of a chunk in which the file ends is read too. Where its summary accounts
     for every message, only what is asked for is read: each chunk is checked when it is, and the
     checksum over all data where all of it is read (`check`, `sha256`) or a chunk has none of its
@@ -46,17 +46,17 @@ class LogReader(LogStructure):
     """
 
     def __init__(
-        self, log: str | Path | Store, *, salvage: bool = False, check: Check | None = None
+        self, log: str | Path | Store, *, skip_damaged: bool = False, check: Check | None = None
     ) -> None:
         """Open a log.
 
         Args:
             log: path of a file, or its bytes, which are closed with the reader.
-            salvage: leave out what is damaged.
+            skip_damaged: leave out what is damaged.
             check: "chunks" believes a summary that accounts for every message; "data" looks at
                 every record of a file and at the checksum over its data; "pass" leaves to
-                `one_pass` the latter, and without `salvage` also the former. By default "chunks",
-                with `salvage` "data".
+                `one_pass` the latter, and without `skip_damaged` also the former. By default
+                "chunks", with `skip_damaged` "data".
 
         Raises:
             UsageError: it cannot be opened.
@@ -66,10 +66,10 @@ class LogReader(LogStructure):
         self._defined = self._searched = self._checked = False
         if not isinstance(log, Store):
             log = OnePass(Path(log)) if check == "pass" else Store(Path(log))
-        check = check or ("data" if salvage else "chunks")
+        check = check or ("data" if skip_damaged else "chunks")
         try:
-            by_index = check == "chunks" or (check == "pass" and not salvage)
-            super().__init__(log, salvage=salvage, by_index=by_index)
+            by_index = check == "chunks" or (check == "pass" and not skip_damaged)
+            super().__init__(log, skip_damaged=skip_damaged, by_index=by_index)
             note = None if check == "chunks" else self.note
             self._chunks = Chunks(log, self.definitions, note, self._check_unproven)
             if self.torn is not None and self.torn in self.segments:
@@ -169,7 +169,7 @@ class LogReader(LogStructure):
             topics: only these; None for all.
 
         Raises:
-            LogDamagedError: at the first damage, without `salvage`.
+            LogDamagedError: at the first damage, without `skip_damaged`.
         """
         for segment, table in self.tables(topics=topics):
             known = {c: self._channel(c, segment) for c in np.unique(table.channel).tolist()}
@@ -188,7 +188,7 @@ class LogReader(LogStructure):
         index those without any of `topics`.
 
         Raises:
-            LogDamagedError: at the first damage, without `salvage`.
+            LogDamagedError: at the first damage, without `skip_damaged`.
         """
         chosen = [s for s in self.segments if s.end >= start]
         if self.by_index:
@@ -203,11 +203,11 @@ class LogReader(LogStructure):
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
         """Yield every chunk in file order, None for one that is damaged and left out.
 
-        Without `salvage` each byte is read once, and every record is looked at on the way. The
+        Without `skip_damaged` each byte is read once, and every record is looked at on the way. The
         checksum over all of the data is checked at the end. The log was opened with check "pass".
 
         Raises:
-            LogDamagedError: at the first damage, without `salvage`.
+            LogDamagedError: at the first damage, without `skip_damaged`.
         """
         file = self.file
         assert isinstance(file, OnePass)
@@ -231,18 +231,18 @@ class LogReader(LogStructure):
         """Decode a chunk and check it; the last few are kept.
 
         Returns:
-            Its messages in file order, or None where it is damaged and `salvage` is on.
+            Its messages in file order, or None where it is damaged and `skip_damaged` is on.
 
         Raises:
-            LogDamagedError: it is damaged, without `salvage`.
+            LogDamagedError: it is damaged, without `skip_damaged`.
         """
-        if self.salvage and segment.offset in self._failed:
+        if self.skip_damaged and segment.offset in self._failed:
             return None
         try:
             return self._chunks.table(segment)
         except MalformedRecord as error:
             self._failed.add(segment.offset)
-            if not (segment.cut and self.salvage):  # that the file ends in it is said anyway
+            if not (segment.cut and self.skip_damaged):  # that the file ends in it is said anyway
                 self.refuse(segment.name, str(error))
             return None
 
@@ -280,7 +280,7 @@ class LogReader(LogStructure):
             return
         self._checked = True
         if (self.file.crc(0, self.data_end) if crc is None else crc) != self.data_crc:
-            if not self.salvage:
+            if not self.skip_damaged:
                 self._search()  # an error that names the chunk says more
             self.refuse("data section", "its CRC does not match: damaged")
 

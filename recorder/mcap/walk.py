@@ -51,7 +51,7 @@ class LogStructure:
 
     Args:
         file: the log.
-        salvage: note damage in `problems`, and continue at the next sound chunk; else raise.
+        skip_damaged: note damage in `problems`, and continue at the next sound chunk; else raise.
         by_index: believe a summary that accounts for every message, and read no chunk.
 
     Attributes:
@@ -66,8 +66,8 @@ class LogStructure:
         first_damage: place of the first record that is damaged, None where none is.
     """
 
-    def __init__(self, file: Store, *, salvage: bool, by_index: bool) -> None:
-        self.file, self.path, self.salvage = file, file.path, salvage
+    def __init__(self, file: Store, *, skip_damaged: bool, by_index: bool) -> None:
+        self.file, self.path, self.skip_damaged = file, file.path, skip_damaged
         self.problems: list[Problem] = []
         self.by_index = self.complete = False
         self.first_damage: int | None = None
@@ -92,7 +92,7 @@ class LogStructure:
             raise no_log(file.path)
         self.summary: Summary | None = read_summary(file, self.definitions, self.refuse)
         # The damage in a footer may be in the place where it says that the data ends.
-        lies = salvage and self.summary is not None and self.summary.broken
+        lies = skip_damaged and self.summary is not None and self.summary.broken
         self._limit = self.summary.begin if self.summary and not lies else None
         if not by_index or not self._take_index():
             self._walk_data()
@@ -109,11 +109,11 @@ class LogStructure:
         return self._attachments
 
     def refuse(self, where: str, what: str) -> None:
-        """Raise an error for damage at a place, or note it with `salvage`."""
-        if not self.salvage:
+        """Raise an error for damage at a place, or note it with `skip_damaged`."""
+        if not self.skip_damaged:
             raise LogDamagedError(
                 f"{self.path}: {where}: {what}; save the rest with cdmisfa recover (from a "
-                "recording, cdmisfa learn --salvage learns without it)"
+                "recording, cdmisfa learn --skip-damaged leaves it out)"
             )
         self.note(where, what)
 
@@ -201,7 +201,7 @@ class LogStructure:
             for what in self.summary.contradictions(self.segments):
                 self._damaged("summary", what)
         # The CRC of a cut chunk is that of records that are not there.
-        if self.torn is not None and (self.salvage or not self.torn.crc):
+        if self.torn is not None and (self.skip_damaged or not self.torn.crc):
             self.segments.append(self.torn)
 
     # The outer records
@@ -220,7 +220,7 @@ class LogStructure:
             if self._limit is None and not any(map(any, rest)):
                 return self._cut(f"from byte {self._at} on there are only zeros")
             raise MalformedRecord("no record (opcode 0)")
-        inner = inner_end(self.file, opcode, content) if self.salvage else None
+        inner = inner_end(self.file, opcode, content) if self.skip_damaged else None
         if inner is not None and inner < end and is_record(self.file, inner, limit):
             # Only the record's own length is damaged: what it holds ends where a record begins.
             self._damaged(f"byte {self._at}", "a record's length is not that of what it holds")
@@ -234,7 +234,7 @@ class LogStructure:
             )
         if self._at == len(MAGIC) and opcode != Opcode.HEADER:
             raise MalformedRecord("the file does not begin with a header record")
-        if self.salvage and self.summary and opcode != Opcode.CHUNK:
+        if self.skip_damaged and self.summary and opcode != Opcode.CHUNK:
             # A damaged length would jump over sound chunks: the summary says where these begin.
             named = self.summary.named
             place = bisect_left(named, self._at)
@@ -289,12 +289,12 @@ class LogStructure:
         elif opcode == Opcode.DATA_END:
             self.data_end = self._at
             crc = Fields(self.file.peek(content, min(length, 4)), "the data end").read4()
-            if self.salvage and self._limit is None and length != 4:
+            if self.skip_damaged and self._limit is None and length != 4:
                 raise MalformedRecord("a data end of another length than its own")
             if self._limit is not None and content + length != self._limit:
                 raise MalformedRecord("the data section does not end where the summary starts")
             self.data_crc = crc
-        elif opcode <= max(Opcode) or (self.salvage and opcode < _PRIVATE):
+        elif opcode <= max(Opcode) or (self.skip_damaged and opcode < _PRIVATE):
             raise MalformedRecord(f"a record of opcode {opcode} among the data")
 
     def _definition(self, content: int, length: int) -> bytes:
@@ -348,7 +348,7 @@ class LogStructure:
         if self._limit is not None:
             raise MalformedRecord("the data section has no end record before the summary")
         self.missing = f"cut short: {what}"
-        if self.torn is not None and self.torn.crc and not self.salvage:
+        if self.torn is not None and self.torn.crc and not self.skip_damaged:
             self.missing += "; recover can save part of the last chunk, unverified"
         return False
 
@@ -359,7 +359,7 @@ class LogStructure:
         place = None
         if self.summary and self.summary.named:
             place = next((c for c in self.summary.named if c > self._at), None)
-        elif self.salvage:
+        elif self.skip_damaged:
             stop = self.file.size if self._limit is None else self._limit
             place = next_chunk(self.file, self._sure + (self._sure == self._at), stop)
         if place is None:
@@ -374,7 +374,7 @@ class LogStructure:
         """Continue where it was a damaged length that made the file look cut."""
         what = self.missing.removeprefix("cut short: ")
         more = self.torn is None and self._at < self.file.size
-        if not (self.salvage and more and self._resume_after()):
+        if not (self.skip_damaged and more and self._resume_after()):
             return False
         self.missing = ""
         self._damaged(f"byte {self._sure}", what)

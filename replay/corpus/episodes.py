@@ -56,7 +56,7 @@ class EpisodeSource(StoredSource):
         inputs: InputOptions | None = None,
         *,
         loop: bool = False,
-        salvage: bool = False,
+        skip_damaged: bool = False,
         told: Progress = lambda done, total: None,
     ) -> None:
         """Open every log once, for its frames and its identity.
@@ -65,7 +65,7 @@ class EpisodeSource(StoredSource):
             logs: the files of each log.
             inputs: how images of external logs become frames.
             loop: begin again at the end.
-            salvage: skip damaged parts of a log; else the rest of the log is left out.
+            skip_damaged: skip damaged parts of a log; else the rest of the log is left out.
             told: called with the number of opened logs, and of all.
 
         Raises:
@@ -76,7 +76,7 @@ class EpisodeSource(StoredSource):
             raise UsageError("--color auto is for a single log: choose on or off for episodes")
         if len(logs) > MOST_EPISODES:
             raise UsageError(f"{len(logs):,} logs: a run has at most {MOST_EPISODES:,} episodes")
-        self._inputs, self._loop, self._salvage = inputs, loop, salvage
+        self._inputs, self._loop, self._skip_damaged = inputs, loop, skip_damaged
         self._open_now: tuple[int, LoggedSource] | None = None
         self._reading = 0, 0
         self._lost: list[str] = []
@@ -142,7 +142,7 @@ class EpisodeSource(StoredSource):
         """See `LoggedSource`."""
         return self._pixels[stream]
 
-    def salvaged(self) -> list[str]:
+    def skipped_damage(self) -> list[str]:
         """Return a line for each log that is damaged, and was left out from there on."""
         return list(_few(self._lost))
 
@@ -242,7 +242,7 @@ class EpisodeSource(StoredSource):
         return self._open_now[1]
 
     def _open(self, log: Log) -> LoggedSource:
-        return open_log(log, self._inputs, salvage=self._salvage)
+        return open_log(log, self._inputs, skip_damaged=self._skip_damaged)
 
     def _leave_out(self, error: LogDamagedError) -> None:
         """Leave out a log that is damaged, from the block that was read on."""

@@ -109,7 +109,7 @@ def _streams_of(place: Path, log: ListedLog, deep: bool) -> Iterator[dict[str, A
         report, sha256 = describe_log(place, decode=deep), _hash_of(identity_of(place))
         topics = [c.topic for c in report.channels if deep and c.encoding != "numpy"]
     else:
-        with LogReader(place, salvage=True, check="chunks") as reader:
+        with LogReader(place, skip_damaged=True, check="chunks") as reader:
             sha256 = _hash_of(McapIdentity(reader))
             report = describe_reader(reader, decode=False)
         if deep:

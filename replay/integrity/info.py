@@ -116,7 +116,7 @@ def describe_log(log: Path, *, decode: bool | None = None) -> LogReport:
         return _describe_external(log, 0 if decode is False else CHECK_BYTES)
     if decode or (decode is None and log.stat().st_size <= CHECK_BYTES):
         return read_once(log, lambda reader: describe_reader(reader, decode=decode))
-    with LogReader(log, salvage=True, check="chunks") as reader:
+    with LogReader(log, skip_damaged=True, check="chunks") as reader:
         return describe_reader(reader, decode=False)
 
 
@@ -135,7 +135,7 @@ def read_once(path: Path, work: Callable[[LogReader], Result]) -> Result:
         if not reader.problems:
             return result
     # The strict pass stopped at the first damage: read again and list all of it.
-    with LogReader(path, salvage=True, check="pass") as reader:
+    with LogReader(path, skip_damaged=True, check="pass") as reader:
         return work(reader)
 
 

@@ -86,7 +86,7 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
     if src.exists() and only_external(src):
         raise UsageError(
             f"{src} is no MCAP file, and others are not recovered: learn and convert pass over "
-            "broken images of them with --salvage"
+            "broken images of them with --skip-damaged"
         )
     files, alone = log_files(src), not src.is_dir()
     if alone:
@@ -108,12 +108,12 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
 
 def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
     with ExitStack() as stack:
-        reader = stack.enter_context(LogReader(src, salvage=True))
+        reader = stack.enter_context(LogReader(src, skip_damaged=True))
         repaired: list[Problem] = []
         if reader.problems:
             store = repair(reader)
             repaired = [Problem(f"{src}: {p.where}", p.what) for p in store.repaired]
-            reader = stack.enter_context(LogReader(store, salvage=True))
+            reader = stack.enter_context(LogReader(store, skip_damaged=True))
         empty = not (reader.channels or reader.metadata or reader.attachments)
         if alone and reader.missing and empty:  # in a folder, other logs may hold something
             raise LogDamagedError(f"{src}: nothing in it can be saved, and nothing was written")

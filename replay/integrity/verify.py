@@ -113,7 +113,7 @@ def _content_of(path: Path, reader: LogReader, beside: bool) -> _Content | None:
         return _RunContent(path, reader, beside=beside)
     if kind == "recording":
         return _ViewContent(path, reader)
-    return None if reader.salvage else _ImageContent(path, reader)
+    return None if reader.skip_damaged else _ImageContent(path, reader)
 
 
 class _Content:
@@ -295,7 +295,7 @@ def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Probl
     if any(content.error is not None for content in contents):
         return
     try:
-        source = LoggedSource(recorded.streams(views, salvage=True))
+        source = LoggedSource(recorded.streams(views, skip_damaged=True))
     except LogDamagedError as error:
         yield replace(as_problem(views[0].path, error), where=folder)
         return

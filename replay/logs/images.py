@@ -15,7 +15,7 @@ from recorder.images.compressed import AT_ONCE, compressed_image
 from recorder.images.pixels import Shown, UnknownPixels
 from replay.logs.stream import BROKEN, LogStream
 
-SALVAGE: Final = "learn and convert replace broken images with --salvage"
+REMEDY: Final = "learn and convert replace broken images with --skip-damaged"
 
 # Images that are decoded at once.
 CORES: Final = thread_count()
@@ -33,11 +33,11 @@ class Images:
     Args:
         streams: the streams.
         color: whether images are decoded in their colours.
-        salvage: show for a broken image the last whole one before it, else the first of all.
+        skip_damaged: show for a broken image the last whole one before it, else the first of all.
     """
 
-    def __init__(self, streams: Sequence[LogStream], *, color: bool, salvage: bool) -> None:
-        self._streams, self._color, self._salvage = streams, color, salvage
+    def __init__(self, streams: Sequence[LogStream], *, color: bool, skip_damaged: bool) -> None:
+        self._streams, self._color, self._skip_damaged = streams, color, skip_damaged
         self._threads = ThreadPoolExecutor(CORES)
         self._pending: dict[Place, Future[ByteArray] | None] = {}
         self._coming: Iterator[Place] = iter(())
@@ -87,15 +87,17 @@ class Images:
 
         Raises:
             UsageError: the image has no pixels, or the message no fields, that are read.
-            LogDamagedError: the image is broken, or with `salvage` all are.
+            LogDamagedError: the image is broken, or with `skip_damaged` all are.
         """
         name = self._streams[stream].name_of
         try:
-            return self._whole_image(stream, row) if self._salvage else self._decoded(stream, row)
+            return (
+                self._whole_image(stream, row) if self._skip_damaged else self._decoded(stream, row)
+            )
         except UnknownPixels as error:
             raise UsageError(f"{name(row)}: {error}") from None
         except BROKEN as error:
-            remedy = "" if self._salvage else f": {SALVAGE}"
+            remedy = "" if self._skip_damaged else f": {REMEDY}"
             raise LogDamagedError(f"{name(row)}: {error}{remedy}") from None
         except UsageError as error:
             raise UsageError(f"{name(row)}: {error}") from None

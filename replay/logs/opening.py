@@ -93,7 +93,7 @@ class OpenLogs:
         options: InputOptions,
         opened: ExitStack,
         *,
-        salvage: bool = False,
+        skip_damaged: bool = False,
     ) -> None:
         """Open the topics that are asked for.
 
@@ -104,11 +104,11 @@ class OpenLogs:
             files: the logs.
             options: the topics, and whether images or fields are read.
             opened: closes the logs.
-            salvage: leave out what is damaged, of several logs also one that cannot be read.
+            skip_damaged: leave out what is damaged, of several logs also one that cannot be read.
 
         Raises:
             UsageError: no log has a topic.
-            LogDamagedError: a log is damaged; with `salvage` all are.
+            LogDamagedError: a log is damaged; with `skip_damaged` all are.
         """
         topics, self.streams = options.topics, list[LogStream]()
         self.logs: list[tuple[Path, LogReader | None]] = []
@@ -119,7 +119,7 @@ class OpenLogs:
         for i, file in enumerate(files):
             chosen = replace(options, topics=topics[i : i + 1]) if in_turn else options
             try:
-                streams = FORMATS[log_format(file)](file, chosen, opened, salvage=salvage)
+                streams = FORMATS[log_format(file)](file, chosen, opened, skip_damaged=skip_damaged)
                 self.streams += streams
                 self.logs.append((file, streams[0].reader))
             except NoTopicError as error:
@@ -127,7 +127,7 @@ class OpenLogs:
                     raise
                 refused.append(error)
             except LogDamagedError as error:
-                if not salvage or len(files) == 1:
+                if not skip_damaged or len(files) == 1:
                     raise
                 broken.append(error)
         self.left_out = [f"{error}: this log is left out" for error in broken]
@@ -137,7 +137,9 @@ class OpenLogs:
             for topic in topics:
                 if not any(fits_topic(stream.topic, [topic]) for stream in self.streams):
                     alone = replace(options, topics=(topic,))  # whose error names those there are
-                    FORMATS[log_format(files[0])](files[0], alone, opened, salvage=salvage)
+                    FORMATS[log_format(files[0])](
+                        files[0], alone, opened, skip_damaged=skip_damaged
+                    )
             self.streams.sort(
                 key=lambda s: next(i for i, t in enumerate(topics) if fits_topic(s.topic, [t]))
             )
@@ -176,7 +178,7 @@ def image_topics(path: Path) -> list[str]:
     Raises:
         LogDamagedError: it is no MCAP file, or has nothing in it.
     """
-    with LogReader(path, salvage=True) as reader:
+    with LogReader(path, skip_damaged=True) as reader:
         mcap_log.refuse_empty(reader)
         return mcap_log.topics_in(reader)
 

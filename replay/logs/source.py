@@ -44,7 +44,7 @@ class LoggedSource(StoredSource):
         streams: the streams, one at least; all views of a recording, or none.
         options: how images become frames, and streams are aligned.
         loop: begin again at the end.
-        salvage: show for a broken image the last whole one before it, else the first of all.
+        skip_damaged: show for a broken image the last whole one before it, else the first of all.
         logs: the external logs, MCAP files with their readers.
         opened: the files, which are closed with the source, or if it cannot be made.
         left_out: a line for each log that could not be read.
@@ -71,13 +71,13 @@ class LoggedSource(StoredSource):
         options: InputOptions | None = None,
         *,
         loop: bool = False,
-        salvage: bool = False,
+        skip_damaged: bool = False,
         logs: Sequence[tuple[Path, LogReader | None]] = (),
         opened: ExitStack | None = None,
         left_out: Sequence[str] = (),
     ) -> None:
         self.streams, self._options = list(streams), options or InputOptions()
-        self._loop, self._salvage = loop, salvage
+        self._loop, self._skip_damaged = loop, skip_damaged
         self._log_list, self._opened = logs, opened or ExitStack()
         self.recorded, self.color = bool(streams[0].views), self._options.color is True
         self.in_memory = any(stream.digest for stream in streams)
@@ -114,7 +114,9 @@ class LoggedSource(StoredSource):
             self._spec = replace(facts.spec, streams=names, length=length)
         else:
             names = names_of(self.streams)
-            self._images = images = Images(self.streams, color=self.color, salvage=self._salvage)
+            self._images = images = Images(
+                self.streams, color=self.color, skip_damaged=self._skip_damaged
+            )
             firsts = [images.image(i, int(rows[0])) for i, rows in enumerate(clock.rows)]
             how = self._options
             self.framings = made = framings(firsts, how.size, how.fit, color=self.color)
@@ -253,7 +255,7 @@ class LoggedSource(StoredSource):
                 f"--align time --rate {self._fps:g} to keep its times"
             )
 
-    def salvaged(self) -> list[str]:
+    def skipped_damage(self) -> list[str]:
         """See `StoredSource`."""
         return self._images.broken_lines() if self._images else []
 
@@ -263,7 +265,7 @@ class LoggedSource(StoredSource):
         try:
             return log.taken(0, log.pixel_format) if log.pixel_format else ""
         except BROKEN:
-            if not self._salvage:
+            if not self._skip_damaged:
                 raise
             return ""
 

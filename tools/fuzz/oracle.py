@@ -51,13 +51,13 @@ def check(case: Case, path: Path, number: int = 0) -> None:
     """
     path.write_bytes(case.raw)
     with _only_our_errors():
-        _read(case, path, salvage=False)
+        _read(case, path, skip_damaged=False)
     if number % 2 == 0:
         with _only_our_errors():
-            _read(case, path, salvage=True)
+            _read(case, path, skip_damaged=True)
     if case.base.startswith("recording"):
         with _only_our_errors():
-            _play(case, path, salvage=number % 3 == 0)
+            _play(case, path, skip_damaged=number % 3 == 0)
     if number % 25 == 0:
         with _only_our_errors():
             describe(path)
@@ -90,20 +90,20 @@ def _truth(base: str) -> frozenset[tuple[int, bytes]]:
             return frozenset((m.log_time, m.data) for m in reader.messages())
 
 
-def _read(case: Case, path: Path, *, salvage: bool) -> None:
-    with LogReader(path, salvage=salvage) as reader:
+def _read(case: Case, path: Path, *, skip_damaged: bool) -> None:
+    with LogReader(path, skip_damaged=skip_damaged) as reader:
         found = list(reader.messages())
         for attachment in reader.attachments:
             reader.attachment_data(attachment)
-        reported = reader.problems or reader.crc_absent() or (salvage and reader.missing)
+        reported = reader.problems or reader.crc_absent() or (skip_damaged and reader.missing)
         if case.trusted and not reported:
             true = _truth(case.base)
             if not all((m.log_time, m.data) in true for m in found):
                 raise BrokenPromise("a message was changed, its checksum does not say so")
 
 
-def _play(case: Case, path: Path, *, salvage: bool) -> None:
-    with open_recording([path], salvage=salvage) as source:
+def _play(case: Case, path: Path, *, skip_damaged: bool) -> None:
+    with open_recording([path], skip_damaged=skip_damaged) as source:
         if source.frames > 1000:
             raise BrokenPromise(f"{source.frames} frames in {len(case.raw)} bytes")
         blocks: list[Block] = []
@@ -111,14 +111,14 @@ def _play(case: Case, path: Path, *, salvage: bool) -> None:
             while (left := source.frames - sum(map(len, blocks))) > 0:
                 blocks.append(source.take(0, min(left, _BLOCK)))
         finally:
-            _same_slowly(path, blocks, salvage=salvage)
+            _same_slowly(path, blocks, skip_damaged=skip_damaged)
 
 
-def _same_slowly(path: Path, blocks: list[Block], *, salvage: bool) -> None:
+def _same_slowly(path: Path, blocks: list[Block], *, skip_damaged: bool) -> None:
     """Compare the blocks of a source with what the reader in Python decodes."""
     if not blocks:
         return
-    with contextlib.closing(ViewFile(path, salvage=salvage)) as view:
+    with contextlib.closing(ViewFile(path, skip_damaged=skip_damaged)) as view:
         all_frames = np.concatenate([b.frames for b in blocks])
         all_truth = np.concatenate([b.truth for b in blocks])
         at = 0

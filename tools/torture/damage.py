@@ -74,7 +74,7 @@ def _recorded(place: Path, out: Path) -> Words:
 LOGS: tuple[Line, ...] = (
     lambda place, out: ("info", place),
     lambda place, out: ("recover", _first(place), "-o", out.with_suffix(".mcap")),
-    lambda place, out: ("learn", place, "--salvage", *QUICK),
+    lambda place, out: ("learn", place, "--skip-damaged", *QUICK),
 )
 RUNS: tuple[Line, ...] = (
     lambda place, out: ("info", place),
@@ -109,7 +109,7 @@ KINDS: Mapping[str, Kind] = {
     "progress run begun": Kind(RUNS[:1], learn=_resume),
     "preset": Kind(PRESETS),
     "camera log": Kind(
-        (*LOGS[:2], _convert(*BOTH), _learn("--salvage", *BOTH)), learn=_learn(*BOTH)
+        (*LOGS[:2], _convert(*BOTH), _learn("--skip-damaged", *BOTH)), learn=_learn(*BOTH)
     ),
     "png": Kind((_convert(*RATE),), learn=_learn(*RATE)),
     "bag": Kind((_convert(*BOTH), _learn(*BOTH))),

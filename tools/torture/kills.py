@@ -134,7 +134,7 @@ def check_disk(place: Path, wanted: dict[str, int], ran: Ran) -> None:
 
 def _counted(path: Path, whole: bool) -> Counter[str]:
     counts: Counter[str] = Counter()
-    with LogReader(path, salvage=not whole) as reader:
+    with LogReader(path, skip_damaged=not whole) as reader:
         for message in reader.messages():
             topic = message.channel.topic
             if topic == SIGNALS_TOPIC:

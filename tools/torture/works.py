@@ -79,7 +79,7 @@ def _run(place: Path) -> dict[str, Any]:
 
 
 def _sweep(place: Path) -> Any:
-    return here("results", place, "--json").json
+    return here("sweep", place, "--summary", "--json").json
 
 
 def _learn(*words: object) -> Callable[[Path, Path], Words]:

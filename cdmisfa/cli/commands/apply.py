@@ -30,7 +30,7 @@ STDOUT = "stdout"
 @click.command("apply")
 @click.argument("run", type=options.LOCAL)
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
-@options.out(
+@options.output(
     "File for the outputs on one log: .parquet, .csv, .mcap or .rrd (a view). Or a folder, "
     "with a file for each log."
 )
@@ -42,7 +42,7 @@ STDOUT = "stdout"
 )
 @click.option("--frames", type=options.COUNT, help="End after this many frames per stream.")
 @options.loop
-@options.salvage
+@options.skip_damaged
 @options.inputs("topics", "fields", "rate", "start", "end", "align", "settings")
 @options.jobs
 @options.scheduler
@@ -53,7 +53,7 @@ STDOUT = "stdout"
 def apply_command(
     run: Path,
     source: tuple[str, ...],
-    out: Path | None,
+    output: Path | None,
     to: str | None,
     frames: int | None,
     jobs: int,
@@ -78,16 +78,16 @@ def apply_command(
     from recorder.log.files import refuse_taken
     from recorder.world.scenes import SCENES
 
-    ending = "" if out is None else out.suffix.lower().removeprefix(".")
+    ending = "" if output is None else output.suffix.lower().removeprefix(".")
     is_stored = not any(is_live(word) or word in SCENES for word in source)
-    if out is not None and is_stored and to != STDOUT and (out.is_dir() or not ending):
+    if output is not None and is_stored and to != STDOUT and (output.is_dir() or not ending):
         from cdmisfa.experiments.apply_logs import apply_to_logs
 
-        with resumable_bar(out, "applying", "logs") as shown:
+        with resumable_bar(output, "applying", "logs") as shown:
             applied = apply_to_logs(
                 run,
                 source,
-                out,
+                output,
                 form=to or FILE_FORMS[0],
                 frames=frames,
                 jobs=jobs,
@@ -101,17 +101,17 @@ def apply_command(
         _print_applied_logs(run, applied, as_json)
         return applied.exit_code
     logs = _logs(source)
-    if out is None:
+    if output is None:
         fits = to in (None, STDOUT)
     else:
         fits = ending in FILE_FORMS and to in (None, STDOUT, ending) and len(logs) == 1
-        refuse_taken(out, force=force)
+        refuse_taken(output, force=force)
     if not fits:
         raise UsageError(
             f"-o is a file {', '.join(f'.{form}' for form in FILE_FORMS)} for one log or live "
             "stream, or a folder for several logs; --to names the format of files in a folder"
         )
-    return _apply_to_each(run, logs, out, frames, to == STDOUT, as_json, **how)
+    return _apply_to_each(run, logs, output, frames, to == STDOUT, as_json, **how)
 
 
 def _logs(source: Sequence[str]) -> list[list[str]]:
@@ -139,7 +139,7 @@ def _logs(source: Sequence[str]) -> list[list[str]]:
 def _apply_to_each(
     run: Path,
     logs: Sequence[Sequence[str]],
-    out: Path | None,
+    output: Path | None,
     frames: int | None,
     as_lines: bool,
     as_json: bool,
@@ -158,12 +158,12 @@ def _apply_to_each(
         for words in logs:
             opened = application.open(words, say=printing.status, **how)
             with contextlib.closing(opened) as source:
-                totals = _apply(application, source, out, frames, stop, as_lines)
+                totals = _apply(application, source, output, frames, stop, as_lines)
             error = None if totals.damaged is None else str(totals.damaged)
             if totals.damaged is not None:
                 printing.status(f"{error}: outputs up to the damage are kept")
                 code = totals.damaged.exit_code
-            row = {"log": " ".join(words), "out": out and str(out), "frames": totals.frames}
+            row = {"log": " ".join(words), "out": output and str(output), "frames": totals.frames}
             rows.append({**row, "error": error, "modules": totals.rows()})
             if stop():
                 break
@@ -177,7 +177,7 @@ def _apply_to_each(
 def _apply(
     application: Application,
     source: FrameSource,
-    out: Path | None,
+    output: Path | None,
     frames: int | None,
     stop: Stop,
     as_lines: bool,
@@ -194,8 +194,8 @@ def _apply(
     modules, spec = application.modules, source.spec
     totals, sinks = Totals(spec, modules), []
     with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
-        if out is not None:
-            sinks.append(stack.enter_context(written_to(out, spec, modules, force=True)))
+        if output is not None:
+            sinks.append(stack.enter_context(written_to(output, spec, modules, force=True)))
         if as_lines:
             sinks.append(lambda block: printing.line(line(block, spec, modules)))
         blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))

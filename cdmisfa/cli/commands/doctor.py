@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shlex
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -43,12 +44,16 @@ class Check:
 
 
 @click.command("doctor")
+@click.argument("files", nargs=-1, metavar="")
 @options.as_json
-def doctor_command(as_json: bool) -> int:
+def doctor_command(files: tuple[str, ...], as_json: bool) -> int:
     """Check which required and optional software is installed.
 
     The exit code is 1 if something is missing that every command needs.
     """
+    if files:
+        command = f"cdmisfa verify {shlex.join(files)}"
+        raise click.UsageError(f"doctor checks this machine, not files: check files with {command}")
     checks = [*_check_packages(), *_check_kernels(), *_check_display()]
     ok = all(check.ok or check.needed_for for check in checks)
     if as_json:

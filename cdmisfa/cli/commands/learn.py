@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @click.command("learn")
 @click.argument("source", nargs=-1, type=options.WORD)
-@options.out("Folder of the run; without it nothing is written.")
+@options.output("Folder of the run; without it nothing is written.")
 @options.seed
 @options.preset
 @options.settings()
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 @options.max_modules
 @options.loop
 @click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
-@options.salvage
+@options.skip_damaged
 @click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
 @options.no_rerun
 @click.option("--episodes", is_flag=True, help="Learn from each log as a separate episode.")
@@ -59,7 +59,7 @@ def learn_command(
     ctx: click.Context,
     /,
     source: tuple[str, ...],
-    out: Path | None,
+    output: Path | None,
     seed: int,
     settings: tuple[str, ...],
     algorithm: str | None,
@@ -95,28 +95,28 @@ def learn_command(
     from cdmisfa.experiments.session import Session
     from recorder.cameras.words import is_live
 
-    if resume and (out is None or force):
+    if resume and (output is None or force):
         raise click.UsageError("--resume needs -o RUN, the run to resume, and no --force")
     if not source:
-        return _learn_as_started(ctx, out if resume else None)
+        return _learn_as_started(ctx, output if resume else None)
     if algorithm is not None:
         settings = (*settings, f"learner.algorithm={algorithm}")
     live = any(map(is_live, source))
     how |= {"inputs": inputs, "settings": settings, "seed": seed, "resumed": resume}
     with (
-        _opened(source, out, record_to, force, **how) as (frames, configuration),
+        _opened(source, output, record_to, force, **how) as (frames, configuration),
         learning(frames.spec, max_iterations) as (stop, progress),
     ):
         color = getattr(frames, "color", inputs.color)  # the choice of auto is kept
         session = Session(
             frames,
             configuration.learner,
-            out,
+            output,
             seed=seed,
             max_iterations=max_iterations,
             max_modules=max_modules,
             sections=configuration.tables(),
-            command=command_of(source, {**ctx.params, "color": color}, out or Path()),
+            command=command_of(source, {**ctx.params, "color": color}, output or Path()),
             force=force,
             resume=resume,
             hashing=progress.hashing,
@@ -146,7 +146,7 @@ def _learn_as_started(ctx: click.Context, run: Path | None) -> int:
 
 @contextlib.contextmanager
 def _opened(
-    words: Sequence[str], out: Path | None, record_to: Path | None, force: bool, **how: Any
+    words: Sequence[str], output: Path | None, record_to: Path | None, force: bool, **how: Any
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """Open a source with arguments of `open_source`; print notes before and after it is read."""
     from cdmisfa.experiments.holdout import hold_out
@@ -160,10 +160,11 @@ def _opened(
             "--record is for live streams, and --resume for all others: live streams cannot go "
             "back, learn from a recording of them"
         )
-    unused = [f"--{name}" for name in ("loop", "salvage", "episodes") if how[name]]
+    flags = {"loop": "--loop", "skip_damaged": "--skip-damaged", "episodes": "--episodes"}
+    unused = [flag for name, flag in flags.items() if how[name]]
     if unused and (live or is_scene(words)):
         raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
-    for folder in filter(None, (out, record_to) if live else ()):
+    for folder in filter(None, (output, record_to) if live else ()):
         refuse_existing(folder, force=force, goes_on=False)
     with bar("opening", "logs") as shown:
         frames, configuration = open_source(words, told=shown.update, say=printing.status, **how)
@@ -232,7 +233,7 @@ def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool
     metavar="K",
     help="Keep K iterations of RUN.",
 )
-@options.out("Folder of the new run.", required=True)
+@options.output("Folder of the new run.", required=True)
 @options.settings("Set a key learner.* from iteration K on. Repeatable.")
 @click.option("--seed", type=options.SEED, help="Seed of random choices from iteration K on.")
 @options.max_iterations
@@ -245,7 +246,7 @@ def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool
 def fork_command(
     run: Path,
     iteration: int,
-    out: Path,
+    output: Path,
     max_iterations: int | None,
     max_modules: int | None,
     no_rerun: bool,
@@ -262,10 +263,10 @@ def fork_command(
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
     limits = {name: limit for name, limit in given.items() if limit is not None}
     with (
-        Session.fork(run, iteration, out, limits=limits, **how) as session,
+        Session.fork(run, iteration, output, limits=limits, **how) as session,
         learning(session.source.spec, max_iterations) as (stop, progress),
     ):
         result = _learned(session, stop, progress, rerun=not no_rerun)
-    both = f"{printing.quoted(run)} {printing.quoted(out)}"
+    both = f"{printing.quoted(run)} {printing.quoted(output)}"
     printing.status(f"both in one view: cdmisfa compare {both} --save both.rrd")
     return _print_run(result, stop, can_resume=True, as_json=as_json)

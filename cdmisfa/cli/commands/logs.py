@@ -165,10 +165,10 @@ def verify_command(path: tuple[str, ...], as_json: bool) -> int:
 
 @click.command("recover")
 @click.argument("path", type=options.WORD)
-@options.out("New MCAP file to write.", required=True)
+@options.output("New MCAP file to write.", required=True)
 @options.force
 @options.as_json
-def recover_command(path: str, out: Path, force: bool, as_json: bool) -> int:
+def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
     """Repair a damaged MCAP file: save what can be read into a new file.
 
     PATH is an MCAP file or its URL, as a view of a recording or the run.mcap of a run. The exit
@@ -176,7 +176,7 @@ def recover_command(path: str, out: Path, force: bool, as_json: bool) -> int:
     """
     from replay.integrity.recover import recover_log
 
-    recovery = recover_log(path, out, force=force)
+    recovery = recover_log(path, output, force=force)
     if as_json:
         printing.json_document(recovery.as_json())
     else:
@@ -188,7 +188,7 @@ def recover_command(path: str, out: Path, force: bool, as_json: bool) -> int:
             printing.table(("lost", "what"), [(p.where, p.what) for p in recovery.lost])
         for mended in recovery.mended:
             printing.status(f"{mended.where}: {mended.what}")
-        printing.line(f"written {out}")
+        printing.line(f"written {output}")
     return 0 if recovery.complete else LogDamagedError.exit_code
 
 
@@ -200,7 +200,7 @@ def recover_command(path: str, out: Path, force: bool, as_json: bool) -> int:
     metavar="FORM",
     help="parquet, npz, csv, images, mp4 or lerobot; by default the ending of the file's name.",
 )
-@options.out("File to write, for images a folder.", required=True)
+@options.output("File to write, for images a folder.", required=True)
 @click.option("--lossless", is_flag=True, help="Keep every pixel value in a video.")
 @click.option(
     "--task",
@@ -213,7 +213,7 @@ def recover_command(path: str, out: Path, force: bool, as_json: bool) -> int:
 def export_command(
     path: tuple[Path, ...],
     form: str | None,
-    out: Path,
+    output: Path,
     lossless: bool,
     as_json: bool,
     **how: Any,
@@ -228,23 +228,23 @@ def export_command(
     from replay.export.forms import export
     from replay.export.tables import CSV_LEAVES_OUT, TABLES
 
-    form = form or out.suffix.removeprefix(".")
-    rows = export(path, out, form, lossless=lossless, about=printing.source, **how)
+    form = form or output.suffix.removeprefix(".")
+    rows = export(path, output, form, lossless=lossless, about=printing.source, **how)
     if form == "csv":
         printing.status(f"CSV leaves out {' and '.join(CSV_LEAVES_OUT)}: Parquet and npz hold them")
-    videos = out.is_file() or next(out.rglob("*.mp4"), None) is not None
+    videos = output.is_file() or next(output.rglob("*.mp4"), None) is not None
     if form in ("mp4", "lerobot") and videos and not lossless:
         printing.status("H.264 changes pixels a little: --lossless keeps them all")
     if as_json:
-        printing.document(path=" ".join(map(str, path)), file=str(out), rows=rows)
+        printing.document(path=" ".join(map(str, path)), file=str(output), rows=rows)
         return
     unit = "iterations" if form in TABLES else "images" if form == "images" else "frames"
-    printing.line(f"{rows} {unit} written to {out}")
+    printing.line(f"{rows} {unit} written to {output}")
 
 
 @click.command("index")
 @click.argument("corpus", nargs=-1, required=True, type=options.WORD)
-@options.out("The index, a .parquet file; by default corpus.parquet in the folder.")
+@options.output("The index, a .parquet file; by default corpus.parquet in the folder.")
 @click.option(
     "--deep",
     is_flag=True,
@@ -258,7 +258,7 @@ def export_command(
 @options.as_json
 @options.quiet
 def index_command(
-    corpus: tuple[str, ...], out: Path | None, deep: bool, jobs: int | None, as_json: bool
+    corpus: tuple[str, ...], output: Path | None, deep: bool, jobs: int | None, as_json: bool
 ) -> int:
     """Index many logs: streams, times and damage in one Parquet file.
 
@@ -271,7 +271,7 @@ def index_command(
     with bar("indexing", "logs") as shown, stoppable() as stop:
         indexed = index_logs(
             corpus,
-            out,
+            output,
             deep=deep,
             jobs=jobs or os.cpu_count() or 1,
             progress=shown.update,

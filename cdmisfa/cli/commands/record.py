@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @click.command("record")
 @click.argument("source", nargs=-1, type=options.WORD)
-@options.out("Folder of the recording.", required=True)
+@options.output("Folder of the recording.", required=True)
 @click.option(
     "--frames",
     type=options.COUNT,
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 @options.quiet
 def record_command(
     source: tuple[str, ...],
-    out: Path,
+    output: Path,
     frames: int | None,
     seed: int | None,
     views: tuple[str, ...],
@@ -85,24 +85,24 @@ def record_command(
         if options := [name for name, value in given.items() if value]:
             raise UsageError(f"{source[0]} is a live stream: {are_for(options, 'scenes')}")
         how = {"inputs": inputs, "preset": preset, "settings": settings, "seed": seed or 0}
-        return _record_live(source, out, frames, limit, force, as_json, **how)
+        return _record_live(source, output, frames, limit, force, as_json, **how)
     if any(w not in SCENES and (Path(w).exists() or set("*?:") & set(w)) for w in source):
         command = f"cdmisfa convert {shlex.join(source)} -o REC"
         raise UsageError(f"{source[0]} is a log, no scene: write it as a recording with {command}")
-    start = read_start(out) if resume else RecordingStart()
-    _check_resumable(out, start.scene)
+    start = read_start(output) if resume else RecordingStart()
+    _check_resumable(output, start.scene)
     scene = " ".join(source) or start.scene
-    if not scene and resume and not (frames or split) and (files := recorded(out)):
-        printing.status(f"{out} is complete: nothing was left to record")
-        return _print_recording(out, files, as_json)
+    if not scene and resume and not (frames or split) and (files := recorded(output)):
+        printing.status(f"{output} is complete: nothing was left to record")
+        return _print_recording(output, files, as_json)
     if not scene:
         raise click.UsageError(f"name the SCENE, {' or '.join(SCENES)}")
     seed = seed if seed is not None else start.seed or 0
     configuration = configure(scene, Layers.read(preset, settings), seed, inputs)
-    with _writing(out, "recording", notice="") as (shown, stop):
+    with _writing(output, "recording", notice="") as (shown, stop):
         files = record_scene(
             scene,
-            out,
+            output,
             configuration.scene,
             configuration.record,
             frames=frames,
@@ -114,21 +114,21 @@ def record_command(
             progress=lambda done: shown.update(done, max(done, frames or DEFAULT_FRAMES)),
             force=force,
         )
-    return _print_recording(out, files, as_json)
+    return _print_recording(output, files, as_json)
 
 
-def _check_resumable(out: Path, scene: str) -> None:
+def _check_resumable(output: Path, scene: str) -> None:
     """Reject recordings that state no scene but where their frames came from."""
     if scene in ("cameras", "gym"):
-        raise UsageError(f"{out}: a recording of live streams cannot be resumed")
+        raise UsageError(f"{output}: a recording of live streams cannot be resumed")
     if scene == "foreign":
-        command = f"cdmisfa convert SOURCE -o {printing.quoted(out)} --resume"
-        raise UsageError(f"{out} is a conversion: resume it with {command}")
+        command = f"cdmisfa convert SOURCE -o {printing.quoted(output)} --resume"
+        raise UsageError(f"{output} is a conversion: resume it with {command}")
 
 
 def _record_live(
     words: Sequence[str],
-    out: Path,
+    output: Path,
     frames: int | None,
     split: float | None,
     force: bool,
@@ -144,13 +144,13 @@ def _record_live(
     from recorder.log.files import refuse_existing
     from recorder.recording import DEFAULT_FRAMES
 
-    refuse_existing(out, force=force, goes_on=False)
+    refuse_existing(output, force=force, goes_on=False)
     source, configuration = open_source(words, say=printing.status, **how)
     notice = "finishing the recording; again to stop at once\n"
     with contextlib.closing(source), stoppable(notice) as stop:
         frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)
         recorded = RecordedWhileWatched(
-            source, out, settings=configuration.record, split=split, force=force
+            source, output, settings=configuration.record, split=split, force=force
         )
         with bar("recording", "frames") as shown:
             record_watched(
@@ -159,24 +159,24 @@ def _record_live(
     if recorded.ended and not stop():
         printing.status(f"ended at frame {recorded.t}: {recorded.ended}")
     printing.source_changes(recorded)
-    _print_recording(out, recorded.files, as_json)
+    _print_recording(output, recorded.files, as_json)
     return stop.exit_code if stop() and frames is not None and recorded.t < frames else 0
 
 
 @click.command("convert")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
-@options.out("Folder of the recording.", required=True)
+@options.output("Folder of the recording.", required=True)
 @options.inputs(*options.ALL_INPUTS, "settings")
-@options.salvage
+@options.skip_damaged
 @click.option("--resume", is_flag=True, help="Resume an interrupted conversion.")
 @options.force
 @options.as_json
 @options.quiet
 def convert_command(
     source: tuple[str, ...],
-    out: Path,
+    output: Path,
     inputs: InputOptions,
-    salvage: bool,
+    skip_damaged: bool,
     resume: bool,
     force: bool,
     as_json: bool,
@@ -197,26 +197,26 @@ def convert_command(
     paths = locations(source)
     refuse_what_is_no_log(paths)
     if not resume:
-        refuse_existing(out, force=force)
-    opened = open_external(paths, inputs, salvage=salvage)
+        refuse_existing(output, force=force)
+    opened = open_external(paths, inputs, skip_damaged=skip_damaged)
     with contextlib.closing(opened) as frames:
         printing.source(frames)
-        with _writing(out, "converting") as (shown, stop):
+        with _writing(output, "converting") as (shown, stop):
             files = record(
                 frames,
-                out,
+                output,
                 resume=resume,
                 stop=stop,
                 progress=lambda done: shown.update(done, frames.spec.length),
                 force=force,
             )
         printing.source_changes(frames)
-    _print_recording(out, files, as_json)
+    _print_recording(output, files, as_json)
     return LogDamagedError.exit_code if frames.left_out else 0
 
 
 @contextlib.contextmanager
-def _writing(out: Path, title: str, **notice: str) -> Iterator[tuple[Bar, Stop]]:
+def _writing(output: Path, title: str, **notice: str) -> Iterator[tuple[Bar, Stop]]:
     """Show the progress of writing a recording; exit if a signal stops it."""
     from recorder.recording import RecordingStoppedError
 
@@ -224,7 +224,7 @@ def _writing(out: Path, title: str, **notice: str) -> Iterator[tuple[Bar, Stop]]
         try:
             yield shown, stop
         except (RecordingStoppedError, KeyboardInterrupt):
-            printing.status(f"cdmisfa: interrupted: {out} is not finished: go on with --resume")
+            printing.status(f"cdmisfa: interrupted: {output} is not finished: go on with --resume")
             raise SystemExit(stop.exit_code) from None
 
 

@@ -1,4 +1,4 @@
-"""`cdmisfa compare`, `check`, `at` and `signals`: the signals of runs, and how exact they are."""
+"""`cdmisfa compare`, `check`, `inspect` and `signals`: compare and recompute runs."""
 
 from __future__ import annotations
 
@@ -120,12 +120,19 @@ def check_command(
     return 0 if checked.holds else NotReproducedError.exit_code
 
 
-@click.command("at")
+@click.command("inspect")
 @click.argument("run", type=options.LOCAL)
-@click.argument("iterations", metavar="K", type=click.IntRange(0))
+@click.option(
+    "--iteration",
+    "iterations",
+    type=click.IntRange(0),
+    required=True,
+    metavar="K",
+    help="Print the state after K iterations.",
+)
 @options.source
 @options.as_json
-def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: bool) -> None:
+def inspect_command(run: Path, iterations: int, source: tuple[str, ...], as_json: bool) -> None:
     """Print the exact state of the learner after K iterations of a run.
 
     The learner starts from the last state that is stored in the log of the run, and learns the
@@ -167,28 +174,12 @@ def at_command(run: Path, iterations: int, source: tuple[str, ...], as_json: boo
     printing.line(f"memory: {len(state.arrays)} arrays, {size:.1f} kB; --json prints all of it")
 
 
-SIGNALS_PAGE = """\
-# Signals
-
-Made by `cdmisfa signals --markdown`; a test fails when page and code differ.
-Version {version} of the record. One record is one iteration, that is one block of
-T = `learner.tau` frames. A signal that does not exist in an iteration is NaN.
-
-Letters of `dims`: T frames of the block, J outputs of an abstraction, M frozen
-modules, S streams, A actions (stay, switch); nothing is a scalar. `equation` is the
-paper's number. `show` is how the viewer shows it.
-
-{table}
-"""
-
-
 @click.command("signals")
-@click.option("--markdown", is_flag=True, help="Print the page docs/reference/signals.md.")
 @options.as_json
-def signals_command(markdown: bool, as_json: bool) -> None:
+def signals_command(as_json: bool) -> None:
     """List the signals that every run records.
 
-    --json and --markdown also print the type of each signal and how the viewer shows it.
+    --json also prints the type of each signal and how the viewer shows it.
     """
     from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
 
@@ -196,13 +187,5 @@ def signals_command(markdown: bool, as_json: bool) -> None:
     if as_json:
         printing.document(signals_version=SCHEMA_VERSION, signals=signals)
         return
-    more = ("dtype", "show") if markdown else ()
-    columns = ("name", "symbol", "equation", "unit", "dims", *more, "about")
-    rows = [[signal[column] for column in columns] for signal in signals]
-    if not markdown:
-        printing.table(columns, rows)
-        return
-    from cdmisfa.experiments import documents
-
-    table = documents.markdown(columns, [[f"`{name}`", *cells] for name, *cells in rows])
-    printing.text(SIGNALS_PAGE.format(version=SCHEMA_VERSION, table=table))
+    columns = ("name", "symbol", "equation", "unit", "dims", "about")
+    printing.table(columns, [[signal[column] for column in columns] for signal in signals])

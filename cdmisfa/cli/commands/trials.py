@@ -1,4 +1,4 @@
-"""`cdmisfa sweep`, `results`, `reproduce` and `demo`: many trials, and complete examples."""
+"""`cdmisfa sweep`, `reproduce` and `demo`: many trials, and complete examples."""
 
 from __future__ import annotations
 
@@ -21,9 +21,7 @@ MOST_SEEDS = 1_000_000
 
 @click.command("sweep")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
-@options.out(
-    "Folder of the sweep. Trials that are finished in it are not computed again.", required=True
-)
+@options.output("Folder of the sweep. Trials that are finished in it are not computed again.")
 @click.option(
     "--grid",
     metavar="KEY=V1,V2,...",
@@ -46,26 +44,45 @@ MOST_SEEDS = 1_000_000
 @options.jobs
 @options.scheduler
 @options.retry_failed
+@click.option(
+    "--summary",
+    is_flag=True,
+    help="Print mean and standard deviation over the seeds, instead of learning; SOURCE is then "
+    "the folder of one sweep.",
+)
+@click.option("--csv", is_flag=True, help="Print the summary as comma-separated values.")
 @options.as_json
 @options.quiet
+@click.pass_context
 def sweep_command(
+    ctx: click.Context,
+    /,
     source: tuple[str, ...],
-    out: Path,
+    output: Path | None,
     grid: tuple[str, ...],
     seeds: str,
+    summary: bool,
+    csv: bool,
     as_json: bool,
     **how: Any,
 ) -> int:
     """Learn from one source many times: a grid of settings and seeds.
 
     SOURCE is what learn takes, except live streams. The same command resumes an interrupted sweep.
-    cdmisfa results DIR prints the results.
+    With --summary, SOURCE is the folder of a sweep.
     """
+    if summary:
+        _print_summary(_folder_of_sweep(ctx), as_csv=csv, as_json=as_json)
+        return 0
+    if csv:
+        raise click.UsageError("--csv needs --summary: write cdmisfa sweep DIR --summary --csv")
+    if output is None:
+        raise click.UsageError("name the folder of the sweep with -o, or print one with --summary")
     from cdmisfa.experiments.sweep import sweep
 
     values, numbers = parse_grid(grid), parse_seeds(seeds)
-    with resumable_bar(out, "sweep", "trials") as shown:
-        report = sweep(source, out, grid=values, seeds=numbers, progress=shown.trials, **how)
+    with resumable_bar(output, "sweep", "trials") as shown:
+        report = sweep(source, output, grid=values, seeds=numbers, progress=shown.trials, **how)
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if as_json:
         printing.document(
@@ -83,7 +100,7 @@ def sweep_command(
         for row in failed:
             point = " ".join(f"{key}={value}" for key, value in row["point"].items())
             printing.line(f"failed: {point} seed {row['seed']}: {row['error']}")
-        printing.line(f"look at it: cdmisfa results {printing.quoted(out)}")
+        printing.line(f"look at it: cdmisfa sweep {printing.quoted(output)} --summary")
     return 1 if failed else 0
 
 
@@ -115,15 +132,26 @@ def parse_seeds(text: str) -> list[int]:
     return seeds
 
 
-@click.command("results")
-@click.argument("folder", type=options.LOCAL)
-@click.option("--csv", is_flag=True, help="Print comma-separated values.")
-@options.as_json
-def results_command(folder: Path, csv: bool, as_json: bool) -> None:
-    """Print mean and standard deviation over the seeds of a sweep.
+def _folder_of_sweep(ctx: click.Context) -> Path:
+    """Return the folder that `--summary` takes; raise an error for other arguments and options."""
+    given = (ctx.get_parameter_source(param.name or "") for param in ctx.command.params)
+    ignored = [
+        param.opts[0]
+        for param, origin in zip(ctx.command.params, given, strict=True)
+        if origin is click.core.ParameterSource.COMMANDLINE
+        and param.name not in ("source", "summary", "csv", "as_json")
+    ]
+    if ignored:
+        raise click.UsageError(f"--summary only prints results: leave out {ignored[0]}")
+    if ctx.params["csv"] and ctx.params["as_json"]:
+        raise click.UsageError("choose one of --csv and --json")
+    if len(ctx.params["source"]) > 1:
+        raise click.UsageError("--summary takes the folder of one sweep")
+    return Path(ctx.params["source"][0])
 
-    FOLDER is that of the sweep; the trials are those that the last sweep command asked for.
-    """
+
+def _print_summary(folder: Path, *, as_csv: bool, as_json: bool) -> None:
+    """Print mean and standard deviation of the trials that the last sweep command asked for."""
     from cdmisfa.experiments import results
 
     points = results.results(folder)
@@ -131,7 +159,7 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
         printing.status(f"{key} differs: {', '.join(map(str, values))}")
     if as_json:
         printing.json_document(results.as_json(points))
-    elif csv:
+    elif as_csv:
         printing.text(results.as_csv(points))
     else:
         printing.table(*results.as_table(points))
@@ -139,7 +167,7 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
 
 @click.command("reproduce")
 @click.argument("name")
-@options.out("Folder of the results [default: reproduction].")
+@options.output("Folder of the results [default: reproduction].")
 @click.option(
     "--trials", type=options.COUNT, help="Trials per condition, instead of the paper's number."
 )
@@ -153,7 +181,7 @@ def results_command(folder: Path, csv: bool, as_json: bool) -> None:
 @options.quiet
 def reproduce_command(
     name: str,
-    out: Path | None,
+    output: Path | None,
     recording: Path | None,
     as_json: bool,
     **how: Any,
@@ -171,7 +199,7 @@ def reproduce_command(
         reproduce,
     )
 
-    root, documents = out or Path("reproduction"), []
+    root, documents = output or Path("reproduction"), []
     for experiment in EXPERIMENTS if name == "all" else (name,):
         if experiment == "icub" and recording is None:
             printing.status(
@@ -195,7 +223,7 @@ def reproduce_command(
 
 
 @click.command("demo")
-@options.out("Folder of the recordings and runs; by default the current folder.")
+@options.output("Folder of the recordings and runs; by default the current folder.")
 @options.seed
 @click.option(
     "--frames",
@@ -207,7 +235,7 @@ def reproduce_command(
 @options.jobs
 @options.as_json
 @options.quiet
-def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: bool) -> None:
+def demo_command(output: Path | None, seed: int, frames: int, jobs: int, as_json: bool) -> None:
     """Record, learn, check and show an example in a few minutes.
 
     It replaces the results of an earlier demo in the same folder. Without PyBullet, which needs
@@ -215,7 +243,7 @@ def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: b
     """
     from cdmisfa.studies.demo import demo
 
-    report = demo(out or Path(), stage=_stage, seed=seed, frames=frames, jobs=jobs)
+    report = demo(output or Path(), stage=_stage, seed=seed, frames=frames, jobs=jobs)
     if as_json:
         printing.json_document(report)
         return

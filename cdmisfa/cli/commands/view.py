@@ -92,10 +92,10 @@ def view_command(
 
 @click.command("report")
 @options.log_argument("run")
-@options.out("HTML file to write; by default report.html in the folder of a single run.")
+@options.output("HTML file to write; by default report.html in the folder of a single run.")
 @options.force
 @options.as_json
-def report_command(run: tuple[Path, ...], out: Path | None, force: bool, as_json: bool) -> None:
+def report_command(run: tuple[Path, ...], output: Path | None, force: bool, as_json: bool) -> None:
     """Write an HTML report of one run, or of several runs side by side.
 
     RUN is the folder of a run, several of them, or a folder of runs. The page needs no network and
@@ -106,9 +106,9 @@ def report_command(run: tuple[Path, ...], out: Path | None, force: bool, as_json
     from cdmisfa.experiments.reports import write_report
     from replay.storage.location import with_urls
 
-    if out is None and any(with_urls(str(path)) != str(path) for path in run):
+    if output is None and any(with_urls(str(path)) != str(path) for path in run):
         raise click.UsageError("for a run behind a URL name the page to write with -o F.html")
-    page = write_report(run, out, force=force)
+    page = write_report(run, output, force=force)
     if as_json:
         printing.document(report=page, bytes=page.stat().st_size)
     else:

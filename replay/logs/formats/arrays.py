@@ -41,7 +41,7 @@ _FORMS: Final = (
 
 
 def streams(
-    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+    path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
     """Open a file of NumPy, of which an .npz has a stream for each array.
 

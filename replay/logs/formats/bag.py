@@ -99,7 +99,7 @@ class Bag(NamedTuple):
 
 
 def streams(
-    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+    path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
     """Open the topics of a .bag, .db3 or rosbag2's folder.
 

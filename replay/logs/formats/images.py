@@ -24,7 +24,7 @@ MAX_IMAGE: Final = 64 * 1024 * 1024
 
 
 def streams(
-    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+    path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
     """Open the images of a folder as one stream, at any even rate."""
     topic = path.resolve().name

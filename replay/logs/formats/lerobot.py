@@ -61,7 +61,7 @@ class Dataset:
 
 
 def streams(
-    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+    path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
     """Open the cameras of a dataset, or the numbers that are asked for as one stream.
 

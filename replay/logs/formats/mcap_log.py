@@ -22,7 +22,7 @@ from replay.storage.opening import natural_order
 
 
 def streams(
-    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+    path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
     """Open the topics of a file, or of a folder whose files are the parts of one log.
 
@@ -35,7 +35,7 @@ def streams(
     readers: list[LogReader] = []
     empty: list[NothingLoggedError] = []
     for file in sorted(path.glob("*.mcap"), key=natural_order) if path.is_dir() else [path]:
-        reader = opened.enter_context(LogReader(file, salvage=salvage))
+        reader = opened.enter_context(LogReader(file, skip_damaged=skip_damaged))
         try:
             refuse_empty(reader)
             readers.append(reader)

@@ -52,17 +52,17 @@ class ViewFile:
         path: the file.
         facts: its metadata.
         ranges: the frames that are there with their ground truth, each [start, stop); one range,
-            except with `salvage`, and of live streams with gaps.
+            except with `skip_damaged`, and of live streams with gaps.
     """
 
     def __init__(
-        self, path: Path, *, salvage: bool = False, reader: LogReader | None = None
+        self, path: Path, *, skip_damaged: bool = False, reader: LogReader | None = None
     ) -> None:
         """Open one view's file and check the times of its frames.
 
         Args:
             path: the file.
-            salvage: leave out what is damaged.
+            skip_damaged: leave out what is damaged.
             reader: of the file, which the caller closes; then no frame is known until
                 `check_chunk` was called with each chunk, and `finish`.
 
@@ -72,7 +72,7 @@ class ViewFile:
         """
         self.path, by_chunk = path, reader is not None
         self.ranges: list[Span] = []
-        self.reader = reader or LogReader(path, salvage=salvage)
+        self.reader = reader or LogReader(path, skip_damaged=skip_damaged)
         try:
             records = [m for m in self.reader.metadata if m.name == RECORDING_METADATA]
             if len(records) != 1:
@@ -210,7 +210,7 @@ class _ChannelRows:
         self.layout: Any = None
         self._what, self.places, self.width = what, list[int](), 0
         self._reader, self._channel, self._facts = reader, channel, facts
-        self._may_lack = reader.salvage or facts.gaps
+        self._may_lack = reader.skip_damaged or facts.gaps
         self._trusted, self._confirmed = False, set[int]()
 
     def set_layout(self, least: int, marks: dict[int, int], places: list[int], width: int) -> None:
@@ -230,7 +230,7 @@ class _ChannelRows:
 
         Raises:
             LogDamagedError: a log time that is no frame's, a frame twice or out of order, and
-                without `salvage` a frame that is missing, unless the file says that it has gaps.
+                without `skip_damaged` a missing frame, unless the file says that it has gaps.
         """
         self._trusted = self._reader.by_index and not self._may_lack
         for segment in self._reader.segments:
@@ -246,7 +246,7 @@ class _ChannelRows:
         """Number the messages of the next chunk; raises as `extend`."""
         if self._count_messages(segment):
             number = len(self.segments) - 1
-            if not (self._reader.salvage and self._reader.table(segment) is None):
+            if not (self._reader.skip_damaged and self._reader.table(segment) is None):
                 self._number(self._times(number), self.starts[number], self.ranges)
 
     def payload(self, frame: int) -> bytes:

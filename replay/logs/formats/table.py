@@ -36,7 +36,7 @@ _NUMBER: Final = r"^[ \t]*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?[ \t]
 
 
 def streams(
-    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+    path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
     """Read the numbers of a table as one stream, in the order of time.
 

@@ -38,7 +38,7 @@ _FORWARD: Final = 256
 
 
 def streams(
-    path: Path, options: InputOptions, opened: ExitStack, *, salvage: bool = False
+    path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
     """Open the frames of a video's first stream, at its presentation times.
 

@@ -38,18 +38,18 @@ class SeveralRecordingsError(UsageError):
     """Recordings of images that were named together; they can be taken as external logs."""
 
 
-def streams(views: Sequence[ViewFile], *, salvage: bool = False) -> list[LogStream]:
+def streams(views: Sequence[ViewFile], *, skip_damaged: bool = False) -> list[LogStream]:
     """Return the views of a recording as streams, whose rows are the numbers of frames.
 
     Args:
         views: the files, open.
-        salvage: frames may be missing between two parts.
+        skip_damaged: frames may be missing between two parts.
 
     Raises:
         UsageError: the files are of several recordings.
         LogDamagedError: the files contradict each other.
     """
-    return [_stream(parts) for parts in _arrange(views, salvage=salvage)]
+    return [_stream(parts) for parts in _arrange(views, skip_damaged=skip_damaged)]
 
 
 def _stream(parts: Sequence[ViewFile]) -> LogStream:
@@ -82,7 +82,7 @@ def _stream(parts: Sequence[ViewFile]) -> LogStream:
     )
 
 
-def _arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
+def _arrange(views: Sequence[ViewFile], *, skip_damaged: bool) -> list[list[ViewFile]]:
     """Return views by stream index, each as its parts by first frame; raises as `streams`."""
     by_view: dict[tuple[int, str], list[ViewFile]] = {}
     for view in views:
@@ -102,7 +102,7 @@ def _arrange(views: Sequence[ViewFile], *, salvage: bool) -> list[list[ViewFile]
         for one, two in itertools.pairwise(parts):
             end = one.ranges[-1][1] if one.ranges else one.facts.first_frame
             begins = two.facts.first_frame
-            if end > begins or (end < begins and not salvage):
+            if end > begins or (end < begins and not skip_damaged):
                 what = f"begins at frame {begins}, {one.path.name} ends before {end}"
                 raise _unfit(views, two, f"{what}: a part is missing or doubled")
         arranged.append(parts)

@@ -1,4 +1,4 @@
-"""One broken image among many: refused with the remedy, or passed over with --salvage."""
+"""One broken image among many: refused with the remedy, or passed over with --skip-damaged."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def write_video_messages(path: Path, packets: Sequence[bytes]) -> Path:
 
 
 def shown(path: Path, rows: Sequence[int]) -> list[np.ndarray[Any, Any]]:
-    """The frames of a salvaged log, asked for in some order."""
-    with external(path, size=SIZE, salvage=True, loop=True) as source:
+    """The frames of a log whose damage is skipped, asked for in some order."""
+    with external(path, size=SIZE, skip_damaged=True, loop=True) as source:
         frames = []
         for row in rows:
             source.seek(row)
@@ -48,25 +48,25 @@ def shown(path: Path, rows: Sequence[int]) -> list[np.ndarray[Any, Any]]:
 
 def test_a_broken_image_is_refused_with_the_remedy_and_passed_over_with_it(tmp_path: Path) -> None:
     path, images = write(tmp_path / "a.mcap", [0, 7, 8, 39]), list(pictures(40))
-    with pytest.raises(LogDamagedError, match=f"/cam at {START} ns.*broken.*with --salvage"):
+    with pytest.raises(LogDamagedError, match=f"/cam at {START} ns.*broken.*with --skip-damaged"):
         external(path)
     stands_for = {0: 1, 7: 6, 8: 6, 39: 38}
     order = [*range(45), 8, 7, 39, 0, 1, 7]
     for row, frame in zip(order, shown(path, order), strict=True):
         np.testing.assert_array_equal(frame, images[stands_for.get(row % 40, row % 40)])
-    with external(path, salvage=True) as source:
+    with external(path, skip_damaged=True) as source:
         assert source.take(0, 8).frames.shape[0] == 8
-        assert "2 broken of 40 images" in source.salvaged()[0]
+        assert "2 broken of 40 images" in source.skipped_damage()[0]
     with pytest.raises(LogDamagedError, match=r"/cam.*its PNG is cut short$"):
-        external(write(tmp_path / "b.mcap", range(3), 3), salvage=True)
+        external(write(tmp_path / "b.mcap", range(3), 3), skip_damaged=True)
 
 
-def test_salvaged_images_are_learned_from_and_converted_alike(
+def test_images_after_skipped_damage_are_learned_from_and_converted_alike(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
     path = write(tmp_path / "a.mcap", [5, 25])
     assert cdmisfa("learn", path, "--max-iterations", "3", "--set", "learner.tau=10").code == 3
-    for said in learned_alike(cdmisfa, tmp_path, path, "--salvage")["said"]:
+    for said in learned_alike(cdmisfa, tmp_path, path, "--skip-damaged")["said"]:
         assert "2 broken of 40 images: the last whole one is taken" in said
 
 
@@ -121,7 +121,9 @@ def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Pa
     flip(path, path.read_bytes().rfind(time))  # in the chunk's message index
     with (
         external(path) as source,
-        pytest.raises(LogDamagedError, match=r"other messages than the summary names.*--salvage"),
+        pytest.raises(
+            LogDamagedError, match=r"other messages than the summary names.*--skip-damaged"
+        ),
     ):
         source.take(0, 8)
     for row, frame in enumerate(shown(path, range(8))):
