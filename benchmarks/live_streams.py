@@ -18,7 +18,7 @@ from PIL import Image
 
 from benchmarks import foreign
 from benchmarks.report import save
-from cdmisfa.agents.progress.attention import ProgressConfig
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.experiments.session import run
 from recorder.cameras.live import LiveSource
 from recorder.cameras.words import open_live

@@ -14,7 +14,7 @@ from benchmarks.arena.__main__ import LEARNERS, main
 from benchmarks.arena.judging import Course, Saved, judge, probe
 from benchmarks.arena.rules import RULES
 from benchmarks.arena.streams import ArenaSource
-from cdmisfa.agents.progress.attention import RECENT, Situation
+from cdmisfa.agents.progress.attention import ERROR_BLOCKS, Situation
 
 WORDS = ("x1", "x2", "vector-noise")
 TERMS = (5, "quadratic")
@@ -63,8 +63,8 @@ def test_a_small_arena(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 FALLS = np.r_[np.full(8, 2.0), np.full(8, 1.0)]
-EVEN = np.full(RECENT, 1.5)
-NOT_YET = np.full(RECENT, np.nan)
+EVEN = np.full(ERROR_BLOCKS, 1.5)
+NOT_YET = np.full(ERROR_BLOCKS, np.nan)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.agents.progress.attention import ProgressConfig
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.config import (
     LearnerConfig,
     build,

@@ -16,7 +16,7 @@ from contracts.sources import CameraContract
 
 from cdmisfa.agents.inputs import signals_of_block
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.agents.progress.attention import ProgressConfig
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner

@@ -15,7 +15,7 @@ from contracts.sources import same
 from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedReaders, bar
 from waiting import wait_for
 
-from cdmisfa.agents.progress.attention import ProgressConfig
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogExhaustedError, UsageError

@@ -15,9 +15,15 @@ from moving_pictures import MovingPictures
 
 from cdmisfa import Run
 from cdmisfa.agents.progress import candidate as held
-from cdmisfa.agents.progress.attention import RECENT, RULES, ProgressConfig, Situation
-from cdmisfa.agents.progress.candidate import WHITE_NOISE, Candidate, learning_error
-from cdmisfa.agents.progress.judging import flatness, gain, hopeless, promising
+from cdmisfa.agents.progress.attention import ERROR_BLOCKS, RULES, Situation
+from cdmisfa.agents.progress.candidate import WHITE_NOISE_SLOWNESS, Candidate, learning_error
+from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.agents.progress.decisions import (
+    is_promising,
+    rejection_reason,
+    relative_fitted_slowness,
+    relative_slowness,
+)
 from cdmisfa.agents.progress.learner import ProgressLearner
 from cdmisfa.core.blocks import Block, freeze
 from cdmisfa.core.signals import canonical_bytes
@@ -133,7 +139,7 @@ def test_restored_anywhere_it_goes_on_alike(attention: str, k: int) -> None:
 
 
 def test_candidates_are_held_for_so_many_streams_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(held, "HELD", 3)
+    monkeypatch.setattr(held, "MAX_CANDIDATES", 3)
     names = [f"noise.{i}" for i in range(8)] + ["swing", "constant"]
     source = MovingPictures(*names)
     learner = ProgressLearner(CONFIG, source.spec, 0)
@@ -155,18 +161,18 @@ def test_a_candidate_tests_before_it_learns() -> None:
         noise.learn(rng.standard_normal((40, 192)), gap=k == 0)
         swing.learn(source.take(0, 40).frames.reshape(40, -1), gap=k == 0)
     assert noise.tests == swing.tests == 14
-    assert noise.tested[0] == pytest.approx(WHITE_NOISE, rel=0.05)
+    assert noise.tested[0] == pytest.approx(WHITE_NOISE_SLOWNESS, rel=0.05)
     assert noise.fitted < noise.tested[0]
-    assert gain(noise) > 0.85 > 0.4 > gain(swing)
-    assert flatness(noise) > 0.75 > 0.4 > flatness(swing)
-    assert hopeless(noise, ProgressConfig()) == "nothing in it is slow"
-    assert hopeless(swing, ProgressConfig()) == ""
-    assert promising(swing, ProgressConfig())
+    assert relative_slowness(noise) > 0.85 > 0.4 > relative_slowness(swing)
+    assert relative_fitted_slowness(noise) > 0.75 > 0.4 > relative_fitted_slowness(swing)
+    assert rejection_reason(noise, ProgressConfig()) == "nothing in it is slow"
+    assert rejection_reason(swing, ProgressConfig()) == ""
+    assert is_promising(swing, ProgressConfig())
     assert swing.error == learning_error(swing.change, swing.tested[0], swing.fitted)
     black = Candidate(192, 8, 1, 8000, 20)
     for _ in range(12):
         black.learn(np.zeros((40, 192), np.uint8), gap=False)
-    assert (black.alive, hopeless(black, ProgressConfig())) == (False, "it is constant")
+    assert (black.varies, rejection_reason(black, ProgressConfig())) == (False, "it is constant")
 
 
 @pytest.mark.parametrize("tau", [3, 40, 100])
@@ -176,8 +182,8 @@ def test_noise_is_as_fast_on_new_frames_as_it_is_however_short_a_block(tau: int)
     candidate = Candidate(768, 8, 1, 8000, 100)
     for k in range(-(-2400 // tau)):
         candidate.learn(rng.standard_normal((tau, 768)), gap=k == 0)
-    assert candidate.fitted < 0.98 * WHITE_NOISE
-    assert candidate.tested[0] == pytest.approx(WHITE_NOISE, rel=0.03)
+    assert candidate.fitted < 0.98 * WHITE_NOISE_SLOWNESS
+    assert candidate.tested[0] == pytest.approx(WHITE_NOISE_SLOWNESS, rel=0.03)
 
 
 def test_a_test_is_of_weights_that_have_not_learned_from_its_frames() -> None:
@@ -213,7 +219,7 @@ def test_every_rule_chooses_a_stream(name: str, learning: list[bool], seed: int)
         stream=int(rng.integers(n)),
         learning=np.array(learning),
         changed=np.array(learning) & rng.integers(0, 2, n).astype(bool),
-        errors={s: rng.random(int(rng.integers(RECENT + 1))) for s in range(0, n, 2)},
+        errors={s: rng.random(int(rng.integers(ERROR_BLOCKS + 1))) for s in range(0, n, 2)},
         visits=rng.integers(1, 100, n),
         draws=rng.random(2),
         explore=0.1,

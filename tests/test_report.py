@@ -14,7 +14,7 @@ from report_data import HOSTILE, RULES, Page, pictured_run
 from run_data import IMAGE, PROGRESS, VECTOR, by_progress, module_of, write_run
 
 import cdmisfa as library
-from cdmisfa.agents.progress import judging
+from cdmisfa.agents.progress import decisions
 from cdmisfa.experiments import reports
 from cdmisfa.experiments.reports import write_report
 from cdmisfa.experiments.run_folder import command_again
@@ -55,10 +55,10 @@ def test_a_module_is_saved_where_all_rules_hold_and_nowhere_else(run: Path) -> N
 
 def test_the_progress_learner_is_measured_by_its_own_rules(tmp_path: Path) -> None:
     for name in (
-        *("VARIANCE_BOUNDS", "STILL_IMPROVING", "NO_IMPROVEMENT", "NO_DIRECTION", "FITTED_SLOW"),
-        "FULL",
+        *("VARIANCE_BOUNDS", "IMPROVEMENT_ONGOING", "IMPROVEMENT_NEGLIGIBLE", "ROTATING_CHANGE"),
+        *("FITTED_RATIO_SLOW", "SETTLING_WINDOWS"),
     ):
-        assert getattr(measurements, name) == getattr(judging, name)
+        assert getattr(measurements, name) == getattr(decisions, name)
     library.learn("oscillatory", tmp_path / "run", algorithm="progress")
     outline = read_outline(tmp_path / "run")
     rows = attempts(outline, measurements_of(outline))

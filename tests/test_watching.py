@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from waiting import python
 
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.agents.progress.attention import ProgressConfig
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.signals import SignalsHash

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.progress.attention import HALF, RECENT, ProgressConfig, Situation, exploring
+from cdmisfa.agents.progress.attention import ERROR_BLOCKS, PROGRESS_BLOCKS, Situation, exploring
 from cdmisfa.agents.progress.candidate import Candidate
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.agents.progress.learner import ProgressLearner
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import SourceSpec
@@ -29,20 +30,20 @@ class Attentive(ProgressLearner):
         name: of the rule in `RULES`.
 
     Attributes:
-        surprise: (S, RECENT) what was measured on each stream's last blocks, the newest last; NaN
-            before.
+        surprise: (S, ERROR_BLOCKS) value that the rule measured on the last blocks of each stream,
+            the newest last; NaN before.
     """
 
     def __init__(self, config: ProgressConfig, spec: SourceSpec, seed: int, name: str) -> None:
         super().__init__(config, spec, seed)
-        self.surprise = np.full((len(spec.streams), RECENT), np.nan)
+        self.surprise = np.full((len(spec.streams), ERROR_BLOCKS), np.nan)
         self._measure = Distillation(self._n_inputs) if name == "rnd" else prediction_error
         self.rule = lambda situation: RULES[name](situation, self.surprise)
 
-    def _judge(self, stream: int, candidate: Candidate, frames: NDArray[Any]) -> tuple[str, ...]:
+    def _decide(self, stream: int, candidate: Candidate, frames: NDArray[Any]) -> tuple[str, ...]:
         row = self.surprise[stream]
         row[:] = np.append(row[1:], self._measure(frames, candidate))
-        return super()._judge(stream, candidate, frames)
+        return super()._decide(stream, candidate, frames)
 
 
 def prediction_error(frames: NDArray[Any], candidate: Candidate) -> float:
@@ -110,9 +111,14 @@ def _absolute_progress(s: Situation, surprise: FloatArray) -> tuple[int, bool]:
     streams = np.flatnonzero(s.learning) if s.learning.any() else np.arange(len(s.learning))
     if s.draws[0] < 0.2 or not s.learning.any():
         return s.drawn(streams), True
-    if short := [k for k in streams if len(s.errors.get(k, ())) < RECENT]:
+    if short := [k for k in streams if len(s.errors.get(k, ())) < ERROR_BLOCKS]:
         return int(short[0]), False
-    values = np.array([abs(s.errors[k][:HALF].mean() - s.errors[k][HALF:].mean()) for k in streams])
+    values = np.array(
+        [
+            abs(s.errors[k][:PROGRESS_BLOCKS].mean() - s.errors[k][PROGRESS_BLOCKS:].mean())
+            for k in streams
+        ]
+    )
     place = int(np.searchsorted(np.cumsum(values), s.draws[1] * values.sum(), "right"))
     return int(streams[min(place, len(streams) - 1)]), False
 
@@ -122,10 +128,10 @@ RULES: dict[str, Callable[[Situation, FloatArray], tuple[int, bool]]] = {
     "alp": _absolute_progress,
     # Curiosity for prediction errors (ICM, Pathak et al. 2017), for novelty, and for errors that
     # fall below their mean before (learning progress monitoring, Hou et al. 2025).
-    "prediction": lambda s, surprise: _largest(s, surprise[:, HALF:].mean(axis=1)),
-    "rnd": lambda s, surprise: _largest(s, surprise[:, HALF:].mean(axis=1)),
+    "prediction": lambda s, surprise: _largest(s, surprise[:, PROGRESS_BLOCKS:].mean(axis=1)),
+    "rnd": lambda s, surprise: _largest(s, surprise[:, PROGRESS_BLOCKS:].mean(axis=1)),
     "lpm": lambda s, surprise: _largest(
-        s, surprise[:, :HALF].mean(axis=1) - surprise[:, HALF:].mean(axis=1)
+        s, surprise[:, :PROGRESS_BLOCKS].mean(axis=1) - surprise[:, PROGRESS_BLOCKS:].mean(axis=1)
     ),
 }
 """Every rule by its name."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from cdmisfa import kernels
 from cdmisfa.agents.progress.candidate import log_ratio
-from cdmisfa.agents.progress.judging import CHANGED, PRESENT
+from cdmisfa.agents.progress.decisions import CHANGED_SLOWNESS_LOG, MODULE_VARIANCE_BOUNDS
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, unbroken
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
@@ -288,14 +288,14 @@ class _Judge:
         self._mean += rate * (first.mean(axis=0) - self._mean)
         self._square += rate * ((first * first).mean(axis=0) - self._square)
         variance = self._square - self._mean * self._mean
-        alive = (PRESENT[0] < variance) & (variance < PRESENT[1])
+        alive = (MODULE_VARIANCE_BOUNDS[0] < variance) & (variance < MODULE_VARIANCE_BOUNDS[1])
         distance = np.abs(slowness - self._centre) / self._width
         novelty = np.maximum.reduceat(distance, self._firsts)
         if self._step_sizes and len(y) > 1:
             steps = np.diff(first, axis=0)
             sizes = np.sqrt((steps * steps).mean(axis=0)).tolist()
             for i, learned in self._step_sizes.items():
-                novelty[i] = abs(log_ratio(sizes[i], learned)) / CHANGED
+                novelty[i] = abs(log_ratio(sizes[i], learned)) / CHANGED_SLOWNESS_LOG
         return Applied(block, y, slowness, alive, novelty)
 
 

@@ -1,11 +1,11 @@
-"""`RecursiveFeature`: the slowest outputs of all frames so far, exactly, without a learning rate.
+"""`RecursiveFeature`: slow feature analysis of all frames so far, without a learning rate.
 
-Kept are the largest principal components of the frames and the covariance of the differences
-of consecutive frames along them, each over an exponential window. The slow features are the
-directions of least derivative among the whitened components: a small eigenvalue problem, solved
-again for every block. Outputs have unit variance, whatever the units of the frames.
+It stores the largest principal components of the frames and the covariance of the differences of
+consecutive frames along these components, both over an exponential window. The slow features are
+the directions of smallest derivative among the whitened components: a small eigenvalue problem that
+is solved for every block. Outputs have variance 1, whatever the units of the frames.
 
-It is computed, and its sources are named, in `cdmisfa/kernels/recursive.c`.
+`cdmisfa/kernels/recursive.c` has the computation and its sources.
 """
 
 from __future__ import annotations
@@ -21,25 +21,33 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
 
-# Frames taken in at once; longer blocks are cut into pieces of so many.
+# Frames that one update of the basis takes; longer blocks are cut into pieces of this length.
 PIECE: int = kernels.lib.PIECE
 
-_TINY = 1e-300
+# Directions that are stored for each whitened component. Set by hand (decision 0021): directions
+# beyond the whitened ones let a component grow that is small at first. Memory and time of an
+# update grow with it.
+STORED_PER_COMPONENT = 2
+
+# Smallest variance to divide by, so that a constant output has finite slowness.
+_MIN_VARIANCE = 1e-300
 
 
 class RecursiveState(NamedTuple):
-    """Everything that changes: I inputs, L directions, K whitened components, J outputs.
+    """State of a `RecursiveFeature`: I inputs, L directions, K whitened components, J outputs.
 
     Attributes:
         mean: (I,) mean of the frames.
-        basis: (L, I) orthonormal directions, those of the largest variance first.
-        variance: (L,) along them.
-        differences: (L, L) mean square of the differences of consecutive frames along them.
+        basis: (L, I) orthonormal directions, in order of falling variance.
+        variance: (L,) variance of the frames along each direction.
+        differences: (L, L) mean products of the differences of consecutive frames along the
+            directions.
         weights: (J, L) the slow features as weights of the directions.
-        spectrum: (K,) slowness of all slow features, the slowest first; NaN where there is none.
+        spectrum: (K,) slowness of all slow features, the slowest first; NaN for a feature that
+            does not exist.
         last: (I,) the last frame.
-        counts: (3,) directions in use; frames in `mean` and `variance`; differences in
-            `differences`. The latter two stop at the window.
+        counts: (3,) number of directions in use, of frames in `mean` and `variance`, and of
+            differences in `differences`. The latter two stop at the window.
     """
 
     mean: FloatArray
@@ -52,13 +60,13 @@ class RecursiveState(NamedTuple):
     counts: IntArray
 
 
-class Likeness(NamedTuple):
-    """Agreement of an output with the slowest feature of a stream.
+class Agreement(NamedTuple):
+    """Comparison of an output with the slowest feature of a stream.
 
     Attributes:
-        variance: of that output.
-        slowness: of it.
-        rho: its correlation with the slowest feature, from 0 to 1.
+        variance: variance of the output on the stream.
+        slowness: slowness of the output on the stream (cycles a frame).
+        rho: absolute correlation of the output with the slowest feature, 0 to 1.
     """
 
     variance: float
@@ -67,19 +75,19 @@ class Likeness(NamedTuple):
 
 
 class RecursiveFeature:
-    """Slow feature analysis of all frames so far, in blocks.
+    """Slow feature analysis of all frames so far, updated block by block.
 
-    Where the frames have no more directions than are kept (twice `components`), nothing is
-    left out and it does not matter how they are cut into calls, but for rounding.
+    If the frames vary in at most 2 K directions, no direction is dropped and the result does not
+    depend on how the frames are cut into calls, up to rounding.
 
     Args:
-        n_inputs: I, values of a frame.
-        components: K, principal components that are whitened; twice as many are kept.
-        outputs: J.
-        window: frames of the exponential window; the first so many all count the same.
+        n_inputs: number of values I of a frame.
+        components: number of whitened principal components K; 2 K are stored.
+        outputs: number of slow features J.
+        window: exponential window (frames); the first `window` frames have equal weights.
 
     Attributes:
-        state: every array of it; write into them to restore another state.
+        state: the arrays of the state; write into them to restore another state.
 
     Example:
         >>> t = np.arange(2000.0)
@@ -94,10 +102,10 @@ class RecursiveFeature:
     ) -> None:
         if n_inputs < 1 or not 1 <= outputs <= components or window < 1:
             raise UsageError(
-                f"no SFA of {n_inputs} inputs, {components} components, {outputs} outputs and a "
-                f"window of {window}: each is at least 1, and outputs at most components"
+                f"no SFA has {n_inputs} inputs, {components} components, {outputs} outputs and "
+                f"a window of {window}: set each to at least 1, and outputs to at most components"
             )
-        size = min(2 * components, n_inputs)
+        size = min(STORED_PER_COMPONENT * components, n_inputs)
         components = min(components, n_inputs)
         self.window = window
         self.state = RecursiveState(
@@ -118,15 +126,15 @@ class RecursiveFeature:
 
         Args:
             frames: (n, I) uint8 pixels, which count 1/255 each, or float64 values.
-            gap: the first frame does not follow the last one learned from.
+            gap: True if the first frame does not follow the last frame of the previous call.
 
         Returns:
-            (n,): at the last frame of each piece, the change of the slowest output:
-            sqrt(2 - 2 |rho|) of its correlation rho with the one before, from 0 to sqrt 2; NaN
-            elsewhere, and where there was none before.
+            (n,) at the last frame of each piece the change of the slowest output, NaN elsewhere
+            and in the first piece. The change is sqrt(2 - 2 |rho|), 0 to sqrt(2), where rho is the
+            correlation of the output before and after the piece.
 
         Raises:
-            UsageError: these are no frames of I values.
+            UsageError: the array does not have the shape (n, I) or the type of frames.
         """
         return kernels.recursive_update(self._record, frames, gap)
 
@@ -135,32 +143,35 @@ class RecursiveFeature:
         return kernels.recursive_state(self.state._asdict(), self.window)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the record, which points to its own arrays."""
+        """Return all attributes but the C record, which holds pointers."""
         return {name: value for name, value in vars(self).items() if name != "_record"}
 
     @property
     def slowness(self) -> float:
-        """Slowness of the slowest output on the frames it learned from, NaN without any."""
+        """Slowness of the slowest output on the frames learned from; NaN before the first."""
         return float(self.state.spectrum[0])
 
     @property
     def phi(self) -> FloatArray:
-        """Slow features as weights of the centred input, (J, I)."""
+        """(J, I) slow features as weights of the centred frame."""
         rank = self.state.counts[0]
         return kernels.multiply(self.state.weights[:, :rank], self.state.basis[:rank])
 
     @property
     def mean(self) -> FloatArray:
-        """Mean of the input, (I,)."""
+        """(I,) mean of the frames."""
         return self.state.mean
 
-    def compare(self, phi: FloatArray, frames: NDArray[Any] | None = None) -> Likeness:
-        """Return what another output gives on what was learned from, which is not kept.
+    def compare(self, phi: FloatArray, frames: NDArray[Any] | None = None) -> Agreement:
+        """Compare another output with the slowest feature, on the frames learned from.
+
+        The frames themselves are not stored: variance and slowness follow from the stored
+        directions, plus an estimate of what the output takes from outside them.
 
         Args:
-            phi: (I,) its weights of the centred input.
-            frames: (n, I) the last that were learned from, which tell what it takes from outside
-                of the directions kept; without them that counts as nothing.
+            phi: (I,) weights of the output for the centred frame.
+            frames: (n, I) the last frames learned from, for the estimate; None: assume that the
+                output takes nothing from outside the stored directions.
         """
         rank = self.state.counts[0]
         basis, variance = self.state.basis[:rank], self.state.variance[:rank]
@@ -175,8 +186,8 @@ class RecursiveFeature:
             jumps = np.diff(rest, axis=0)
             steps += kernels.multiply(jumps.T, jumps).item() / max(len(jumps), 1)
         shared = kernels.multiply(q * variance, self.state.weights[:1, :rank].T).item()
-        return Likeness(
+        return Agreement(
             variance=power,
-            slowness=math.sqrt(max(steps, 0.0) / max(power, _TINY)) / (2.0 * math.pi),
-            rho=min(abs(shared) / math.sqrt(max(power, _TINY)), 1.0),
+            slowness=math.sqrt(max(steps, 0.0) / max(power, _MIN_VARIANCE)) / (2.0 * math.pi),
+            rho=min(abs(shared) / math.sqrt(max(power, _MIN_VARIANCE)), 1.0),
         )

@@ -12,10 +12,16 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.signals import SIGNALS, STATES
 from replay.runs.run import Outline, Save, rules_of
 
-# The progress learner's constants: replay must not import `cdmisfa/agents/progress/judging.py`,
+# The progress learner's constants: replay must not import `cdmisfa/agents/progress/decisions.py`,
 # where they are explained; a test compares them.
 VARIANCE_BOUNDS = (0.5, 2.0)
-STILL_IMPROVING, NO_IMPROVEMENT, NO_DIRECTION, FITTED_SLOW, FULL = 0.1, 0.03, 4.0, 0.65, 4.5
+(
+    IMPROVEMENT_ONGOING,
+    IMPROVEMENT_NEGLIGIBLE,
+    ROTATING_CHANGE,
+    FITTED_RATIO_SLOW,
+    SETTLING_WINDOWS,
+) = 0.1, 0.03, 4.0, 0.65, 4.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,16 +102,18 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
     frames, settled = header.number("test_frames"), header.number("settled")
     window = None if frames is None else max(frames / max(outline.tau, 1), 1.0)
     was_tested = np.isfinite(tested)
-    exact = {"regret": was_tested & ~(regret > STILL_IMPROVING)}
+    exact = {"regret": was_tested & ~(regret > IMPROVEMENT_ONGOING)}
     with np.errstate(divide="ignore", invalid="ignore"):
         disagreement = np.abs(np.log(tested / fitted))
         gain, flatness = tested / typical, fitted / typical
         if settled is not None and window is not None:
-            # As `mastered` in judging.py: the threshold grows with the windows of tests.
+            # As `is_learned` in decisions.py: the threshold grows with the windows of tests.
             windows = tests / window
-            firm = change < settled * np.clip(windows / FULL, 0.0, 1.0) ** 2
-            turning = (windows >= FULL) & (change < NO_DIRECTION * settled)
-            exact["change"] = was_tested & (firm | (turning & (np.abs(regret) < NO_IMPROVEMENT)))
+            firm = change < settled * np.clip(windows / SETTLING_WINDOWS, 0.0, 1.0) ** 2
+            turning = (windows >= SETTLING_WINDOWS) & (change < ROTATING_CHANGE * settled)
+            exact["change"] = was_tested & (
+                firm | (turning & (np.abs(regret) < IMPROVEMENT_NEGLIGIBLE))
+            )
     variance = lines["variance"].reshape(outline.iterations, -1)[:, 0]
     rows: list[tuple[str, str, NDArray[Any], float | None, float | None]] = [
         ("error", "Learning error: change + disagreement", lines["learning_error"], None, None),
@@ -115,8 +123,9 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
          disagreement, None, header.number("agreement")),
         ("variance", "Variance of the slowest output on new frames", variance, *VARIANCE_BOUNDS),
         ("slow", "Slowness on new frames / typical slowness", gain, None, header.number("slow")),
-        ("slow before", "Slowness on old frames / typical slowness", flatness, None, FITTED_SLOW),
-        ("regret", "Regret: log of the recent gain in slowness", regret, None, STILL_IMPROVING),
+        ("slow before", "Slowness on old frames / typical slowness", flatness, None,
+         FITTED_RATIO_SLOW),
+        ("regret", "Regret: log of the recent gain in slowness", regret, None, IMPROVEMENT_ONGOING),
         ("tests", "Tested blocks", tests, window, None),
     ]  # fmt: skip
     return [

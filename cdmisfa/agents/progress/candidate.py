@@ -1,4 +1,8 @@
-"""`Candidate`: the slow features of one stream as they are learned, tested before they learn."""
+"""`Candidate`: the slow features that are being learned of one stream, with their tests.
+
+Each block is tested before the candidate learns from it, so that every test uses frames that the
+features have not seen.
+"""
 
 from __future__ import annotations
 
@@ -15,63 +19,77 @@ from cdmisfa.core.learning import overwrite
 from cdmisfa.features.outputs import slowness_by_moments, window_rate
 from cdmisfa.features.recursive import RecursiveFeature, RecursiveState
 
-# Slowness of white noise.
-WHITE_NOISE = math.sqrt(2.0) / (2.0 * math.pi)
+# Slowness of white noise in cycles a frame, 0.2251: its differences have twice its variance, and
+# slowness is sqrt(E(dy^2) / Var(y)) / (2 pi).
+WHITE_NOISE_SLOWNESS = math.sqrt(2.0) / (2.0 * math.pi)
 
-# With fewer slow features than this there is no typical one; white noise stands for it.
-FEWEST = 4
+# Slow features that a stream must have for their median to be its typical slowness; with fewer,
+# the slowness of white noise is used. Set by hand: the median of three or fewer features is itself
+# one of the slowest. It matters only for
+# frames of one value or `learner.components` below 4.
+MIN_SPECTRUM = 4
 
-# Blocks whose learning error is kept.
-ERRORS = 90
+# Learning errors that a candidate stores, in blocks: the last 30 are compared with the 60 before
+# (`NO_PROGRESS` in `decisions.py`). Set by hand; each error takes 8 bytes in every stored state.
+ERROR_HISTORY = 90
 
-# Most candidates held at once, and the bytes that they may take together: where frames are large
-# fewer are held. Those of other streams begin again when they are watched.
-HELD = 32
-MEMORY = 2 * 1024**3
+# Largest number of candidates in memory, and largest total size in bytes (decision 0029). Beyond
+# it the candidate of another stream is dropped and starts again at that stream's next block. With
+# 1,000 streams of 64x48 the limits keep a run below 521 MB and a stored state below 28 MB.
+MAX_CANDIDATES = 32
+MAX_CANDIDATE_BYTES = 2 * 1024**3
 
-# Learning error of a block before anything was tested: larger than any that is.
-UNTESTED = 3.0
+# Learning error before the first test. It exceeds the error of any tested candidate in practice
+# (a change of at most sqrt(2), and a disagreement that is seldom above 1).
+UNTESTED_ERROR = 3.0
 
-_TINY = 1e-12
+# Largest change of an output with a block that enters the mean: sqrt(2), the change of an output
+# that is uncorrelated with itself before.
+MAX_CHANGE = math.sqrt(2.0)
+
+# Smallest slowness in a ratio, so that its logarithm is finite for an output that does not move.
+_MIN_SLOWNESS = 1e-12
 
 
 def log_ratio(a: float, b: float) -> float:
-    """Return ln(a / b) of two slownesses, finite where one of them is 0."""
-    return kernels.log(max(a, _TINY) / max(b, _TINY))
+    """Return ln(a / b) of two slownesses, finite also if one of them is 0."""
+    return kernels.log(max(a, _MIN_SLOWNESS) / max(b, _MIN_SLOWNESS))
 
 
 def learning_error(change: float, tested: float, fitted: float) -> float:
-    """Return the learning error, e = c + |ln(test / fit)|.
+    """Return the learning error e = change + |ln(tested / fitted)|.
 
     Equation: P2
 
     Args:
-        change: mean change c of the outputs with a block.
-        tested: slowness on frames not yet learned from.
-        fitted: slowness on those learned from.
+        change: mean change of the outputs per block.
+        tested: slowness on frames that the candidate had not learned from (cycles a frame).
+        fitted: slowness on the frames that it learned from (cycles a frame).
     """
     return change + abs(log_ratio(tested, fitted))
 
 
 class Candidate:
-    """The slow features that are being learned of a stream.
+    """Slow features that are being learned of one stream.
 
     Args:
-        n_inputs: I.
-        components: K.
-        outputs: J.
-        window: frames of the exponential window of its SFA.
-        test_window: blocks of that of its tests.
+        n_inputs: number of inputs I.
+        components: number of whitened components K.
+        outputs: number of slow features J.
+        window: exponential window of the SFA statistics (frames).
+        test_window: exponential window of the tests (blocks).
 
     Attributes:
         sfa: the recursive SFA.
-        y: (n, J) outputs on the last block, before any of it was learned from; NaN without.
-        blocks: blocks learned from.
-        tests: blocks tested before they were learned from.
-        change: mean change of the outputs with a block, see `RecursiveFeature.update`.
-        regret: log of the slowness that the outputs of some time ago have now, over that of
-            today's: 0 where nothing was gained since.
-        errors: (ERRORS,) learning error of the last blocks, the newest last; NaN before.
+        y: (n, J) outputs on the last block, computed before the candidate learned from it; NaN
+            before the first test.
+        blocks: number of blocks that the candidate learned from.
+        tests: number of blocks that were tested.
+        change: mean change of the outputs per block, see `RecursiveFeature.update`.
+        improvement: ln of the slowness that the weights of one test window ago have now, divided
+            by the slowness of the present weights: 0 if learning gained nothing since. The signal
+            is called `regret`.
+        errors: (ERROR_HISTORY,) learning errors of the last blocks, the newest last; NaN before.
     """
 
     def __init__(
@@ -81,8 +99,8 @@ class Candidate:
         n_outputs = len(self.sfa.state.weights)
         self.test_window = test_window
         self.blocks = self.tests = self._reference_age = 0
-        self.change = self.regret = math.nan
-        self.errors = np.full(ERRORS, np.nan)
+        self.change = self.improvement = math.nan
+        self.errors = np.full(ERROR_HISTORY, np.nan)
         self.y = np.zeros((0, n_outputs))
         self._moments = np.zeros((3, n_outputs))
         self._phi = np.zeros((n_outputs, n_inputs))
@@ -94,16 +112,16 @@ class Candidate:
 
         Args:
             frames: (n, I) consecutive frames.
-            gap: they do not follow those before.
+            gap: True if the frames do not follow the previous block.
         """
         self.y = np.full((len(frames), len(self._last)), np.nan)
-        if self.alive:
+        if self.varies:
             self._test(frames, gap)
         changes = self.sfa.update(frames, gap)
         self.blocks += 1
         changes = changes[np.isfinite(changes)]
         if len(changes):
-            change = min(float(changes.sum()), math.sqrt(2.0))
+            change = min(float(changes.sum()), MAX_CHANGE)
             if math.isnan(self.change):
                 self.change = change
             else:
@@ -115,15 +133,18 @@ class Candidate:
         self._reference_age += 1
         if self._reference_age >= self.test_window:
             if self._reference.any():
-                self.regret = log_ratio(self.sfa.compare(self._reference).slowness, self.fitted)
+                before = self.sfa.compare(self._reference).slowness
+                self.improvement = log_ratio(before, self.fitted)
             self._reference[:] = self.sfa.phi[0]
             self._reference_age = 0
 
     def _test(self, frames: NDArray[Any], gap: bool) -> None:
-        """Take in the outputs on a block and their steps from frame to frame.
+        """Update the running moments of the outputs and of their differences.
 
-        The step from the block before is that of the weights that block was tested with: they
-        have learned from neither of its frames.
+        The first difference, from the last frame of the previous block, is computed with the
+        weights that the previous block was tested with, since these have learned from neither of
+        the two frames. With the present weights it would lead from a learned frame to a new one,
+        and the measured slowness of noise would be 0.318 instead of 0.226 (decision 0025).
         """
         self.tests += 1
         rate = window_rate(self.test_window, self.tests)
@@ -139,18 +160,18 @@ class Candidate:
         self._moments += rate * (now - self._moments)
 
     @property
-    def alive(self) -> bool:
-        """Whether the stream has shown anything that varies."""
+    def varies(self) -> bool:
+        """Whether any frame of the stream differed from another."""
         return bool(self.sfa.state.weights.any())
 
     @property
     def fitted(self) -> float:
-        """Slowness of the slowest output on the frames it learned from; NaN where there is none."""
+        """Slowness of the slowest output on the frames learned from; NaN before any output."""
         return self.sfa.slowness
 
     @property
     def tested(self) -> FloatArray:
-        """(J,) slowness of each output on frames not yet learned from; NaN before any."""
+        """(J,) slowness of each output on frames before they were learned; NaN before any test."""
         return np.array(
             [
                 slowness_by_moments(derivative, square - mean * mean) if self.tests else math.nan
@@ -160,37 +181,37 @@ class Candidate:
 
     @property
     def variance(self) -> FloatArray:
-        """(J,) variance of each output on frames not yet learned from."""
+        """(J,) variance of each output on frames before they were learned."""
         mean, square, _ = self._moments
         return np.asarray(square - mean * mean)
 
     @property
     def error(self) -> float:
-        """Its `learning_error`; `UNTESTED` before anything was tested."""
+        """The `learning_error` of the candidate; `UNTESTED_ERROR` before the first test."""
         if not self.tests or math.isnan(self.change):
-            return UNTESTED
+            return UNTESTED_ERROR
         return learning_error(self.change, float(self.tested[0]), self.fitted)
 
     def recent_errors(self, most: int) -> FloatArray:
-        """Return the last learning errors, (n,) with n at most `most`, the newest last."""
+        """Return at most `most` learning errors, the newest last."""
         recent = self.errors[-most:]
         return np.asarray(recent[np.isfinite(recent)])
 
     @property
     def typical(self) -> float:
-        """Slowness of the stream's typical direction: the median of all slow features'."""
+        """The stream's typical slowness: the median slowness of its K slow features."""
         spectrum = self.sfa.state.spectrum
-        known = spectrum[np.isfinite(spectrum)]
-        if len(known) < FEWEST:
-            return WHITE_NOISE
-        return float(known[len(known) // 2])
+        computed = spectrum[np.isfinite(spectrum)]
+        if len(computed) < MIN_SPECTRUM:
+            return WHITE_NOISE_SLOWNESS
+        return float(computed[len(computed) // 2])
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything that changes in it, by name; no copies."""
+        """The arrays of the candidate's state by name; most are views, not copies."""
         arrays = {
             "counters": np.array([self.blocks, self.tests, self._reference_age], dtype=np.int64),
-            "measures": np.array([self.change, self.regret]),
+            "measures": np.array([self.change, self.improvement]),
             "errors": self.errors,
             "moments": self._moments,
             "phi": self._phi,
@@ -201,43 +222,45 @@ class Candidate:
         return arrays | {f"sfa.{name}": array for name, array in sfa}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Go to where another of the same sizes was.
+        """Restore the state of a candidate with the same sizes.
 
         Raises:
-            ValueError: an array is missing or of another shape or type.
+            ValueError: an array is missing or has a different shape or type.
         """
         current = self.arrays
         overwrite(current, arrays)
         self.blocks, self.tests, self._reference_age = current["counters"].tolist()
-        self.change, self.regret = current["measures"].tolist()
+        self.change, self.improvement = current["measures"].tolist()
 
 
 class Candidates(dict[int, Candidate]):
-    """The candidates in memory, by their streams.
+    """The candidates in memory, by the index of their stream.
 
     Args:
-        new: makes one.
-        size: bytes of one.
+        new: creates a candidate.
+        size: size of one candidate (bytes).
 
     Attributes:
-        most: held at once.
+        capacity: largest number of candidates in memory.
     """
 
     def __init__(self, new: Callable[[], Candidate], size: int) -> None:
         super().__init__()
         self._new = new
-        self.most = max(2, min(HELD, MEMORY // size))
+        self.capacity = max(2, min(MAX_CANDIDATES, MAX_CANDIDATE_BYTES // size))
 
-    def opened(self, stream: int, learning: NDArray[np.bool_], last: NDArray[Any]) -> Candidate:
-        """Return the candidate of a stream, for which another may have to go.
+    def get_or_create(
+        self, stream: int, learning: NDArray[np.bool_], last: NDArray[Any]
+    ) -> Candidate:
+        """Return the candidate of a stream; drop another one if a new one does not fit.
 
         Args:
-            stream: which.
-            learning: (S,) which streams are being learned.
-            last: (S,) iterations of their last blocks.
+            stream: index of the stream.
+            learning: (S,) True where a stream is being learned; its candidate is dropped last.
+            last: (S,) iteration of the last block of each stream; the oldest is dropped first.
         """
         if stream not in self:
-            while len(self) >= self.most:
+            while len(self) >= self.capacity:
                 idle = [s for s in self if not learning[s]]
                 del self[min(idle or self, key=lambda s: last[s])]
             self[stream] = self._new()
@@ -245,7 +268,7 @@ class Candidates(dict[int, Candidate]):
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything that changes in them, by name, a copy."""
+        """Copies of the arrays of all candidates, by name."""
         streams = sorted(self)
         arrays = {
             f"candidate.{stream}.{name}": array.copy()
@@ -255,10 +278,10 @@ class Candidates(dict[int, Candidate]):
         return arrays | {"held": np.array(streams, dtype=np.int64)}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Hold the candidates that are stored in these arrays, among others.
+        """Replace all candidates by those stored in `arrays`, which may hold other arrays too.
 
         Raises:
-            ValueError: an array is missing or of another shape or type.
+            ValueError: an array is missing or has a different shape or type.
         """
         self.clear()
         for stream in arrays["held"].tolist():

@@ -1,9 +1,9 @@
-"""`ProgressLearner`: every slow feature of any streams, with one candidate a stream.
+"""`ProgressLearner`: learn the slow features of any streams, with one candidate for each stream.
 
-Each candidate is tested on a block before it learns from it. A feature that is slow on frames not
-yet learned from, and settled, becomes a module; a stream whose feature a module gives already is
-known; a stream in which nothing is slow is rejected. The learner stays with a stream until that is
-decided, and it is over when no stream is being learned.
+The candidate of a stream is tested on a block before it learns from it. A slow feature that holds
+on frames not learned from yet, and has settled, is saved as a module. A stream whose feature a
+module gives already is explained by that module. A stream without slow features is rejected. The
+learner attends to a stream until it is decided, and ends when every stream is.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from cdmisfa import kernels
 from cdmisfa.agents.inputs import count_inputs, rows_of, signals_of_block
-from cdmisfa.agents.progress import judging
-from cdmisfa.agents.progress.attention import RECENT, RULES, ProgressConfig, Situation, interest
+from cdmisfa.agents.progress import decisions
+from cdmisfa.agents.progress.attention import ERROR_BLOCKS, RULES, Situation, interest
 from cdmisfa.agents.progress.candidate import Candidate, Candidates
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand, expanded_size
@@ -26,31 +27,37 @@ from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.modules import Module
 
-# Fewest blocks of a window of tests, however long a block is.
-FEWEST_BLOCKS = 20
+# Smallest test window in blocks, also if `learner.test_frames` holds fewer. Set by hand: the change
+# of an output is a mean over blocks, and fewer blocks make it too noisy to compare. It matters from
+# 100 frames a block on.
+MIN_TEST_BLOCKS = 20
 
-# Windows of tests over which the output of a decided stream's module is averaged.
-WATCHED = 0.4
+# Exponential window over which the output of a decided stream's module is averaged, in test
+# windows: 20 blocks with the default configuration. Set by hand. Smaller values notice a change
+# sooner and learn unchanged streams again more often.
+MONITOR_WINDOWS = 0.4
 
-# To be raised when the rules decide otherwise than before: runs of another version are neither
-# continued nor checked.
-DECIDING = 4
+# Version of the decision rules. Raise it if the rules decide differently for the same frames: runs
+# of another version are then neither resumed nor verified.
+DECISION_VERSION = 4
 
+# Counters of the learner: iterations, the next stream, consecutive blocks of that stream, and
+# consecutive iterations in which every stream was decided.
 COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle", "i8")])
 
 
 class ProgressLearner:
-    """A learner with one candidate a stream, attention to undecided streams, and an end.
+    """Learner with one candidate for each stream, which ends when every stream is decided.
 
     Args:
-        config: its configuration.
-        spec: the source it learns from.
-        seed: seed of its random generator.
+        config: the configuration.
+        spec: the streams and frames of the source.
+        seed: seed of the random generator.
 
     Attributes:
         modules: the saved modules.
-        events: what happened in the last iteration, one line each.
-        rule: chooses the next stream; that of the configuration unless another is assigned.
+        events: events of the last iteration, one line each.
+        rule: the attention rule; assign another `Rule` to replace that of the configuration.
     """
 
     configuration = ProgressConfig
@@ -60,52 +67,53 @@ class ProgressLearner:
         self.config, self.spec = config, spec
         self.modules: list[Module] = []
         self.events: tuple[str, ...] = ()
-        # Products beyond the components that are whitened would drive out what is slow.
+        # With more products than whitened components the slow features are lost among them: a sine
+        # mixed with noise is learned from frames of 4 values, and not of 7 (decision 0032).
         few = expanded_size("quadratic", math.prod(spec.frame_shape)) <= config.components
         self._expansion = config.expansion or ("quadratic" if few else "none")
         self._n_inputs = count_inputs(self._expansion, spec)
         self._n_outputs = min(config.outputs, self._n_inputs)
         self._scale = PIXEL if spec.dtype == "uint8" else 1.0
-        self._window = max(FEWEST_BLOCKS, -(-config.test_frames // config.tau))
-        self._watched = int(WATCHED * self._window)
+        self._test_window = max(MIN_TEST_BLOCKS, -(-config.test_frames // config.tau))
+        self._monitor_window = int(MONITOR_WINDOWS * self._test_window)
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
-        self._streams = judging.new_streams(len(spec.streams))
+        self._streams = decisions.new_streams(len(spec.streams))
         size = 8 * self._n_inputs * (2 * config.components + self._n_outputs + 4)
         self._candidates = Candidates(self._new_candidate, size)
         self.rule = RULES[config.attention]
-        self._freeze()
+        self._stack_modules()
 
     @property
     def tau(self) -> int:
-        """Frames the learner wants in each block."""
+        """Number of frames in each block."""
         return self.config.tau
 
     @property
     def stream(self) -> int:
-        """Stream the learner wants to watch next."""
+        """Index of the stream of the next block."""
         return int(self._counts["stream"][0])
 
     def watch(self, stream: int) -> None:
-        """Have it watch another stream next than it chose."""
+        """Take the next block from `stream` instead of the stream that the rule chose."""
         counts = self._counts[0]
         if stream != counts["stream"]:
             counts["stream"], counts["stay"] = stream, 0
 
     @property
     def arithmetic(self) -> int:
-        """Version of how it computes; see `arithmetic_of`."""
-        return kernels.ARITHMETIC + DECIDING
+        """Version of the kernels and of the decision rules; see `arithmetic_of`."""
+        return kernels.ARITHMETIC + DECISION_VERSION
 
     @property
     def iteration(self) -> int:
-        """Iterations so far."""
+        """Number of iterations done."""
         return int(self._counts["iteration"][0])
 
     @property
     def phi(self) -> FloatArray:
-        """Weights of the candidate of the stream to watch next, (J, I), a copy."""
+        """(J, I) weights of the candidate of the next stream, a copy."""
         candidate = self._candidates.get(self.stream)
         if candidate is None:
             return np.zeros((self._n_outputs, self._n_inputs))
@@ -113,7 +121,7 @@ class ProgressLearner:
 
     @property
     def over(self) -> str:
-        """Whether no stream is being learned, nor was for `learner.watch` blocks; see `Learner`."""
+        """Reason to end: "all_decided" if none was being learned for `learner.watch` blocks."""
         return (
             "all_decided"
             if not self._learning.any() and self._counts["idle"][0] > self.config.watch
@@ -122,43 +130,43 @@ class ProgressLearner:
 
     @property
     def max_modules(self) -> None:
-        """It ends by itself."""
+        """None: the learner ends when every stream is decided."""
         return None
 
     @property
     def state(self) -> LearnerState:
-        """The learner's state, a copy."""
+        """A copy of the learner's state."""
         arrays = self._candidates.arrays
         arrays |= {name: array.copy() for name, array in self._tables.items()}
         return LearnerState(arrays, tuple(self.modules), self._rng.bit_generator.state)
 
     def restore(self, state: LearnerState) -> None:
-        """Go to a state of a learner with the same configuration, spec and seed.
+        """Restore the state of a learner with the same configuration, spec and seed.
 
         Raises:
-            ValueError: an array is missing or of another shape or type.
+            ValueError: an array is missing or has a different shape or type.
         """
         overwrite(self._tables, state.arrays)
         self._candidates.restore(state.arrays)
         self.modules = list(state.modules)
-        self._freeze()
+        self._stack_modules()
         self._rng.bit_generator.state = dict(state.policy_rng)
 
     def step(self, block: Block) -> BlockSignals:
-        """Do one iteration: test on tau frames, learn from them, and choose the next stream.
+        """Do one iteration: test on a block, learn from it, and choose the next stream.
 
         Args:
-            block: tau frames of the stream the learner asked for.
+            block: `tau` frames of the stream `stream`.
 
         Raises:
-            ValueError: the block is of another stream, length, frame shape or type.
-            CdmisfaError: it holds a value that is no finite number.
+            ValueError: the block has a different stream, length, frame shape or type.
+            CdmisfaError: the block holds a value that is not finite.
         """
         frames = expand(self._expansion, rows_of(block, self.spec, self.stream, self.tau))
         stream, count = block.stream, len(self.modules)
         row, counts = self._streams[stream], self._counts[0]
-        novel = int(row["state"]) == judging.LEARNING
-        candidate = self._candidates.opened(stream, self._learning, self._streams["last"])
+        undecided = int(row["state"]) == decisions.LEARNING
+        candidate = self._candidates.get_or_create(stream, self._learning, self._streams["last"])
         y_frozen = kernels.outputs(self._phi, self._offset, frames)
         error = candidate.error
         candidate.learn(frames, gap=int(row["next"]) != block.t)
@@ -166,10 +174,10 @@ class ProgressLearner:
         row["visits"] += 1
         counts["iteration"] += 1
         if int(row["module"]) >= 0:
-            judging.take_output(
-                row, y_frozen[:, int(row["module"]) * self._n_outputs], self._watched
+            decisions.monitor_output(
+                row, y_frozen[:, int(row["module"]) * self._n_outputs], self._monitor_window
             )
-        self.events = self._judge(stream, candidate, frames) + self._look_again()
+        self.events = self._decide(stream, candidate, frames) + self._retry_rejected()
         counts["idle"] = 0 if self._learning.any() else counts["idle"] + 1
         interests, explored = self._choose(self._rng.random(2))
         tested, gained = candidate.tested, error - candidate.error
@@ -177,8 +185,8 @@ class ProgressLearner:
         slowness = [kernels.instantaneous_slowness(y) for y in frozen]
         shape = (count, self._n_outputs)
         signals: dict[str, Any] = {
-            "novel": novel and candidate.alive,
-            "known_by": int(row["module"]) + 1 if candidate.alive else -1,
+            "novel": undecided and candidate.varies,
+            "known_by": int(row["module"]) + 1 if candidate.varies else -1,
             "saved": len(self.modules) > count,
             "novel_blocks": candidate.blocks,
             "y": candidate.y,
@@ -202,7 +210,7 @@ class ProgressLearner:
             "interest": interests,
             "state": self._streams["state"].copy(),
             "typical": candidate.typical,
-            "regret": candidate.regret,
+            "regret": candidate.improvement,
         }
         if candidate.tests:
             signals["variance"] = candidate.variance
@@ -214,84 +222,93 @@ class ProgressLearner:
         return {
             "final_policy": self._policy.tolist(),
             "epsilon": self.config.explore,
-            "streams": judging.outcomes(
+            "streams": decisions.outcomes(
                 self.spec.streams, self._streams, self._candidates, self.config.test_frames
             ),
         }
 
     @property
     def _tables(self) -> dict[str, NDArray[Any]]:
-        """Everything that changes in it but for its candidates, by name; no copies."""
+        """The arrays of the state except those of the candidates, by name; not copies."""
         return {"streams": self._streams, "counts": self._counts}
 
     @property
     def _learning(self) -> NDArray[np.bool_]:
-        """(S,) which streams are being learned."""
-        return np.asarray(self._streams["state"] == judging.LEARNING)
+        """(S,) True where a stream is being learned."""
+        return np.asarray(self._streams["state"] == decisions.LEARNING)
 
     @property
     def _policy(self) -> NDArray[np.int64]:
-        """(S,): 0 stay with a stream, for it is being learned; 1 switch."""
+        """(S,) 0 (stay) where a stream is being learned, else 1 (switch)."""
         return np.where(self._learning, 0, 1)
 
     def _new_candidate(self) -> Candidate:
         c = self.config
-        return Candidate(self._n_inputs, c.components, c.outputs, c.window, self._window)
+        return Candidate(self._n_inputs, c.components, c.outputs, c.window, self._test_window)
 
-    def _judge(self, stream: int, candidate: Candidate, frames: NDArray[Any]) -> tuple[str, ...]:
-        """Decide on a stream, and return the events."""
+    def _decide(self, stream: int, candidate: Candidate, frames: NDArray[Any]) -> tuple[str, ...]:
+        """Decide about a stream after a block of it, and return the events."""
         row = self._streams[stream]
         state, module = int(row["state"]), int(row["module"])
-        if judging.mastered(candidate, self.config):
+        most_blocks = decisions.MAX_STALLED_WINDOWS * self._test_window
+        if decisions.is_learned(candidate, self.config):
             del self._candidates[stream]
-            return self._settle(stream, candidate, frames)
-        if state == judging.LEARNING:
-            why = judging.hopeless(candidate, self.config)
-            if not why and judging.stale(candidate, self.config):
+            return self._assign_module(stream, candidate, frames)
+        if state == decisions.LEARNING:
+            reason = decisions.rejection_reason(candidate, self.config)
+            if not reason and decisions.has_vanished(candidate, self.config):
                 del self._candidates[stream]
-                if row["visits"] - row["decided"] < judging.PATIENCE * self._window:
+                if row["visits"] - row["decided"] < most_blocks:
                     return self._event(stream, "starts again: its slow feature came to rest")
-                why = judging.NO_PROGRESS
-            if why == judging.NO_PROGRESS and module >= 0:  # it gives what can be found there
-                return self._settle(stream, candidate, frames, module)
-            if why:
-                code, eta = judging.REASONS.index(why), float(candidate.tested[0])
-                judging.decide(row, judging.GIVEN_UP, -1, eta, code)
-                return self._event(stream, f"is given up after {row['decided']} blocks: {why}")
-        elif state == judging.GIVEN_UP:
-            if judging.REASONS[int(row["why"])] != judging.NO_PROGRESS and judging.promising(
-                candidate, self.config
-            ):
+                reason = decisions.NO_PROGRESS
+            if reason == decisions.NO_PROGRESS and module >= 0:
+                # The previous module stays: the new candidate found nothing better.
+                return self._assign_module(stream, candidate, frames, module)
+            if reason:
+                code, eta = decisions.REASONS.index(reason), float(candidate.tested[0])
+                decisions.record_decision(row, decisions.REJECTED, -1, eta, code)
+                return self._event(stream, f"is given up after {row['decided']} blocks: {reason}")
+        elif state == decisions.REJECTED:
+            final = decisions.REASONS[int(row["why"])] == decisions.NO_PROGRESS
+            if not final and decisions.is_promising(candidate, self.config):
                 self._learn_again(stream, -1)
                 return self._event(stream, "is learned after all: something in it is slow")
-        elif judging.differs(row, self._watched):
+        elif decisions.output_changed(row, self._monitor_window):
             self._learn_again(stream, module)
             return self._event(stream, f"no longer fits module {module + 1}")
-        if state != judging.LEARNING and candidate.blocks >= judging.PATIENCE * self._window:
+        if state != decisions.LEARNING and candidate.blocks >= most_blocks:
             del self._candidates[stream]
         return ()
 
-    def _settle(
+    def _assign_module(
         self, stream: int, candidate: Candidate, frames: NDArray[Any], index: int | None = None
     ) -> tuple[str, ...]:
-        """Decide by which module a stream is learned or known; a new one where none gives it."""
+        """Assign a stream to a module, save a new module if none fits, and return the events.
+
+        Args:
+            stream: index of the stream.
+            candidate: candidate of the stream.
+            frames: (n, I) the last block of the stream.
+            index: index of the module, if it is decided already.
+        """
         row = self._streams[stream]
         state, before = int(row["state"]), int(row["module"])
         if index is None:
-            index = judging.known_by(candidate, self.modules, before, frames)
+            index = decisions.explaining_module(candidate, self.modules, before, frames)
         new = index is None
         if index is None:
             self.modules.append(self._module(stream, candidate))
-            self._freeze()
+            self._stack_modules()
             index = len(self.modules) - 1
         module = self.modules[index]
         given = candidate.sfa.compare(module.phi[0], frames)
-        judging.begin_watching(row, given.variance, given.slowness)
-        if index == before and state != judging.LEARNING:
+        decisions.start_monitoring(row, given.variance, given.slowness)
+        if index == before and state != decisions.LEARNING:
             return ()
         eta = float(candidate.tested[0]) if new else given.slowness
         learned = module.stream_index == stream
-        judging.decide(row, judging.LEARNED if learned else judging.KNOWN, index, eta)
+        state = decisions.LEARNED if learned else decisions.EXPLAINED
+        decisions.record_decision(row, state, index, eta)
         if index == before:
             return self._event(stream, f"still shows what module {index + 1} gives")
         by = "learned by" if learned else f"known by {module.stream}'s"
@@ -302,19 +319,21 @@ class ProgressLearner:
         return self._event(stream, text)
 
     def _learn_again(self, stream: int, module: int) -> None:
-        """Begin another candidate for a stream that had been decided."""
+        """Set a decided stream back to being learned, with a new candidate."""
         self._candidates.pop(stream, None)
-        judging.decide(self._streams[stream], judging.LEARNING, module, math.nan)
+        decisions.record_decision(self._streams[stream], decisions.LEARNING, module, math.nan)
 
     def _event(self, stream: int, text: str) -> tuple[str, ...]:
         return (f"stream {self.spec.streams[stream]} {text}",)
 
-    def _look_again(self) -> tuple[str, ...]:
-        """Begin rejected streams again before all is over, and return the events."""
+    def _retry_rejected(self) -> tuple[str, ...]:
+        """Try rejected streams again before the learner ends, and return the events."""
         streams = self._streams
         if self._learning.any():
             return ()
-        again = (streams["state"] == judging.GIVEN_UP) & (streams["looks"] < self.config.looks - 1)
+        again = (streams["state"] == decisions.REJECTED) & (
+            streams["looks"] < self.config.looks - 1
+        )
         for stream in np.flatnonzero(again).tolist():
             streams["looks"][stream] += 1
             self._learn_again(stream, -1)
@@ -335,24 +354,28 @@ class ProgressLearner:
             policy=self._policy,
             expansion=self._expansion,
             scale=self._scale,
-            slow=judging.slow_outputs(candidate, self.config),
+            slow=decisions.slow_outputs(candidate, self.config),
             frame_shape=self.spec.frame_shape,
         )
 
-    def _freeze(self) -> None:
-        """Stack the modules' rows, so that one pass over a block serves all of them."""
+    def _stack_modules(self) -> None:
+        """Stack the weights of all modules, so that one pass over a block computes all outputs."""
         self._phi = np.array([m.phi for m in self.modules]).reshape(-1, self._n_inputs)
         offsets = [kernels.mean_output(m.phi, m.mean) for m in self.modules]
         self._offset = np.array(offsets).reshape(-1)
 
     def _choose(self, draws: FloatArray) -> tuple[FloatArray, bool]:
-        """Choose the next stream; return the interest of each, and whether one was drawn."""
+        """Choose the next stream.
+
+        Returns:
+            The interest of each stream (S,), and whether the stream was drawn at random.
+        """
         counts, learning = self._counts[0], self._learning
         candidates = np.zeros(len(learning), dtype=bool)
         candidates[list(self._candidates)] = True
-        if (learning & candidates).sum() >= self._candidates.most:
+        if (learning & candidates).sum() >= self._candidates.capacity:
             learning &= candidates
-        errors = {s: c.recent_errors(RECENT) for s, c in self._candidates.items()}
+        errors = {s: c.recent_errors(ERROR_BLOCKS) for s, c in self._candidates.items()}
         situation = Situation(
             stream=self.stream,
             learning=learning,
