@@ -53,7 +53,13 @@ class Outcome:
 Cdmisfa = Callable[..., Outcome]
 
 
-SLOW = ("test_bombs.py", "test_moments.py", "test_notebook.py", "test_readme.py", "test_viewer.py")
+SLOW = (
+    "test_bombs.py",
+    "test_moments.py",
+    "test_notebook.py",
+    "test_page_blocks.py",
+    "test_viewer.py",
+)
 """Files with a test, or a group of tests, that takes tens of seconds."""
 
 

@@ -59,7 +59,7 @@ def test_readme_has_whole_addresses_where_its_files_are_elsewhere(
     links = re.findall(r"\]\(([^)]*)\)", text)
     assert [link for link in links if not link.startswith("https://")] == []
     assert (f"]({source}/raw/v" in text, "![" in text) == (source is not None,) * 2
-    assert len(text) > 5000
+    assert len(text) > 4000
 
 
 def test_pictures_are_those_that_the_code_draws() -> None:
