@@ -73,7 +73,7 @@ static double window_rate(double window, int64_t count) {
  * CD-MISFA 1.0 is gated by clusters in place of slowness: one node for each label, which is the
  * stream, holds centres of what the abstraction gives out there. Node, winner and error: Luciw,
  * Kompella, Kazerounian and Schmidhuber 2013; clusters with counts: Guedalia, London and Werman
- * 1999. What we read into them is decision 0014.
+ * 1999. Our choices are decision 0014.
  */
 static int64_t nearest(const agent *a, const double *centres, const double *counts,
                        const double *y, double *distance) {

@@ -59,7 +59,7 @@ HELD_OUT = 4000
 # |r| with the position of an object, on held-out frames, from which on a module follows it.
 FOLLOWS = 0.9
 
-# Algorithm and 1.0's threshold of the clustering error: that of decision 0014, and a looser one.
+# Algorithm, and threshold of the clustering error of 1.0: that of decision 0014, and a looser one.
 #
 # 1.0 gets the head's positions as labels.
 LEARNERS = (("2.0", 0.1), ("1.0", 0.1), ("1.0", 0.6))

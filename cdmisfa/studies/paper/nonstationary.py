@@ -40,7 +40,7 @@ TAUS: Mapping[float, float] = {10: 0.98, 30: 0.81, 50: 0.83, 100: 0.80}
 COLUMNS: Mapping[str, Mapping[float, float]] = {"sigma": SIGMAS, "nu": NUS, "tau": TAUS}
 QUICK_COLUMNS = {"sigma": {sigma: SIGMAS[sigma] for sigma in (0.008, 0.0009, 0.0)}}
 
-# Multiplier of epsilon throughout; the text leaves it open, decision 0013.
+# Factor of epsilon in every iteration; the paper does not give it, decision 0013.
 DECAY = 0.998
 
 # Rewarded blocks before a change from which on one can speak of following it.

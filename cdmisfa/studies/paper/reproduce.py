@@ -40,7 +40,8 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "icub": Icub(),
 }
 
-# Seed of an experiment's first trials: no reading was chosen on these, see docs/decisions.
+# Seed of the first trial of an experiment. No choice of docs/project/decisions.md was made on these
+# seeds.
 FIRST_SEED = 28_000
 
 
