@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.arena.__main__ import LEARNERS, main
+from benchmarks.arena.comparison import LEARNERS, main
 from benchmarks.arena.judging import Course, Saved, judge, probe
 from benchmarks.arena.rules import RULES
 from benchmarks.arena.streams import ArenaSource
