@@ -1,0 +1,187 @@
+"""Figures in README and "Results at a glance" are those of the stored results."""
+
+from __future__ import annotations
+
+import json
+import re
+import statistics
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EVIDENCE = ROOT / "docs" / "evidence"
+DATA = EVIDENCE / "data"
+
+
+def load(name: str) -> Any:
+    return json.loads((DATA / f"{name}.json").read_text("utf-8"))
+
+
+def arena(learner: str, *sets: str) -> list[Any]:
+    """Return the results of a learner on sets of streams, by default all that are reported."""
+    return [
+        entry
+        for entry in load("learners")["entries"]
+        if entry["point"].keys() == {"set", "learner"}
+        and entry["point"]["learner"] == learner
+        and (
+            entry["point"]["set"] in sets or (not sets and entry["point"]["set"][:9] == "reported-")
+        )
+    ]
+
+
+def learned(learner: str, *sets: str) -> tuple[int, int]:
+    """Return how many streams were learned, and how many could be, over all seeds."""
+    streams = [stream for entry in arena(learner, *sets) for stream in entry["targets"]]
+    return sum(s["learned"] for s in streams), sum(s["trials"] for s in streams)
+
+
+def missed(*names: str) -> tuple[int, int]:
+    """Return in how many of how many trials streams of the reported sets were not learned.
+
+    Args:
+        names: SET/STREAM each.
+    """
+    streams = [
+        stream
+        for entry in arena("progress")
+        for stream in entry["targets"]
+        if f"{entry['point']['set'][9:]}/{stream['stream']}" in names
+    ]
+    trials = sum(s["trials"] for s in streams)
+    return trials - sum(s["learned"] for s in streams), trials
+
+
+def mean(measure: str, learner: str, *sets: str) -> float:
+    """Return the mean of a measure over sets of streams."""
+    found = [entry["measures"][measure]["mean"] for entry in arena(learner, *sets)]
+    return statistics.fmean(value for value in found if value is not None)
+
+
+def noise_modules(learner: str, *sets: str) -> int:
+    """Return how many modules were saved on streams of noise, over all seeds."""
+    found = [entry["measures"]["wrong"] for entry in arena(learner, *sets)]
+    return round(sum(each["mean"] * each["n"] for each in found))
+
+
+def claims(experiment: str) -> list[Any]:
+    return [claim["holds"] for claim in load(experiment)["claims"]]
+
+
+def detail(experiment: str, claim: int) -> tuple[int, ...]:
+    """Return the numbers of what was measured about a claim of the paper."""
+    return tuple(map(int, re.findall(r"\d+", load(experiment)["claims"][claim]["detail"])))
+
+
+OTHERS = ("games", "light", "oscillatory-noise")
+RULES = ("progress", "robin", "random")
+CHOICE = ("reported-photographs", "reported-grids", "reported-many")
+
+Figures = list[tuple[str, Callable[[], Any]]]
+
+RESULTS: dict[str, Figures] = {
+    "Does it learn the slow feature of a stream?": [
+        ("{} of {} streams", lambda: learned("progress")),
+        ("({:.1%})", lambda: [learned("progress")[0] / learned("progress")[1]]),
+        ("in {} sets of streams", lambda: [len(arena("progress"))]),
+        ("{} module was saved", lambda: [noise_modules("progress") or "No"]),
+        ("drifting light ({} of {})", lambda: missed("light/drift")),
+        ("pauses ({} of {})", lambda: missed("pauses/bowling", "pauses/pausing:acrobot")),
+        ("20 streams ({} of {})", lambda: missed("many/boxing")),
+    ],
+    "Do the features carry the state of the world?": [
+        ("R² {:.2f} (mean", lambda: [mean("probe", "progress")]),
+        ("of the {} sets", lambda: [len(arena("progress"))]),
+        ("components with {:.2f}", lambda: [mean("probe_components", "progress")]),
+        (
+            "games little: {:.2f} against {:.2f}",
+            lambda: [mean(m, "progress", "reported-games") for m in ("probe", "probe_components")],
+        ),
+        (
+            "better: {:.2f} against {:.2f}",
+            lambda: [mean(m, "progress", "reported-pauses") for m in ("probe", "probe_components")],
+        ),
+    ],
+    "Is it better than the paper's CD-MISFA 2.0?": [
+        (
+            "{} of {} streams learned against {} of {}",
+            lambda: (*learned("progress", *OTHERS), *learned("2.0", *OTHERS)),
+        ),
+        (
+            "{} against {}, in {} runs",
+            lambda: (
+                *(noise_modules(learner, *OTHERS) for learner in ("progress", "2.0")),
+                sum(len(entry["seeds"]) for entry in arena("2.0", *OTHERS)),
+            ),
+        ),
+    ],
+    "Does it choose streams well?": [
+        (
+            "{:,.0f} frames (rotation {:,.0f}, random choice {:,.0f};",
+            lambda: [round(mean("frames_learned", each, *CHOICE), -2) for each in RULES],
+        ),
+        (
+            "noise: {:.0%} ({:.0%}, {:.0%})",
+            lambda: [mean("in_vain", each, *CHOICE) for each in RULES],
+        ),
+    ],
+    "Is the paper reproduced?": [
+        ("{} of {} trials", lambda: detail("oscillatory", 0)),
+        ("{} of {} on the iCub", lambda: detail("icub", 0)),
+        (
+            "{} of {} claims",
+            lambda: (claims("nonstationary").count(False), len(claims("nonstationary"))),
+        ),
+    ],
+}
+"""What stands in the result of each question: texts with their figures."""
+
+NAMES = ("2.0", "1.0")
+"""Numbers that are names, and come from no measurement."""
+
+
+def rows(page: Path) -> Iterator[list[str]]:
+    """Yield the cells of the tables of a page."""
+    for line in page.read_text("utf-8").splitlines():
+        if line.startswith("|") and not line.startswith("|-"):
+            yield [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+
+
+def percent(text: str) -> str:
+    """Write a space before the sign, as the pages do."""
+    return re.sub(r"(\d)%", r"\1 %", text)
+
+
+@pytest.mark.parametrize("question", RESULTS)
+def test_results_have_the_figures_of_the_stored_results(question: str) -> None:
+    [cell] = [row[1] for row in rows(EVIDENCE / "results.md") if row[0] == question]
+    for text, figures in RESULTS[question]:
+        expected = percent(text.format(*figures()))
+        assert expected in cell
+        cell = cell.replace(expected, "")
+    rest = re.findall(r"\d[\d.]*\d|\d", cell)
+    assert [number for number in rest if number not in NAMES] == []
+
+
+def test_every_question_of_the_results_is_compared() -> None:
+    assert {row[0] for row in rows(EVIDENCE / "results.md")} - {"Question"} == RESULTS.keys()
+
+
+def test_readme_repeats_figures_of_the_results() -> None:
+    results = {row[0]: row[1] for row in rows(EVIDENCE / "results.md")}
+    repeated = [row for row in rows(ROOT / "README.md") if row[0] in results]
+    for question, result, *_ in repeated:
+        text = re.sub(r"\]\([^)]*\)", "]", result)
+        for number in re.findall(r"\d[\d.,]*(?: %)?", text):
+            assert number.rstrip(".,") in results[question], (question, number)
+
+
+def test_results_name_the_commit_of_their_data() -> None:
+    for row in list(rows(EVIDENCE / "results.md"))[1:]:
+        files = re.findall(r"\]\(([^)]*\.json)\)", row[3])
+        commits = {json.loads((EVIDENCE / f).read_text("utf-8"))["commit"] for f in files}
+        assert files
+        assert commits == {row[3].rsplit(" ", 1)[-1]}
