@@ -81,7 +81,7 @@ def test_a_viewer_shows_the_run_as_it_grows_and_keeps_it():
             ask = opened.enter_context(shown(view.address))
             ask(lambda client: end(client) >= 30 * 40 - 1)
             views = ask(lambda client: client.get_state().views)
-            assert "Summary" in {v.name for v in views}
+            assert "Results" in {v.name for v in views}
             assert [v.reports for v in views] == [[]] * len(views)
             feed(view, IMAGE, 60)
         ask(lambda client: end(client) >= 60 * 40 - 1)

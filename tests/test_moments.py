@@ -301,4 +301,4 @@ def test_forks_of_forks_are_resumed_and_checked(
     assert (keyframe.iteration, found.iteration >= 52) == (52, True)
 
 
-SAME, OTHER = "the same was learned, at other iterations", "what was learned differs"
+SAME, OTHER = "same results, at other iterations", "different results"

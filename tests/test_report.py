@@ -66,7 +66,7 @@ def test_the_progress_learner_is_measured_by_its_own_rules(tmp_path: Path) -> No
     settings = {**PROGRESS, "test_frames": 400}
     write_run(tmp_path / "run.mcap", VECTOR, 60, learner=settings, edit=by_progress)
     text = Page(write_report([tmp_path])).text
-    for words in ("Learning error", "below 0.25", "below 0.05", "given up", "known"):
+    for words in ("Learning error", "below 0.25", "below 0.05", "rejected", "explained"):
         assert words in text
     outline = read_outline(tmp_path)
     rules = {rule.name: rule for rule in measurements_of(outline)}
@@ -80,7 +80,7 @@ def test_the_page_shows_the_data_of_the_run(run: Path) -> None:
     n, visits = len(signals["iteration"]), np.bincount(signals["stream"], minlength=3)
     expected = [
         f"2 of 3 streams learned, {n:,} iterations, {n * TAU:,} frames",
-        *(f"{v / n:.1%} of its attention, {v * TAU:,} frames" for v in visits.tolist()),
+        *(f"attended for {v * TAU:,} frames, {v / n:.1%} of the run" for v in visits.tolist()),
         *(f"module {m.index}, frame {(m.iteration + 1) * TAU:,}" for m in data.modules),
         *(f"module {m.index}, slowness {m.eta[0]:.4f}" for m in data.modules),
         *data.streams,
@@ -91,7 +91,7 @@ def test_the_page_shows_the_data_of_the_run(run: Path) -> None:
     for module in data.modules:
         frames = data.frames()[np.repeat(signals["stream"], TAU) == module.stream_index]
         text = page.text[page.text.index(f"Module {module.index}: ") :]
-        least = re.search(r"Frames of least output: ([-+.\d]+) at", text)
+        least = re.search(r"Least output: ([-+.\d]+) at", text)
         assert least is not None
         y = module.transform(frames)[:, 0]
         assert float(least[1]) == pytest.approx(y.min(), abs=0.006)
@@ -196,7 +196,7 @@ def test_several_runs_and_a_folder_of_them(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     twin = shutil.copytree(runs[0], tmp_path / "twin")
     write_run(tmp_path / "run.mcap", VECTOR, 0)  # interrupted before its first iteration
     page = Page(write_report([*runs, twin, tmp_path], tmp_path / "all.html"))
-    assert "4 runs; identical to the first, bit for bit: 1 of 3" in page.text
+    assert "4 runs; 1 of 3 have the same signals as the first, bit for bit" in page.text
     done = cdmisfa("report", tmp_path / "runs", "-o", tmp_path / "folder.html", "--json")
     assert done.json["bytes"] == (tmp_path / "folder.html").stat().st_size
 

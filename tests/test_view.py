@@ -86,11 +86,12 @@ def test_lanes_say_what_was_the_case(shown):
         return [state for frame, state in states if frame <= t][-1]
 
     for s in records:
-        assert at("/attends", s.t) == [spec.streams[s.stream]]
-        verdict = "novel" if s.novel else f"known by {s.known_by}" if s.known_by > 0 else "constant"
-        assert at("/novelty", s.t) == [verdict]
+        assert at("/attended/each_block", s.t) == [spec.streams[s.stream]]
+        verdict = "novel" if s.novel else f"explained by module {s.known_by}"
+        verdict = verdict if s.novel or s.known_by > 0 else "constant"
+        assert at("/novelty/each_block", s.t) == [verdict]
         did = "switch" if s.action else f"stay on {spec.streams[s.stream]}"
-        assert at("/does", s.t) == [did]
+        assert at("/action", s.t) == [did]
         for i, name in enumerate(spec.streams):
             assert at(f"/policy/{i + 1}_{name}", s.t) == [["stay", "switch"][s.policy[i]]]
 
@@ -120,10 +121,11 @@ def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
     assert f"of its {len(last)} blocks" in text
     novel = [s.stream for s in last if s.novel]
     most = max(set(novel), key=novel.count)
-    share = f"{novel.count(most) / len(novel):.0%} of these were of {VECTOR.streams[most]}."
+    name = VECTOR.streams[most]
+    share = f"{novel.count(most) / len(novel):.0%} of the novel blocks came from {name}."
     assert 0 < len(novel) < len(last)
     assert share in text
-    assert "It ended: nothing was left." in text
+    assert "Stopped: nothing was left." in text
 
 
 def test_many_streams_show_the_most_watched(tmp_path, monkeypatch):

@@ -85,7 +85,14 @@ def test_modules_stand_where_they_were_saved(shown):
         assert (weights["frame"], weights["iteration"]) == ([save.t], [save.iteration])
 
 
-@pytest.mark.parametrize("lane", ["attends", "novelty", "mostly/attends", "mostly/novelty"])
+@pytest.mark.parametrize(
+    "lane",
+    [
+        f"{s}/{t}_block{'s' * (t == 'most')}"
+        for s in ("attended", "novelty")
+        for t in ("each", "most")
+    ],
+)
 def test_a_bar_ends_where_a_gap_begins(shown, lane):
     _, records, rows = shown
     frames, states = rows[f"/{lane}"]["frame"], rows[f"/{lane}"]["StateChange:state"]
@@ -93,7 +100,7 @@ def test_a_bar_ends_where_a_gap_begins(shown, lane):
     assert none == [GAP_AFTER * TAU, records[-1].t + TAU]
     begin = frames.index(GAP_AFTER * TAU + GAP)
     assert begin == frames.index(none[0]) + 1
-    if lane == "attends":
+    if lane == "attended/each_block":
         assert states[begin] == [IMAGE.streams[records[GAP_AFTER].stream]]
 
 

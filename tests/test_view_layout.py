@@ -77,7 +77,7 @@ def test_a_colour_means_one_thing(built):
             own = [s for s in IMAGE.streams if state == "stay" and entity.endswith(f"_{s}")]
             stream = own or [s for s in IMAGE.streams if s in state.split()]
             kind = stream[0] if stream else state.partition(" ")[0]
-            meaning[rgb].add("mixed" if kind in ("switches", "both", "switch") else kind)
+            meaning[rgb].add("mixed" if kind in ("several", "mixed", "switch") else kind)
         for rgb in parts.get("SeriesLines:colors", []):
             named = [s for s in IMAGE.streams if s in " ".join(parts["SeriesLines:names"])]
             told = entity.startswith(("/signals/", "/modules/"))  # a tab names its stream

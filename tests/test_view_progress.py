@@ -39,9 +39,9 @@ def shown(request, tmp_path_factory):
 def test_each_stream_has_a_lane_that_says_what_became_of_it(shown):
     _, _, view = shown
     told = {
-        1: [(0, "learning"), (10, "learned")],
-        2: [(0, "learning"), (10, "known by 1"), (22, "known by 2")],
-        3: [(0, "learning"), (10, "given up"), (25, "learning")],
+        1: [(0, "not decided"), (10, "learned")],
+        2: [(0, "not decided"), (10, "explained by module 1"), (22, "explained by module 2")],
+        3: [(0, "not decided"), (10, "rejected"), (25, "not decided")],
     }
     for place, changes in told.items():
         (entity,) = [e for e in view.rows if e.startswith(f"/state/{place}_")]
@@ -72,7 +72,7 @@ def test_nothing_is_there_that_the_run_does_not_tell(shown):
     names = shown[-1].names
     of_2_0 = ("/policy/", "/gate/", "/decision/R", "/decision/Q", "/decision/adv", "/abstraction/d")
     of_2_0 += tuple(f"/signals/{name}" for name in (*UNTOLD, "R"))
-    of_2_0 += ("/learns", "/novelty", "/mostly/novelty", "/does", "/explores", "/abstraction/s")
+    of_2_0 += ("/candidate", "/novelty", "/action", "/action_choice", "/abstraction/s")
     assert [n for n in names if n.startswith(of_2_0)] == []
     assert {"/signals/learning_error", "/signals/state", "/signals/band_mean/1"} <= names
 

@@ -14,7 +14,7 @@ from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.config import section_table
-from cdmisfa.core.signals import STATES
+from cdmisfa.core.signals import STATE_WORDS
 from recorder.log.scenery import scenery_of, turned
 from recorder.mcap.reader import LogReader
 from recorder.world.icub.config import IcubConfig
@@ -101,7 +101,7 @@ def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
         followed = scalars(view.rows[f"/learned/{number}/followed"])[:, 0]
         assert len(followed) == len(records) * TAU
         r = f"{np.corrcoef(followed[t], y)[0, 1]:.2f}"
-        titles = [name for name in view.titles() if name.startswith(f"Module {number} on")]
+        titles = [name for name in view.titles() if name.startswith(f"Module {number} (")]
         assert len(titles) == 1
         assert r in titles[0]
 
@@ -127,7 +127,7 @@ def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
             state = said.get(record.t, state)
             if algorithm == "progress":
                 code = record.state[s]
-                word = f": {STATES[code].replace('_', ' ')}" if code >= 0 else ""
+                word = f": {STATE_WORDS[code]}" if code >= 0 else ""
                 assert state == f"{name}{word}"
         saves = [r.module for r in own if r.saved]
         if algorithm == "2.0":

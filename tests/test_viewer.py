@@ -34,7 +34,7 @@ ITERATIONS = 24
 def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
     """Opens the view, scrubs to two frames, and looks at the pixels."""
     write_run(tmp_path / "run.mcap", IMAGE, ITERATIONS)
-    build_view(tmp_path, tmp_path / "run.rrd", tab="Abstraction")
+    build_view(tmp_path, tmp_path / "run.rrd", tab="Candidate")
     blocks = [block for _, block in run_of(IMAGE, ITERATIONS)]
     with shown(tmp_path / "run.rrd") as ask:
         views = {view.name: view for view in ask(all_views)}
@@ -42,16 +42,28 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
         for block in (blocks[3], next(b for b in blocks if b.stream != blocks[3].stream)):
             ask(lambda client, t=block.t: client.set_time("frame", sequence=t) or True)
             grey = int(block.frames[0].min())
-            view = views["Input x"].view_id
+            view = views["Current frame x"].view_id
             ask(lambda client, v=view, g=grey: shows(client, v, g))
 
 
 NAMED = {
-    "2.0": (6, 28, ("Policy in each stream", "What was done: the last 50 blocks", "Events")),
+    "2.0": (
+        6,
+        28,
+        (
+            "Policy in each stream",
+            "Attended stream, action, and whether the action was random, last 50 blocks",
+            "Events",
+        ),
+    ),
     "progress": (
         4,
         22,
-        ("What it mostly attends to", "Output y on new frames, from least to most", "Events"),
+        (
+            "Attended stream",
+            "Variance of each output on new frames (1 on training frames)",
+            "Events",
+        ),
     ),
 }
 
@@ -86,7 +98,7 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(
         views = ask(all_views)
         assert len(views) > n_views
         for name in some:
-            (view,) = [v for v in views if v.name == name]
+            view = next(v for v in views if v.name == name)
             ask(lambda client, v=view: client.take_screenshot(v.view_id))
         state = ask(lambda client: client.get_state())
         assert [(v.name, v.reports) for v in state.views if v.reports] == []
@@ -94,7 +106,7 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(
 
 def all_views(client):
     state = client.get_state()
-    found = [view for view in state.views if view.name in ("Summary", "Input x")]
+    found = [view for view in state.views if view.name in ("Results", "Current frame x")]
     return state.views if found and not state.loading else None
 
 
@@ -116,7 +128,7 @@ def test_a_screenshot_shows_a_tab_at_a_moment(tmp_path, monkeypatch, cdmisfa: Cd
 
     monkeypatch.setattr(viewer, "is_painted", look)
     words = ("view", tmp_path, "--screenshot", tmp_path / "s.png")
-    assert cdmisfa(*words, "--at", "iteration 5", "--tab", "gate").code == 0
+    assert cdmisfa(*words, "--at", "iteration 5", "--tab", "novelty").code == 0
     with Image.open(tmp_path / "s.png") as picture:
         assert picture.size in ((800, 500), (1600, 1000))
         assert len(np.unique(np.asarray(picture.convert("L")))) > 20
@@ -126,7 +138,7 @@ def test_a_screenshot_shows_a_tab_at_a_moment(tmp_path, monkeypatch, cdmisfa: Cd
     ]
     tabs = max(kinds, key=lambda part: len(part["contents"]) * (part["container_kind"] == "Tabs"))
     opened = blueprint[f"/{tabs['active_tab']}"]["ContainerBlueprint"]["display_name"]
-    assert (state.recordings[0].current_time, opened) == (records[5].t, "Gate")
+    assert (state.recordings[0].current_time, opened) == (records[5].t, "Novelty")
     assert "--force" in cdmisfa(*words).err
 
 

@@ -30,6 +30,9 @@ Show = Literal["line", "lane", "heat", "text", "hidden"]
 ACTIONS = ("stay", "switch")
 STATES = ("learning", "learned", "known", "given_up")
 
+# Words of the states for people; `STATES` are the stored ones.
+STATE_WORDS = ("not decided", "learned", "explained", "rejected")
+
 # Code of a stream's state where the learner has none.
 NO_STATE = -1
 

@@ -83,6 +83,7 @@ class Plot:
         rows: names at its left, each with its CSS class; a plot without them has `ticks` there.
         frames: key of the frames that are shown where the reader points; "" without any.
         most: ticks across.
+        x_label: name and unit of the horizontal axis.
     """
 
     about: str
@@ -91,6 +92,7 @@ class Plot:
     rows: list[tuple[str, str]] = field(default_factory=list)
     frames: str = ""
     most: int = 8
+    x_label: str = "frame"
     shapes: list[Markup] = field(default_factory=list)
     labels: list[Text] = field(default_factory=list)
     ticks: list[Text] = field(default_factory=list)

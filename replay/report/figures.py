@@ -69,7 +69,7 @@ def timeline(outline: Outline, frames: str = "") -> Plot:
     blocks, streams = outline.blocks, outline.streams(STREAMS)
     row_of = {s: k for k, s in enumerate(streams)}
     plot = _over_run(
-        outline, "Watched streams and saves over the frames of the run",
+        outline, "Attended streams and saved modules over the frames of the run",
         Axis(0, ROW * len(streams), ROW * len(streams)), frames,
     )  # fmt: skip
     plot.rows = [(outline.names()[s], colour_class(s)) for s in streams]
@@ -131,7 +131,7 @@ def output_plot(run: RunData, module: ModuleData, saved: int, frames: str) -> Pl
     """Draw a module's first output on its stream over the run, before and after its save."""
     t, y, _ = module.outputs.columns
     plot = _over_run(
-        run.outline, f"Output of module {module.frozen.index} on its own stream",
+        run.outline, f"Output 1 of module {module.frozen.index} over the frames of the run",
         Axis(*value_range(y[:, 0]), TALL, upward=True), frames,
     )  # fmt: skip
     plot.boxes("after", saved, run.outline.end)
@@ -175,6 +175,7 @@ def truth_plot(module: ModuleData, fit: Fit) -> Plot:
         Axis(*value_range(value), WIDE),
         Axis(*value_range(output), TALL, upward=True),
         most=4,
+        x_label="",  # the caption names the quantity
     )
     plot.grid(4, "+g")
     plot.dots(f"faint {colour_class(module.frozen.stream_index)}", value, output)
@@ -221,7 +222,7 @@ def curves(name: str, outlines: Sequence[Outline], about: str, *, log: bool) -> 
         return None
     low, high = value_range(np.concatenate([values for *_, values in lines]), log=log)
     across = Axis(0, max(int(at[-1]) + 1 for _, at, _ in lines), WIDE)
-    plot = Plot(about, across, Axis(low, high, TALL, log, upward=True))
+    plot = Plot(about, across, Axis(low, high, TALL, log, upward=True), x_label="iteration")
     plot.grid(5)
     for k, at, values in lines:
         plot.curve(colour_class(k), at, values)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.signals import SIGNALS, STATES
+from cdmisfa.core.signals import SIGNALS, STATE_WORDS
 from replay.runs.run import Outline, Save, rules_of
 
 # The progress learner's constants: replay must not import `cdmisfa/agents/progress/decisions.py`,
@@ -102,7 +102,7 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
     frames, settled = header.number("test_frames"), header.number("settled")
     window = None if frames is None else max(frames / max(outline.tau, 1), 1.0)
     was_tested = np.isfinite(tested)
-    exact = {"regret": was_tested & ~(regret > IMPROVEMENT_ONGOING)}
+    exact = {"improvement": was_tested & ~(regret > IMPROVEMENT_ONGOING)}
     with np.errstate(divide="ignore", invalid="ignore"):
         disagreement = np.abs(np.log(tested / fitted))
         gain, flatness = tested / typical, fitted / typical
@@ -117,16 +117,19 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
     variance = lines["variance"].reshape(outline.iterations, -1)[:, 0]
     rows: list[tuple[str, str, NDArray[Any], float | None, float | None]] = [
         ("error", "Learning error: change + disagreement", lines["learning_error"], None, None),
-        ("change", "Change of the outputs with a block; the limit is lower after few tests, and "
-         "higher without recent gain", change, None, settled),
-        ("disagreement", "Disagreement |ln(tested / fitted)| of the slowness on new and old frames",
+        ("change", "Change of the outputs by one block; the limit is lower after few tests, and "
+         "higher without recent improvement", change, None, settled),
+        ("disagreement", "Disagreement |ln(slowness on new frames / slowness on training frames)|",
          disagreement, None, header.number("agreement")),
-        ("variance", "Variance of the slowest output on new frames", variance, *VARIANCE_BOUNDS),
-        ("slow", "Slowness on new frames / typical slowness", gain, None, header.number("slow")),
-        ("slow before", "Slowness on old frames / typical slowness", flatness, None,
-         FITTED_RATIO_SLOW),
-        ("regret", "Regret: log of the recent gain in slowness", regret, None, IMPROVEMENT_ONGOING),
-        ("tests", "Tested blocks", tests, window, None),
+        ("variance", "Variance of output 1 on new frames (1 on training frames)",
+         variance, *VARIANCE_BOUNDS),
+        ("slow, new frames", "Slowness on new frames / typical slowness of the stream",
+         gain, None, header.number("slow")),
+        ("slow, training frames", "Slowness on training frames / typical slowness of the stream",
+         flatness, None, FITTED_RATIO_SLOW),
+        ("improvement", "Improvement: ln(slowness of an earlier candidate / slowness now)",
+         regret, None, IMPROVEMENT_ONGOING),
+        ("tests", "Number of tested blocks", tests, window, None),
     ]  # fmt: skip
     return [
         Measurement(
@@ -189,7 +192,7 @@ def attempts(outline: Outline, rules: list[Measurement]) -> list[Attempt]:
             tuple(float(rule.holds[blocks].mean()) for rule in deciding),
             int(together[blocks].sum()),
             save,
-            STATES[state].replace("_", " ") if state > 0 else "",
+            STATE_WORDS[state] if state > 0 else "",
         )
         for name, blocks, save, state in groups
         if blocks.any()

@@ -1,5 +1,5 @@
 "use strict";
-// Shows the frame that belongs to the place of a plot at which one points, or goes by keys.
+// Shows the frame at the position of a plot that the pointer or the arrow keys select.
 const frames = JSON.parse(document.getElementById("frames").textContent);
 
 function nearest(places, x) {
@@ -10,28 +10,28 @@ function nearest(places, x) {
 }
 
 for (const plot of document.querySelectorAll("[data-frames]")) {
-  const shown = frames[plot.dataset.frames];
+  const images = frames[plot.dataset.frames];
   const area = plot.querySelector(".area"), tip = plot.querySelector(".tip");
   const cursor = plot.querySelector(".cursor"), canvas = tip.querySelector("canvas");
-  const said = tip.querySelector("span"), picture = new Image();
+  const caption = tip.querySelector("span"), sheet = new Image();
   let at = -1;
-  if (shown.source) picture.src = shown.source;
+  if (images.source) sheet.src = images.source;
   else canvas.remove();
 
   function show(i) {
     at = i;
-    const box = area.getBoundingClientRect(), x = shown.x[i] / 1000 * box.width;
+    const box = area.getBoundingClientRect(), x = images.x[i] / 1000 * box.width;
     plot.setAttribute("aria-valuenow", String(i + 1));
-    plot.setAttribute("aria-valuetext", shown.text[i]);
-    said.textContent = shown.text[i];
-    if (shown.source) {
-      const zoom = Math.max(1, Math.round(192 / shown.width));
-      canvas.width = shown.width * zoom;
-      canvas.height = shown.height * zoom;
+    plot.setAttribute("aria-valuetext", images.text[i]);
+    caption.textContent = images.text[i];
+    if (images.source) {
+      const zoom = Math.max(1, Math.round(192 / images.width));
+      canvas.width = images.width * zoom;
+      canvas.height = images.height * zoom;
       const pen = canvas.getContext("2d");
       pen.imageSmoothingEnabled = false;
-      pen.drawImage(picture, i % shown.columns * shown.width,
-        Math.floor(i / shown.columns) * shown.height, shown.width, shown.height,
+      pen.drawImage(sheet, i % images.columns * images.width,
+        Math.floor(i / images.columns) * images.height, images.width, images.height,
         0, 0, canvas.width, canvas.height);
     }
     tip.style.display = cursor.style.display = "block";
@@ -43,18 +43,18 @@ for (const plot of document.querySelectorAll("[data-frames]")) {
   function hide() {
     tip.style.display = cursor.style.display = "none";
   }
-  function pointed(event) {
+  function showAtPointer(event) {
     const box = area.getBoundingClientRect();
-    show(nearest(shown.x, (event.clientX - box.left) / box.width * 1000));
+    show(nearest(images.x, (event.clientX - box.left) / box.width * 1000));
   }
-  picture.addEventListener("load", () => { if (tip.style.display === "block") show(at); });
-  area.addEventListener("pointermove", pointed);
-  area.addEventListener("pointerdown", pointed);
+  sheet.addEventListener("load", () => { if (tip.style.display === "block") show(at); });
+  area.addEventListener("pointermove", showAtPointer);
+  area.addEventListener("pointerdown", showAtPointer);
   area.addEventListener("pointerleave", () => { if (document.activeElement !== plot) hide(); });
   plot.addEventListener("focus", () => show(Math.max(at, 0)));
   plot.addEventListener("blur", hide);
   plot.addEventListener("keydown", event => {
-    const last = shown.x.length - 1;
+    const last = images.x.length - 1;
     const to = {
       ArrowRight: at + 1, ArrowUp: at + 1, ArrowLeft: at - 1, ArrowDown: at - 1,
       Home: 0, End: last,

@@ -27,15 +27,15 @@ FRAMES = (192, 96, 48, 24, 12)
 
 # Signals that the page of several runs draws over each other.
 CURVES = {
-    "learning_error": "Learning error of the watched stream",
-    "eta_dot": "Change of slowness |η̇| of the first output",
-    "tested": "Slowness of the watched stream on new frames",
-    "share": "Share of recent blocks that are novel and of the same stream",
+    "learning_error": "Learning error of the attended stream",
+    "eta_dot": "Change of slowness |η̇| of output 1 [cycles/frame]",
+    "tested": "Slowness of the attended stream on new frames [cycles/frame]",
+    "share": "Share of recent blocks that are novel and of one stream",
     "epsilon": "Probability of a random action ε",
 }
 
 
-def report_of_run(path: Path, reproducible: str = "not examined", again: str = "") -> str:
+def report_of_run(path: Path, reproducible: str = "not checked", again: str = "") -> str:
     """Return the page of a run.
 
     Args:
@@ -70,8 +70,8 @@ def report_of_runs(paths: Sequence[Path], title: str) -> str:
         {
             "kind": "runs",
             "title": title,
-            "lead": f"{len(rows)} runs; identical to the first, bit for bit: "
-            f"{sum(row.difference is None for row in rows[1:])} of {len(rows) - 1}",
+            "lead": f"{len(rows)} runs; {sum(row.difference is None for row in rows[1:])} of "
+            f"{len(rows) - 1} have the same signals as the first, bit for bit",
             "rows": [(colour_class(place), *row.cells()) for place, row in enumerate(rows)],
             "explained": [line for row in rows for line in row.explanation().splitlines()],
             "curves": [plot for plot in plots if plot is not None],

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.core.signals import STATES
+from cdmisfa.core.signals import STATE_WORDS, STATES
 from replay.palette import shade
 from replay.report.data import ModuleData, RunData
 from replay.report.figures import (
@@ -77,7 +77,7 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         "open_cards": OPEN_CARDS,
         "timeline": lanes,
         "states": [
-            (f"state{code}", STATES[code].replace("_", " "))
+            (f"state{code}", STATE_WORDS[code])
             for code in np.unique(outline.changes[:, 2]).tolist()
             if code >= 0
         ],
@@ -115,7 +115,7 @@ def _watched_texts(run: RunData, rules: Sequence[Measurement], t: Any) -> list[s
     for frame, row in zip(t.tolist(), blocks.places(t).tolist(), strict=True):
         text = f"frame {frame:,}, iteration {blocks.iterations[row]:,}: "
         text += run.spec.streams[blocks.streams[row]]
-        for word, truth in (("held", True), ("not", False)):
+        for word, truth in (("rules that hold", True), ("not", False)):
             if names := [name for name, holds in deciding if holds[row] == truth]:
                 text += f"; {word}: {', '.join(names)}"
         texts.append(text)
@@ -138,9 +138,10 @@ def _cards(run: RunData) -> list[dict[str, Any]]:
     for place, s in enumerate(streams):
         name, code = run.spec.streams[s], outline.states[s]
         outcome = outcomes.get(name, {})
-        state = STATES[code] if code >= 0 else "learned" if s in learned else "not_learned"
+        state = STATES[code] if code >= 0 else "learned" if s in learned else ""
+        words = STATE_WORDS[code] if code >= 0 else state or "not learned"
         notes = [
-            f"module {save.module}, slowness {save.eta[0]:.4f}"
+            f"module {save.module}, slowness {save.eta[0]:.4f} cycles/frame"
             for save in outline.saved
             if save.stream == s
         ]
@@ -152,7 +153,7 @@ def _cards(run: RunData) -> list[dict[str, Any]]:
         if last is not None and run.spec.images:
             image = data_uri(reduced(last, THUMBNAIL))
         elif last is not None:
-            plot = numbers_plot(last, f"The last {len(last)} frames of {name}")
+            plot = numbers_plot(last, f"Last {len(last)} frames of {name}")
         cards.append(
             {
                 "name": name,
@@ -160,6 +161,7 @@ def _cards(run: RunData) -> list[dict[str, Any]]:
                 "image": image,
                 "plot": plot,
                 "state": state,
+                "words": words,
                 "notes": "; ".join(notes),
                 "frames": int(outline.visits[s]),
                 "share": int(outline.visits[s]) / max(outline.frames, 1),
@@ -187,6 +189,7 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
         ),
         "after": 0,
         "plot": None,
+        "quantity": run.spec.truth[fits[0].column] if fits else "",
         "truth": truth_plot(module, fits[0]) if fits else None,
         "recent": recent_plots(module),
         "view": command("view", run.path, "--at", f"iteration {frozen.iteration}"),
@@ -236,8 +239,8 @@ def _weights(module: ModuleData, *, images: bool) -> dict[str, Any]:
             "weights": data_uri(shade(reduced(weights, WEIGHTS))),
             "saliency": saliency_image(saliency, stream.mean) if stream.count else "",
         }
-    kind = "expanded inputs" if weights is None else "numbers of a frame"
-    about = f"Weights of module {frozen.index} on {frozen.phi.shape[1]} {kind}"
+    kind = "expanded inputs" if weights is None else "values of a frame"
+    about = f"Weights of output 1 of module {frozen.index} on the {frozen.phi.shape[1]} {kind}"
     return {"bars": bars(frozen.phi[0], about), "weights": "", "saliency": ""}
 
 
@@ -250,7 +253,7 @@ def _origin(run: RunData, again: str) -> list[tuple[str, Any]]:
     fork = manifest.get("fork")
     if isinstance(fork, Mapping):
         parent = os.path.normpath(run.path / str(fork.get("parent")))
-        rows.append(("compare with its parent", command("compare", parent, run.path)))
+        rows.append(("compare with the parent run", command("compare", parent, run.path)))
     rows += [
         ("algorithm", run.header.setting("learner", "algorithm")),
         ("seed", manifest.get("seed")),
@@ -270,15 +273,15 @@ def _origin(run: RunData, again: str) -> list[tuple[str, Any]]:
         rows.append(("further files", f"{len(files) - MOST_FILES:,}, listed in run.json"))
     jumps = np.diff(run.outline.blocks.starts) - run.outline.tau
     if (gaps := jumps[jumps > 0]).size:
-        rows.append(("gaps", f"{len(gaps)}, {int(gaps.sum()):,} frames that a stream lacks"))
+        rows.append(("gaps", f"{len(gaps)} gaps, {int(gaps.sum()):,} missing frames"))
     alignment = source.get("alignment")
     for name, counts in alignment.items() if isinstance(alignment, Mapping) else ():
         rows.append((f"messages of {name}", _pairs(counts)))
     return [
         *rows,
         ("SHA-256 of the signals", run.result.get("signals_sha256")),
-        ("arithmetic", f"version {run.header.arithmetic}"),
-        ("versions", _pairs(document.get("versions"))),
+        ("version of the arithmetic", run.header.arithmetic),
+        ("versions of packages", _pairs(document.get("versions"))),
         ("machine", _pairs(document.get("platform"))),
     ]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.learning import ARITHMETIC
-from cdmisfa.core.signals import SIGNALS, STATES
+from cdmisfa.core.signals import SIGNALS, STATE_WORDS
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import read_columns, read_header
@@ -192,7 +192,7 @@ def outcome(outline: Outline, *, timed: bool = False) -> dict[str, str]:
             if save.stream == s
         ]
         state = outline.states[s]
-        without = "no module" if state < 0 else STATES[state].replace("_", " ")
+        without = "no module" if state < 0 else STATE_WORDS[state]
         outcomes[name] = ", ".join(modules) or without
     return {**outcomes, ITERATIONS: str(outline.iterations)} if timed else outcomes
 
@@ -210,10 +210,10 @@ def differing_outcomes(first: Outline, second: Outline) -> tuple[tuple[str, str,
 def verdict(first: Outline, second: Outline) -> str:
     """Return a phrase that says whether two runs learned the same."""
     if outcome(first) != outcome(second):
-        return "what was learned differs"
+        return "different results"
     if differing_outcomes(first, second):
-        return "the same was learned, at other iterations"
-    return "the same was learned, at the same iterations"
+        return "same results, at other iterations"
+    return "same results, at the same iterations"
 
 
 @dataclass(frozen=True, slots=True)

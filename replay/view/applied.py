@@ -73,11 +73,19 @@ class ViewSink:
         entity, end = f"/{view_entities(self._spec)[s]}", self._end
         column = rrb.Vertical(
             images(entity, name) if self._spec.images else curve_view(name, [entity], end),
-            curve_view("Novelty of blocks: known below 1", [f"/novelty/{stream}"], end),
-            curve_view("Slowness of first outputs [1/frame]", [f"/slowness/{stream}"], end),
+            curve_view(
+                "Novelty of each block (a module explains the block below 1)",
+                [f"/novelty/{stream}"],
+                end,
+            ),
+            curve_view(
+                "Slowness of output 1 of each module [cycles/frame]", [f"/slowness/{stream}"], end
+            ),
         )
         outputs = [
-            curve_view(f"Module {m.index}: outputs", [f"/outputs/{stream}/{m.index}"], near=NEAR)
+            curve_view(
+                f"Outputs of module {m.index} [SD]", [f"/outputs/{stream}/{m.index}"], near=NEAR
+            )
             for m, _ in self._modules
         ]
         return rrb.Horizontal(column, rrb.Vertical(*outputs), column_shares=[2, 3], name=name)

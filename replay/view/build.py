@@ -239,6 +239,6 @@ def recording_layout(
     if has_scene:
         column = rrb.Vertical(*(images(f"/{entity}", name) for entity, name in places))
         tabs.append(rrb.Horizontal(scene(), column, column_shares=[5, 2], name="World"))
-    below = [curve_view("What the world knows", ["/world/truth"], end)] if spec.truth else []
+    below = [curve_view("Ground truth", ["/world/truth"], end)] if spec.truth else []
     tabs.append(rrb.Vertical(views, *below, name="Views"))
     return blueprint(*tabs, name="Recording", length=end, tab=tab)

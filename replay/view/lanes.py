@@ -1,9 +1,9 @@
 """Lanes: labelled bars of colour, one for each state of a run.
 
-A lane's label is its entity, and the viewer sorts lanes by the alphabet, which decides their names.
-A state that changes with many blocks has two lanes: `/attends` holds every change, and
-`/mostly/attends` the state of most of the blocks around, which can be read when all of a run is in
-view.
+The viewer labels a lane with its entity and sorts lanes by these labels.
+A state that changes often has two lanes: `/attended/each_block` has every change, and
+`/attended/most_blocks` has the state of most of the surrounding blocks, which is readable when the
+whole run is visible.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import rerun as rr
 
 from cdmisfa.core.arrays import IntArray
-from cdmisfa.core.signals import ACTIONS, STATES
+from cdmisfa.core.signals import ACTIONS, STATE_WORDS, STATES
 from replay import palette
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
@@ -59,23 +59,25 @@ class Lanes:
         self._lanes: list[tuple[Codes, Lane]] = []
 
         def lane(path: str, codes: Codes, states: States, mixed: str = "") -> None:
-            self._lanes.append((codes, Lane(rows, path, states)))
+            entity = f"{path}/each_block" if mixed else path
+            self._lanes.append((codes, Lane(rows, entity, states)))
             if mixed:
-                self._lanes.append((codes, Lane(rows, f"mostly/{path}", states, piece, mixed)))
+                entity = f"{path}/most_blocks"
+                self._lanes.append((codes, Lane(rows, entity, states, piece, mixed)))
 
         attended = {s: (name, colour(s)) for s, name in enumerate(names)}
-        lane("attends", lambda c: c["stream"], attended.__getitem__, "switches")
+        lane("attended", lambda c: c["stream"], attended.__getitem__, "several")
         if by_progress:
             for s in selected:
                 lane(f"state/{part(streams, s)}", partial(self._states, s), _state)
             return
         done = {s: (f"{stay} on {name}", colour(s)) for s, name in enumerate(names)}
         done |= {count + s: (switch, palette.GREY) for s in range(count)}
-        explored = {0: ("greedy", palette.MOSS), 1: ("explored", palette.ROSE)}
-        lane("learns", lambda c: c["module"], _learned)
-        lane("novelty", _verdicts, _verdict, "both")
-        lane("does", lambda c: c["stream"] + count * c["action"], done.__getitem__)
-        lane("explores", lambda c: c["explored"], explored.__getitem__)
+        explored = {0: ("best known", palette.MOSS), 1: ("random", palette.ROSE)}
+        lane("candidate", lambda c: c["module"], _learned)
+        lane("novelty", _verdicts, _verdict, "mixed")
+        lane("action", lambda c: c["stream"] + count * c["action"], done.__getitem__)
+        lane("action_choice", lambda c: c["explored"], explored.__getitem__)
         for s in selected:
             planned = {0: (stay, colour(s)), 1: (switch, palette.GREY)}
             codes = partial(lambda s, c: c["policy"][:, s], s)
@@ -199,12 +201,13 @@ def _verdicts(columns: SignalColumns) -> IntArray:
 def _verdict(code: int) -> tuple[str, Rgb]:
     if code == _NOVEL:
         return "novel", palette.LILAC
-    return (f"known by {code}", palette.MIST) if code else ("constant", palette.BROWN)
+    return (f"explained by module {code}", palette.MIST) if code else ("constant", palette.BROWN)
 
 
 def _state(code: int) -> tuple[str, Rgb]:
     """Return the name of a stream's state in `STATES`; beyond are the modules that know it."""
     if code >= len(STATES):
         module = code - len(STATES)
-        return f"known by {module}" if module else "known", palette.STATES[_KNOWN]
-    return STATES[code].replace("_", " "), palette.STATES[code]
+        text = STATE_WORDS[_KNOWN]
+        return f"{text} by module {module}" if module else text, palette.STATES[_KNOWN]
+    return STATE_WORDS[code], palette.STATES[code]

@@ -163,7 +163,7 @@ def curve_view(
     return rrb.TimeSeriesView(
         origin="/",
         contents=[*entities],
-        name=f"{name}: the last {near} frames" if near else name,
+        name=f"{name}, last {near} frames" if near else name,
         axis_x=axis,
         axis_y=None if span is None else rrb.ScalarAxis(range=span),
         plot_legend=rrb.PlotLegend(corner, visible=legend),
@@ -199,7 +199,7 @@ def images(origin: str, name: str, bounds: tuple[Span, Span] | None = None) -> r
 
 def scene() -> rrb.View:
     """Return the world in 3D, seen from in front of the robot."""
-    name, hidden = "The world, and where it looks", rrb.LineGrid3D(visible=False)
+    name, hidden = "World and attended view", rrb.LineGrid3D(visible=False)
     eye = rrb.EyeControls3D(
         position=(-1.5, -0.85, 0.72), look_target=(-0.38, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
     )

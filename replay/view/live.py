@@ -77,7 +77,7 @@ class LiveView(Sink):
         self.address = str(sink.uri)
         self._recording.send_recording_name("live")
         self._rows = rows = Rows(self._recording, spec)
-        rows.log("summary", rr.TextDocument("The run is still learning."))
+        rows.log("summary", rr.TextDocument("The run has not finished: results follow at its end."))
         streams = empty.streams(MOST_STREAMS)
         self._view = RunView(rows, header, streams, run or Path(), every=EVERY_FRAMES, piece=PIECE)
         has_scene = isinstance(self._view.world, SceneView)

@@ -169,7 +169,9 @@ class ModulesView:
             except UsageError as error:
                 del self._known[number]
                 self._first.pop(number, None)
-                self._notes.append(f"module {number} says nothing of these frames: {error}")
+                self._notes.append(
+                    f"module {number} cannot be applied to the logged frames: {error}"
+                )
 
     def finish(self, outline: Outline) -> list[str]:
         """Write weights and frames of the modules that are known.
@@ -250,12 +252,12 @@ class ModulesView:
                 continue
             s, root = self._known[number].module.stream_index, f"learned/{number}"
             stream, line = spec.streams[s], best(values[:, best.column])[:, None]
-            name, where = f"{best.function}, fitted to it", outline.blocks.iteration(t)
+            name, where = f"{best.function}, fitted", outline.blocks.iteration(t)
             self._rows.lines(f"{root}/followed", [name], at, line, [GREY], width=BROAD, gap=1)
             name, rgbs = f"module {number} on {stream}", [colour(s)]
             self._rows.lines(f"{root}/output", [name], (t, where), y[:, None], rgbs, gap=1)
-            words = f"{drawable(best.function)} (grey, |r| = {best.r:.2f})"
-            title = f"Module {number} on {drawable(stream)} has learned {words}"
+            function, r = drawable(best.function), f"|r| = {best.r:.2f}"
+            title = f"Module {number} ({drawable(stream)}) follows {function} (grey), {r}"
             entities = f"/{root}/followed", f"/{root}/output"
             panels.append(Panel(title, entities, "near", fit=True, legend=False))
         self._rows.flush()

@@ -20,12 +20,12 @@ from replay.view.summary import text_table
 
 # Signals that are overlaid where a run has them, with the titles of their panels.
 CURVES = {
-    "eta_dot": "Change of slowness η̇, as powers of ten: a module is saved when it is below δ",
-    "epsilon": "Exploration ε",
-    "eta": "Slowness η [1/frame]",
+    "eta_dot": "Change of slowness η̇, log10 of [cycles/frame]: a module is saved only below δ",
+    "epsilon": "Exploration: probability ε of a random action",
+    "eta": "Slowness η [cycles/frame]",
     "reward": "Reward",
-    "share": "Share of novel blocks",
-    "tested": "Slowness on new frames, of the stream that is watched [1/frame]",
+    "share": "Share of recent blocks that are novel",
+    "tested": "Slowness of the attended stream on new frames [cycles/frame]",
 }
 
 # The signal that is overlaid stream by stream.

@@ -76,8 +76,8 @@ class RunLayout:
         self._rows, self._spec, self._has_scene = rows, outline.header.spec, has_scene
         keys = ("roc_error", "delta", "novel_share", "min_variance")
         self._facts = {key: f"{self._header.number(key) or 0.0:g}" for key in keys}
-        self._facts["colours"] = " (blue below 0, orange above)" if self._spec.images else ""
-        self._facts["kept"] = f", every {PHI_EVERY} blocks" if outline.iterations else ""
+        self._facts["colours"] = " (blue < 0, orange > 0)" if self._spec.images else ""
+        self._facts["interval"] = f", every {PHI_EVERY} blocks" if outline.iterations else ""
 
     def tab(self, tab: Tab) -> rrb.Container:
         """Return a tab of a table."""
@@ -120,7 +120,7 @@ class RunLayout:
         if panel.kind == "lanes":
             return [layouts.lanes(title, panel.entities, self._end)]
         if panel.kind == "near lanes":
-            title = f"{title}: the last {layouts.NEAR_BLOCKS} blocks"
+            title = f"{title}, last {layouts.NEAR_BLOCKS} blocks"
             blocks = layouts.NEAR_BLOCKS * max(self._outline.tau, 1)
             return [layouts.lanes(title, panel.entities, near=blocks, room=False)]
         if panel.kind == "summary":
@@ -167,13 +167,13 @@ class RunLayout:
 
     def world(self, followed: Sequence[Panel]) -> rrb.Container:
         """Return the world, what the learner sees and learned of it, and what happened."""
-        summary = rrb.TextDocumentView(origin="/summary", name="What came of it")
-        words = rrb.Tabs(summary, layouts.events("What happened when"))
+        summary = rrb.TextDocumentView(origin="/summary", name="Results")
+        words = rrb.Tabs(summary, layouts.events("Events"))
         if self._has_scene:
-            right = rrb.Vertical(self._input("What it sees now"), words, row_shares=[2, 4])
+            right = rrb.Vertical(self._input("Current frame"), words, row_shares=[2, 4])
             above = rrb.Horizontal(layouts.scene(), right, column_shares=[5, 3])
         else:
-            above = rrb.Horizontal(self._streams("What it sees"), words, column_shares=[5, 3])
+            above = rrb.Horizontal(self._streams("Current frame"), words, column_shares=[5, 3])
         plots: Views = [self._plot(panel, panel.title, panel.entities) for panel in followed]
         below = [beside(plots[i : i + 2]) for i in range(0, len(plots), 2)]
         return rrb.Vertical(above, *below, row_shares=[5, *(2 for _ in below)], name="World")
@@ -181,7 +181,7 @@ class RunLayout:
     def modules(self, sheets: Collection[int]) -> rrb.Container:
         """Return the modules, each on a page of its own; many share pages."""
         count = max(self._outline.modules, len(self._outline.saved))
-        truth = Panel("What the world knows", ("/world/truth",), "near")
+        truth = Panel("Ground truth", ("/world/truth",), "near")
         known: Views = [*(self._views(truth) if self._spec.truth else ()), layouts.events("Events")]
         if not count:
             return rrb.Vertical(*known, name="Modules")
@@ -200,19 +200,21 @@ class RunLayout:
         left, output = ([view] for view in self._module_views(i))
         name = f"Module {i}"
         if has_sheet:
-            title = "Frames of least, middle and greatest output 1, and its values"
+            title = "Frames with the least, middle and greatest output 1"
             width, height = sheet_size(*self._spec.frame_shape)
             left.append(images(f"/modules/{i}/sheet", title, bounds(3, height, width, columns=1)))
         for save in (save for save in self._outline.saved if save.module == i):
             name += f": {drawable(self._spec.streams[save.stream])}"
             blocks, saved = self._outline.blocks, save.t + self._outline.tau
             later = blocks.starts[(blocks.streams == save.stream) & (blocks.starts >= saved)]
-            ends = {"until it was saved": saved}
+            ends = {"before the save": saved}
             if len(later):
-                ends["of its stream"] = int(later[-1]) + self._outline.tau
+                ends["of the stream"] = int(later[-1]) + self._outline.tau
             entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
             windows: Views = [
-                curve_view(f"The last {NEAR} frames {words}", entities, end, start=end - NEAR)
+                curve_view(
+                    f"Output in the last {NEAR} frames {words}", entities, end, start=end - NEAR
+                )
                 for words, end in ends.items()
             ]
             output.append(beside(windows))
@@ -221,8 +223,8 @@ class RunLayout:
 
     def _module_views(self, i: int) -> Views:
         """Return a module's weights, and its output wherever its own stream was watched."""
-        colours = f"{self._facts['colours']}, each by its largest" if self._spec.images else ""
-        output = f"Output of module {i} wherever its own stream was watched"
+        colours = self._facts["colours"]
+        output = f"Output of module {i} [SD] while its stream was attended"
         return [
             self._weights(f"/modules/{i}/weights", f"Weights of module {i}{colours}"),
             curve_view(output, [f"/modules/{i}/output", f"/modules/{i}/saved"], self._end),
@@ -234,7 +236,7 @@ class RunLayout:
             return self._input(title)
         count = min(len(self._spec.streams), MOST_STREAMS)
         wall = bounds(count, *self._spec.frame_shape)
-        return images(f"/{WALL}", "What each stream showed last", wall)
+        return images(f"/{WALL}", "Latest attended frame of each stream", wall)
 
     def _input(self, name: str) -> rrb.View | rrb.Container:
         """Return the learner's input: an image with the name of its stream, or the last values."""
@@ -243,7 +245,7 @@ class RunLayout:
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
         values = curve_view(name, ["/world/watched"], near=NEAR)
-        whose = layouts.lanes("Of which stream", ["/attends"], near=NEAR)
+        whose = layouts.lanes("Attended stream", ["/attended/each_block"], near=NEAR)
         return rrb.Vertical(values, whose, row_shares=[3, 2])
 
     def _weights(self, path: str, name: str) -> rrb.View:

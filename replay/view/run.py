@@ -279,8 +279,7 @@ class SignalCurves:
             for signal in OF_STREAM if watched.any() else ():
                 values = power_of_ten(np.where(untested, np.nan, columns[signal][watched]))
                 rgbs = [faint(rgb) if signal == "fitted" else rgb]
-                names = [f"{SIGNALS[signal].symbol} {name}"]
-                yield Curve(f"streams/log_{signal}/{place}", names, values, rgbs, watched)
+                yield Curve(f"streams/log_{signal}/{place}", [name], values, rgbs, watched)
             interest = columns["interest"][:, s]
             values = np.where(interest < HARDLY_WATCHED, interest, np.nan)
             yield Curve(f"streams/interest/{place}", [name], values, [rgb])

@@ -60,7 +60,7 @@ BODY = "body"
 # Prefix of the meshes' names in the models.
 PACKAGE = "package://iCub/"
 
-PRESET = "the recording that it learned from is not where it was: the scene is that of its preset"
+PRESET = "the run's recording was not found: the 3D scene is that of its preset"
 
 
 def world_of_run(
@@ -168,7 +168,7 @@ class SceneView:
         try:
             self._joints = write_body(rows.recording, scenery.robot)
         except ImportError:
-            self.notes = ["the robot's body is not shown: `pip install icub-models` for it"]
+            self.notes = ["the robot's body is not shown: run `pip install icub-models`"]
         except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:
             self.notes = [f"the robot's body is not shown: {error}"]
 

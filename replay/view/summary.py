@@ -1,4 +1,4 @@
-"""A run in words, for the first page of its view."""
+"""The results of a run as Markdown, for the first tab of its view."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from cdmisfa.core.names import counted
-from cdmisfa.core.signals import ACTIONS, STATES
+from cdmisfa.core.signals import ACTIONS, STATE_WORDS, STATES
 from replay.runs.run import Outline
 from replay.view.rows import MOST_STREAMS
 
@@ -41,18 +41,21 @@ def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str
     ]
     lines += _of_streams(outline, events) if by_progress else _of_modules(outline)
     reasons = [text.removeprefix(ENDED).strip() for text in events if text.startswith(ENDED)]
-    lines += [f"It ended: {reason}.\n" for reason in reasons[-1:] if reason]
+    lines += [f"Stopped: {reason}.\n" for reason in reasons[-1:] if reason]
     if not by_progress:
         visits, frames = outline.visits, max(outline.frames, 1)
         shares = (
             (names[s], f"{visits[s]} frames, {visits[s] / frames:.0%}")
             for s in outline.streams(MOST_STREAMS)
         )
-        lines += text_table(("stream", "watched"), shares)
+        lines += text_table(("stream", "attended"), shares)
     settings = [("seed", header.manifest.get("seed"))]
     keys = SETTINGS["progress" if by_progress else "paper"]
     settings += [(key, header.setting("learner", key)) for key in keys]
-    lines += [", ".join(f"{key} {value}" for key, value in settings if value is not None), ""]
+    lines += [
+        "Settings: " + ", ".join(f"{key} {value}" for key, value in settings if value is not None),
+        "",
+    ]
     return "\n".join(lines)
 
 
@@ -63,13 +66,13 @@ def _of_modules(outline: Outline) -> list[str]:
         eta = ", ".join(f"{value:.4f}" for value in save.eta)
         policy = policy_text(save.policy, streams)
         rows.append((save.module, streams[save.stream], save.iteration, eta, policy))
-    head = "module", "stream", "iteration", "η [1/frame]", "policy"
+    head = "module", "stream", "iteration", "slowness [cycles/frame]", "policy"
     lines = text_table(head, rows) if rows else []
     if last is None or any(save.module == last.module for save in outline.saved):
         return lines
     most = int(last.novel_of.argmax())
     share = last.novel_of[most] / max(last.novel, 1)
-    of_most = f", and {share:.0%} of these were of {streams[most]}" if last.novel else ""
+    of_most = f"; {share:.0%} of the novel blocks came from {streams[most]}" if last.novel else ""
     unsaved = (
         f"Module {last.module} was not saved: {last.novel / last.blocks:.0%} of its "
         f"{last.blocks:,} blocks were novel{of_most}."
@@ -86,14 +89,14 @@ def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
             name = max(about, key=len)
             outcomes[name] = text.removeprefix(f"stream {name} ").removeprefix("is ")
     counts = Counter(outline.states)
-    states = [(counts[code], state.replace("_", " ")) for code, state in enumerate(STATES)]
+    states = [(counts[code], words) for code, words in enumerate(STATE_WORDS)]
     lines = [", ".join(f"{count} {state}" for count, state in states if count), ""]
     for s in outline.streams(MOST_STREAMS):
         learning = outline.states[s] == STATES.index("learning")
-        outcome = "being learned" if learning else outcomes.get(names[s], "")
+        outcome = STATE_WORDS[0] if learning else outcomes.get(names[s], "")
         lines.append(f"- **{names[s]}**: {outcome}")
     more = len(names) - MOST_STREAMS
-    return [*lines, "", *([f"And {more} streams that were watched less.", ""] if more > 0 else [])]
+    return [*lines, "", *([f"{more} more streams were attended less.", ""] if more > 0 else [])]
 
 
 def policy_text(policy: Sequence[int], streams: Sequence[str]) -> str:
@@ -102,10 +105,10 @@ def policy_text(policy: Sequence[int], streams: Sequence[str]) -> str:
         s for s, action in zip(streams, policy, strict=True) if action == ACTIONS.index("stay")
     ]
     if len(stays) == len(streams):
-        return "stay everywhere"
+        return "stay on every stream"
     if len(stays) > NAMED:
         return f"stay on {len(stays)} of {len(streams)} streams"
-    return f"stay on {', '.join(stays)}" if stays else "switch everywhere"
+    return f"stay on {', '.join(stays)}" if stays else "switch on every stream"
 
 
 def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from cdmisfa.core.signals import STATES
+from cdmisfa.core.signals import STATE_WORDS
 from replay.outputs import EACH
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
@@ -128,7 +128,7 @@ class WallView:
         if self._by_progress:
             codes = columns["state"][:, s]
             for i in changes(codes, codes[0] - 1).tolist():
-                state = STATES[codes[i]].replace("_", " ") if codes[i] >= 0 else ""
+                state = STATE_WORDS[codes[i]] if codes[i] >= 0 else ""
                 texts.append((i, f"{name}: {state}" if state else name))
         else:
             saves = np.flatnonzero(columns["saved"] & (columns["stream"] == s)).tolist()
