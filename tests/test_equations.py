@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = {
-    "docs/explanation/algorithm.md": [str(number) for number in range(1, 10)],
+    "docs/project/contributing.md": [str(number) for number in range(1, 10)],
     "docs/explanation/progress.md": [f"P{number}" for number in range(1, 5)],
 }
 """The page that explains equations, and their numbers: the paper's, and the progress learner's."""
