@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import fields
 from pathlib import Path
 
@@ -34,10 +35,46 @@ def test_options_stay_few() -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_each_command_and_option_has_a_help_text(name: str) -> None:
     command = command_of(name)
-    assert (command.name, (command.help or "").partition("\n")[0]) == (name, COMMANDS[name][1])
+    assert command.name == name
+    for text in (command.help, cli.help):
+        assert len((text or "").partition("\n")[0].split()) <= 12
     for option in options_of(name):
-        assert option.help, option.name
-        assert option.help.rstrip(")").endswith((".", "]")), option.help
+        assert (option.help or "").endswith((".", "]")), option.name
+
+
+def test_the_root_help_fits_on_one_screen(cdmisfa: Cdmisfa) -> None:
+    lines = cdmisfa("--help").out.splitlines()
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_ends_with_three_examples_that_the_command_takes(cdmisfa: Cdmisfa, name: str) -> None:
+    text = cdmisfa(name, "--help").out
+    assert max(map(len, text.splitlines())) <= 80
+    examples = text.partition("\nExamples:\n")[2].splitlines()
+    assert len(examples) == 3
+    assert examples[0].startswith(f"  cdmisfa {name}")
+    for example in examples:
+        program, other, *words = shlex.split(example)
+        command = command_of(other)
+        context = click.Context(command)
+        values, rest, _ = command.make_parser(context).parse_args(words)
+        assert (program, rest) == ("cdmisfa", [])
+        for param in command.params:
+            value = values.get(param.name or "")
+            assert isinstance(value, str | list | tuple) or not param.required, example
+            if isinstance(value, str | list):
+                param.type_cast_value(context, value)
+
+
+def test_help_says_what_each_argument_may_be(cdmisfa: Cdmisfa) -> None:
+    for name in COMMANDS:
+        text = cdmisfa(name, "--help").out
+        for param in command_of(name).params:
+            if isinstance(param, click.Argument) and name != "doctor":
+                argument = param.make_metavar(click.Context(cli)).strip("[].")
+                assert re.search(rf"^  {argument} is( one of)?:$", text, re.M), (name, argument)
 
 
 def test_every_setting_of_inputs_is_an_option_or_a_key() -> None:
@@ -92,7 +129,7 @@ def test_a_shell_completes_commands_options_choices_and_files(
         pairs = [found.split(",", 1) for found in cdmisfa().out.splitlines()]
         return [value if kind == "plain" else None for kind, value in pairs]
 
-    assert completed("") == list(COMMANDS)
+    assert completed("") == COMMANDS
     assert completed("lea") == ["learn"]
     assert completed("learn x --max-mod") == ["--max-modules"]
     for command in ("learn", "convert", "view", "info", "check", "apply"):

@@ -1,7 +1,7 @@
 """The `cdmisfa` command group: its table of commands, its help page, and its exit codes.
 
-`--help` imports no command: the module of a command is imported when the command runs, and imports
-the library inside the command, so that no help page waits for numpy, PyBullet or Rerun.
+Each command imports the library inside its function, so that no help page waits for numpy, PyBullet
+or Rerun.
 """
 
 from __future__ import annotations
@@ -23,47 +23,26 @@ from cdmisfa.cli.options import quiet
 from cdmisfa.cli.printing import Stderr, line
 from cdmisfa.core.errors import CdmisfaError
 
-# Commands by their heading on the help page: module in `cdmisfa.cli.commands`, first sentence.
-#
-# The sentence repeats the first line of the command's docstring, which --help does not import.
-HELP = {
-    "Record": {
-        "record": ("record", "Record a simulated scene or live cameras, one MCAP file per view."),
-        "convert": ("record", "Convert camera logs, videos, images or tables to a recording."),
-    },
-    "Learn": {
-        "learn": ("learn", "Learn slow features from a scene, a recording, logs or live cameras."),
-        "fork": ("learn", "Continue a run from an earlier iteration with other settings."),
-        "sweep": ("trials", "Learn from one source many times: a grid of settings and seeds."),
-        "apply": ("apply", "Compute the features that a run learned on other logs or cameras."),
-    },
-    "Look at results": {
-        "view": ("view", "Show a run, recording or log in the Rerun viewer, or save the view."),
-        "report": ("view", "Write an HTML report of one run, or of several runs side by side."),
-        "info": ("logs", "Show what a log, recording or run contains."),
-        "signals": ("runs", "List the signals that every run records."),
-    },
-    "Compare and reproduce": {
-        "compare": ("runs", "Compare runs: signals bit for bit, results and settings."),
-        "check": ("runs", "Learn a run again from its source and compare every signal."),
-        "inspect": ("runs", "Print the exact state of the learner after K iterations of a run."),
-    },
-    "Logs": {
-        "verify": ("logs", "Verify that logs are complete: structure, checksums, no lost data."),
-        "recover": ("logs", "Repair a damaged MCAP file: save what can be read into a new file."),
-        "export": ("logs", "Export signals as a table, or images as PNG, MP4 or LeRobot dataset."),
-        "index": ("logs", "Index many logs: streams, times and damage in one Parquet file."),
-    },
-    "Studies": {
-        "reproduce": ("trials", "Reproduce an experiment of the CD-MISFA paper."),
-        "demo": ("trials", "Record, learn, check and show an example in a few minutes."),
-    },
-    "This machine": {
-        "doctor": ("doctor", "Check which required and optional software is installed.")
-    },
+# Commands by their heading on the help page.
+HEADINGS = {
+    "Learn": "record learn apply fork sweep demo reproduce",
+    "Look at runs and check them": "view report compare check inspect signals",
+    "Logs and this machine": "info convert verify recover export index doctor",
 }
 
-COMMANDS = {name: command for commands in HELP.values() for name, command in commands.items()}
+# Commands by their module in `cdmisfa.cli.commands`.
+MODULES = {
+    "apply": "apply",
+    "doctor": "doctor",
+    "learn": "learn fork",
+    "logs": "info verify recover export index",
+    "record": "record convert",
+    "runs": "compare check inspect signals",
+    "trials": "sweep demo reproduce",
+    "view": "view report",
+}
+
+COMMANDS = " ".join(HEADINGS.values()).split()
 
 
 class LazyGroup(click.Group):
@@ -71,13 +50,14 @@ class LazyGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names in the order of the help page."""
-        return list(COMMANDS)
+        return COMMANDS
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command."""
         if cmd_name not in COMMANDS:
             return None
-        module = importlib.import_module(f"cdmisfa.cli.commands.{COMMANDS[cmd_name][0]}")
+        name = next(name for name, names in MODULES.items() if cmd_name in names.split())
+        module = importlib.import_module(f"cdmisfa.cli.commands.{name}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 
@@ -94,28 +74,26 @@ class LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands below their headings."""
         width = max(map(len, COMMANDS))  # so that the columns of all headings align
-        for heading, commands in HELP.items():
+        for heading, names in HEADINGS.items():
             with formatter.section(heading):
-                formatter.write_dl(
-                    [(name.ljust(width), text) for name, (_, text) in commands.items()]
-                )
+                commands = filter(None, (self.get_command(ctx, name) for name in names.split()))
+                rows = [(f"{c.name:{width}}", (c.help or "").partition("\n")[0]) for c in commands]
+                formatter.write_dl(rows)
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="\b\ncdmisfa COMMAND --help lists options and examples. Exit codes:\n"
+    "0 success, 1 failure, 2 wrong usage, 3 damaged log, 4 results differ.",
+)
 @quiet
 @click.version_option(package_name="cdmisfa", message="cdmisfa %(version)s")
 def cli() -> None:
-    """Learn slow features from cameras and robot logs.
+    """Learn slow features from cameras and robot logs, without labels.
 
-    Slow features are those functions of the images that change most slowly. In practice they tell
-    where an object is, how a joint is turned, or how bright the room is. The learner attends to
-    one stream at a time, chooses by curiosity which one, and logs everything that it computes.
-
-    cdmisfa COMMAND --help lists the options of a command. With --json a command prints one JSON
-    document on stdout. Progress, warnings and errors go to stderr; an error is one line.
-
-    Exit codes: 0 success, 1 failure, 2 wrong usage, 3 damaged or only partly recovered log,
-    4 results differ or are not reproduced, 130 interrupted (143 by SIGTERM, 129 by SIGHUP).
+    Slow features are the functions of the input that change most slowly, such as where an object
+    is, how a joint is turned, or how bright the room is.
     """
 
 

@@ -10,9 +10,13 @@ from typing import Any
 
 import click
 
+from cdmisfa.cli.help import Command
 from cdmisfa.cli.printing import Stderr
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+# Makes a command of a function whose docstring is the help page.
+command = functools.partial(click.command, cls=Command)
 
 # Paths
 
@@ -41,7 +45,7 @@ def output(help: str, *, required: bool = False) -> Decorator:
     return click.option("-o", "--output", type=LOCAL, required=required, help=help)
 
 
-def log_argument(name: str) -> Decorator:
+def log_argument(name: str, metavar: str | None = None) -> Decorator:
     """Return an argument of one or more paths, URLs or patterns, passed as existing paths."""
 
     def located(
@@ -53,7 +57,8 @@ def log_argument(name: str) -> Decorator:
 
         return tuple(locations(words))
 
-    return click.argument(name, nargs=-1, required=True, callback=located, type=WORD)
+    about: Any = {"nargs": -1, "required": True, "metavar": metavar}
+    return click.argument(name, callback=located, type=WORD, **about)
 
 
 # How external logs and live streams become streams of frames
@@ -77,6 +82,22 @@ def parse_seconds(text: str) -> float:
     return hours * 3600 + minutes * 60 + seconds
 
 
+class WholeNumber(click.IntRange):
+    """A whole number whose limits the help does not print."""
+
+    name = "n"
+
+    def _describe_range(self) -> str:
+        return ""
+
+
+class Rate(click.FloatRange):
+    """A number whose limits the help does not print."""
+
+    def _describe_range(self) -> str:
+        return ""
+
+
 # Options by the names of `InputOptions`; `settings` are the keys `input.*` of commands that have
 # no other keys.
 INPUTS = {
@@ -85,44 +106,51 @@ INPUTS = {
         "topics",
         multiple=True,
         metavar="TOPIC",
-        help="Topic of a log, or a pattern such as '/cam*'; each topic is a stream. Repeatable.",
+        help="Read this topic of a log, or all that match a pattern such as '/cam*'; each becomes "
+        "a stream. Repeatable. [default: the only one with images; apply, view and export: all]",
     ),
     "fields": click.option(
         "--field",
         "fields",
         multiple=True,
         metavar="FIELD",
-        help="Read numbers instead of images: a field of the messages, as pose.position.x or "
-        "ranges[0:100], or a column of a table. Several fields become one vector.",
+        help="Read these numbers: a field of the messages, such as pose.position.x or "
+        "ranges[0:100], or a column of a table. Repeatable; several form one vector. [default: "
+        "images, or all columns of a table]",
     ),
     "size": click.option(
         "--size",
         type=parse_size,
         metavar="WxH",
-        help="Shrink images to this size. By default the aspect ratio stays, and frames have at "
-        "most as many pixels as 128x48.",
+        help="Shrink images to frames of this width and height in pixels. [default: same aspect "
+        "ratio, at most as many pixels as 128x48]",
     ),
     "rate": click.option(
         "--rate",
-        type=click.FloatRange(1e-3, 1e6),
+        type=Rate(1e-3, 1e6),
         metavar="HZ",
-        help="Frames per second; by default the rate of the first stream.",
+        help="Frames per second. [default: rate of the first stream]",
     ),
     "start": click.option(
         "--start",
         type=parse_seconds,
         metavar="TIME",
         default="0",
-        help="Skip what a log has before this time, in seconds or as MINUTES:SECONDS.",
+        show_default=True,
+        help="Skip the part of a log before this time, in seconds or as MINUTES:SECONDS.",
     ),
     "end": click.option(
-        "--end", type=parse_seconds, metavar="TIME", help="Skip what a log has from this time on."
+        "--end",
+        type=parse_seconds,
+        metavar="TIME",
+        help="Skip the part of a log from this time on, in seconds or as MINUTES:SECONDS. "
+        "[default: end of the log]",
     ),
     "align": click.option(
         "--align",
         type=click.Choice(["index", "time"]),
-        help="Align streams of different rates: by message number, or by the latest message at "
-        "each time. By default such streams are refused.",
+        help="Combine streams of different rates: by message number (index), or by the newest "
+        "message at each time (time). [default: stop with an error]",
     ),
     "color": click.option(
         "--color",
@@ -130,15 +158,16 @@ INPUTS = {
         is_flag=False,
         flag_value="on",
         default="off",
-        help="Use color: red, green and blue side by side in a frame of three times the width. "
-        "auto uses it if hue varies in the first frames of a log and brightness does not.",
+        show_default=True,
+        help="Put red, green and blue side by side in frames of three times the width. auto does "
+        "so if the hue varies in the first 2,000 frames, independently of brightness.",
     ),
     "settings": click.option(
         "--set",
         "input_settings",
         multiple=True,
         metavar="KEY=VALUE",
-        help="Set a configuration key input.*, as input.fit=pad. Repeatable.",
+        help="Set a configuration key input.*, such as input.fit=pad. Repeatable.",
     ),
 }
 
@@ -173,57 +202,69 @@ def inputs(*names: str) -> Decorator:
 
 # Options of several commands
 
-COUNT = click.IntRange(1)
-SEED = click.IntRange(0, 2**63 - 1)
+COUNT = WholeNumber(1)
+SEED = WholeNumber(0, 2**63 - 1)
+PROCESSES = WholeNumber(1, 1024)
 
 
-def settings(help: str = "Set a configuration key, as learner.nu=0.02. Repeatable.") -> Decorator:
+def count(name: str, help: str) -> Decorator:
+    """Return an option whose value is a whole number from 1."""
+    return click.option(name, type=COUNT, help=help)
+
+
+def settings(
+    help: str = "Set a configuration key, such as learner.nu=0.02. Repeatable.",
+) -> Decorator:
     """Return the option `--set`."""
     return click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help=help)
 
 
+max_iterations = count(
+    "--max-iterations", "Stop after this number of iterations. [default: no limit; fork: as RUN]"
+)
+max_modules = count(
+    "--max-modules",
+    "Stop after this number of modules. [default: no limit; learners 2.0 and 1.0: number of "
+    "streams; fork: as RUN]",
+)
 seed = click.option(
     "--seed", type=SEED, default=0, show_default=True, help="Seed of every random choice."
 )
 preset = click.option(
     "--preset",
     metavar="NAME",
-    help="Preset (icub, icub-real, oscillatory, cameras) or a .toml file; by default the source's.",
+    help="Use the configuration values of a preset (icub, icub-real, oscillatory or cameras) or "
+    "of your .toml file. [default: the preset for SOURCE]",
 )
 source = click.option(
     "--source",
     metavar="SOURCE",
     multiple=True,
-    help="What the run learned from, if that has moved. Repeatable.",
+    help="Read the source of the run here, if it was moved. Repeatable. [default: as the run "
+    "states]",
 )
-max_iterations = click.option(
-    "--max-iterations", type=COUNT, help="End after this number of iterations."
-)
-max_modules = click.option(
-    "--max-modules",
-    type=COUNT,
-    help="End after this number of learned modules. By default the paper's learners end after as "
-    "many modules as there are streams.",
-)
-loop = click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
+
+loop = click.option("--loop", is_flag=True, help="Start a recording or log again when it ends.")
 skip_damaged = click.option(
-    "--skip-damaged", is_flag=True, help="Skip damaged parts and images of a log."
+    "--skip-damaged",
+    is_flag=True,
+    help="Skip damaged parts and images of a log, instead of stopping with an error.",
 )
-force = click.option("--force", is_flag=True, help="Overwrite existing results.")
-no_rerun = click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+force = click.option("--force", is_flag=True, help="Overwrite existing files.")
+no_rerun = click.option("--no-rerun", is_flag=True, help="Do not write the Rerun view run.rrd.")
 retry_failed = click.option(
-    "--retry-failed", is_flag=True, help="Compute again what failed before."
+    "--retry-failed", is_flag=True, help="Compute failed trials or logs again."
 )
 as_json = click.option(
-    "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
+    "--json", "as_json", is_flag=True, help="Print the results as one JSON document."
 )
 jobs = click.option(
-    "--jobs", type=click.IntRange(1, 1024), default=1, show_default=True, help="Parallel processes."
+    "--jobs", type=PROCESSES, default=1, show_default=True, help="Number of parallel processes."
 )
 scheduler = click.option(
     "--scheduler",
     metavar="ADDRESS",
-    help="Compute on the dask cluster with this scheduler, instead of --jobs.",
+    help="Compute on the dask cluster with this scheduler, instead of in --jobs processes.",
 )
 
 
@@ -238,5 +279,5 @@ quiet = click.option(
     is_flag=True,
     expose_value=False,
     callback=_set_quiet,
-    help="Print nothing on stderr but errors.",
+    help="Print no progress and no warnings, only errors.",
 )

@@ -27,20 +27,21 @@ FILE_FORMS = ("parquet", "csv", "mcap", "rrd")
 STDOUT = "stdout"
 
 
-@click.command("apply")
+@options.command("apply")
 @click.argument("run", type=options.LOCAL)
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.output(
-    "File for the outputs on one log: .parquet, .csv, .mcap or .rrd (a view). Or a folder, "
-    "with a file for each log."
+    "File to write for one log: .parquet, .csv, .mcap or .rrd (a view). Or the folder to write "
+    "into, one file for each log. [default: print a summary only]",
 )
 @click.option(
     "--to",
     type=click.Choice([*FILE_FORMS, STDOUT]),
-    help="Format of the files in a folder, by default parquet. stdout prints each block as a JSON "
-    "line as soon as it is complete.",
+    metavar="FORMAT",
+    help="Format of the files in the folder -o: parquet, csv, mcap or rrd. stdout writes no file: "
+    "it prints a JSON line for each block as soon as the block is complete. [default: parquet]",
 )
-@click.option("--frames", type=options.COUNT, help="End after this many frames per stream.")
+@options.count("--frames", "Stop after this number of frames of each stream. [default: all]")
 @options.loop
 @options.skip_damaged
 @options.inputs("topics", "fields", "rate", "start", "end", "align", "settings")
@@ -63,16 +64,32 @@ def apply_command(
     as_json: bool,
     **how: Any,
 ) -> int:
-    """Compute the features that a run learned on other logs or cameras.
+    """Compute learned features on other logs or cameras.
 
-    SOURCE is what cdmisfa learn takes. Images of any size become frames like those of the run. For
-    each frame the result has the outputs of each module, their slowness within the block, whether
-    the module is alive there, and how novel the block is: above 1 the module does not know it.
+    For each frame, the result has the outputs of every module of RUN (a module is a learned slow
+    feature). For each block of 40 frames it has their slowness, whether the module responds as on
+    the frames that it learned from (alive), and the novelty: above 1 the block is unknown to the
+    module.
 
-    With a folder as -o, SOURCE may be a folder with many logs, or an index of them. All files are
-    one table. The same command continues where it was stopped, and skips what is done.
+    With a folder as -o, SOURCE may be a folder with many logs; each log gets its own file. Run the
+    same command again to resume. Logs that cannot be read are skipped; the exit code is then 2 or
+    3.
 
-    With a folder as -o, logs that cannot be read are skipped; the exit code is then 3, or 2.
+    RUN is:
+        {run}
+
+    SOURCE is one of:
+        {scene}
+        {recording}
+        {logs}
+        {url}
+        {index}
+        {live}
+
+    Examples:
+        cdmisfa apply runs/kitchen today.mcap -o features.parquet
+        cdmisfa apply runs/kitchen logs -o features --jobs 4
+        cdmisfa apply runs/kitchen camera:/dev/video0 --to stdout
     """
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_taken

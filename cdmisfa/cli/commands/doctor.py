@@ -43,13 +43,19 @@ class Check:
     needed_for: str = ""
 
 
-@click.command("doctor")
+@options.command("doctor")
 @click.argument("files", nargs=-1, metavar="")
 @options.as_json
 def doctor_command(files: tuple[str, ...], as_json: bool) -> int:
     """Check which required and optional software is installed.
 
-    The exit code is 1 if something is missing that every command needs.
+    The command prints for each missing package how to install it and what needs it. The exit code
+    is 1 if something is missing that every command needs. To check a log, use cdmisfa verify.
+
+    Examples:
+        cdmisfa doctor
+        cdmisfa doctor --json
+        cdmisfa verify left.mcap
     """
     if files:
         command = f"cdmisfa verify {shlex.join(files)}"

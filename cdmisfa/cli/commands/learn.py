@@ -23,32 +23,40 @@ if TYPE_CHECKING:
     from recorder.images.options import InputOptions
 
 
-@click.command("learn")
+@options.command("learn")
 @click.argument("source", nargs=-1, type=options.WORD)
-@options.output("Folder of the run; without it nothing is written.")
+@options.output("Folder of the run to write. [default: write nothing]")
 @options.seed
 @options.preset
 @options.settings()
 @click.option(
     "--algorithm",
     metavar="NAME",
-    help="The learner: 2.0, 1.0 or progress, or your own class, package.module:Class. By default "
-    "2.0 for scenes and their recordings, progress for all other streams.",
+    help="Use this learner: progress, 2.0 or 1.0 (of the paper), or your package.module:Class. "
+    "[default: 2.0 for scenes and their recordings, else progress]",
 )
 @options.max_iterations
 @options.max_modules
 @options.loop
-@click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Continue the interrupted run in the folder -o; SOURCE and options may be left out.",
+)
 @options.skip_damaged
-@click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
+@click.option("--live-view", is_flag=True, help="Show the run in the Rerun viewer while it learns.")
 @options.no_rerun
-@click.option("--episodes", is_flag=True, help="Learn from each log as a separate episode.")
+@click.option(
+    "--episodes",
+    is_flag=True,
+    help="Learn from the logs one after the other; no block crosses from one to the next.",
+)
 @click.option(
     "--record",
     "record_to",
     type=options.LOCAL,
     metavar="DIR",
-    help="Also record all live streams, so that the same can be learned from the recording.",
+    help="Also record all live streams into this folder, to learn from them again.",
 )
 @options.inputs(*options.ALL_INPUTS)
 @options.force
@@ -74,22 +82,32 @@ def learn_command(
     as_json: bool,
     **how: Any,
 ) -> int:
-    """Learn slow features from a scene, a recording, logs or live cameras.
+    """Learn slow features from a scene, logs or live cameras.
 
-    SOURCE is a simulated scene (icub, oscillatory), the folder of a recording, or the MCAP files
-    of its views. The same seed gives the same signals, bit for bit, from each.
+    With -o, the command writes a run: a folder with the learned features, every value that the
+    learner computed, a report (report.html) and a view for Rerun (run.rrd). It stops when each
+    stream is learned, explained by an earlier module, or rejected because nothing in it is slow;
+    when SOURCE ends; or with Ctrl-C.
 
-    Or SOURCE is external logs: MCAP files, ROS bags, LeRobot datasets, tables of numbers (CSV,
-    Parquet), or a video or a folder of images for each stream. Logs may be URLs: s3://, http://
-    and https://.
+    SOURCE is one of:
+        {scene}
+        {recording}
+        {logs}
+        {url}
+        {index}
+        {live}
 
-    Or SOURCE is a folder that cdmisfa index has indexed: its logs are episodes, ordered by their
-    start times, and nothing is learned across two of them.
+    Words:
+        stream     the images of one camera, or the numbers of one topic
+        block      40 frames of one stream; each iteration learns from one block
+        module     a slow feature that is learned and no longer changes
+        gap        a pause of a stream of more than ten frames; no block crosses it
+        preset     a named set of configuration values
 
-    Or SOURCE is one or several live streams: camera:/dev/video0, rtsp://, http://.../x.mjpg,
-    tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
-
-    With --resume, SOURCE and options are by default those of the interrupted run.
+    Examples:
+        cdmisfa learn left.mcap right.mcap -o runs/kitchen
+        cdmisfa learn camera:/dev/video0 --record recordings/desk -o runs/desk
+        cdmisfa learn recordings/kitchen --loop --max-modules 2 -o runs/kitchen
     """
     from cdmisfa.experiments.run_folder import command_of
     from cdmisfa.experiments.session import Session
@@ -160,8 +178,8 @@ def _opened(
             "--record is for live streams, and --resume for all others: live streams cannot go "
             "back, learn from a recording of them"
         )
-    flags = {"loop": "--loop", "skip_damaged": "--skip-damaged", "episodes": "--episodes"}
-    unused = [flag for name, flag in flags.items() if how[name]]
+    flags = ("--loop", "--skip-damaged", "--episodes")
+    unused = [flag for flag in flags if how[flag.removeprefix("--").replace("-", "_")]]
     if unused and (live or is_scene(words)):
         raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
     for folder in filter(None, (output, record_to) if live else ()):
@@ -224,18 +242,22 @@ def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool
     return 0
 
 
-@click.command("fork")
+@options.command("fork")
 @click.argument("run", type=options.LOCAL)
 @click.option(
     "--iteration",
-    type=click.IntRange(0),
+    type=options.WholeNumber(0),
     required=True,
     metavar="K",
-    help="Keep K iterations of RUN.",
+    help="Begin with the first K iterations of RUN.",
 )
-@options.output("Folder of the new run.", required=True)
-@options.settings("Set a key learner.* from iteration K on. Repeatable.")
-@click.option("--seed", type=options.SEED, help="Seed of random choices from iteration K on.")
+@options.output("Folder of the new run to write.", required=True)
+@options.settings("Set a configuration key learner.* from iteration K on. Repeatable.")
+@click.option(
+    "--seed",
+    type=options.SEED,
+    help="Seed of every random choice from iteration K on. [default: the seed of RUN]",
+)
 @options.max_iterations
 @options.max_modules
 @options.source
@@ -255,8 +277,16 @@ def fork_command(
 ) -> int:
     """Continue a run from an earlier iteration with other settings.
 
-    The new run begins with the first K iterations of RUN; resume, check and view it like any run.
-    Limits that are not given are those of RUN.
+    The new run begins with the first K iterations of RUN and learns the rest from the source of
+    RUN. Limits and settings that are not given are those of RUN.
+
+    RUN is:
+        {run}
+
+    Examples:
+        cdmisfa fork runs/kitchen --iteration 100 --set learner.visit=9 -o runs/slower
+        cdmisfa fork runs/kitchen --iteration 100 --seed 7 -o runs/seed7
+        cdmisfa fork runs/kitchen --iteration 0 --max-modules 2 -o runs/two
     """
     from cdmisfa.experiments.session import Session
 

@@ -24,15 +24,26 @@ if TYPE_CHECKING:
 MOST_STREAMS = 8
 
 
-@click.command("info")
+@options.command("info")
 @click.argument("path", nargs=-1, required=True, type=options.WORD)
 @options.as_json
 def info_command(path: tuple[str, ...], as_json: bool) -> int:
     """Show what a log, recording or run contains.
 
-    PATH is one or several files, folders, URLs or patterns such as 'logs/*.mcap'. The exit code is
-    3 if a log is cut short or damaged, else 2 if one of several is no log. Contents that only
-    cdmisfa verify reads are reported as unchecked: images, videos, bags, tables, files above 1 GiB.
+    The command prints topics, times and sizes, and for a run its modules and the result of each
+    stream. The exit code is 3 if a file is damaged or cut short, else 2 if one of several is no
+    log. Contents that only cdmisfa verify reads are called unchecked.
+
+    PATH is one of:
+        {run}
+        {recording}
+        {logs}
+        {url}
+
+    Examples:
+        cdmisfa info left.mcap
+        cdmisfa info 'logs/*.mcap'
+        cdmisfa info runs/kitchen --json
     """
     from replay.integrity.info import describe
     from replay.integrity.report import EXIT_CODES
@@ -138,15 +149,25 @@ def _print_channels(channels: Sequence[ChannelInfo]) -> None:
     printing.table(list(columns), list(zip(*columns.values(), strict=True)))
 
 
-@click.command("verify")
+@options.command("verify")
 @click.argument("path", nargs=-1, required=True, type=options.WORD)
 @options.as_json
 def verify_command(path: tuple[str, ...], as_json: bool) -> int:
-    """Verify that logs are complete: structure, checksums, no lost data.
+    """Verify that logs are complete and undamaged.
 
-    PATH is one or several files, folders, URLs or patterns such as 'logs/*.mcap'. Every image of a
-    camera log without checksums is decoded. The exit code is 3 if anything is wrong, else 2 if one
-    of several is no log.
+    The command reads every byte, compares checksums, and decodes every image of a log that has no
+    checksums. The exit code is 3 if anything is wrong, else 2 if one of several is no log.
+
+    PATH is one of:
+        {run}
+        {recording}
+        {logs}
+        {url}
+
+    Examples:
+        cdmisfa verify left.mcap
+        cdmisfa verify 'logs/**/*.mcap'
+        cdmisfa verify runs/kitchen --json
     """
     from replay.integrity.report import EXIT_CODES
     from replay.integrity.verify import check_logs
@@ -163,16 +184,25 @@ def verify_command(path: tuple[str, ...], as_json: bool) -> int:
     return EXIT_CODES[checked.state]
 
 
-@click.command("recover")
+@options.command("recover")
 @click.argument("path", type=options.WORD)
 @options.output("New MCAP file to write.", required=True)
 @options.force
 @options.as_json
 def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
-    """Repair a damaged MCAP file: save what can be read into a new file.
+    """Repair a damaged MCAP file into a new file.
 
-    PATH is an MCAP file or its URL, as a view of a recording or the run.mcap of a run. The exit
-    code is 3 if something could not be saved.
+    The command copies every message that can be read, and prints how many are lost. The damaged
+    file does not change. The exit code is 3 if something is lost.
+
+    PATH is one of:
+        left.mcap             an MCAP file, such as one of a recording, or run.mcap
+        s3://lab/left.mcap    an MCAP file at an s3://, http:// or https:// address
+
+    Examples:
+        cdmisfa recover left.mcap -o left-repaired.mcap
+        cdmisfa recover runs/kitchen/run.mcap -o repaired/run.mcap
+        cdmisfa recover https://example.org/left.mcap -o left.mcap --json
     """
     from replay.integrity.recover import recover_log
 
@@ -192,20 +222,22 @@ def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
     return 0 if recovery.complete else LogDamagedError.exit_code
 
 
-@click.command("export")
+@options.command("export")
 @options.log_argument("path")
 @click.option(
     "--to",
     "form",
-    metavar="FORM",
-    help="parquet, npz, csv, images, mp4 or lerobot; by default the ending of the file's name.",
+    metavar="FORMAT",
+    help="Format to write: parquet, csv, npz, images, mp4 or lerobot. [default: the ending of -o]",
 )
-@options.output("File to write, for images a folder.", required=True)
-@click.option("--lossless", is_flag=True, help="Keep every pixel value in a video.")
+@options.output("File or folder to write.", required=True)
+@click.option(
+    "--lossless", is_flag=True, help="Encode videos without changing any pixel; they become larger."
+)
 @click.option(
     "--task",
     metavar="TEXT",
-    help="Task that a LeRobot dataset shows; by default as the log states it.",
+    help="Task that a LeRobot dataset names for its episodes. [default: as the log states]",
 )
 @options.inputs("topics", "fields", "rate", "settings")
 @options.force
@@ -218,12 +250,23 @@ def export_command(
     as_json: bool,
     **how: Any,
 ) -> None:
-    """Export signals as a table, or images as PNG, MP4 or LeRobot dataset.
+    """Export signals as a table, or images as PNG, MP4 or LeRobot.
 
-    The signals of a run go to one file: Parquet, CSV or NumPy's npz. CSV leaves out the outputs
-    frame by frame (y, y_frozen). Recordings and external logs go to a folder: PNG files, one MP4
-    file per view (a single view also to a file), or a LeRobot dataset v3.0, in which several
-    recordings are episodes. --field exports numbers of external logs.
+    The signals of a run (the values that the learner computed) go to one Parquet, CSV or NumPy
+    file; CSV leaves out the outputs of single frames (y, y_frozen). Recordings and logs go to a
+    folder of PNG files, to one MP4 file for each stream, or to a LeRobot dataset v3.0, in which
+    each recording is an episode.
+
+    PATH is one of:
+        {run}
+        {recording}
+        {logs}
+        {url}
+
+    Examples:
+        cdmisfa export runs/kitchen -o signals.parquet
+        cdmisfa export recordings/kitchen --to mp4 -o films
+        cdmisfa export monday.mcap tuesday.mcap --to lerobot --lossless -o dataset
     """
     from replay.export.forms import export
     from replay.export.tables import CSV_LEAVES_OUT, TABLES
@@ -242,18 +285,18 @@ def export_command(
     printing.line(f"{rows} {unit} written to {output}")
 
 
-@click.command("index")
-@click.argument("corpus", nargs=-1, required=True, type=options.WORD)
-@options.output("The index, a .parquet file; by default corpus.parquet in the folder.")
+@options.command("index")
+@click.argument("corpus", nargs=-1, required=True, type=options.WORD, metavar="PATH...")
+@options.output("Parquet file to write. [default: corpus.parquet in the folder PATH]")
 @click.option(
     "--deep",
     is_flag=True,
-    help="Decode every log, to find shapes, gaps, and damage that no summary shows.",
+    help="Decode every message, to find image sizes, gaps, and damage that summaries do not show.",
 )
 @click.option(
     "--jobs",
-    type=click.IntRange(1, 1024),
-    help="Parallel processes; by default as many as there are processors.",
+    type=options.PROCESSES,
+    help="Number of parallel processes. [default: number of processors]",
 )
 @options.as_json
 @options.quiet
@@ -262,9 +305,18 @@ def index_command(
 ) -> int:
     """Index many logs: streams, times and damage in one Parquet file.
 
-    CORPUS is a folder with everything below it, or several folders, files, URLs or patterns such
-    as 'logs/**/*.mcap'. The index has a row for each stream; a log that cannot be read is a row
-    with its problem. When the command runs again, it reads only new and changed logs.
+    The index has a row for each stream, and for each log that cannot be read a row with the reason.
+    When the command runs again, it reads only new and changed logs.
+
+    PATH is one of:
+        logs                  a folder with logs in it or in folders below
+        'logs/**/*.mcap'      a file, or a pattern that names several
+        s3://lab/logs/        a folder or file at an s3:// address
+
+    Examples:
+        cdmisfa index logs
+        cdmisfa index logs --deep --jobs 8
+        cdmisfa index monday tuesday -o week.parquet
     """
     from replay.corpus.index import index_logs
 

@@ -20,30 +20,35 @@ if TYPE_CHECKING:
     from recorder.recording import ViewRecording
 
 
-@click.command("record")
+@options.command("record")
 @click.argument("source", nargs=-1, type=options.WORD)
-@options.output("Folder of the recording.", required=True)
-@click.option(
+@options.output("Folder of the recording to write.", required=True)
+@options.count(
     "--frames",
-    type=options.COUNT,
-    help="Frames of each view. By default 1000, with --resume as many as first asked for, and of "
-    "cameras all until Ctrl-C.",
+    "Stop after this number of frames of each stream. [default: 1000; cameras: until Ctrl-C; "
+    "with --resume: as before]",
 )
 @click.option(
     "--seed",
     type=options.SEED,
-    help="Seed of every random choice; by default 0, with --resume that of the recording.",
+    help="Seed of every random choice. [default: 0; with --resume: as before]",
 )
-@click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view. Repeatable.")
+@click.option(
+    "--view",
+    "views",
+    multiple=True,
+    metavar="NAME",
+    help="Record only this view (stream) of the scene. Repeatable. [default: all]",
+)
 @options.jobs
 @options.preset
 @options.settings()
-@click.option("--resume", is_flag=True, help="Resume an interrupted recording.")
+@click.option("--resume", is_flag=True, help="Continue the interrupted recording in the folder -o.")
 @click.option(
     "--split",
     metavar="TIME",
-    help="Begin a new file of each view after this time: 90s, 10min. With --resume by default as "
-    "first asked for.",
+    help="Begin a new file for each stream after this time, such as 90s or 10min. [default: one "
+    "file; with --resume: as before]",
 )
 @options.inputs("fields", "size", "rate", "color")
 @options.force
@@ -64,13 +69,19 @@ def record_command(
     force: bool,
     as_json: bool,
 ) -> int:
-    """Record a simulated scene or live cameras, one MCAP file per view.
+    """Record a simulated scene or live cameras as MCAP files.
 
-    SOURCE is a scene, icub or oscillatory; the same seed gives the same bytes. With --resume the
-    scene, the seed and the split are by default those of the interrupted recording.
+    The recording is a folder with one MCAP file for each camera or stream. A scene is simulated:
+    the same seed gives the same bytes. To record existing logs, use cdmisfa convert.
 
-    Or SOURCE is one or several live streams: camera:/dev/video0, rtsp://, http://.../x.mjpg,
-    tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. For existing logs see cdmisfa convert.
+    SOURCE is one of:
+        {scene}
+        {live}
+
+    Examples:
+        cdmisfa record icub -o recordings/table --frames 2000 --seed 3
+        cdmisfa record camera:/dev/video0 -o recordings/desk --split 10min
+        cdmisfa record --resume -o recordings/table
     """
     from cdmisfa.experiments.sources import Layers, configure
     from recorder.cameras.words import is_live
@@ -163,12 +174,12 @@ def _record_live(
     return stop.exit_code if stop() and frames is not None and recorded.t < frames else 0
 
 
-@click.command("convert")
+@options.command("convert")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
-@options.output("Folder of the recording.", required=True)
+@options.output("Folder of the recording to write.", required=True)
 @options.inputs(*options.ALL_INPUTS, "settings")
 @options.skip_damaged
-@click.option("--resume", is_flag=True, help="Resume an interrupted conversion.")
+@click.option("--resume", is_flag=True, help="Continue the interrupted recording in the folder -o.")
 @options.force
 @options.as_json
 @options.quiet
@@ -181,11 +192,21 @@ def convert_command(
     force: bool,
     as_json: bool,
 ) -> int:
-    """Convert camera logs, videos, images or tables to a recording.
+    """Convert logs, videos, images or tables to a recording.
 
-    SOURCE is MCAP files or their URLs, ROS bags, LeRobot datasets, tables of numbers (CSV,
-    Parquet), or a video or a folder of images for each stream; several, or a pattern such as
-    'logs/*.mcap'.
+    The recording is a folder with one MCAP file for each stream. All its frames are on one clock
+    and have the size that the learner sees. If the recording was interrupted, --resume continues
+    it.
+
+    SOURCE is one of:
+        {recording}
+        {logs}
+        {url}
+
+    Examples:
+        cdmisfa convert left.mp4 right.mp4 -o recordings/kitchen
+        cdmisfa convert robot.mcap --topic '/camera/*' --end 1:30 -o recordings/robot
+        cdmisfa convert joints.csv --field elbow --field wrist -o recordings/joints
     """
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing

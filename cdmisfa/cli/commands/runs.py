@@ -17,22 +17,31 @@ if TYPE_CHECKING:
     from replay.runs.compare import Row
 
 
-@click.command("compare")
-@options.log_argument("runs")
+@options.command("compare")
+@options.log_argument("runs", "RUN...")
 @click.option(
     "--save",
     type=options.LOCAL,
     metavar="F.rrd",
-    help="Also write a view with the curves of all runs.",
+    help="Also write a Rerun view with the curves of all runs.",
 )
 @options.force
 @options.as_json
 def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_json: bool) -> int:
     """Compare runs: signals bit for bit, results and settings.
 
-    For two runs it prints where their signals first differ, which signals those are, and which
-    settings and results differ; the exit code is then 4. For more runs it prints a table in which
-    each is compared with the first. RUNS may be URLs of run.mcap files.
+    Signals are the values that the learner computed in each iteration. For two runs, the command
+    prints where their signals first differ and which settings and results differ; if any signal
+    differs, the exit code is 4. For more runs, it prints a table that compares each with the first.
+
+    RUN is one of:
+        {run}
+        {log of run}
+
+    Examples:
+        cdmisfa compare runs/kitchen runs/again
+        cdmisfa compare runs/kitchen runs/seed7 --save both.rrd
+        cdmisfa compare runs/seed0 runs/seed1 runs/seed2 --json
     """
     from replay.runs.compare import side_by_side
 
@@ -91,24 +100,31 @@ def _iterations(
     return int(first or 0), int(end) if end else None
 
 
-@click.command("check")
+@options.command("check")
 @click.argument("run", type=options.LOCAL)
 @click.option(
     "--iterations",
     metavar="FIRST:END",
     callback=_iterations,
-    help="Check only these iterations, without END; by default all.",
+    help="Check only the iterations from FIRST to before END. [default: all]",
 )
 @options.source
 @options.as_json
 def check_command(
     run: Path, iterations: tuple[int, int | None], source: tuple[str, ...], as_json: bool
 ) -> int:
-    """Learn a run again from its source and compare every signal.
+    """Learn a run again and compare every signal.
 
-    Signals and stored states of the learner must be equal bit for bit. If not, it prints the first
-    difference and the source files that have changed, and the exit code is 4. With --iterations it
-    begins at the last stored state before FIRST.
+    Signals and stored states of the learner must be equal bit for bit. Otherwise the command prints
+    the first difference and the changed source files; the exit code is then 4.
+
+    RUN is:
+        {run}
+
+    Examples:
+        cdmisfa check runs/kitchen
+        cdmisfa check runs/kitchen --iterations 100:200
+        cdmisfa check runs/kitchen --source /data/left.mcap --source /data/right.mcap
     """
     from cdmisfa.experiments.resume import check_run
 
@@ -120,23 +136,32 @@ def check_command(
     return 0 if checked.holds else NotReproducedError.exit_code
 
 
-@click.command("inspect")
+@options.command("inspect")
 @click.argument("run", type=options.LOCAL)
 @click.option(
     "--iteration",
     "iterations",
-    type=click.IntRange(0),
+    type=options.WholeNumber(0),
     required=True,
     metavar="K",
-    help="Print the state after K iterations.",
+    help="Print the state after the first K iterations.",
 )
 @options.source
 @options.as_json
 def inspect_command(run: Path, iterations: int, source: tuple[str, ...], as_json: bool) -> None:
-    """Print the exact state of the learner after K iterations of a run.
+    """Print the state of the learner after an iteration of a run.
 
-    The learner starts from the last state that is stored in the log of the run, and learns the
-    rest again from the source of the run. --json prints all of its memory.
+    The command loads the last state that the run stores before that iteration, and learns the rest
+    again from the source of the run. One iteration is one block of 40 frames. --json prints the
+    values of all arrays.
+
+    RUN is:
+        {run}
+
+    Examples:
+        cdmisfa inspect runs/kitchen --iteration 100
+        cdmisfa inspect runs/kitchen --iteration 100 --json
+        cdmisfa inspect runs/kitchen --iteration 100 --source /data/left.mcap
     """
     from cdmisfa.core.names import counted
     from cdmisfa.core.signals import ACTIONS
@@ -174,12 +199,18 @@ def inspect_command(run: Path, iterations: int, source: tuple[str, ...], as_json
     printing.line(f"memory: {len(state.arrays)} arrays, {size:.1f} kB; --json prints all of it")
 
 
-@click.command("signals")
+@options.command("signals")
 @options.as_json
 def signals_command(as_json: bool) -> None:
     """List the signals that every run records.
 
-    --json also prints the type of each signal and how the viewer shows it.
+    A signal is a value that the learner computes in each iteration. --json also prints its type and
+    how the viewer shows it.
+
+    Examples:
+        cdmisfa signals
+        cdmisfa signals --json
+        cdmisfa export runs/kitchen -o signals.parquet
     """
     from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
 

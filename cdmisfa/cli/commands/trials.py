@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from cdmisfa.cli import options, printing
 from cdmisfa.cli.progress import Bar, bar, resumable_bar
@@ -19,21 +20,23 @@ from cdmisfa.cli.progress import Bar, bar, resumable_bar
 MOST_SEEDS = 1_000_000
 
 
-@click.command("sweep")
+@options.command("sweep")
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
-@options.output("Folder of the sweep. Trials that are finished in it are not computed again.")
+@options.output(
+    "Folder of the sweep to write, required without --summary. Finished trials in it are skipped."
+)
 @click.option(
     "--grid",
     metavar="KEY=V1,V2,...",
     multiple=True,
-    help="Values to try for a configuration key. Repeatable; several grids multiply.",
+    help="Try these values of a configuration key. Repeatable: every combination is tried.",
 )
 @click.option(
     "--seeds",
     metavar="FIRST:END",
     default="0:20",
     show_default=True,
-    help="Seeds of every point: a range without its end, or numbers with commas, as 1,5,9.",
+    help="Use each of these seeds: from FIRST to before END, or a list such as 1,5,9.",
 )
 @options.preset
 @options.settings()
@@ -47,8 +50,8 @@ MOST_SEEDS = 1_000_000
 @click.option(
     "--summary",
     is_flag=True,
-    help="Print mean and standard deviation over the seeds, instead of learning; SOURCE is then "
-    "the folder of one sweep.",
+    help="Learn nothing; print mean and standard deviation over the seeds of the sweep in the "
+    "folder SOURCE.",
 )
 @click.option("--csv", is_flag=True, help="Print the summary as comma-separated values.")
 @options.as_json
@@ -66,10 +69,23 @@ def sweep_command(
     as_json: bool,
     **how: Any,
 ) -> int:
-    """Learn from one source many times: a grid of settings and seeds.
+    """Learn with many settings and seeds, and summarize the results.
 
-    SOURCE is what learn takes, except live streams. The same command resumes an interrupted sweep.
-    With --summary, SOURCE is the folder of a sweep.
+    The command learns once for every seed and every combination of the --grid values: each is a
+    trial. To resume an interrupted sweep, run the same command again. With --summary, it prints the
+    results of the sweep in the folder SOURCE.
+
+    SOURCE is one of:
+        {scene}
+        {recording}
+        {logs}
+        {url}
+        {index}
+
+    Examples:
+        cdmisfa sweep oscillatory --grid learner.nu=0.02,0.05 --jobs 4 -o sweeps/nu
+        cdmisfa sweep recordings/kitchen --loop --seeds 0:5 -o sweeps/kitchen
+        cdmisfa sweep sweeps/nu --summary --csv
     """
     if summary:
         _print_summary(_folder_of_sweep(ctx), as_csv=csv, as_json=as_json)
@@ -134,15 +150,11 @@ def parse_seeds(text: str) -> list[int]:
 
 def _folder_of_sweep(ctx: click.Context) -> Path:
     """Return the folder that `--summary` takes; raise an error for other arguments and options."""
-    given = (ctx.get_parameter_source(param.name or "") for param in ctx.command.params)
-    ignored = [
-        param.opts[0]
-        for param, origin in zip(ctx.command.params, given, strict=True)
-        if origin is click.core.ParameterSource.COMMANDLINE
-        and param.name not in ("source", "summary", "csv", "as_json")
-    ]
-    if ignored:
-        raise click.UsageError(f"--summary only prints results: leave out {ignored[0]}")
+    applies = ("source", "summary", "csv", "as_json")
+    for param in ctx.command.params:
+        name = param.name or ""
+        if name not in applies and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"--summary only prints results: leave out {param.opts[0]}")
     if ctx.params["csv"] and ctx.params["as_json"]:
         raise click.UsageError("choose one of --csv and --json")
     if len(ctx.params["source"]) > 1:
@@ -165,18 +177,19 @@ def _print_summary(folder: Path, *, as_csv: bool, as_json: bool) -> None:
         printing.table(*results.as_table(points))
 
 
-@click.command("reproduce")
-@click.argument("name")
-@options.output("Folder of the results [default: reproduction].")
-@click.option(
-    "--trials", type=options.COUNT, help="Trials per condition, instead of the paper's number."
-)
+@options.command("reproduce")
+@click.argument("name", metavar="EXPERIMENT")
+@options.output("Folder of the results to write. [default: reproduction]")
+@options.count("--trials", "Number of trials of each condition. [default: as in the paper]")
 @options.jobs
 @options.scheduler
 @click.option(
-    "--recording", type=options.LOCAL, metavar="DIR", help="Existing recording of the iCub scene."
+    "--recording",
+    type=options.LOCAL,
+    metavar="DIR",
+    help="Folder of a recording of the scene icub to use. [default: record it now]",
 )
-@click.option("--quick", is_flag=True, help="Run few trials, enough to test the claim.")
+@click.option("--quick", is_flag=True, help="Run only a few trials, enough to test the claims.")
 @options.as_json
 @options.quiet
 def reproduce_command(
@@ -188,9 +201,21 @@ def reproduce_command(
 ) -> None:
     """Reproduce an experiment of the CD-MISFA paper.
 
-    NAME is oscillatory, five, stability, nonstationary, icub or all. It writes numbers, tables and
-    figures. Finished trials are not run again. The exit code is 4 if a claim of the paper is not
-    reproduced.
+    The command writes numbers, tables and figures, and skips trials that are finished. The exit
+    code is 4 if a claim of the paper is not reproduced.
+
+    EXPERIMENT is one of:
+        oscillatory           order in which three synthetic streams are learned
+        five                  the same with five streams
+        stability             CD-MISFA 1.0 against 2.0: which policy is stable
+        nonstationary         whether the learner follows a changing stream
+        icub                  order in which the robot's three views are learned
+        all                   all of them
+
+    Examples:
+        cdmisfa reproduce oscillatory --quick
+        cdmisfa reproduce icub --recording recordings/table --jobs 4
+        cdmisfa reproduce all -o reproduction --jobs 8
     """
     from cdmisfa.studies.paper.reproduce import (
         EXPERIMENTS,
@@ -222,15 +247,15 @@ def reproduce_command(
         check_claims(document)
 
 
-@click.command("demo")
-@options.output("Folder of the recordings and runs; by default the current folder.")
+@options.command("demo")
+@options.output("Folder to write recordings/ and runs/ into. [default: current folder]")
 @options.seed
 @click.option(
     "--frames",
-    type=click.IntRange(400),
+    type=options.WholeNumber(400),
     show_default=True,
     default=8000,
-    help="Frames of each view.",
+    help="Number of frames to record of each view, at least 400.",
 )
 @options.jobs
 @options.as_json
@@ -238,8 +263,14 @@ def reproduce_command(
 def demo_command(output: Path | None, seed: int, frames: int, jobs: int, as_json: bool) -> None:
     """Record, learn, check and show an example in a few minutes.
 
-    It replaces the results of an earlier demo in the same folder. Without PyBullet, which needs
-    Python 3.11 or older, it records the scene oscillatory instead of icub.
+    The command simulates the iCub robot at a table, learns from its three views, and writes a
+    report. It overwrites the results of an earlier demo in the same folder. Without PyBullet, which
+    needs Python 3.11 or older, it uses the scene oscillatory instead.
+
+    Examples:
+        cdmisfa demo
+        cdmisfa demo -o demo --frames 4000 --jobs 2
+        cdmisfa demo --seed 7 --json
     """
     from cdmisfa.studies.demo import demo
 

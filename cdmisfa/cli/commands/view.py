@@ -11,31 +11,34 @@ from cdmisfa.cli import options, printing
 from cdmisfa.core.errors import UsageError
 
 
-@click.command("view")
-@options.log_argument("run")
-@click.option("--save", type=options.LOCAL, metavar="F.rrd", help="Write the view to a file.")
-@click.option("--web", is_flag=True, help="Serve the view to browsers on this machine only.")
+@options.command("view")
+@options.log_argument("run", "PATH...")
+@click.option("--save", type=options.LOCAL, metavar="F.rrd", help="Write the view to this file.")
+@click.option("--web", is_flag=True, help="Show the view in a browser on this machine.")
 @click.option(
     "--screenshot",
     type=options.LOCAL,
     metavar="F.png",
-    help="Draw the view into an image file; needs no screen.",
+    help="Draw the view into this image file; needs no screen.",
 )
 @click.option(
     "--at",
     metavar="WHEN",
-    help='Time at which the view opens: a frame, "iteration 500", or words of an event, as '
-    '"module 2".',
+    help='Open the view at this frame, at "iteration 500", or at an event, such as "module 2". '
+    "[default: end of the run]",
 )
-@click.option("--tab", metavar="NAME", help="Name of the open tab; by default the first.")
-@click.option("--port", type=click.IntRange(1, 65535), help="Port of --web; by default a free one.")
+@click.option("--tab", metavar="NAME", help="Open this tab of the view. [default: the first]")
+@click.option(
+    "--port",
+    type=options.WholeNumber(1, 65535),
+    help="Port of --web on this machine. [default: a free one]",
+)
 @click.option(
     "--every",
     type=options.COUNT,
-    metavar="N",
     show_default=True,
     default=10,
-    help="Show every Nth image; numbers are all shown.",
+    help="Show every Nth image; curves show every value.",
 )
 @options.inputs("topics", "fields", "rate", "settings")
 @options.force
@@ -49,10 +52,22 @@ def view_command(
     force: bool,
     **content: Any,
 ) -> None:
-    """Show a run, recording or log in the Rerun viewer, or save the view.
+    """Show a run, recording or log in the Rerun viewer.
 
-    RUN is the folder of a run, or its run.mcap, a recording, an .rrd file, or one or several
-    camera logs, as paths or URLs.
+    The viewer opens in a window, with --web in a browser on this machine. --save and --screenshot
+    write a file instead.
+
+    PATH is one of:
+        {run}
+        {recording}
+        {logs}
+        {url}
+        {view}
+
+    Examples:
+        cdmisfa view runs/kitchen
+        cdmisfa view left.mcap right.mcap --save logs.rrd
+        cdmisfa view runs/kitchen --at "module 2" --screenshot kitchen.png
     """
     if sum((save is not None, web, screenshot is not None)) > 1 or (at and (web or save)):
         raise click.UsageError(
@@ -90,18 +105,26 @@ def view_command(
             open_window(view, frame)
 
 
-@click.command("report")
+@options.command("report")
 @options.log_argument("run")
-@options.output("HTML file to write; by default report.html in the folder of a single run.")
+@options.output("HTML file to write. [default: report.html in the folder of a single run]")
 @options.force
 @options.as_json
 def report_command(run: tuple[Path, ...], output: Path | None, force: bool, as_json: bool) -> None:
-    """Write an HTML report of one run, or of several runs side by side.
+    """Write an HTML report of one or several runs.
 
-    RUN is the folder of a run, several of them, or a folder of runs. The page needs no network and
-    no other file. It shows what was learned and when, which stream the learner attended to, why
-    it ended, what each module distinguishes, and whether the run is reproducible. `learn` writes
+    The page shows what was learned and when, which stream the learner attended to, why the run
+    ended, and whether it is reproducible. It is one file and needs no network. cdmisfa learn writes
     the same page as report.html into its run.
+
+    RUN is one of:
+        {run}
+        {runs}
+
+    Examples:
+        cdmisfa report runs/kitchen
+        cdmisfa report runs/kitchen runs/desk -o compared.html
+        cdmisfa report runs -o all.html
     """
     from cdmisfa.experiments.reports import write_report
     from replay.storage.location import with_urls
