@@ -1,13 +1,10 @@
-"""Slow features of streams, learned by curiosity.
-
-From arrays, logs, scenes or cameras to a run, its signals as a table, and what was learned at work:
+"""Learn slow features from arrays, logs, simulated scenes or cameras.
 
     run = learn("oscillatory", max_modules=1)
     table = run.signals.to_arrow()
-    outputs = run.modules[0].transform(run.frames())
+    features = run.modules[0].transform(run.frames())
 
-docs/how-to/python.md shows more. `cdmisfa.experiments` has the loop of every run, `recorder`
-records sources, `replay` reads and shows what was logged.
+docs/start/python.md has more examples.
 """
 
 import os

@@ -1,6 +1,8 @@
 # %% [markdown]
 # # Slow features in a notebook
-# Open this file as a notebook with Jupytext, or run its cells in an editor that knows `# %%`.
+# Open this file as a notebook with Jupytext, or run its cells in an editor that supports `# %%`.
+#
+# Two streams of numbers: `arm` mixes a slow and a fast oscillation, `noise` is random.
 
 # %%
 import numpy as np
@@ -15,11 +17,14 @@ streams = {
 cdmisfa.Recording(streams)
 
 # %% [markdown]
-# The learner chooses by itself what it watches.
+# Learn from both streams. The learner finds the slow oscillation of `arm` and rejects `noise`.
 
 # %%
 run = cdmisfa.learn(streams)
 run
+
+# %% [markdown]
+# The module that was saved, and the run in the Rerun viewer.
 
 # %%
 run.modules[0]

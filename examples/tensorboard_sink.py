@@ -1,6 +1,10 @@
-"""Curves of a run in TensorBoard, while it learns: `pip install tensorboardX tensorboard`.
+"""Show the signals of a run in TensorBoard while it learns.
 
-python examples/tensorboard_sink.py runs/curves, then tensorboard --logdir runs/curves
+Install and run it:
+
+    pip install tensorboardX tensorboard
+    python examples/tensorboard_sink.py runs/curves
+    tensorboard --logdir runs/curves
 """
 
 import sys
@@ -12,7 +16,7 @@ import cdmisfa
 
 
 class TensorBoard(cdmisfa.Sink):
-    """Writes every scalar signal of an iteration as a point of its curve."""
+    """Write every scalar signal of an iteration as a point of a curve."""
 
     def __init__(self, folder):
         self.writer = SummaryWriter(folder, flush_secs=5)

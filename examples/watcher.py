@@ -1,6 +1,8 @@
-"""A learner of your own: it watches one stream after the other, and keeps the mean of its frames.
+"""A learner of your own: it attends to the streams in turn and stores the mean of all frames.
 
-PYTHONPATH=examples cdmisfa learn oscillatory --algorithm watcher:Watcher -o runs/watcher
+Run it with its module and class name:
+
+    PYTHONPATH=examples cdmisfa learn oscillatory --algorithm watcher:Watcher -o runs/watcher
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from cdmisfa.modules import Module
 
 @dataclass(frozen=True)
 class WatcherConfig:
-    """Keys `learner.*`: `algorithm` is needed, the others are the learner's own."""
+    """Configuration keys `learner.*`. Only `algorithm` is required."""
 
     algorithm: str = "watcher:Watcher"
     tau: int = 30
@@ -29,7 +31,7 @@ class WatcherConfig:
 
 
 class Watcher:
-    """See `cdmisfa.core.learning.Learner`."""
+    """A learner with the members of `cdmisfa.core.learning.Learner`."""
 
     configuration = WatcherConfig
     events: tuple[str, ...] = ()
@@ -44,22 +46,22 @@ class Watcher:
 
     @property
     def iteration(self) -> int:
-        """Return the number of blocks that were watched."""
+        """Return the number of blocks so far."""
         return int(self._count[0])
 
     @property
     def stream(self) -> int:
-        """Return the stream to watch next."""
+        """Return the index of the stream to attend to next."""
         return self.iteration % len(self.spec.streams)
 
     @property
     def phi(self) -> NDArray[np.float64]:
-        """Return what is learned, (outputs, inputs), for the log."""
+        """Return the weights, (outputs, inputs), for the log."""
         return self._mean.copy()
 
     @property
     def over(self) -> str:
-        """Return why learning ends, or ""."""
+        """Return the reason why learning ends, or "" to continue."""
         return "nothing_left" if self.iteration >= self.config.patience else ""
 
     def step(self, block: Block) -> BlockSignals:
@@ -71,20 +73,20 @@ class Watcher:
         iteration = self.iteration
         self._mean[0] += (mean - self._mean[0]) / (iteration + 1)
         self._count += 1
-        given = {"reward": change, "next_stream": self.stream}
-        return signals_of_block(block, self.spec, iteration, outputs=1, modules=0, **given)
+        values = {"reward": change, "next_stream": self.stream}
+        return signals_of_block(block, self.spec, iteration, outputs=1, modules=0, **values)
 
     @property
     def state(self) -> LearnerState:
-        """Return a copy of everything that a resumed run continues from."""
+        """Return a copy of all state that a resumed run needs."""
         arrays = {"mean": self._mean.copy(), "count": self._count.copy()}
         return LearnerState(arrays, (), self._rng.bit_generator.state)
 
     def restore(self, state: LearnerState) -> None:
-        """Continue from such a copy."""
+        """Continue from a copy of the state."""
         overwrite({"mean": self._mean, "count": self._count}, state.arrays)
         self._rng.bit_generator.state = dict(state.policy_rng)
 
     def summary(self) -> Mapping[str, Any]:
-        """Return what `learn --json` says beside."""
+        """Return further keys for `learn --json` and run.json."""
         return {"mean": self._mean[0].tolist()}
