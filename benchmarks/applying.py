@@ -98,7 +98,7 @@ Rows = list[list[object]]
 
 
 def throughput(folder: Path, rounds: int) -> tuple[Rows, Rows]:
-    """Rows of a log and the outputs of a module.
+    """Rows of a log and the outputs a module.
 
     Returns:
         CPU microseconds a frame, of all threads; frames a second that are read by the wall's
@@ -151,22 +151,18 @@ def main(*, quick: bool = False) -> None:
         rounds = 2 if quick else 5
         cpu, wall = throughput(Path(place), rounds)
         late = latency(Path(place), 5 if quick else 30)
-    head = "log", "outputs of a module"
+    head = "log", "outputs a module"
     forms = [f"to {form}" if form else "to nothing" for form in FORMS]
     save(
         "applying",
-        "Modules applied to logs",
-        "Ten modules applied to frames of 128x48, as `cdmisfa apply` does, with what is written, "
-        "against reading the frames alone. First CPU microseconds a frame, of all threads; then, "
-        "by the wall's clock, which counts whatever else runs, frames a second of reading, and the "
-        "share of them that is left. A recording of ours is read faster than it can be projected: "
-        "each output takes 6,144 multiply-adds in double precision a frame, whose sums keep their "
-        "order, so that the bits are those of `module.transform`. Last how much later than it "
-        "lasts a block is printed as a JSON line, counted from the time of its first frame: JPEGs "
-        "of 640x480 at 30 Hz over HTTP, ten modules of eight outputs, milliseconds.",
+        "Apply modules to a log",
+        "CPU time of a frame (all threads) for ten modules on frames of 128x48: reading "
+        'alone, with the modules ("to nothing"), and with output to a file. Second table: '
+        "frames a second by wall time, and the share of the reading speed that remains. "
+        "Third: delay of live results after the end of a block.",
         [
-            ([*head, "reading, us", *(f"{form}, us" for form in forms)], cpu),
-            ([*head, "read, frames a second", *forms], wall),
-            (["blocks", "median, ms", "95 %, ms", "most, ms"], [late]),
+            ([*head, "reading, µs", *(f"{form}, µs" for form in forms)], cpu),
+            ([*head, "reading, frames/s", *forms], wall),
+            (["blocks", "median, ms", "95 %, ms", "maximum, ms"], [late]),
         ],
     )

@@ -93,13 +93,13 @@ def main(*, quick: bool = False) -> None:
                 row += [middle(times["decoding"], 1), middle(times["converting"], 1)]
                 row.append(f"{share:.0f} %")
             rows.append(row)
-    ours = ["decoding, us", "converting, us", "share"]
+    ours = ["decoding, µs", "converting, µs", "share"]
     header = ["log", *(f"CPU: {part}" for part in ours), *(f"wall: {part}" for part in ours)]
     save(
         "converting",
-        "Converting",
-        f"{n} images of 640x480 as frames of 80x60, opening included: all of the conversion, with "
-        "the checksums of what was read and written, against decoding and scaling alone. The "
-        "share is the frame rate of converting over that of decoding.",
+        "Convert a log",
+        f"{n} images of 640x480 to frames of 80x60: decoding and scaling alone, and the "
+        "complete conversion with checksums. Share: speed of converting relative to decoding "
+        "alone.",
         [(header, rows)],
     )

@@ -53,9 +53,9 @@ def commands(folder: Path, recordings: int) -> list[list[object]]:
     """What commands take on that many small recordings."""
     write_corpus(folder, recordings)
     work: list[tuple[str, tuple[object, ...]]] = [
-        ("index, the first time", ("index", folder, "--jobs", 2)),
+        ("index, first time", ("index", folder, "--jobs", 2)),
         ("index, nothing changed", ("index", folder)),
-        ("--version, to compare with", ("--version",)),
+        ("--version (start-up alone)", ("--version",)),
     ]
     rows: list[list[object]] = []
     for name, words in work:
@@ -88,13 +88,13 @@ def main(*, quick: bool = False) -> None:
         files = per_file(Path(folder), 20 if quick else 100)
     save(
         "corpus",
-        "The index of many logs",
-        f"Recordings of three views and {FRAMES} frames, each a folder of three files. Commands "
-        "are processes of their own: seconds by the wall's clock, of all processors, and the peak "
-        "of one process, without pandas, which no command needs and pyarrow imports where it is "
-        "installed: about a second of CPU. Below, a file's row by its summary and by decoding it.",
+        "Index of many logs",
+        f"Index recordings of three views and {FRAMES} frames each. Wall time and CPU time of "
+        "whole processes, and the peak memory of the largest one. pandas is not installed; "
+        "where it is, pyarrow imports it (about 1 s of CPU). Second table: one file by its "
+        "summary, and by decoding all frames.",
         [
-            (["command", "recordings", "seconds", "CPU, seconds", "peak, MB"], rows),
-            (["a file by its summary, ms", "by decoding, ms", "ratio"], [files]),
+            (["command", "recordings", "seconds, wall", "seconds, CPU", "peak MB"], rows),
+            (["by its summary, ms", "by decoding, ms", "ratio"], [files]),
         ],
     )

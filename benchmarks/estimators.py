@@ -102,17 +102,16 @@ def main(*, quick: bool = False) -> None:
                 slowest = f"{slowness(np.asarray(call().transform(following))):.2g}"
                 row = [f"{n:,} x {size:,}", name, took, against, f"{allocated(call):.1f}", slowest]
                 rows.append(row)
-    head = ["samples x values", "", "CPU s", "vs RecursiveSFA", "MB beside X", "slowest found"]
+    head = ["samples x values", "", "CPU s", "vs RecursiveSFA", "MB allocated", "slowness"]
     save(
         "estimators",
-        "Estimators",
-        f"Learning {FEATURES} features of arrays: sums of as many sines as there are values, of "
-        ".002 to .4 cycles a sample, and noise. CPU time of one thread; the most that numpy and "
-        "Python allocate meanwhile; the slowness of the slowest output on as many samples that "
-        f"follow, in cycles a sample. RecursiveSFA and IncSFA look among {WHITENED} principal "
-        "components, sklearn-sfa, deeptime's TICA and RecursiveSFA where it says so among all "
-        "values; IncrementalPCA keeps 32 components, and looks for no slow ones. It and the second "
-        f"TICA take batches of {BATCH:,}. Above {LARGEST} values sklearn-sfa and RecursiveSFA "
-        "among all are left out, and so is what is not installed.",
+        "Estimators against other libraries",
+        f"Learn {FEATURES} features of an array: sums of as many sines as there are values "
+        "(0.002 to 0.4 cycles a sample) and noise. CPU time of one thread, memory allocated "
+        "meanwhile, and the slowness of the slowest output on as many further samples "
+        f"(smaller is better). RecursiveSFA and IncSFA first reduce the values to {WHITENED} "
+        'principal components; the others and "RecursiveSFA, all" use all values. '
+        'IncrementalPCA (32 components) does not look for slow features. "Batches": of '
+        f"{BATCH:,} samples.",
         [(head, rows)],
     )

@@ -244,19 +244,18 @@ def main(*, quick: bool = False) -> None:
         + [f"{c['times_faster_than'][o]}x" if o in c["times_faster_than"] else "" for o in others]
         for c in cases
     ]
-    header = ["inputs", "K", "J", "tau", "kernel", "us a frame", *(f"vs {o}" for o in others)]
+    header = ["inputs", "K", "J", "tau", "kernel", "µs a frame", *(f"vs {o}" for o in others)]
     save(
         "kernels",
         "IncSFA kernels",
-        "CPU time of one thread, medians of interleaved rounds. IncrementalPCA does the "
-        "whitening only; of the images of the first table every pixel changes. The second table "
-        "is of the sample log, where most stand still within a block, against its frames with "
-        "noise (6144 inputs, tau = 40); the third what numpy does on one core of this machine, its "
-        "BLAS with the widest vectors there are; the fourth the errors against a run in long "
-        "double (600 inputs, K = 16, J = 3, tau = 40).",
+        "CPU time of one thread, medians of interleaved rounds. IncrementalPCA does only the "
+        "whitening. First table: images in which every pixel changes. Second: the sample "
+        "log, where most pixels are constant within a block, against its frames with noise "
+        "(6144 inputs, tau = 40). Third: limits of numpy on one core of this machine. "
+        "Fourth: errors against long double (600 inputs, K = 16, J = 3, tau = 40).",
         [
             (header, rows),
-            (["K", "J", "us a frame", "with noise", "gain"], still),
+            (["K", "J", "µs a frame", "with noise", "gain"], still),
             (["limit", "value"], list(limits.items())),
             (["frames", "order", "phi", "vectors", "carried Gram matrix"], errors),
         ],

@@ -86,24 +86,20 @@ def fixed(brief: list[float], each: list[float], short: int) -> float:
 def main(*, quick: bool = False) -> None:
     """Measure, and write results/learn.json."""
     rounds, short, long = (2, 10, 60) if quick else (5, 10, 1000)
-    head = ["CPU of", "logs", "us an iteration, whole run", "more than no log"]
-    head += ["us a further iteration", "more than no log", "fixed ms"]
+    head = ["CPU of", "logs", "µs an iteration", "more than no log"]
+    head += ["µs a further iteration", "more than no log", "fixed ms"]
     tables = []
     for name, config in CONFIGS.items():
         rows = table(config, rounds, short, long)
         tables.append(([f"{name}: {head[0]}", *head[1:]], rows))
     save(
         "learn",
-        "Learning with and without logs",
-        f"Whole runs of {long} iterations of 40 frames of the sample log (48 x 128 pixels), "
-        "with opening and finishing the files, as the preset icub learns and with "
-        "K = 32, J = 5. The chunks of the log are compressed in a thread of their own (10 us of "
-        "LZ4 an iteration, and 9 us of checksums, indexes and writing). The view is built after "
-        "the run, in one pass over its log; what other threads do is nearly all Rerun's, which "
-        "compress the pictures and the times of all rows again: 50 us an iteration of the preset "
-        "icub in a program that sends the same chunks and does nothing else. From runs of "
-        f"{short} iterations in the same round: what a further iteration takes, and what a run "
-        "takes however short it is. Importing Rerun, once a process, is not in it.",
+        "Learning",
+        f"Runs of {long} iterations on the sample log (blocks of 40 frames, 48 x 128 pixels), "
+        "with opening and closing all files. CPU time of an iteration, and by how much it "
+        "grows when the run is logged (`run.mcap`) and when the Rerun view (`run.rrd`) is "
+        'written after the run. The second table is for K = 32, J = 5. "Further iteration" '
+        f'and "fixed" follow from runs of {short} iterations in the same round.',
         tables,
     )
 

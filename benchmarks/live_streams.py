@@ -102,10 +102,10 @@ def main(*, quick: bool = False) -> None:
     header = ["streams", "seconds", "cores busy", "cores of the sender", *_LOST]
     save(
         "live_streams",
-        "Live streams",
-        "JPEGs of 640x480 at 30 Hz from a process on this machine, over HTTP; each recorded, and "
-        "learned from with the progress learner as it is by default. Counted over all streams, as "
-        "the recording states it: what is lost was pushed out of a full queue.",
+        "Live cameras",
+        "JPEG streams of 640x480 at 30 Hz over HTTP from a process on the same machine, "
+        "recorded and learned from at the same time. Frames dropped or lost are counted over "
+        "all streams.",
         [(header, [row])],
     )
 

@@ -111,15 +111,15 @@ def main(*, quick: bool = False) -> None:
                 rows[work] += [round(seconds, 2), round(peak), share]
     header = ["work"]
     for size in (short, long):
-        header += [f"{size} MB: seconds", f"{size} MB: peak of memory, MB"]
-        header += [f"{size} MB: read of it"]
+        header += [f"{size} MB: seconds", f"{size} MB: peak MB"]
+        header += [f"{size} MB: part read"]
     save(
         "long_recordings",
-        "Long recordings",
-        f"One view of {SHAPE[0]} x {SHAPE[1]} frames, uncompressed, each kind of work in a "
-        "process of its own, whose peak counts Python and its libraries, too. Seconds and bytes "
-        "read are of a second recording, once all is imported. What is read is checked against "
-        "its checksums.",
+        "Memory for long recordings",
+        f"A recording of one view ({SHAPE[0]} x {SHAPE[1]} pixels, uncompressed). Peak memory "
+        "of a process for each kind of work, Python and libraries included, and the part of "
+        "the file that it reads. Small recordings are read first, so that imports are not "
+        "counted in seconds and bytes.",
         [(header, list(rows.values()))],
     )
 

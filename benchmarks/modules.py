@@ -114,13 +114,13 @@ def main(*, quick: bool = False) -> None:
         projected = middle(ours) if count else ""
         more = f"{ratio(step, times['step 0']):.2f}x"
         rows.append([count, middle(step), more, projected, share, middle(digest, 1)])
-    head = ["modules", "us an iteration", "of none", "us to project", "vs a matrix product"]
+    head = ["modules", "µs an iteration", "of no module", "µs to project", "vs matrix product"]
     save(
         "modules",
-        "Many modules",
-        "An iteration of 40 frames of the sample log (48 x 128 pixels, K = 32, J = 5) of a learner "
-        "that has modules already, reading included and the digest of its signals not; projecting "
-        "the block on all modules alone, against numpy's BLAS; and the digest. CPU time of one "
-        "thread.",
-        [([*head, "us to digest"], rows)],
+        "Learning with many modules",
+        "CPU time of an iteration (40 frames of the sample log, K = 32, J = 5, one thread) "
+        "of a learner that has saved modules: each block is projected on all of them. Also: "
+        "the projection alone, against a matrix product of numpy, and the digest of the "
+        "signals.",
+        [([*head, "µs for the digest"], rows)],
     )

@@ -145,14 +145,13 @@ def main(*, quick: bool = False) -> None:
                 there = moments(out, count)
                 seconds = f"{statistics.median(there):.3f} ({max(there):.3f})"
                 rows.append([name, case, many, round(took), *percent, seconds])
-    head = ["run", "keyframes", "how many", "us an iteration", "of that", "of run.mcap"]
+    head = ["run", "keyframes", "how many", "µs an iteration", "of that", "of run.mcap"]
     save(
         "moments",
-        "Any moment of a run",
-        f"Runs of {frames:,} frames of 2.0 with a log, CPU of all threads; what of that keyframes "
-        "take, which is to copy, encode, compress and write them; and what it takes to go to a "
-        "moment, which is to open log and source, to take the keyframe before it, and to learn on "
-        f"from there: the median, and the most, of {MOMENTS} moments drawn at random, after "
-        "start-up.",
+        "Any iteration of a run",
+        f"Runs of {frames:,} frames of CD-MISFA 2.0 with a log: CPU time of all threads, the "
+        "share that keyframes take, and the time to restore an iteration (open log and "
+        "source, load the keyframe before it, learn up to it): median and maximum of "
+        f"{MOMENTS} random iterations.",
         [([*head, "CPU s to a moment"], rows)],
     )

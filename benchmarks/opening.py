@@ -128,14 +128,12 @@ def main(*, quick: bool = False) -> None:
             learned.append([*row, round(first_block(path) / MEGABYTE)])
     save(
         "opening",
-        "Opening a log of others",
-        "Opening a log of noise of 640x480 that mcap's own writer wrote, uncompressed, and taking "
-        "its first frame: seconds by the wall's clock, the file not in memory, and in memory. "
-        "What is read is the file's end, the message index of each chunk, and one chunk. Below, "
-        "all of `learn LOG -o RUN` after start-up until its first block of 40 frames is learned, "
-        "and what it has read by then.",
+        "Open a long log",
+        "Time from opening an uncompressed external MCAP log (640x480) until its first "
+        "frame, with the file on disk (cold) and in memory (warm), and the part of the file "
+        "that is read. Second table: until `learn` has learned its first block.",
         [
-            (["log", "cold, seconds", "warm, seconds", "read of it"], rows),
+            (["log", "cold, seconds", "warm, seconds", "part read"], rows),
             (["log", "learn: cold, seconds", "learn: warm, seconds", "read, MB"], learned),
         ],
     )

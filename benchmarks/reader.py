@@ -123,13 +123,13 @@ def main(*, quick: bool = False) -> None:
                 + [f"{ratio(times[k], mine):.1f}x" for k in ("mcap", "mcap to arrays")]
                 + [f"{100 * share:.0f} %" for share in shares]
             )
-    header = ["file", "compressed", "us a frame", "vs mcap", "vs mcap to arrays"]
+    header = ["file", "compressed", "µs a frame", "vs mcap", "vs mcap to arrays"]
     header += ["of decompression's speed", "of decompression in memory", "of memcpy"]
     save(
         "reader",
         "Reading a recording",
-        "Blocks of 40 frames (48 x 128) with ground truth, zstd, every CRC checked, CPU of all "
-        "threads. Decompression is mcap's chunk reader and zstd alone, without a checksum; in "
-        "memory, zstd alone.",
+        "Blocks of 40 frames (48 x 128) with ground truth, zstd, every CRC checked, CPU time "
+        'of all threads. "Decompression" is mcap\'s chunk reader and zstd without '
+        "checksums; in memory, zstd alone.",
         [(header, rows)],
     )

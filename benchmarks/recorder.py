@@ -75,10 +75,10 @@ def main(*, quick: bool = False, scene: str = "icub") -> None:
         rows.append([f"{n} job{'s' * (n > 1)}, wall", round(frame), gain, round(start, 1)])
     save(
         "recorder",
-        "Recording",
-        f"{frames} frames of each of three views of the scene {scene}, opening the scene "
-        "included. The share is the frame rate of recording over that of rendering alone. Jobs are "
-        f"compared by the wall's clock, which counts whatever else runs: what {more} frames of "
-        f"each view and {5 * more} differ by is the time of a frame, what is left is the start.",
-        [(["what", "us a frame", "ratio", "start, seconds"], rows)],
+        "Recording a scene",
+        f"{frames} frames of each of three views of the scene {scene}, with opening the "
+        "scene. Share: speed of recording relative to rendering alone. Jobs are compared by "
+        f"wall time: the time of a frame is the difference of recordings of {more} and "
+        f"{5 * more} frames, the start is the rest.",
+        [(["what", "µs a frame", "ratio", "start, seconds"], rows)],
     )

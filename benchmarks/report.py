@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import platform
@@ -20,7 +21,7 @@ from cdmisfa.experiments.documents import markdown
 
 RESULTS = Path(__file__).parent / "results"
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
-PAGE = Path(__file__).parent.parent / "docs" / "results" / "benchmarks.md"
+PAGE = Path(__file__).parent.parent / "docs" / "evidence" / "benchmarks.md"
 
 
 def interleaved(
@@ -28,11 +29,11 @@ def interleaved(
     rounds: int,
     clock: Callable[[], int] = time.thread_time_ns,
 ) -> dict[str, list[float]]:
-    """CPU microseconds per unit of work, one list entry a round, after one round to warm up.
+    """Return CPU microseconds per unit of work, one list entry a round, after a warm-up round.
 
-    The candidates take turns, so that a slow spell of the machine hits all of them. Each is a call
-    that does some units of work and returns how many. The clock tells nanoseconds, of the calling
-    thread; or of the process or the wall.
+    The candidates take turns, so that a slow phase of the machine affects all of them. Each is a
+    call that does some units of work and returns their number. The clock returns nanoseconds of
+    the calling thread, of the process or of wall time.
     """
     times: dict[str, list[float]] = {name: [] for name in work}
     for turn in range(rounds + 1):
@@ -45,12 +46,12 @@ def interleaved(
 
 
 def middle(times: Sequence[float], digits: int | None = None) -> float:
-    """The median of times, rounded."""
+    """Return the median of times, rounded."""
     return round(statistics.median(times), digits)
 
 
 def ratio(slow: Sequence[float], fast: Sequence[float]) -> float:
-    """Median of the ratios within each round."""
+    """Return the median of the ratios within each round."""
     return statistics.median(s / f for s, f in zip(slow, fast, strict=True))
 
 
@@ -79,7 +80,7 @@ def save(
 
     Args:
         name: of the benchmark.
-        title: its heading on the page.
+        title: of the results.
         note: what was measured.
         tables: each its header and its rows.
     """
@@ -97,23 +98,117 @@ def save(
     print("\n\n".join([f"## {title}", note, *(markdown(*table) for table in tables)]))
 
 
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One part of the page: heading, text, and columns of a stored table from a first row on."""
+
+    heading: str
+    text: str
+    columns: Sequence[int]
+    table: int = 0
+    first: int = 0
+
+
+PARTS = {
+    "learn": Part(
+        "Learning, and the cost of a log",
+        "CPU time of an iteration (40 frames of 48x128, all threads) with the preset `icub`, and "
+        "by how much it grows with the log of the run and with the Rerun view, which is written "
+        "after the run.",
+        (1, 2, 3),
+        first=3,
+    ),
+    "modules": Part(
+        "Learning with many modules",
+        "CPU time of an iteration of a learner that has already saved modules (32 components, "
+        "5 outputs): it computes the outputs of all of them for each block.",
+        (0, 1, 2),
+    ),
+    "live_streams": Part(
+        "Live cameras",
+        "JPEG streams of 640x480 at 30 Hz over HTTP, recorded and learned from at the same time: "
+        "busy cores, and frames lost over all streams.",
+        (0, 1, 2, 5, 9),
+    ),
+    "applying": Part(
+        "Computing features of a log",
+        "CPU time of a frame: reading alone, with ten modules of one or eight outputs each, and "
+        "with a Parquet file as output. Decoding dominates for videos.",
+        (0, 1, 2, 3, 4),
+    ),
+    "estimators": Part(
+        "Estimators against other libraries",
+        "Five features of an array of sines and noise, one thread. The last column is the slowness "
+        "of the slowest output on further samples: smaller is better. RecursiveSFA and IncSFA "
+        "first reduce the values to 20 principal components, which is fast and with 300 values "
+        "loses half of the slowness; `RecursiveSFA, all` keeps them. IncrementalPCA does not look "
+        "for slow features.",
+        (0, 1, 2, 3, 4, 5),
+    ),
+    "foreign": Part(
+        "Reading MCAP logs of other programs",
+        "Gray images: CPU time of mcap's own Python reader with the same image decoder, and how "
+        "many times as fast cdmisfa is. Both check the CRC of every chunk.",
+        (0, 1, 2),
+        table=2,
+    ),
+    "converting": Part(
+        "Converting a log",
+        "400 images of 640x480 to frames of 80x60. Share: the speed that is left of decoding and "
+        "scaling alone when a recording with checksums is written.",
+        (0, 1, 2, 3),
+    ),
+    "corpus": Part(
+        "Indexing many logs",
+        "Recordings of three views with 1,000 frames each, on two cores.",
+        (0, 1, 2, 3, 4),
+    ),
+    "long_recordings": Part(
+        "Memory for long recordings",
+        "Peak memory of a process, Python and its libraries included, for a recording of 100 MB "
+        "and one of 10 GB, and the part of the large one that is read.",
+        (0, 2, 5, 6),
+    ),
+    "opening": Part(
+        "Opening a long log",
+        "Seconds until the first frame of an uncompressed log of another program, with the file "
+        "on disk (cold) and in memory (warm), and the part of the file that is read.",
+        (0, 1, 2, 3),
+    ),
+    "startup": Part(
+        "Start-up",
+        "CPU time of a whole command; `learn` runs one iteration.",
+        (0, 1, 2),
+    ),
+}
+"""Parts of the page in their order, by the name of their benchmark."""
+
+INTRODUCTION = """\
+# Benchmarks
+
+How fast the commands are, how much memory they need, and how that compares with other libraries.
+Repeat a part with `python -m benchmarks NAME` in a checkout with the extra `bench`; `--quick` uses
+fewer rounds.
+
+Times depend on the machine; trust the ratios. The candidates of a table take turns within one
+process, and a ratio is the median over the rounds, so it may differ from the ratio of two cells.
+Times are CPU time unless "wall" is written.
+"""
+
+
 def write_page() -> Path:
-    """Write docs/results/benchmarks.md from the results: the first table of each."""
-    parts = [
-        "# Benchmarks\n\n`make bench` measures all of it and makes this page from "
-        "`benchmarks/results/*.json`; `python -m benchmarks NAME [--quick]` measures one part, "
-        "`python -m benchmarks page` makes the page. Candidates take turns, times are CPU time, "
-        "and what counts is the median of the ratios within each round: a slow spell of the "
-        "machine hits all of them. So the ratio of two cells need not be the ratio beside them. "
-        "Below each part is the commit that it measured: parts of different commits are not "
-        "to be compared with each other."
-    ]
-    for path in sorted(RESULTS.glob("*.json")):
+    """Write docs/evidence/benchmarks.md from the stored results."""
+    parts = [INTRODUCTION.strip()]
+    for name, part in PARTS.items():
+        path = RESULTS / f"{name}.json"
+        if not path.exists():
+            continue
         document = json.loads(path.read_text(encoding="utf-8"))
-        first = document["tables"][0]
+        table = document["tables"][part.table]
+        rows = [[row[k] for k in part.columns] for row in table["rows"][part.first :]]
         link = f"[{path.name}]({os.path.relpath(path, PAGE.parent)})"
-        end = f"Measured at {document['code']}; the machine and all tables: {link}."
-        table = markdown(first["header"], first["rows"])
-        parts += [f"## {document['title']}", document["note"], table, end]
+        end = f"`python -m benchmarks {name}` at commit {document['code']}; all tables: {link}."
+        columns = [table["header"][k] for k in part.columns]
+        parts += [f"## {part.heading}", part.text, markdown(columns, rows), end]
     PAGE.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return PAGE

@@ -123,15 +123,13 @@ def main(*, quick: bool = False) -> None:
     save(
         "scaling",
         "Scaling",
-        "One iteration of the agent for n streams, called from Python (every block novel, policy "
-        "iteration included). CPU time a frame and peak memory of a process that learns from the "
-        "oscillatory streams in blocks of 100. Trials in processes, by the wall's clock. What a "
-        "sweep takes for a trial of the oscillatory streams, from start to end, beyond computing "
-        "it: planning all trials reads the preset once.",
+        "First: one iteration of the agent for n streams. Second: CPU time and peak memory "
+        "of a process that learns from the oscillatory streams in blocks of 100. Third: "
+        "trials in processes, wall time. Fourth: overhead of a sweep for one trial.",
         [
-            (["streams", "us a step", "of 10 streams"], by_streams),
-            (["frames", "us a frame", "peak MB"], by_frames),
+            (["streams", "µs a step", "of 10 streams"], by_streams),
+            (["frames", "µs a frame", "peak MB"], by_frames),
             (["jobs", f"ms a trial of {40 * lengths[0]} frames", "speed"], by_jobs),
-            (["of a trial", "us", "of computing it"], by_part),
+            (["of a trial", "µs", "of computing it"], by_part),
         ],
     )

@@ -93,12 +93,10 @@ def main(*, quick: bool = False) -> None:
     ]
     save(
         "spreading",
-        "Modules applied to many logs by dask",
-        f"{MODULES} modules of {OUTPUTS[-1]} outputs applied to {LOGS} films of {FRAMES} frames of "
-        "640x480, by `cdmisfa apply --scheduler`, from its call to the last file, the index of "
-        "the logs included; workers of one thread each, which are there before. Two clusters take "
-        f"turns; the machine had a load of {load:.1f} meanwhile, which a second worker takes a "
-        "second share of: how many seconds of processors all workers took together says whether "
-        "they wait for each other.",
+        "Apply modules to many logs with dask",
+        f"{MODULES} modules of {OUTPUTS[-1]} outputs applied to {LOGS} videos of {FRAMES} "
+        "frames of 640x480 by `cdmisfa apply --scheduler`, from the call to the last file. "
+        "Workers have one thread each and are started before. Average load of the machine: "
+        f"{load:.1f}.",
         [(["workers", "seconds", "of processors", "faster"], rows)],
     )

@@ -20,11 +20,11 @@ WARM = {
     "import of numpy and rerun": ("-c", "import numpy, rerun"),
     "cdmisfa --help": ("-m", "cdmisfa", "--help"),
     "cdmisfa signals": ("-m", "cdmisfa", "signals"),
-    "cdmisfa info of a recording": ("-m", "cdmisfa", "info", str(SAMPLE / "left.mcap")),
-    "learn oscillatory --no-rerun": (*LEARN, "RUN", "oscillatory", "--no-rerun"),
+    "cdmisfa info RECORDING": ("-m", "cdmisfa", "info", str(SAMPLE / "left.mcap")),
+    "learn oscillatory, no view": (*LEARN, "RUN", "oscillatory", "--no-rerun"),
     "learn oscillatory": (*LEARN, "RUN", "oscillatory"),
-    "learn of two views --no-rerun": (*LEARN, "RUN", *VIEWS, "--no-rerun"),
-    "learn of two views by progress --no-rerun": (*LEARN, "RUN", *PROGRESS, "--no-rerun"),
+    "learn of two views by 2.0, no view": (*LEARN, "RUN", *VIEWS, "--no-rerun"),
+    "learn of two views, no view": (*LEARN, "RUN", *PROGRESS, "--no-rerun"),
 }
 FIRST = [name for name in WARM if name.startswith("learn")]
 
@@ -65,17 +65,15 @@ def main(*, quick: bool = False) -> None:
     least = times["import of numpy"]
     save(
         "startup",
-        "Starting",
-        "CPU time of whole processes; `learn` learns one iteration. The second table is of first "
-        "runs, where Python makes the bytecode of all that is imported, its own library included; "
-        "nothing else is compiled.",
+        "Start-up",
+        "CPU time of whole processes. `learn` runs one iteration.",
         [
             (
-                ("process", "CPU ms", "times the import of numpy"),
+                ("process", "CPU ms", "of importing numpy"),
                 [(n, middle(t), f"{ratio(t, least):.2f}x") for n, t in times.items()],
             ),
             (
-                ("first run of", "CPU ms", "times a later one"),
+                ("first run of", "CPU ms", "of a later run"),
                 [(n, middle(t), f"{ratio(t, times[n]):.2f}x") for n, t in first.items()],
             ),
         ],

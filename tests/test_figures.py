@@ -76,6 +76,12 @@ def detail(experiment: str, claim: int) -> tuple[int, ...]:
     return tuple(map(int, re.findall(r"\d+", load(experiment)["claims"][claim]["detail"])))
 
 
+def scenes(column: int) -> tuple[int, int]:
+    """Return in how many of how many trials both objects of the iCub's scenes were learned."""
+    cells = [row[column].split(" of ") for row in load("scenes")["tables"][0][1]]
+    return sum(int(cell[0]) for cell in cells), sum(int(cell[1]) for cell in cells)
+
+
 OTHERS = ("games", "light", "oscillatory-noise")
 RULES = ("progress", "robin", "random")
 CHOICE = ("reported-photographs", "reported-grids", "reported-many")
@@ -117,6 +123,10 @@ RESULTS: dict[str, Figures] = {
                 sum(len(entry["seeds"]) for entry in arena("2.0", *OTHERS)),
             ),
         ),
+    ],
+    "Does it work on other scenes than the paper's?": [
+        ("both objects in {} of {} trials", lambda: scenes(3)),
+        ("2.0 in {} of {}", lambda: scenes(1)),
     ],
     "Does it choose streams well?": [
         (

@@ -10,9 +10,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from cdmisfa.agents.learners import open_learner
 from cdmisfa.experiments.documents import markdown, plain, versions
-from cdmisfa.studies.paper.experiment import Settings, Trial
-from cdmisfa.studies.paper.icub import make_recording
+from cdmisfa.experiments.loop import learn_blocks
+from cdmisfa.studies.paper.experiment import Settings, Trial, module_row
+from cdmisfa.studies.paper.icub import ITERATIONS, follows, make_recording
 from cdmisfa.studies.paper.reproduce import FIRST_SEED
 
 Table = tuple[Sequence[str], Sequence[Sequence[Any]]]
@@ -57,3 +59,22 @@ def study(
     given.out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(plain({**document, "versions": versions()}), indent=1)
     (given.out / f"{name}.json").write_text(text + "\n", "utf-8")
+
+
+def learn_and_judge(source: Any, config: Any, seed: int, frames: int) -> dict[str, Any]:
+    """Learn the iCub scene up to a frame; return a row that judges modules on the frames after it.
+
+    Args:
+        source: of the scene.
+        config: of the learner.
+        seed: of the learner.
+        frames: to learn from, at most `ITERATIONS` blocks.
+    """
+    learner = open_learner(config, source.spec, seed)
+    iterations = min(ITERATIONS, frames // learner.tau)
+    learn_blocks(source, learner, [], max_iterations=iterations, max_modules=iterations)
+    return {
+        **module_row(learner.modules),
+        "iterations": learner.iteration,
+        "follows": [follows(module, source, frames) for module in learner.modules],
+    }

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.paper import Table, study
+from benchmarks.paper import Table, learn_and_judge, study
 from cdmisfa.experiments.trial import run_trial
 from cdmisfa.studies.paper import icub, oscillatory
 from cdmisfa.studies.paper.experiment import (
@@ -75,7 +75,7 @@ def run(settings: Settings) -> dict[str, Any]:
         most = oscillatory.MAX_ITERATIONS
         return module_row(run_trial(config, seed=seed, max_iterations=most).modules)
     with contextlib.closing(open_recording(settings["recording"])) as source:
-        return icub.learn_and_judge(source, config, seed, source.frames - icub.HELD_OUT)
+        return learn_and_judge(source, config, seed, source.frames - icub.HELD_OUT)
 
 
 def tables(trials: Sequence[Trial]) -> list[Table]:

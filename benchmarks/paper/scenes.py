@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.paper import Table, study
+from benchmarks.paper import Table, learn_and_judge, study
 from cdmisfa.core.config import load_preset
 from cdmisfa.experiments.sources import Layers, configure
 from cdmisfa.studies.paper import icub
@@ -42,7 +42,7 @@ def run(settings: Settings) -> dict[str, Any]:
     config = configure("icub", Layers.read(words=words), settings["seed"])
     with contextlib.closing(config.open_scene()) as source:
         end = icub.ITERATIONS * config.learner.tau
-        return icub.learn_and_judge(source, config.learner, settings["seed"], end)
+        return learn_and_judge(source, config.learner, settings["seed"], end)
 
 
 def tables(trials: Sequence[Trial]) -> list[Table]:

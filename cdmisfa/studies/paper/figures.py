@@ -41,10 +41,10 @@ def save_figure(figure: Figure, folder: Path, name: str) -> Path:
 
 def letter_panel(axes: Axes, letter: str, x: str, y: str) -> None:
     """Letter a panel and name its axes."""
-    axes.set_title(f"({letter})", loc="left", fontsize=9)
-    axes.set_xlabel(x, fontsize=8)
-    axes.set_ylabel(y, fontsize=8)
-    axes.tick_params(labelsize=7)
+    axes.set_title(f"({letter})", loc="left", fontsize=10)
+    axes.set_xlabel(x, fontsize=9)
+    axes.set_ylabel(y, fontsize=9)
+    axes.tick_params(labelsize=8)
 
 
 def stack(curves: Curves) -> FloatArray:
@@ -109,5 +109,5 @@ def draw_policies(axes: Axes, curves: Curves, letter: str, y: str) -> None:
 
 def explain_above(axes: Axes) -> None:
     """Put a legend above the panel, where it hides nothing."""
-    how: dict[str, Any] = {"fontsize": 6, "ncols": 4, "frameon": False, "borderaxespad": 0.2}
+    how: dict[str, Any] = {"fontsize": 8, "ncols": 4, "frameon": False, "borderaxespad": 0.2}
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), **how)

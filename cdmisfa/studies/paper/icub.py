@@ -141,7 +141,7 @@ class Icub(Experiment):
                 continue
             y, truth = one[f"y{i + 1}"], one[f"truth{i + 1}"]
             axes[i, 0].plot(y, color=figures.COLOURS[0], linewidth=0.8)
-            figures.letter_panel(axes[i, 0], "ac"[i], "frame", f"output y of module {i + 1}")
+            figures.letter_panel(axes[i, 0], "ac"[i], "frame", f"output of module {i + 1}")
             axes[i, 1].plot(truth, y, ".", color=figures.COLOURS[0], markersize=3)
             figures.letter_panel(axes[i, 1], "bd"[i], f"{name}, m", "")
             axes[i, 1].locator_params(axis="x", nbins=5)

@@ -163,8 +163,8 @@ class NonStationary(Experiment):
         figure, axes = figures.new_figure(1, 2)
         for panel, sigma, letter in zip(axes[0], shown, "ab", strict=True):
             _draw_policies(panel, of_sigma[sigma])
-            axis = rf"$\epsilon^c$   ($\sigma$ = {sigma:g})"
-            figures.letter_panel(panel, letter, axis, "policy, mean")
+            axis = rf"$\epsilon$ at the change ($\sigma$ = {sigma:g})"
+            figures.letter_panel(panel, letter, axis, "mean final policy")
             panel.set_ylim(-0.07, 1.07)
             panel.set_yticks([0, 1], ["stay", "switch"])
         return [figures.save_figure(figure, folder, "nonstationary")]

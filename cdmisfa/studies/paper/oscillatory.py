@@ -122,13 +122,13 @@ class Oscillatory(Experiment):
         names = ("eta_dot", "R", "Q", "policy")
         eta_dot, R, Q, policy = ([t.arrays[name] for t in trials] for name in names)
         figures.draw_eta_dot(axes[0, 0], eta_dot, paper_config("oscillatory").delta, "a")
-        figures.draw_means(axes[0, 1], R, "b", "R, stay entries")
+        figures.draw_means(axes[0, 1], R, "b", "reward for staying")
         figures.draw_means(axes[1, 0], gains(Q), "c", GAIN)
         figures.draw_policies(axes[1, 1], policy, "d", "share of trials that stay")
         return [figures.save_figure(figure, folder, "oscillatory")]
 
 
-GAIN = "Q(s, stay) - Q(s, switch)"
+GAIN = "advantage of staying"
 
 
 def gains(Q: figures.Curves) -> figures.Curves:
@@ -213,7 +213,7 @@ class Stability(Experiment):
         for row, algorithm in enumerate(ALGORITHMS):
             one = groups(trials, "algorithm")[algorithm,][0]
             reward, policy = ([one.arrays[name]] for name in ("R", "policy"))
-            figures.draw_means(axes[row, 0], reward, "ac"[row], f"{algorithm}: R, stay entries")
+            figures.draw_means(axes[row, 0], reward, "ac"[row], f"{algorithm}: reward for staying")
             figures.draw_policies(axes[row, 1], policy, "bd"[row], f"{algorithm}: stays on")
             for panel in axes[row]:
                 ends = {"color": "grey", "linestyle": ":", "linewidth": 0.8}
