@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import resource
-import shlex
 import shutil
 import signal
 import socket
@@ -262,23 +260,27 @@ def test_a_log_damaged_half_way_is_named_each_time(
     assert cdmisfa("apply", run, log, "-o", tmp_path / "w.csv", "--skip-damaged").code == 0
 
 
-def test_the_commands_of_the_page_work(
+def test_workers_of_a_dask_cluster_apply_and_sweep(
     run: Path, cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed")
-    page = (ROOT / "docs" / "how-to" / "clusters.md").read_text("utf-8")
-    (block,) = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
     (tmp_path / "runs").mkdir()
     run.rename("runs/cameras")
+    address = f"tcp://127.0.0.1:{port}"
     with contextlib.ExitStack() as ended:
-        for program, *words in map(shlex.split, block.replace("8786", port).splitlines()):
-            if program == "dask":
-                ended.enter_context(running("-m", "dask", *words, "--no-dashboard"))
-                continue
-            done = cdmisfa(*words)
+        for words in (
+            f"scheduler --host 127.0.0.1 --port {port}",
+            f"worker {address} --nthreads 1 --nworkers 2",
+        ):
+            ended.enter_context(running("-m", "dask", *words.split(), "--no-dashboard"))
+        for words in (
+            "apply runs/cameras sample_logs/ic* -o applied/there",
+            "sweep oscillatory --seeds 0:2 --max-modules 1 -o sweeps/there",
+        ):
+            done = cdmisfa(*words.split(), "--scheduler", address)
             assert done.code == 0, done.err
     assert pq.read_table("applied/there")["log"].unique().to_pylist() == ["icub"]

@@ -46,7 +46,7 @@ class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with 
     """A record contradicts the format; the reader adds file and place."""
 
 
-# The formats that are read, for errors; docs/how-to/logs.md says more.
+# The formats that are read, for errors; docs/how-to/open-data.md describes each.
 KINDS: Final = (
     "logs are .mcap, .bag and .db3 files, videos (.mp4, .m4v, .mov, .mkv, .webm, .avi, .wmv, .mpg, "
     ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, LeRobot datasets, and arrays "

@@ -38,7 +38,7 @@ MOST_LETTERS: Final = 500
 
 _WORD: Final = pa.dictionary(pa.int32(), pa.string())
 
-# Columns of the index; docs/how-to/corpus.md says what each is.
+# Columns of the index; docs/reference/files.md describes each.
 SCHEMA: Final = pa.schema(
     [
         ("path", pa.string()),
