@@ -9,7 +9,7 @@ SOURCES := pyproject.toml setup.py $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/ker
 SANITIZED := build/sanitized
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
 
-.PHONY: demo test suite lint bench docs pictures fuzz torture attacks sanitized release \
+.PHONY: demo test suite lint bench docs images fuzz torture attacks sanitized release \
     clean install
 
 demo: $(INSTALLED)
@@ -33,7 +33,7 @@ bench: .venv/.with-bench
 docs: .venv/.with-docs
 	$(BIN)/sphinx-build -W -b html docs build/site
 
-pictures: .venv/.with-docs
+images: .venv/.with-docs
 	$(BIN)/python docs/images/draw.py
 
 fuzz: $(TESTED)

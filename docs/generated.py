@@ -19,7 +19,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import interrupts
-from cdmisfa.cli.app import HELP, cli
+from cdmisfa.cli.app import HEADINGS, cli
 from cdmisfa.core import errors
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.documents import markdown
@@ -101,9 +101,9 @@ def commands() -> str:
     formatter = click.HelpFormatter(width=WIDTH)
     formatter.write_dl(first)
     parts = ["## Options of several commands", _console(formatter)]
-    for heading, names in HELP.items():
+    for heading, names in HEADINGS.items():
         parts.append(f"## {heading}")
-        for name in names:
+        for name in names.split():
             parts += [f"### cdmisfa {name}", _console(_help(contexts[name], shared))]
     return "\n\n".join(parts)
 

@@ -1,6 +1,6 @@
-"""Draw the pictures of these pages again: runs, views of every tab. `make pictures`.
+"""Draw the images of these pages again: every tab of views, and tops of reports. `make images`.
 
-With names of pictures, only those; runs that are in build/pictures already are not learned again.
+With names of images, only those; runs that are in build/images already are not learned again.
 """
 
 from __future__ import annotations
@@ -8,23 +8,40 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import demonstrations
+
 from cdmisfa.cli import run
+from replay import viewer
 from replay.runs.compare import side_by_side
 from replay.view.overlay import build_overlay
 
-IMAGES = Path(__file__).parent
-SAMPLE = str(IMAGES.parents[1] / "sample_logs" / "icub")
-BUILD = IMAGES.parents[1] / "build" / "pictures"
+DOCS = Path(__file__).parents[1]
+IMAGES = DOCS / "images"
+SAMPLE = str(DOCS.parent / "sample_logs" / "icub")
+BUILD = DOCS.parent / "build" / "images"
+GALLERY = DOCS.parent / "build" / "gallery"
 
-COLOURS = 256
-"""Colours of a view's picture, which so takes a third of the bytes; rare ones are kept."""
+# Colors of an image, which so takes a third of the bytes; rare colors are kept.
+COLORS = 256
 
+# Size of the viewer's window in points. Text stays readable where a page shows the image 700
+# pixels wide.
+WINDOW = "1150x800"
+SMALL_WINDOW = "900x700"
+
+# Points at the top of the window: the viewer's menu, with warnings about this machine.
+MENU = 36
+
+# Runs, and the arguments of `learn` that make them.
 LEARN = {
-    "room": ("icub", "--preset", "icub-real"),
+    "room": ("icub", "--preset", "icub-real", "--set", "learner.watch=120"),
     "icub": (SAMPLE, "--loop"),
     "progress": (SAMPLE, "--loop", "--algorithm", "progress"),
     "progress1": (SAMPLE, "--loop", "--algorithm", "progress", "--seed", "1"),
@@ -34,16 +51,16 @@ LEARN = {
     ),
     **{f"seed{seed}": ("oscillatory", "--seed", str(seed)) for seed in range(3)},
 }
-"""Runs, and what `learn` is told to make them."""
 
+# Runs that are laid over one another.
 COMPARED = {"by 2.0": ("seed0", "seed1", "seed2"), "by progress": ("progress", "progress1")}
-"""Runs that are laid over one another."""
 
+# Images of views: the run or recording, the tab, and further options.
 VIEWS = {
-    "view": ("room", "World", "--at", "4590"),
+    "view": ("room", "World", "--at", "14680"),
     "oscillatory": ("seed0", "Overview"),
-    "abstraction": ("icub", "Abstraction"),
-    "gate": ("icub", "Gate"),
+    "abstraction": ("icub", "Candidate"),
+    "gate": ("icub", "Novelty"),
     "decisions": ("seed0", "Decision"),
     "modules": ("progress", "Modules"),
     "values": ("seed0", "World", "--at", "module 2"),
@@ -55,10 +72,17 @@ VIEWS = {
     "compare": ("by 2.0", "Overview"),
     "errors": ("by progress", "Streams"),
 }
-"""Pictures of views: the run or recording, the tab, and further options."""
 
-REPORTS = {"report": ("icub", "1180,1150")}
-"""Pictures of reports: the run, and the size of the browser's window."""
+# Views in a small window.
+SMALL = ("view", "recording")
+
+# Images of reports: the run, in the gallery with its folder, and the size of the browser's window.
+REPORTS = {
+    "report": ("icub", "1000,1100"),
+    "gallery-icub": ("runs/icub", "900,720"),
+    "gallery-photographs": ("runs/photographs", "900,720"),
+    "gallery-rejected": ("runs/rejected", "900,720"),
+}
 
 
 def must(*words: str) -> None:
@@ -68,7 +92,12 @@ def must(*words: str) -> None:
 
 
 def learned(name: str) -> Path:
-    """A run, learned where it is not there yet."""
+    """Return the folder of a run, which is learned if it is missing."""
+    if name.startswith("runs/"):
+        if not GALLERY.exists():
+            GALLERY.mkdir(parents=True)
+            demonstrations.make_runs(GALLERY)
+        return GALLERY / name
     folder = BUILD / name
     if not (folder / "run.json").exists():
         must("learn", *LEARN[name], "-o", str(folder), "--no-rerun", "--force")
@@ -79,25 +108,26 @@ def draw_view(name: str) -> None:
     """Draw one tab of one view."""
     source, tab, *options = VIEWS[name]
     if source in COMPARED:
-        shown = BUILD / f"{name}.rrd"
+        path = BUILD / f"{name}.rrd"
         runs = [learned(compared) for compared in COMPARED[source]]
-        build_overlay(runs, side_by_side(runs), shown, force=True, tab=tab)
+        build_overlay(runs, side_by_side(runs), path, force=True, tab=tab)
         tab = ""
     else:
-        shown = learned(source) if source in LEARN else Path(source)
-    opened = ("--tab", tab) if tab else ()
+        path = learned(source) if source in LEARN else Path(source)
+    tab_options = ("--tab", tab) if tab else ()
     drawn = BUILD / f"{name}.png"
-    must("view", str(shown), "--screenshot", str(drawn), "--force", *opened, *options)
-    fewer_colours(drawn)
+    viewer.WINDOW = SMALL_WINDOW if name in SMALL else WINDOW
+    must("view", str(path), "--screenshot", str(drawn), "--force", *tab_options, *options)
+    save(drawn, top=MENU)
 
 
-def fewer_colours(drawn: Path) -> None:
-    """Keep a picture with fewer colours."""
-    with Image.open(drawn) as picture:
-        few = picture.convert("RGB").quantize(
-            COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+def save(drawn: Path, top: int = 0) -> None:
+    """Save an image for the pages: without its top, and with fewer colors."""
+    with Image.open(drawn) as image:
+        part = image.convert("RGB").crop((0, top, *image.size))
+        part.quantize(COLORS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+            IMAGES / drawn.name, optimize=True
         )
-        few.save(IMAGES / drawn.name, optimize=True)
 
 
 def draw_report(name: str) -> None:
@@ -111,15 +141,15 @@ def draw_report(name: str) -> None:
     flags = ("--headless", "--no-sandbox", "--hide-scrollbars", f"--window-size={size}")
     words = [browser, *flags, f"--screenshot={drawn}", page.resolve().as_uri()]
     subprocess.run(words, check=True, capture_output=True)
-    fewer_colours(drawn)
+    save(drawn)
 
 
-def main() -> None:
-    """Draw the pictures that are named, by default all."""
+def main(names: Sequence[str]) -> None:
+    """Draw the images that are named, by default all."""
     BUILD.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[1:] or [*VIEWS, *REPORTS]:
+    for name in names or [*VIEWS, *REPORTS]:
         (draw_report if name in REPORTS else draw_view)(name)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
