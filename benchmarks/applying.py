@@ -25,9 +25,9 @@ from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
 from replay.export.applied import written
 from replay.export.frames import write_video
-from replay.inputs import open_arrays, open_log
+from replay.open_sources import open_arrays, open_log
 from replay.runs.modules import save_modules
-from replay.stored import StoredSource
+from replay.stored_source import StoredSource
 from replay.view.applied import written_view
 
 MODULES, TAU = 10, 40

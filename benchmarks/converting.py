@@ -18,7 +18,7 @@ from benchmarks.report import ratio as times_ratio
 from recorder.images.options import InputOptions
 from recorder.recording import record
 from recorder.world.scenes import BLOCK
-from replay.inputs import open_external
+from replay.open_sources import open_external
 
 RATE = 30.0
 

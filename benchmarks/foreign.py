@@ -28,7 +28,7 @@ from recorder.images.framing import default_size, fitted, size_of
 from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import IMAGES
 from recorder.mcap.reader import LogReader
-from replay.inputs import open_external
+from replay.open_sources import open_external
 
 TAU = 40
 STEP_NS = 33_333_333

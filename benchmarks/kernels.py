@@ -18,7 +18,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import IncSFAState, new_state
 from recorder.world.oscillatory import one_period
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 from tests.reference.incsfa import PlainIncSFA
 
 PIXELS = 6144

@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks.report import SAMPLE, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig, load_preset
 from cdmisfa.experiments.session import run
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 CONFIGS = {
     "preset icub": LearnerConfig(**load_preset("icub")["learner"]),

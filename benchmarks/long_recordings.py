@@ -46,7 +46,7 @@ def write_long(folder: Path, size: int) -> Path:
 
 def first_frames(path: Path) -> None:
     """Open a recording and take its first block."""
-    from replay.inputs import open_recording
+    from replay.open_sources import open_recording
 
     with contextlib.closing(open_recording(path)) as source:
         source.take(0, TAU)
@@ -54,7 +54,7 @@ def first_frames(path: Path) -> None:
 
 def play(path: Path) -> None:
     """Take every block of a recording."""
-    from replay.inputs import open_recording
+    from replay.open_sources import open_recording
 
     with contextlib.closing(open_recording(path)) as source:
         for _ in range(source.frames // TAU):

@@ -15,8 +15,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.signals import BlockSignals, canonical_bytes
 from cdmisfa.features.outputs import project
 from cdmisfa.modules import Module
-from replay.inputs import open_recording
 from replay.logs.source import LoggedSource
+from replay.open_sources import open_recording
 
 MODULES = (0, 1, 10, 100)
 CONFIG = LearnerConfig(components=32, outputs=5, nu=0.005, tau=40, expansion="none")

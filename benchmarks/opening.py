@@ -20,7 +20,7 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import open_source
-from replay.inputs import open_external
+from replay.open_sources import open_external
 
 
 def write(path: Path, size: int) -> Path:

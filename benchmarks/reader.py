@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks import long_recordings
 from benchmarks.report import SAMPLE, interleaved, middle, ratio, save
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 TAU = 40
 

@@ -23,7 +23,7 @@ from benchmarks.report import middle, save
 from cdmisfa.experiments.apply_logs import apply_to_logs
 from recorder.images.options import InputOptions
 from replay.export.frames import write_video
-from replay.inputs import open_arrays
+from replay.open_sources import open_arrays
 
 LOGS, FRAMES = 16, 500
 

@@ -22,7 +22,7 @@ import rerun_cli
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.files import atomic_write
-from replay.inputs import holds_run
+from replay.open_sources import holds_run
 from replay.runs.log import EVENT_TOPIC, read_batches, read_columns
 
 HOST = "127.0.0.1"
@@ -112,7 +112,7 @@ class Program(subprocess.Popen[bytes]):
         """
         from rerun.experimental import ViewerClient
 
-        from replay.view.rows import FRAME
+        from replay.view.writer import FRAME
 
         client = self.ask(lambda: ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy"))
         self.ask(lambda: is_painted(client))

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from recorder.images.options import InputOptions
-from replay.inputs import open_external, open_recording
 from replay.logs.source import LoggedSource
+from replay.open_sources import open_external, open_recording
 
 
 def contents(folder: Path) -> dict[str, bytes]:

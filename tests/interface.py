@@ -143,12 +143,12 @@ def formats() -> dict[str, int]:
     from cdmisfa.core import signals
     from cdmisfa.kernels import ARITHMETIC
     from recorder.log import messages
-    from replay.corpus import rows
+    from replay.corpus import index_rows
     from replay.integrity import report
 
     return {
         "arithmetic": ARITHMETIC,
-        "index of logs": rows.VERSION,
+        "index of logs": index_rows.VERSION,
         "JSON documents": printing.SCHEMA,
         "JSON of info, verify and recover": report.SCHEMA,
         "recordings": messages.SCHEMA_VERSION,

@@ -61,7 +61,7 @@ def test_an_mcap_has_a_topic_a_module_beside_the_frames(
     log, out = camera(tmp_path / "a.mcap", 50), tmp_path / "o.mcap"
     assert cdmisfa("apply", run, log, "-o", out).code == 0
     from recorder.images.options import InputOptions
-    from replay.inputs import open_log
+    from replay.open_sources import open_log
 
     frames = external(log, size=SIZE).take(0, 50).frames
     again = external(out, ["/view/cam"]).take(0, 50).frames

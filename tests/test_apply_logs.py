@@ -27,7 +27,7 @@ from cdmisfa.experiments import apply_logs as applying
 from cdmisfa.experiments import store
 from cdmisfa.experiments.apply_logs import STORE, AppliedLogs, apply_to_logs
 from recorder.recording import record
-from replay.inputs import open_arrays
+from replay.open_sources import open_arrays
 
 ROOT = Path(__file__).parents[1]
 NAMES = ["a.mcap", "night/b.mcap", "night/c.mcap", "night/copy.mcap"]

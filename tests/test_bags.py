@@ -17,7 +17,7 @@ from conftest import Cdmisfa
 from folders import external
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
-from replay.logs.opening import open_stream
+from replay.logs.open_logs import open_stream
 
 pytest.importorskip("rosbags")
 from rosbags import rosbag1, rosbag2

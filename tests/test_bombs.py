@@ -18,7 +18,7 @@ from recorder.cameras.video import VideoCamera
 from recorder.log.files import RECORDING
 from recorder.log.manifest import read_start
 from recorder.mcap.records import MalformedRecord
-from replay.logs.opening import open_stream
+from replay.logs.open_logs import open_stream
 from replay.runs.folders import REQUEST, RUN_JSON, read_run_json
 
 pytestmark = pytest.mark.xdist_group("bombs")  # one process makes what all of them share

@@ -15,8 +15,8 @@ from cdmisfa.core.errors import LogDamagedError
 from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
-from replay.inputs import open_recording
 from replay.integrity.verify import check_log
+from replay.open_sources import open_recording
 
 FRAMES = 2000
 
@@ -40,7 +40,7 @@ def share_read(path: Path, work: str) -> float:
         "from pathlib import Path\n"
         "from replay.integrity.info import describe\n"
         "from replay.integrity.verify import check_log\n"
-        "from replay.inputs import open_recording\n"
+        "from replay.open_sources import open_recording\n"
         "from recorder.mcap.reader import LogReader\n"
         f"def work(path): {work}\n"
         "def read(): return int(Path('/proc/self/io').read_text().split()[1])\n"

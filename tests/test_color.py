@@ -17,8 +17,8 @@ from PIL import Image
 from recorder.images.messages import decoder_of
 from recorder.images.options import InputOptions
 from recorder.images.videos import frame_colors
-from replay.inputs import open_recording
-from replay.logs.hue import hue_varies
+from replay.logs.color_choice import hue_varies
+from replay.open_sources import open_recording
 
 HEIGHT, WIDTH, COUNT = 12, 16, 60
 

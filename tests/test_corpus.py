@@ -17,9 +17,9 @@ from conftest import Cdmisfa
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.corpus import index as indexing
-from replay.corpus.finding import INDEX, find_logs
 from replay.corpus.index import index_logs, read_index
-from replay.corpus.rows import SCHEMA
+from replay.corpus.index_rows import SCHEMA
+from replay.corpus.listing import INDEX, find_logs
 
 ROOT = Path(__file__).parents[1]
 

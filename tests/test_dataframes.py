@@ -11,7 +11,7 @@ import pytest
 import cdmisfa
 from cdmisfa import Run
 from cdmisfa.core.errors import UsageError
-from replay.inputs import open_arrays
+from replay.open_sources import open_arrays
 
 ROWS = 60
 COLUMNS = {

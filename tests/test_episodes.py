@@ -17,9 +17,9 @@ from message_files import write_table
 
 import cdmisfa as package
 from cdmisfa.core.arrays import GRAY, centred, mean_of
-from replay.corpus.episodes import EpisodeSource
-from replay.inputs import locations
+from replay.corpus.episode_source import EpisodeSource
 from replay.logs.formats.lerobot import PAUSE
+from replay.open_sources import locations
 
 STEP_MS = 50
 SIZE = 16, 24

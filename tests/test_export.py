@@ -12,7 +12,7 @@ from run_data import VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS
-from replay.export.forms import export
+from replay.export.formats import export
 
 
 @pytest.fixture

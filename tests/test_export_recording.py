@@ -18,8 +18,8 @@ from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.export import frames
-from replay.export.forms import export
-from replay.inputs import open_recording
+from replay.export.formats import export
+from replay.open_sources import open_recording
 
 ROOT = Path(__file__).parents[1]
 FRAMES = 53

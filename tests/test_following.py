@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from run_data import IMAGE, VECTOR, module_of, write_run
 
-from replay.following import fits
-from replay.outputs import EACH, OwnStream, Thinned
+from replay.module_outputs import SAMPLE_FRAMES, ModuleOutputs, Subsample
 from replay.runs.log import read_batches
+from replay.truth_fits import truth_fits
 
 
 def best_fit(names, y, *truth):
-    return next(iter(fits(names, np.column_stack(truth), y)), None)
+    return next(iter(truth_fits(names, np.column_stack(truth), y)), None)
 
 
 def test_an_output_finds_the_truth_it_follows():
@@ -49,8 +49,8 @@ def test_the_simplest_function_of_a_truth_is_named(function, said):
     np.testing.assert_allclose(found(phase), function(phase), atol=0.05)
 
 
-def heard(run: Path, module, spec) -> tuple[OwnStream, np.ndarray, np.ndarray]:
-    own, t, y = OwnStream(module, spec), [], []
+def heard(run: Path, module, spec) -> tuple[ModuleOutputs, np.ndarray, np.ndarray]:
+    own, t, y = ModuleOutputs(module, spec), [], []
     for batch in read_batches(run):
         for frames, _, outputs in own.take(batch):
             t += frames.tolist()
@@ -84,7 +84,7 @@ def test_outputs_are_those_on_every_logged_frame_of_the_stream(tmp_path: Path, s
     picks = [pick for part in sheet.values() for pick in part]
     assert len({pick.t for pick in picks}) == len(picks)
     for part in sheet.values():
-        assert 0 < len(part) <= EACH
+        assert 0 < len(part) <= SAMPLE_FRAMES
         assert [pick.y for pick in part] == sorted(pick.y for pick in part)
     for pick in picks:
         assert pick.y == y[t.tolist().index(pick.t)]
@@ -93,7 +93,7 @@ def test_outputs_are_those_on_every_logged_frame_of_the_stream(tmp_path: Path, s
 
 @given(st.lists(st.integers(0, 400)), st.integers(2, 90))
 def test_rows_kept_do_not_depend_on_how_they_came(sizes: list[int], most: int) -> None:
-    parts, one = Thinned(most), Thinned(most)
+    parts, one = Subsample(most), Subsample(most)
     numbers = np.arange(sum(sizes))
     one.add(numbers, -numbers)
     for part in np.split(numbers, np.cumsum(sizes))[:-1]:

@@ -16,7 +16,7 @@ from live_cameras import SHAPE, bar
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.recording import RecordingStoppedError, record
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 FRAMES = 700
 

@@ -21,9 +21,9 @@ from cdmisfa.core.errors import LogExhaustedError
 from recorder.images.framing import FRAME_PIXELS, default_size
 from recorder.images.options import Align
 from recorder.recording import RecordingStoppedError, record, recorded
-from replay.inputs import open_recording
 from replay.logs.clock import intersection
 from replay.logs.source import LoggedSource
+from replay.open_sources import open_recording
 
 STEP_MS = 20
 PAUSED = (*range(0, 2000, STEP_MS), *range(5000, 9000, STEP_MS))

@@ -15,7 +15,7 @@ from cdmisfa.core.learning import Learner
 from cdmisfa.experiments.loop import Digest, learn_blocks
 from cdmisfa.studies.paper import icub
 from cdmisfa.studies.paper.experiment import paper_config
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 

@@ -14,8 +14,8 @@ from conftest import Cdmisfa
 from folders import external
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.inputs import open_recording
 from replay.logs.formats.lerobot import PAUSE
+from replay.open_sources import open_recording
 
 pytest.importorskip("av")
 

@@ -24,9 +24,9 @@ from cdmisfa.experiments.session import run
 from recorder.cameras.live import LiveSource, Steady
 from recorder.cameras.readers import Readers
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
-from replay.inputs import open_recording
 from replay.integrity.info import describe
 from replay.integrity.verify import check_log
+from replay.open_sources import open_recording
 
 FPS = 30.0
 

@@ -32,7 +32,7 @@ from cdmisfa.core.errors import UsageError
 from recorder.cameras.video import VideoCamera
 from recorder.cameras.words import live_names, open_live
 from recorder.images.options import InputOptions
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 TEST = "av:lavfi:testsrc=size=160x120:rate=30"
 

@@ -22,8 +22,8 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
-from replay import stored
-from replay.inputs import open_recording
+from replay import stored_source
+from replay.open_sources import open_recording
 from replay.runs.compare import different_settings
 from replay.runs.log import read_header
 
@@ -34,7 +34,7 @@ ITERATIONS = 12
 @pytest.fixture(autouse=True)
 def long(monkeypatch: pytest.MonkeyPatch) -> None:
     """All logs count as long."""
-    monkeypatch.setattr(stored, "AT_ONCE", 0)
+    monkeypatch.setattr(stored_source, "AT_ONCE", 0)
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_a_run_begins_with_a_sample_and_ends_with_the_sha256(
         seen.extend(read_header(tmp_path / "run").manifest["source"]["views"])
 
     result = learn(recording, tmp_path / "run", Then(look))
-    monkeypatch.setattr(stored, "AT_ONCE", 2**40)
+    monkeypatch.setattr(stored_source, "AT_ONCE", 2**40)
     before = learn(recording, tmp_path / "before")
     keys = {"name", "frames", "file", "bytes", "sample_sha256"}
     assert [view.keys() for view in seen] == [keys] * 3
@@ -134,7 +134,7 @@ def test_every_kind_of_log_is_known_by_a_sample_and_in_the_end_by_all_of_it(
         other = source_of(kind, oscillatory_recording, tmp_path / "b", 2)
         assert description(other, at_once=True)["files"][0]["bytes"] == known["bytes"]
         assert description(other, at_once=True)["files"][0] != known
-    monkeypatch.setattr(stored, "AT_ONCE", 2**40)
+    monkeypatch.setattr(stored_source, "AT_ONCE", 2**40)
     assert description(source, at_once=True) == description(source)
     source.close()
 

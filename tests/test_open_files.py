@@ -50,7 +50,7 @@ def test_more_parts_than_files_may_be_open_are_read(parts: Path) -> None:
         f"import sys; sys.path.append({str(Path(__file__).parent)!r})\n"
         "from contracts.sources import same\n"
         "from recorder.world.oscillatory import OscillatorySource\n"
-        "from replay.inputs import open_recording\n"
+        "from replay.open_sources import open_recording\n"
         "from replay.integrity.verify import check_log\n"
         "live, source = OscillatorySource(), open_recording(sys.argv[1])\n"
         "for _ in range(2):\n"

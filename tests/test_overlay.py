@@ -11,7 +11,7 @@ from view_data import View, scalars
 
 from cdmisfa.core.errors import UsageError
 from replay.runs.compare import first_difference, side_by_side
-from replay.view.overlay import build_overlay
+from replay.view.comparison import build_overlay
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
-from replay.inputs import open_recording
 from replay.integrity.verify import check_log
+from replay.open_sources import open_recording
 
 FRAMES = 700
 SPLIT = 3.0

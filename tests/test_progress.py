@@ -30,7 +30,7 @@ from cdmisfa.core.signals import canonical_bytes
 from cdmisfa.experiments.loop import learn_blocks
 from cdmisfa.experiments.session import run
 from recorder.recording import record
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 CONFIG = ProgressConfig(components=8)
 

@@ -16,8 +16,8 @@ from cdmisfa import Recording, Run, learn
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.resume import check_run
 from recorder.images.options import InputOptions
-from replay.inputs import open_arrays
 from replay.logs.source import LoggedSource
+from replay.open_sources import open_arrays
 
 ROOT = Path(__file__).parents[1]
 FEW: dict[str, Any] = {"max_iterations": 12, "tau": 20}

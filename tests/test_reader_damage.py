@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, IndexType
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.reader import LogReader
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 MESSAGES = 40
 

@@ -19,9 +19,9 @@ from recorder.log.viewlog import ViewLog
 from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
-from replay.inputs import open_recording
 from replay.integrity.recover import recover_log
 from replay.integrity.verify import check_log
+from replay.open_sources import open_recording
 
 FRAMES = 330
 IMAGES = SourceSpec(("left", "right"), (12, 16), "uint8", ("x", "y"), 50.0, 10**18)

@@ -17,7 +17,7 @@ from recorder.log.scenery import scenery_of, times, turned
 from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.icub.config import IcubConfig
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "icub"
 FRAMES = 120

@@ -18,7 +18,7 @@ from recorder.log.scenery import scenery_of, turned
 from recorder.recording import record_scene
 from recorder.world.icub.config import EyesConfig, IcubConfig
 from recorder.world.icub.head import FRAMES_OF_A_LOOK, Roaming
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 from replay.runs.run import read_outline
 
 YAW = (45.0, 0.0, -45.0)

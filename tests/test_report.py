@@ -18,11 +18,11 @@ from cdmisfa.agents.progress import decisions
 from cdmisfa.experiments import reports
 from cdmisfa.experiments.reports import write_report
 from cdmisfa.experiments.run_folder import command_again
-from replay.report import measurements
-from replay.report.data import RunData
-from replay.report.drawing import Axis, Plot
-from replay.report.measurements import attempts, measurements_of
+from replay.report import saving_rules
 from replay.report.page import MOST_BYTES
+from replay.report.run_data import RunData
+from replay.report.saving_rules import attempts, measurements_of
+from replay.report.svg_plot import Axis, Plot
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 
@@ -58,7 +58,7 @@ def test_the_progress_learner_is_measured_by_its_own_rules(tmp_path: Path) -> No
         *("VARIANCE_BOUNDS", "IMPROVEMENT_ONGOING", "IMPROVEMENT_NEGLIGIBLE", "ROTATING_CHANGE"),
         *("FITTED_RATIO_SLOW", "SETTLING_WINDOWS"),
     ):
-        assert getattr(measurements, name) == getattr(decisions, name)
+        assert getattr(saving_rules, name) == getattr(decisions, name)
     library.learn("oscillatory", tmp_path / "run", algorithm="progress")
     outline = read_outline(tmp_path / "run")
     rows = attempts(outline, measurements_of(outline))

@@ -29,7 +29,7 @@ from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 from replay.runs.compare import first_difference
 from replay.runs.folders import run_log
 from replay.runs.keyframes import KEYFRAME_TOPIC, read_keyframe

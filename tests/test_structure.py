@@ -41,15 +41,15 @@ FORBIDDEN = {
     "recorder.cameras": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner", "rerun"),
     "recorder.images": ("recorder.log.logfile", "recorder.cameras.live", "replay.palette"),
     "recorder.log": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner"),
-    "recorder.mcap": ("recorder.log.logfile", "recorder.world.scenes", "replay.storage.opening"),
+    "recorder.mcap": ("recorder.log.logfile", "recorder.world.scenes", "replay.storage.paths"),
     "recorder.world": ("recorder.log.logfile", "replay.palette", "cdmisfa.features.sfa", "mcap"),
     "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),
     "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),
     "replay.corpus": ("replay.viewer", "cdmisfa.experiments.session", "rerun"),
     "replay.export": ("replay.view.build", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer", "rerun"),
-    "replay.logs": ("replay.inputs", "replay.view.build", "recorder.recording", "rerun"),
-    "replay.logs.formats": ("replay.inputs", "replay.runs.log", "recorder.recording"),
+    "replay.logs": ("replay.open_sources", "replay.view.build", "recorder.recording", "rerun"),
+    "replay.logs.formats": ("replay.open_sources", "replay.runs.log", "recorder.recording"),
     "replay.report": ("replay.view.build", "replay.export.frames", "rerun"),
     "replay.runs": ("replay.logs.source", "replay.view.build", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
@@ -85,7 +85,7 @@ def test_every_room_has_forbidden_imports_that_the_rules_catch(tmp_path: Path) -
             probe.write_text(f"import {target}\n")
             probes.append((f"{room}.{probe.stem}", target))
     with (tmp_path / "replay" / "storage" / "location.py").open("a") as file:
-        file.write("\ndef probe() -> None:\n    import replay.storage.opening\n")
+        file.write("\ndef probe() -> None:\n    import replay.storage.paths\n")
     done = lint_imports(tmp_path)
     assert done.returncode == 1
     assert "No cycles are allowed in replay.storage." in done.stdout

@@ -23,7 +23,7 @@ from recorder.cameras.words import open_live
 from recorder.images.messages import MessageKind
 from recorder.images.options import InputOptions
 from recorder.images.videos import frame_gray
-from replay.logs.opening import open_stream
+from replay.logs.open_logs import open_stream
 from replay.logs.stream import LogStream
 
 av = pytest.importorskip("av")

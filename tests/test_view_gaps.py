@@ -12,7 +12,7 @@ from view_data import View
 from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 from replay.runs.modules import load_modules, save_modules
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view

@@ -15,7 +15,7 @@ from cdmisfa.core.errors import UsageError
 from replay.palette import CYCLE, packed
 from replay.runs.run import read_outline
 from replay.view.build import build_view
-from replay.view.panels import run_layout
+from replay.view.run_layout import run_layout
 
 ITERATIONS, TAU = 420, 40
 MIN_MAX = rr.components.AggregationPolicy.MinMax.value
@@ -104,5 +104,5 @@ def test_few_modules_have_a_page_each_and_many_stand_on_pages(tmp_path):
         shown = [view.origin for view in views_of(modules) if "weights" in str(view.origin)]
         assert shown == [f"/modules/{i}/weights" for i in range(1, count + 1)]
         assert layout.root_container.active_tab == tabs.index(modules)
-    with pytest.raises(UsageError, match=r"no tab 'nowhere': there are Overview, .*Modules"):
+    with pytest.raises(UsageError, match=r"no tab 'nowhere' .*: choose one of Overview, .*Modules"):
         run_layout(outline, tab="nowhere")

@@ -23,8 +23,8 @@ from recorder.world.icub.head import NECK
 from recorder.world.icub.source import TRUTH
 from replay.palette import colour, packed
 from replay.view.build import build_view
+from replay.view.image_grid import grid_positions
 from replay.view.modules import LAST_BLOCKS
-from replay.view.wall import places_of
 
 CONFIG = section_table(IcubConfig())
 SCENE = SourceSpec(("left", "center", "right"), (12, 32), "uint8", TRUTH, 50.0, IMAGE.start_ns)
@@ -113,14 +113,14 @@ def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
     build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
     rows = View(tmp_path / "run.rrd").rows
     height, width = IMAGE.frame_shape
-    hang = places_of(3, width, height)
+    hang = grid_positions(3, width, height)
     for s, name in enumerate(IMAGE.streams):
         own = [r for r in records if r.stream == s]
-        pictures = rows[f"/wall/{s + 1}_{name}"]
+        pictures = rows[f"/latest_frames/{s + 1}_{name}"]
         assert pictures["frame"] == [r.t + EVERY for r in own]  # the last one of each block
         for (image,) in pictures["Image:buffer"]:
             assert {40 * s + 20, 250} == set(image)
-        texts = rows[f"/wall/{s + 1}_{name}/state"]
+        texts = rows[f"/latest_frames/{s + 1}_{name}/state"]
         said = dict(zip(texts["frame"], (x for (x,) in texts["Points2D:labels"]), strict=True))
         state = None
         for record in records:
@@ -132,7 +132,7 @@ def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
         saves = [r.module for r in own if r.saved]
         if algorithm == "2.0":
             assert state == (f"{name}: module {saves[-1]}" if saves else name)
-    framed, frame = rows["/wall/frame"], None
+    framed, frame = rows["/latest_frames/frame"], None
     centres = dict(zip(framed["frame"], (c for (c,) in framed["Boxes2D:centers"]), strict=True))
     for record in records:
         frame = centres.get(record.t, frame)

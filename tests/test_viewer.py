@@ -23,7 +23,7 @@ from waiting import started, wait_for
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay import viewer
-from replay.view import panels
+from replay.view import run_layout
 from replay.view.build import build_view, view_of
 from replay.viewer import Program, frame_at
 
@@ -91,7 +91,7 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(
         every = [view for tab in views for view in views_of(tab)]  # none behind another page
         return rrb.Blueprint(rrb.Grid(*every), auto_views=False, auto_layout=False)
 
-    monkeypatch.setattr(panels.layouts, "blueprint", side_by_side)
+    monkeypatch.setattr(run_layout.layouts, "blueprint", side_by_side)
     build_view(tmp_path, tmp_path / "run.rrd")
     assert len(tabs) == n_tabs
     with shown(tmp_path / "run.rrd", "2400x1600") as ask:

@@ -18,7 +18,7 @@ from cdmisfa.studies.paper.experiment import (
     of_all,
     paper_config,
 )
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 Keys = dict[str, float]
 

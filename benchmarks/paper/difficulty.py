@@ -19,7 +19,7 @@ from cdmisfa.features.sfa import slowness
 from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_text, paper_config
 from cdmisfa.studies.paper.oscillatory import STREAMS
 from recorder.world.oscillatory import one_period
-from replay.inputs import open_recording
+from replay.open_sources import open_recording
 
 THRESHOLD = 0.95
 """Direction cosine with batch SFA above which a stream counts as learned.

@@ -53,7 +53,7 @@ def log_argument(name: str, metavar: str | None = None) -> Decorator:
     ) -> tuple[Path, ...]:
         if ctx.resilient_parsing:  # while a shell completes what follows
             return ()
-        from replay.inputs import locations
+        from replay.open_sources import locations
 
         return tuple(locations(words))
 

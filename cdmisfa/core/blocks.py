@@ -180,7 +180,7 @@ class SeekableSource(FrameSource, Protocol):
 class LongSource(FrameSource, Protocol):
     """A source of files that take long to read: less is known of it until all of them were."""
 
-    def describe(self, told: Callable[[int, int], None] = ...) -> Mapping[str, Any]:
+    def describe(self, progress: Callable[[int, int], None] = ...) -> Mapping[str, Any]:
         """See `FrameSource`; tells how many bytes were read and how many there are, if many."""
 
     def describe_at_once(self) -> Mapping[str, Any]:
@@ -302,20 +302,20 @@ def description(
     source: FrameSource,
     *,
     at_once: bool = False,
-    told: Callable[[int, int], None] = lambda done, size: None,
+    progress: Callable[[int, int], None] = lambda done, size: None,
 ) -> dict[str, Any]:
     """Return what identifies a source, its kind at least; see `FrameSource.describe`.
 
     Args:
         source: the source.
         at_once: with less of its files where they take long to read; see `LongSource`.
-        told: of bytes that were read and that are to be read, where they take long to read.
+        progress: of bytes that were read and that are to be read, where they take long to read.
 
     Raises:
         LogDamagedError: as for `FrameSource.describe`.
     """
     if isinstance(source, LongSource):
-        return dict(source.describe_at_once() if at_once else source.describe(told))
+        return dict(source.describe_at_once() if at_once else source.describe(progress))
     return dict(source.describe())
 
 

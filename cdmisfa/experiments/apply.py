@@ -31,14 +31,14 @@ from recorder.cameras.words import is_live, open_live
 from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
 from replay.export.applied import Applied, AppliedSink
-from replay.inputs import locations, open_recording, with_every_topic
 from replay.logs.formats.recording import NoRecordingError
 from replay.logs.formats.views import SeveralRecordingsError
-from replay.logs.opening import only_external
+from replay.logs.open_logs import is_external_format
+from replay.open_sources import locations, open_recording, with_every_topic
 from replay.runs.folders import MODULES_FILE
 from replay.runs.run import Run
 from replay.storage.identity import file_sha256
-from replay.stored import StoredSource, centre_as
+from replay.stored_source import StoredSource, centre_as
 
 # Standard deviations of a module's slowness within which it knows a block, as its learner says.
 KNOWN_WITHIN: Final = 2.0
@@ -137,7 +137,7 @@ class Application:
 
     def _open_log(self, words: Sequence[str], inputs: InputOptions, **how: Any) -> FrameSource:
         places = locations(words)
-        if not inputs.external and not any(map(only_external, places)):
+        if not inputs.external and not any(map(is_external_format, places)):
             with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
                 recorded = open_recording(places, **how)
                 if recorded.spec.frame_shape == self.recipe.shape or not recorded.spec.images:

@@ -31,8 +31,8 @@ from recorder.log.files import (
     relative_path,
     to_disk,
 )
-from replay.corpus.finding import INDEX
 from replay.corpus.index import IndexedLog, index_logs, indexed_logs, is_index
+from replay.corpus.listing import INDEX
 from replay.export.applied import AppliedSink, written
 
 # Folder of the state of the logs; programs that read data sets skip names with an underscore.

@@ -15,7 +15,7 @@ from cdmisfa.core.expansion import expand
 from cdmisfa.experiments.sources import OF_CAMERAS, Configuration
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.modules import Module
-from replay.stored import StoredSource
+from replay.stored_source import StoredSource
 
 # Frames that are in memory at once.
 PIECE = 256

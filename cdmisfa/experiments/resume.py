@@ -34,7 +34,7 @@ from replay.runs.folders import run_log
 from replay.runs.keyframes import arrays_of, read_keyframe, read_keyframes
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.provenance import changed_files, stated_source
-from replay.stored import StoredSource
+from replay.stored_source import StoredSource
 
 # Facts that a source must have in common with the one that a run learned from.
 SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")

@@ -39,7 +39,7 @@ from replay.runs.log import read_header
 from replay.runs.modules import save_modules
 from replay.runs.provenance import final_record
 from replay.runs.writer import RunWriter
-from replay.stored import StoredSource
+from replay.stored_source import StoredSource
 
 # Key of a manifest: the command that started the run, which may differ when it is resumed.
 COMMAND = "command"
@@ -149,8 +149,8 @@ def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     keys = config.get("input", {})
     chosen = {name: options[name] for name in INPUTS if name in options}
     if words != named and not options.get("episodes"):
-        from replay.corpus.finding import may_be_corpus  # loads pyarrow, which no scene needs
-        from replay.inputs import is_recording
+        from replay.corpus.listing import may_be_corpus  # loads pyarrow, which no scene needs
+        from replay.open_sources import is_recording
 
         if not may_be_corpus(words) and is_recording(words):  # its frames were made before
             chosen, keys = {}, {name: keys[name] for name in OF_EVERY_SOURCE if name in keys}

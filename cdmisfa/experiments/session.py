@@ -132,7 +132,7 @@ class Session:
                 raise
             return  # killed before the log stated anything: start again
         if has_whole_hashes(stated_source(log)):
-            self.manifest["source"] = description(source, told=self.hashing)
+            self.manifest["source"] = description(source, progress=self.hashing)
         if header.forked_at is not None:
             self.manifest[FORK] = header.manifest[FORK]
         as_json = json.loads(json.dumps(self.manifest))  # lists for tuples, as the log has them
@@ -296,7 +296,7 @@ class Session:
             judgement = judged(self.source, learner.modules, components, stop)
             ended, held_out = (INTERRUPTED, {}) if judgement is None else (ended, judgement)
         # After an interrupt nothing is read that is as long as the source.
-        described = description(self.source, at_once=ended == INTERRUPTED, told=self.hashing)
+        described = description(self.source, at_once=ended == INTERRUPTED, progress=self.hashing)
         streams, undecided = self.source.spec.streams, tuple[str, ...]()
         if not learner.over:
             learned = {streams[module.stream_index] for module in learner.modules}

@@ -18,8 +18,8 @@ from recorder.images.options import InputConfig, InputOptions
 from recorder.world.scenes import SCENES, open_scene
 
 if TYPE_CHECKING:
-    from replay.corpus.episodes import Progress
-    from replay.stored import StoredSource
+    from replay.corpus.episode_source import Progress
+    from replay.stored_source import StoredSource
 
 # The learner of streams that are no scene of ours, nor recorded from one.
 OF_CAMERAS = "progress"
@@ -264,7 +264,7 @@ def open_logs(
     skip_damaged: bool = False,
     inputs: InputOptions | None = None,
     episodes: bool = False,
-    told: Progress = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> SeekableSource:
     """Open a recording, external logs, or many of both as episodes.
 
@@ -274,15 +274,15 @@ def open_logs(
         skip_damaged: pass over damaged parts.
         inputs: how images become frames; given, paths are taken as external logs.
         episodes: each path is an episode of its own; those of an index always are.
-        told: called with the number of opened episodes and the total.
+        progress: called with the number of opened episodes and the total.
 
     Raises:
         UsageError: no path that exists.
         LogDamagedError: the log is damaged.
     """
-    from replay.corpus.finding import may_be_corpus
-    from replay.inputs import locations, open_log
-    from replay.storage.opening import no_such
+    from replay.corpus.listing import may_be_corpus
+    from replay.open_sources import locations, open_log
+    from replay.storage.paths import no_such
 
     inputs = inputs or InputOptions()
     if live := [str(word) for word in words if is_live(str(word))]:
@@ -300,11 +300,11 @@ def open_logs(
     how: Any = {"loop": loop, "skip_damaged": skip_damaged}
     source: StoredSource | None = None
     if episodes or may_be_corpus(words):
-        from replay.corpus.episodes import EpisodeSource
+        from replay.corpus.episode_source import EpisodeSource
         from replay.corpus.index import logs_of_corpus
 
         if logs := logs_of_corpus(words) or ([[path] for path in paths] if episodes else None):
-            source = EpisodeSource(logs, inputs, told=told, **how)
+            source = EpisodeSource(logs, inputs, progress=progress, **how)
     source = source or open_log(paths, inputs, **how)
     source.centre = inputs.centre
     return source

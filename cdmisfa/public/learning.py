@@ -26,7 +26,7 @@ from cdmisfa.public.recording import Given, Recording, as_words
 from cdmisfa.public.run import Run
 from recorder.images.options import OPTIONS, Centre, InputOptions
 from replay.logs.source import LoggedSource
-from replay.stored import centre_as
+from replay.stored_source import centre_as
 
 
 def learn(

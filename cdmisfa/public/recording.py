@@ -17,7 +17,7 @@ from cdmisfa.core.blocks import Described, SourceSpec
 from cdmisfa.core.errors import UsageError, did_you_mean
 from cdmisfa.experiments.sources import open_logs
 from recorder.images.options import InputOptions
-from replay.inputs import open_arrays
+from replay.open_sources import open_arrays
 
 # A source for `learn`: arrays, tables, mappings of these by names of streams, paths and URLs of
 # logs, names of scenes, words of live streams, or an open source.

@@ -20,7 +20,7 @@ from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import Layers, configure, open_source
 from cdmisfa.modules import Module
-from replay.following import fits
+from replay.truth_fits import truth_fits
 
 SCENE, PRESET = "icub", "icub-real"
 
@@ -125,7 +125,7 @@ def followed_by(module: Module, source: SeekableSource) -> dict[str, Any]:
     source.seek(0)
     block = source.take(module.stream_index, SCORED_FRAMES)
     y = module.transform(block.frames)[:, 0]
-    best = next(iter(fits(source.spec.truth, block.truth, y)), None)
+    best = next(iter(truth_fits(source.spec.truth, block.truth, y)), None)
     return {
         "module": module.index,
         "view": module.stream,

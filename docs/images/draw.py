@@ -20,7 +20,7 @@ import demonstrations
 from cdmisfa.cli import run
 from replay import viewer
 from replay.runs.compare import side_by_side
-from replay.view.overlay import build_overlay
+from replay.view.comparison import build_overlay
 
 DOCS = Path(__file__).parents[1]
 IMAGES = DOCS / "images"

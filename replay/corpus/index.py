@@ -19,10 +19,10 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_l
 from cdmisfa.core.processes import run_all
 from cdmisfa.core.untrusted import check_regular, parse_json
 from recorder.log.files import atomic_write, held, make_folder, refuse_unless
-from replay.corpus.finding import INDEX, ListedLog, find_logs, may_be_corpus
-from replay.corpus.rows import MARK, SCHEMA, VERSION, read_rows
+from replay.corpus.index_rows import MARK, SCHEMA, VERSION, read_rows
+from replay.corpus.listing import INDEX, ListedLog, find_logs, may_be_corpus
 from replay.storage.location import is_url, location
-from replay.storage.opening import no_such
+from replay.storage.paths import no_such
 
 # Logs that a process reads at a time.
 BATCH: Final = 32

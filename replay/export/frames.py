@@ -23,7 +23,7 @@ from cdmisfa.core.names import stream_names
 from recorder.images.videos import pyav
 from replay.logs.clock import intersection
 from replay.logs.source import LoggedSource
-from replay.stored import Span
+from replay.stored_source import Span
 
 # Most frames and bytes in memory at once, unless one frame is larger.
 PIECE, PIECE_BYTES = 1000, 64 * 2**20

@@ -24,7 +24,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import ACTION, BEGINS, JOINT, stream_names
 from replay.export.frames import pieces, pixel_format, shared_spans, write_video
 from replay.logs.source import LoggedSource
-from replay.stored import Span
+from replay.stored_source import Span
 
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 

@@ -20,10 +20,7 @@ from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem, Segment
-from replay.inputs import locations
-from replay.integrity.learned import run_facts
 from replay.integrity.report import (
-    ChannelInfo,
     Crc,
     Kind,
     LogReport,
@@ -32,10 +29,13 @@ from replay.integrity.report import (
     combined,
     failed,
 )
+from replay.integrity.run_facts import run_facts
 from replay.logs.formats.images import broken_images, image_files
-from replay.logs.opening import channels_of, log_format, only_external
+from replay.logs.open_logs import channels_of, is_external_format, log_format
+from replay.logs.stream import ChannelInfo
+from replay.open_sources import locations
 from replay.runs.folders import RUN_METADATA
-from replay.storage.opening import log_files
+from replay.storage.paths import log_files
 
 # Bytes of a log, decompressed or not, that `info` decodes; it reads the index of larger logs.
 CHECK_BYTES: Final = 1024 * 1024 * 1024
@@ -95,7 +95,7 @@ def report_all(
 
 def _describe_place(place: Path, alone: bool) -> Iterator[LogReport]:
     """Describe the logs in a place, the only one or not."""
-    logs = [place] if only_external(place) else log_files(place)
+    logs = [place] if is_external_format(place) else log_files(place)
     for log in logs:
         try:
             yield describe_log(log)
@@ -112,7 +112,7 @@ def describe_log(log: Path, *, decode: bool | None = None) -> LogReport:
         log: the file or the folder.
         decode: decode the content, or read its summary only; by default as its size allows.
     """
-    if only_external(log):
+    if is_external_format(log):
         return _describe_external(log, 0 if decode is False else CHECK_BYTES)
     if decode or (decode is None and log.stat().st_size <= CHECK_BYTES):
         return read_once(log, lambda reader: describe_reader(reader, decode=decode))
@@ -152,10 +152,7 @@ def _describe_external(place: Path, most: int) -> LogReport:
     files = [place] if place.is_file() else place.rglob("*")
     return LogReport(
         path=str(place),
-        channels=tuple(
-            ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
-            for c in channels
-        ),
+        channels=tuple(replace(c.info, file=place.name) for c in channels),
         complete=not missing,
         crc=crc,
         problems=(*missing, *(broken or ())),

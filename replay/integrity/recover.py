@@ -23,9 +23,9 @@ from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segmen
 from recorder.mcap.store import PARTIAL, Store
 from replay.integrity.info import ChannelCount, problems_of
 from replay.integrity.report import SCHEMA
-from replay.logs.opening import only_external
+from replay.logs.open_logs import is_external_format
 from replay.storage.location import location
-from replay.storage.opening import log_files
+from replay.storage.paths import log_files
 
 # Most bytes that are repaired, because they are held in memory.
 _MOST_BYTES: Final = 64 * 1024 * 1024
@@ -83,7 +83,7 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
         LogWriteError: the disk does not take it.
     """
     src, dst = location(src), Path(dst)
-    if src.exists() and only_external(src):
+    if src.exists() and is_external_format(src):
         raise UsageError(
             f"{src} is no MCAP file, and others are not recovered: learn and convert pass over "
             "broken images of them with --skip-damaged"

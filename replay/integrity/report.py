@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.mcap.records import Problem
+from replay.logs.stream import ChannelInfo
 
 if TYPE_CHECKING:
     from cdmisfa.modules import Module
@@ -34,26 +35,6 @@ EXIT_CODES: Final[Mapping[State, int]] = {
 
 # The best state of checksums is first.
 _CRCS: Final[tuple[Crc, ...]] = ("ok", "absent", "unchecked", "bad")
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelInfo:
-    """A channel of a log; its times are log times in nanoseconds."""
-
-    topic: str
-    encoding: str
-    schema: str
-    messages: int
-    start_ns: int | None
-    end_ns: int | None
-    file: str
-
-    @property
-    def rate(self) -> float | None:
-        """Messages a second between the first and the last; None without a duration."""
-        if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
-            return None
-        return (self.messages - 1) * 1e9 / (self.end_ns - self.start_ns)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,13 @@ from replay.integrity.report import LogReport, State, as_problem, combined, fail
 from replay.logs.formats import views as recorded
 from replay.logs.formats.mcap_log import decoders_in
 from replay.logs.formats.recording import ViewFile
-from replay.logs.opening import channels_of, image_topics, log_format, only_external, open_stream
+from replay.logs.open_logs import (
+    channels_of,
+    image_topics,
+    is_external_format,
+    log_format,
+    open_stream,
+)
 from replay.logs.source import LoggedSource
 from replay.logs.stream import check_times, limited
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
@@ -32,7 +38,7 @@ from replay.runs.modules import load_modules
 from replay.runs.provenance import facts_sha256
 from replay.storage.arrays import MAX_BYTES
 from replay.storage.location import location
-from replay.storage.opening import log_files
+from replay.storage.paths import log_files
 
 
 def check_logs(*words: str | Path) -> LogReport:
@@ -52,7 +58,7 @@ def check_log(path: str | Path) -> LogReport:
         CdmisfaError: a package that reads it is missing.
     """
     place = location(path)
-    if only_external(place):
+    if is_external_format(place):
         return combined(str(place), [_check_external(place)])
     reports: list[LogReport] = []
     views: list[_ViewContent] = []
@@ -316,8 +322,8 @@ def _check_external(path: Path) -> LogReport:
         channels = channels_of(path, whole=True)
     except LogDamagedError as error:
         return replace(failed(path, error), crc="absent")
-    report = _check_topics(path, [c.topic for c in channels if c.images and c.messages])
-    if kind == "pictures" and channels[0].encoding == "png":  # PNG has checksums of its own
+    report = _check_topics(path, [c.info.topic for c in channels if c.images and c.info.messages])
+    if kind == "pictures" and channels[0].info.encoding == "png":  # PNG has checksums of its own
         report = replace(report, crc="ok" if report.ok else "bad")
     notes = dict.fromkeys(line for channel in channels for line in channel.remarks)
     return replace(report, notes=tuple(notes | dict.fromkeys(report.notes)))

@@ -15,7 +15,7 @@ from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.clock import NANOSECONDS, times_of
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.manifest import ViewMetadata
-from replay.stored import Span, merged, outside
+from replay.stored_source import Span, merged, outside
 
 # Most frames that streams are aligned to.
 MAX_FRAMES: Final = 2**31

@@ -26,10 +26,10 @@ from replay.logs import clock as clocks
 from replay.logs.aligning import align, names_of
 from replay.logs.formats.views import SCENE
 from replay.logs.images import Images
-from replay.logs.opening import identity_of
+from replay.logs.open_logs import identity_of
 from replay.logs.stream import BROKEN, LogStream, Rows
 from replay.storage.identity import Identity, McapIdentity
-from replay.stored import Span, StoredSource, outside
+from replay.stored_source import Span, StoredSource, outside
 
 # Frames behind a block that are decoded ahead, at least: some show the same image.
 LIKELY: Final = 32

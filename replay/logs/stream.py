@@ -228,19 +228,17 @@ def limited(path: object, program: str, *, held: int = 0, remedy: str = "") -> I
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelFacts:
-    """The contents of one topic of a log, as `info` prints them.
+class ChannelInfo:
+    """A channel of a log, or one stream of a log that has no channels.
 
     Attributes:
-        topic: its name, or what stands for it.
-        encoding: of its messages: "cdr", "ros1", the codec of a video, "png".
+        topic: name of the topic; of the file or column in formats without topics.
+        encoding: encoding of its messages: "protobuf", "cdr", "ros1", "png", codec of a video.
         schema: type of its messages.
-        messages: how many there are.
-        start_ns: time of the first, nanoseconds; None if it is not known.
-        end_ns: time of the last.
-        images: whether they are images that are read.
-        missing: what a file that was cut lacks; "" of others.
-        remarks: a line for each thing that the format cannot prove.
+        messages: number of messages.
+        start_ns: log time of the first message in nanoseconds; None if unknown.
+        end_ns: log time of the last message in nanoseconds; None if unknown.
+        file: name of the file.
     """
 
     topic: str
@@ -249,6 +247,28 @@ class ChannelFacts:
     messages: int
     start_ns: int | None = None
     end_ns: int | None = None
+    file: str = ""
+
+    @property
+    def rate(self) -> float | None:
+        """Messages per second between the first and the last; None without a duration."""
+        if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
+            return None
+        return (self.messages - 1) * 1e9 / (self.end_ns - self.start_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class ExternalChannel:
+    """A channel of an external log, and what its format cannot guarantee.
+
+    Attributes:
+        info: the channel.
+        images: whether its messages are images that can be read.
+        missing: the missing part of a truncated file, or "".
+        remarks: a line for each property that the format cannot prove, as checksums.
+    """
+
+    info: ChannelInfo
     images: bool = True
     missing: str = ""
     remarks: tuple[str, ...] = ()

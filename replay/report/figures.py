@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray, IntArray
-from replay.following import Fit
 from replay.palette import CYCLE, shade
-from replay.report.data import ModuleData, RunData
-from replay.report.drawing import WIDE, Axis, Plot
-from replay.report.measurements import Measurement
+from replay.report.run_data import ModuleData, RunData
+from replay.report.saving_rules import Measurement
+from replay.report.svg_plot import WIDE, Axis, Plot
 from replay.runs.run import Outline
+from replay.truth_fits import TruthFit
 
 # Pixels from one row of a timeline to the next, and of its bars; `.names div` of page.css.
 ROW, BAR = 22, 16
@@ -165,7 +165,7 @@ def recent_plots(module: ModuleData) -> list[Plot]:
     return plots
 
 
-def truth_plot(module: ModuleData, fit: Fit) -> Plot:
+def truth_plot(module: ModuleData, fit: TruthFit) -> Plot:
     """Draw a module's first output over the true quantity that it follows."""
     _, y, truth = module.outputs.columns
     known = np.isfinite(truth[:, fit.column])

@@ -13,10 +13,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from replay.palette import CYCLE, STATES
-from replay.report.data import RunData
-from replay.report.drawing import number
 from replay.report.figures import colour_class, curves, timeline
+from replay.report.run_data import RunData
 from replay.report.run_page import command, run_content
+from replay.report.svg_plot import number
 from replay.runs.compare import side_by_side
 
 # Size of a page that mail programs still send and phones still open.

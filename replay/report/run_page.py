@@ -11,7 +11,6 @@ import numpy as np
 
 from cdmisfa.core.signals import STATE_WORDS, STATES
 from replay.palette import shade
-from replay.report.data import ModuleData, RunData
 from replay.report.figures import (
     FRAME,
     THUMBNAIL,
@@ -31,7 +30,8 @@ from replay.report.figures import (
     timeline,
     truth_plot,
 )
-from replay.report.measurements import Measurement, attempts, measurements_of
+from replay.report.run_data import ModuleData, RunData
+from replay.report.saving_rules import Measurement, attempts, measurements_of
 
 # Streams that have a card, the most watched, and those that are visible at once.
 CARDS, OPEN_CARDS = 64, 12
@@ -175,13 +175,13 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
     frozen, outline, images = module.frozen, run.outline, run.spec.images
     save = next((save for save in outline.saved if save.module == frozen.index), None)
     saved = outline.end if save is None else save.t + outline.tau
-    fits = module.fits()
+    truth_fits = module.truth_fits()
     section: dict[str, Any] = {
         "frozen": frozen,
         "colour": colour_class(frozen.stream_index),
         "saved": saved,
         "frames": module.stream.count,
-        "fits": fits,
+        "fits": truth_fits,
         "overfitting": _overfitting(run, frozen.iteration),
         "alike": max(
             ((module.correlation(m), m.frozen.index) for m in run.modules if m is not module),
@@ -189,8 +189,8 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
         ),
         "after": 0,
         "plot": None,
-        "quantity": run.spec.truth[fits[0].column] if fits else "",
-        "truth": truth_plot(module, fits[0]) if fits else None,
+        "quantity": run.spec.truth[truth_fits[0].column] if truth_fits else "",
+        "truth": truth_plot(module, truth_fits[0]) if truth_fits else None,
         "recent": recent_plots(module),
         "view": command("view", run.path, "--at", f"iteration {frozen.iteration}"),
         **_weights(module, images=images),

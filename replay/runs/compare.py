@@ -217,7 +217,7 @@ def verdict(first: Outline, second: Outline) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ComparedRun:
     """A run in a table of runs, compared with the first one.
 
     Attributes:
@@ -277,20 +277,20 @@ def _short(value: Any) -> str:
     return text if len(text) <= MAX_LETTERS else f"{text[: MAX_LETTERS - 3]}..."
 
 
-def side_by_side(runs: Sequence[Path]) -> tuple[Row, ...]:
+def side_by_side(runs: Sequence[Path]) -> tuple[ComparedRun, ...]:
     """Return a row for each run, compared with the first one."""
-    rows: list[Row] = []
+    rows: list[ComparedRun] = []
     for run, name in zip(runs, short_names(runs), strict=True):
         outline = read_outline(run)
         if not rows:
-            rows.append(Row(name, outline, None))
+            rows.append(ComparedRun(name, outline, None))
         elif (difference := first_difference(runs[0], run)) is None:
-            rows.append(Row(name, outline, None, IDENTICAL))
+            rows.append(ComparedRun(name, outline, None, IDENTICAL))
         else:
             phrase = verdict(rows[0].outline, outline)
             versions = different_versions(runs[0], run)
             settings = different_settings(runs[0], run)
-            rows.append(Row(name, outline, difference, phrase, versions, settings))
+            rows.append(ComparedRun(name, outline, difference, phrase, versions, settings))
     return tuple(rows)
 
 

@@ -10,7 +10,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import MAX_LIST, check_regular, read_json
 from recorder.log.files import partial_path
 from recorder.mcap.reader import LogReader
-from replay.storage.opening import no_such
+from replay.storage.paths import no_such
 
 # Name of the log in a run's folder.
 RUN_FILE = "run.mcap"

@@ -123,7 +123,7 @@ class Outline:
         saved: saves in order.
         last: phase since the last save.
         lines: values of each signal in `LINES`, (n,) or flattened.
-        told: names of the signals that have a value anywhere in the run.
+        progress: names of the signals that have a value anywhere in the run.
         states: (S,) final state of each stream, as codes of the signal `state`.
         changes: (n, 3) block, stream and new code of every change of a state, ordered by block.
     """
@@ -140,7 +140,7 @@ class Outline:
     saved: tuple[Save, ...]
     last: Phase | None
     lines: dict[str, FloatArray]
-    told: frozenset[str]
+    progress: frozenset[str]
     states: tuple[int, ...]
     changes: IntArray = field(default_factory=lambda: np.empty((0, 3), np.int64))
 
@@ -212,7 +212,7 @@ class Tally:
             saved=tuple(self._saved),
             last=last,
             lines={name: values[name] for name in LINES},
-            told=frozenset(self._told),
+            progress=frozenset(self._told),
             states=self._states,
             changes=np.concatenate(self._changes),
         )
@@ -227,7 +227,7 @@ def read_outline(path: Path) -> Outline:
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class SavingRule:
     """Condition for saving a module: a signal must be above or below a threshold.
 
     Attributes:
@@ -258,14 +258,16 @@ class Rule:
         return np.asarray(met.min(axis=1))
 
 
-def rules_of(header: RunHeader) -> list[Rule]:
+def rules_of(header: RunHeader) -> list[SavingRule]:
     """Return the rules of a CD-MISFA learner whose thresholds the header states."""
     if header.by_progress:
         return []
     error = ("roc_error", "clustering error") if header.clusters else ("eta_dot", "|η̇|")
     rules = [
-        Rule(*error, header.number("roc_error" if header.clusters else "delta") or 0, "below"),
-        Rule("share", "share", header.number("novel_share") or 0, "above"),
-        Rule("variance", "variance", header.number("min_variance") or 0, "above"),
+        SavingRule(
+            *error, header.number("roc_error" if header.clusters else "delta") or 0, "below"
+        ),
+        SavingRule("share", "share", header.number("novel_share") or 0, "above"),
+        SavingRule("variance", "variance", header.number("min_variance") or 0, "above"),
     ]
     return [rule for rule in rules if rule.threshold]

@@ -14,8 +14,8 @@ import rerun.blueprint as rrb
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.modules import Module, columns_of
 from replay.view.build import recording_to, view_entities
-from replay.view.layouts import NEAR, blueprint, curve_view, images
-from replay.view.rows import MOST_STREAMS, Rows, drawable, part
+from replay.view.layouts import RECENT_FRAMES, blueprint, curve_view, images
+from replay.view.writer import MOST_STREAMS, ViewWriter, drawable, part
 
 if TYPE_CHECKING:
     from replay.export.applied import Applied, AppliedSink
@@ -40,7 +40,7 @@ class ViewSink:
         self, recording: rr.RecordingStream, spec: SourceSpec, modules: Sequence[Module]
     ) -> None:
         self._recording, self._spec, self._end = recording, spec, 0
-        self._rows, self._modules = Rows(recording, spec), list(columns_of(modules))
+        self._writer, self._modules = ViewWriter(recording, spec), list(columns_of(modules))
 
     def add(self, applied: Applied) -> None:
         """Write the outputs on a block."""
@@ -50,20 +50,20 @@ class ViewSink:
         self._end = max(self._end, block.t + len(block))
         drawn = frames % (EVERY if self._spec.images else 1) == 0
         at = frames[drawn], None
-        self._rows.frames(view_entities(self._spec)[s], at, block.frames[drawn])
+        self._writer.frames(view_entities(self._spec)[s], at, block.frames[drawn])
         first, names = (frames[:1], None), [f"module {m.index}" for m, _ in self._modules]
         slowness = applied.slowness[[columns.start for _, columns in self._modules]]
         slowness = np.where(np.isfinite(slowness), slowness, np.nan)
-        self._rows.lines(f"slowness/{stream}", names, first, slowness[None])
-        self._rows.lines(f"novelty/{stream}", names, first, applied.novelty[None])
+        self._writer.lines(f"slowness/{stream}", names, first, slowness[None])
+        self._writer.lines(f"novelty/{stream}", names, first, applied.novelty[None])
         for module, columns in self._modules:
             outputs = [f"y{j}" for j in range(1, len(module.phi) + 1)]
             path = f"outputs/{stream}/{module.index}"
-            self._rows.lines(path, outputs, (frames, None), applied.y[:, columns], gap=1)
+            self._writer.lines(path, outputs, (frames, None), applied.y[:, columns], gap=1)
 
     def close(self) -> None:
         """Write what waits, and the layout of the view."""
-        self._rows.flush()
+        self._writer.flush()
         tabs = [self._tab(s) for s in range(min(len(self._spec.streams), MOST_STREAMS))]
         self._recording.send_blueprint(blueprint(*tabs, name="Applied modules", length=self._end))
 
@@ -84,7 +84,9 @@ class ViewSink:
         )
         outputs = [
             curve_view(
-                f"Outputs of module {m.index} [SD]", [f"/outputs/{stream}/{m.index}"], near=NEAR
+                f"Outputs of module {m.index} [SD]",
+                [f"/outputs/{stream}/{m.index}"],
+                recent=RECENT_FRAMES,
             )
             for m, _ in self._modules
         ]

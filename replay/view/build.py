@@ -21,17 +21,17 @@ from cdmisfa.core.errors import CdmisfaError, UsageError, are_for
 from cdmisfa.core.untrusted import opened_regular
 from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
-from replay.inputs import About, holds_run, open_to_look
+from replay.open_sources import Announce, holds_run, open_for_viewing
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_batches, read_header
 from replay.runs.modules import load_modules
 from replay.runs.run import Tally, read_outline
 from replay.view.layouts import blueprint, curve_view, images, scene
-from replay.view.panels import run_layout
-from replay.view.rows import MOST_STREAMS, Rows, drawable, part
 from replay.view.run import RunView
+from replay.view.run_layout import run_layout
 from replay.view.scene import SceneView, scenery_of_recording
 from replay.view.summary import summary_text
+from replay.view.writer import MOST_STREAMS, ViewWriter, drawable, part
 
 # Rerun's application id: the viewer remembers one layout for it.
 APPLICATION = "cdmisfa"
@@ -51,7 +51,7 @@ def build_view(
     tab: str | None = None,
     beside: Sequence[Path] = (),
     inputs: InputOptions | None = None,
-    about: About = lambda source: None,
+    about: Announce = lambda source: None,
 ) -> None:
     """Write the view of a run, a recording or camera logs as an .rrd file, whole or not at all.
 
@@ -150,8 +150,8 @@ def _write_run(recording: rr.RecordingStream, log: Path, every: int, tab: str | 
     if len(streams) > MOST_STREAMS:  # the most watched are known at the end only
         streams = read_outline(log).streams(MOST_STREAMS)
     known = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
-    tally, rows = Tally(header), Rows(recording, header.spec)
-    view = RunView(rows, header, streams, folder, every=every, modules=known)
+    tally, writer = Tally(header), ViewWriter(recording, header.spec)
+    view = RunView(writer, header, streams, folder, every=every, modules=known)
     events: list[str] = []
     for batch in read_batches(log, header, every=every):
         for columns in batch.signals:
@@ -161,10 +161,10 @@ def _write_run(recording: rr.RecordingStream, log: Path, every: int, tab: str | 
     outline = tally.outline()
     view.finish(outline)
     text = drawable(summary_text(outline, log.resolve().parent.name, events))
-    rows.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    writer.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
     layout = run_layout(
         outline,
-        rows,
+        writer,
         has_scene=isinstance(view.world, SceneView),
         followed=view.modules.followed(outline),
         sheets=view.modules.sheets,
@@ -179,19 +179,19 @@ def _write_recording(
     every: int,
     tab: str | None,
     inputs: InputOptions | None,
-    about: About,
+    about: Announce,
 ) -> None:
     """Write a recording's views and ground truth, and the layout for them."""
-    with contextlib.closing(open_to_look(paths, inputs)) as source:
+    with contextlib.closing(open_for_viewing(paths, inputs)) as source:
         about(source)
         first, count, spec = source.t, source.frames, source.spec
         ours = source.recorded
         files = [view.path for stream in source.streams for view in stream.views]
         scenery = scenery_of_recording(files) if ours else None
-        rows = Rows(recording, spec)
-        world = None if scenery is None else SceneView(rows, scenery, every)
+        writer = ViewWriter(recording, spec)
+        world = None if scenery is None else SceneView(writer, scenery, every)
         for note in (*source.warnings, *(world.notes if world is not None else ())):
-            rows.event(first, None, note, "WARN")
+            writer.event(first, None, note, "WARN")
         step, entities = every if spec.images else 1, view_entities(spec)
         for t in range(first, first + count, BLOCK):
             for stream, entity in enumerate(entities):
@@ -199,12 +199,12 @@ def _write_recording(
                     source.seek(low)
                     block, frames = source.take(stream, high - low), np.arange(low, high)
                     drawn = frames % step == 0
-                    rows.frames(entity, (frames[drawn], None), block.frames[drawn])
+                    writer.frames(entity, (frames[drawn], None), block.frames[drawn])
                     if spec.truth and stream == 0:
-                        rows.lines("world/truth", spec.truth, (frames, None), block.truth, gap=1)
+                        writer.lines("world/truth", spec.truth, (frames, None), block.truth, gap=1)
                         if world is not None:
                             world.move(frames, block.truth)
-        rows.flush()
+        writer.flush()
     names = drawable(", ".join(spec.streams))
     properties: Any = {"frames": count, "streams": names, "fps": spec.fps}
     recording.send_property("recording", rr.AnyValues(**properties))

@@ -1,4 +1,4 @@
-"""Parts of layouts: the tables of layouts.toml, plots and lanes, and the frame around all tabs."""
+"""Building blocks of layouts: panels of layouts.toml, plots, state timelines, images, tabs."""
 
 from __future__ import annotations
 
@@ -13,57 +13,61 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cdmisfa.core.errors import UsageError
-from replay.view.rows import FRAME, ITERATION, Span
+from replay.view.writer import FRAME, ITERATION, Range
 
 Views = list[rrb.View | rrb.Container]
 
-# Frames of a window in which the inside of a block can be seen, up to the time cursor.
-NEAR = 300
+# Frames of a plot up to the time cursor: few enough that single frames are visible.
+RECENT_FRAMES = 300
 
-# Blocks of the windows of lanes.
-NEAR_BLOCKS = 50
+# Blocks of a state timeline up to the time cursor: few enough that single blocks are visible.
+RECENT_BLOCKS = 50
 
-# Part of a time axis, beyond its end, that is left to the legend, which so covers no data.
+# Share of a time axis that is added beyond its end, so that the legend covers no data.
 ROOM = 0.14
 
-# Part of a time axis that the numbers of a plot take; lanes have none, and begin as much later.
+# Share of a time axis that the labels of a plot's y axis take; state timelines have no such labels
+# and begin later by this share, so that both are aligned.
 MARGIN = 0.018
 
 CURSOR = rr.TimeRangeBoundary.cursor_relative
 
-# Time in which a run is played.
+# Duration in which the viewer plays a run of any length, in seconds.
 PLAY_SECONDS = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A view in a column of views.
+    """A panel of a tab.
 
     Attributes:
-        title: with the number of the module as {i}, and facts of the run, see `RunLayout`.
-        entities: that it draws; curves that the run does not have are left out, and the panel
-            where the first of them is.
-        kind: curves, or lanes; of all of the run, or of the last frames or blocks; or of the time
-            cursor the last frame of each stream, the input, the weights, or the summary.
-        height: of all but lanes, which have what they need.
-        beside: it is on the right of the one before.
-        lanes: how many there are; `per_stream` besides one for each stream.
-        low: least value of the axis.
-        high: greatest value of the axis.
-        fit: the axis holds every value, from `low` on if that is given.
-        legend: there may be one.
-        each_module: there is one for each module.
-        when: the run has it where its gate has bands or clusters, or with several outputs.
+        title: title, with the number of the module as {i} and facts of the run; see `RunLayout`.
+        entities: entities that the panel draws. Curves that the run does not have are omitted; so
+            is the panel if the first of them is missing.
+        kind: curves ("lines") or state timelines ("states") of the whole run, or of the frames or
+            blocks up to the time cursor ("recent", "recent states"); the last frame of each stream,
+            the input, the weights, or the summary.
+        height: relative height; state timelines have a fixed height per row.
+        beside: place the panel to the right of the previous one.
+        state_rows: number of state timelines, without those of `per_stream`.
+        per_stream: add one state timeline for each stream.
+        low: least value of the y axis.
+        high: greatest value of the y axis.
+        fit: fit the y axis to all values, from `low` on if that is given.
+        legend: show a legend if there are several curves.
+        each_module: repeat the panel for each module.
+        when: show the panel only if novelty is measured by bands or by clusters, or if there are
+            several outputs.
     """
 
     title: str
     entities: tuple[str, ...] = ()
     kind: Literal[
-        "lines", "near", "lanes", "near lanes", "streams", "input", "weights", "summary"
+        "lines", "recent", "states", "recent states", "streams", "input", "weights", "summary"
     ] = "lines"
     height: float = 130
     beside: bool = False
-    lanes: int = 0
+    state_rows: int = 0
     per_stream: bool = False
     low: float | None = None
     high: float | None = None
@@ -75,7 +79,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Tab:
-    """Panels below one another, with others on their left."""
+    """A tab: a column of panels, and a narrower column to its left."""
 
     name: str
     panels: tuple[Panel, ...]
@@ -103,23 +107,23 @@ def blueprint(
     length: int = 0,
     tab: str | None = None,
 ) -> rrb.Blueprint:
-    """Return tabs with one plain time bar below and no panels around.
+    """Return a layout of tabs above a time bar, without the viewer's side panels.
 
-    The cursor starts at the end, where all that was learned is shown.
+    The time cursor starts at the end, where every result is visible.
 
     Args:
-        tabs: one beside the other.
-        name: of all.
-        timeline: of the time bar.
-        length: of the timeline, which is played in a minute; 0: not known.
-        tab: name of the one that is open; by default the first.
+        tabs: the tabs from left to right.
+        name: name of the layout.
+        timeline: timeline of the time bar.
+        length: length of the timeline, which is played in `PLAY_SECONDS`; 0 if unknown.
+        tab: name of the open tab; by default the first.
 
     Raises:
         UsageError: there is no such tab.
     """
     names = [str(part.name) for part in tabs]
     if tab is not None and tab.lower() not in map(str.lower, names):
-        raise UsageError(f"there is no tab {tab!r}: there are {', '.join(names)}")
+        raise UsageError(f"no tab {tab!r} in this view: choose one of {', '.join(names)}")
     opened = 0 if tab is None else [part.lower() for part in names].index(tab.lower())
     speed = max(round(length / PLAY_SECONDS), 1) if length else None
     return rrb.Blueprint(
@@ -138,46 +142,46 @@ def curve_view(
     end: int = 0,
     *,
     start: int = 0,
-    near: int = 0,
-    span: Span | None = None,
+    recent: int = 0,
+    span: Range | None = None,
     legend: bool = True,
 ) -> rrb.TimeSeriesView:
-    """Return curves over time.
+    """Return a plot of curves over time.
 
     Args:
-        name: the title.
-        entities: that are drawn.
-        end: of the time axis, which has room for a legend beyond; 0: it grows with the values.
-        start: of the time axis.
-        near: only this many frames up to the time cursor are drawn.
-        span: of the values.
-        legend: whether there is one.
+        name: title of the plot.
+        entities: entities of the curves.
+        end: last frame on the time axis, without the space for the legend; 0 if the axis grows.
+        start: first frame on the time axis.
+        recent: draw only this many frames up to the time cursor; 0 draws all.
+        span: range of the y axis; None leaves it to the viewer.
+        legend: show a legend.
     """
-    corner = rrb.Corner2D.RightTop if end or near else rrb.Corner2D.LeftTop
-    axis, recent = None, None
-    if near:
-        axis = _axis(-near, round(ROOM * near), CURSOR)
-        recent = [rr.VisibleTimeRange(FRAME, start=CURSOR(seq=-near), end=CURSOR(seq=0))]
+    corner = rrb.Corner2D.RightTop if end or recent else rrb.Corner2D.LeftTop
+    axis, time_ranges = None, None
+    if recent:
+        axis = _axis(-recent, round(ROOM * recent), CURSOR)
+        time_ranges = [rr.VisibleTimeRange(FRAME, start=CURSOR(seq=-recent), end=CURSOR(seq=0))]
     elif end:
         axis = _axis(start, end + round(ROOM * max(end - start, 1)))
     return rrb.TimeSeriesView(
         origin="/",
         contents=[*entities],
-        name=f"{name}, last {near} frames" if near else name,
+        name=f"{name}, last {recent} frames" if recent else name,
         axis_x=axis,
         axis_y=None if span is None else rrb.ScalarAxis(range=span),
         plot_legend=rrb.PlotLegend(corner, visible=legend),
-        time_ranges=recent,
+        time_ranges=time_ranges,
     )
 
 
-def lanes(
-    name: str, entities: Sequence[str], end: int = 0, *, near: int = 0, room: bool = True
+def state_rows(
+    name: str, entities: Sequence[str], end: int = 0, *, recent: int = 0, room: bool = True
 ) -> rrb.View:
-    """Return states over time, in line with plots of the same time; see `curve_view`."""
+    """Return state timelines, aligned with plots of the same time axis; see `curve_view`."""
     axis = None
-    if near:
-        axis = _axis(-near, round(ROOM * near) if room else 0, CURSOR)
+    if recent:
+        axis = _axis(-recent, round(ROOM * recent) if room else 0, CURSOR)
     elif end:
         axis = _axis(-round(MARGIN * (1 + ROOM) * end), end + round(ROOM * end))
     return rrb.StateTimelineView(origin="/", contents=[*entities], name=name, time_view=axis)
@@ -190,15 +194,15 @@ def _axis(
     return rrb.archetypes.TimeAxis(view_range=visible)
 
 
-def images(origin: str, name: str, bounds: tuple[Span, Span] | None = None) -> rrb.View:
-    """Return an image, or those of several images that lie within some ranges of x and y."""
+def images(origin: str, name: str, bounds: tuple[Range, Range] | None = None) -> rrb.View:
+    """Return a view of images; with `bounds`, of the part within ranges of x and y."""
     across, down = bounds or (None, None)
     visible = rrb.VisualBounds2D(x_range=across, y_range=down) if across and down else None
     return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=visible)
 
 
 def scene() -> rrb.View:
-    """Return the world in 3D, seen from in front of the robot."""
+    """Return the 3D view of the world, seen from in front of the robot."""
     name, hidden = "World and attended view", rrb.LineGrid3D(visible=False)
     eye = rrb.EyeControls3D(
         position=(-1.5, -0.85, 0.72), look_target=(-0.38, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
@@ -207,11 +211,11 @@ def scene() -> rrb.View:
 
 
 def beside(views: Views) -> rrb.View | rrb.Container:
-    """Return views beside one another."""
+    """Return views side by side."""
     return views[0] if len(views) == 1 else rrb.Horizontal(*views)
 
 
 def events(name: str) -> rrb.View:
-    """Return events in words, with their iterations."""
+    """Return the list of events with their iterations."""
     columns = rrb.archetypes.TextLogColumns(timeline_columns=[ITERATION], text_log_columns=["body"])
     return rrb.TextLogView(origin="/events", name=name, columns=columns)

@@ -24,10 +24,10 @@ from replay.runs.columns import Blocks, columns_of_records
 from replay.runs.log import Batch, RunHeader, read_batches
 from replay.runs.run import Tally
 from replay.view.build import APPLICATION
-from replay.view.panels import MOST_MODULES, run_layout
-from replay.view.rows import MOST_STREAMS, Rows
 from replay.view.run import RunView
+from replay.view.run_layout import MOST_MODULES, run_layout
 from replay.view.scene import SceneView
+from replay.view.writer import MOST_STREAMS, ViewWriter
 
 # Time between two pieces.
 EVERY_SECONDS = 1.5
@@ -76,10 +76,14 @@ class LiveView(Sink):
         self._recording.set_sinks(sink)
         self.address = str(sink.uri)
         self._recording.send_recording_name("live")
-        self._rows = rows = Rows(self._recording, spec)
-        rows.log("summary", rr.TextDocument("The run has not finished: results follow at its end."))
+        self._writer = writer = ViewWriter(self._recording, spec)
+        writer.log(
+            "summary", rr.TextDocument("The run has not finished: results follow at its end.")
+        )
         streams = empty.streams(MOST_STREAMS)
-        self._view = RunView(rows, header, streams, run or Path(), every=EVERY_FRAMES, piece=PIECE)
+        self._view = RunView(
+            writer, header, streams, run or Path(), every=EVERY_FRAMES, piece=PIECE
+        )
         has_scene = isinstance(self._view.world, SceneView)
         self._recording.send_blueprint(run_layout(empty, has_scene=has_scene))
         self._images = spec.images
@@ -112,11 +116,11 @@ class LiveView(Sink):
         """
         for batch in read_batches(run, every=EVERY_FRAMES):
             self._view.take(batch)
-            self._rows.flush()
+            self._writer.flush()
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Log an event in words; see `Sink`."""
-        self._rows.event(t, iteration, text, level)
+        self._writer.event(t, iteration, text, level)
 
     def finish(self) -> None:
         """Write the rest; viewers are served until `__exit__`."""
@@ -138,7 +142,7 @@ class LiveView(Sink):
             )
             self._view.take(batch)
             self._clear()
-        self._rows.flush()
+        self._writer.flush()
         self._next = time.monotonic() + EVERY_SECONDS
 
     def __enter__(self) -> Self:

@@ -16,15 +16,15 @@ import rerun as rr
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.modules import Module
-from replay.following import fits
-from replay.outputs import OwnStream, Pick
+from replay.module_outputs import ModuleOutputs, SampledFrame
 from replay.palette import BRICK, DARK, GREY, MIST, Colour, Rgb, colour, faint, packed, shade
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, Frames
 from replay.runs.run import Outline
+from replay.truth_fits import truth_fits
+from replay.view.image_grid import BETWEEN, grid_positions, place_image, sheet_size
 from replay.view.layouts import Panel
-from replay.view.rows import Rows, drawable
-from replay.view.wall import BETWEEN, hang, places_of, sheet_size
+from replay.view.writer import ViewWriter, drawable
 
 PHI = "abstraction/phi"
 
@@ -52,31 +52,33 @@ def saved_mark() -> rr.SeriesPoints:
     )
 
 
-def hang_weights(rows: Rows, path: str, labels: Sequence[str], rgbs: Sequence[Rgb] = ()) -> None:
+def hang_weights(
+    writer: ViewWriter, path: str, labels: Sequence[str], rgbs: Sequence[Rgb] = ()
+) -> None:
     """Write where the weights of several outputs hang, framed, in grey by default."""
-    if not rows.spec.images or len(labels) == 1:
+    if not writer.spec.images or len(labels) == 1:
         return
-    height, width = rows.spec.frame_shape
-    corners = places_of(len(labels), width, height)
+    height, width = writer.spec.frame_shape
+    corners = grid_positions(len(labels), width, height)
     for j, (words, corner) in enumerate(zip(labels, corners, strict=True)):
         rgb = rgbs[j] if rgbs else GREY
-        hang(rows, f"{path}/{j + 1}", corner, (width, height), words, rgb)
+        place_image(writer, f"{path}/{j + 1}", corner, (width, height), words, rgb)
 
 
-def write_weights(rows: Rows, path: str, t: int, iteration: int, phi: FloatArray) -> None:
+def write_weights(writer: ViewWriter, path: str, t: int, iteration: int, phi: FloatArray) -> None:
     """Show (J, I) weights at a frame and iteration: as images, or bars.
 
     Each output's image, at `path` or of several at `path/<number>`, is in full colour at its own
     largest weight.
     """
-    shape = rows.spec.frame_shape
-    if not rows.spec.images or phi.shape[1] != shape[0] * shape[1]:
+    shape = writer.spec.frame_shape
+    if not writer.spec.images or phi.shape[1] != shape[0] * shape[1]:
         bars = rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST))
-        rows.log_at(path, t, iteration, bars)
+        writer.log_at(path, t, iteration, bars)
         return
     for j, weights in enumerate(phi):
         place = path if len(phi) == 1 else f"{path}/{j + 1}"
-        rows.log_at(place, t, iteration, rr.Image(shade(weights.reshape(shape))))
+        writer.log_at(place, t, iteration, rr.Image(shade(weights.reshape(shape))))
 
 
 def _numbers(phi: FloatArray) -> list[str]:
@@ -91,12 +93,12 @@ class Weights:
     those that its candidate had last, or none (white).
 
     Args:
-        rows: of the recording.
+        writer: of the recording.
         by_progress: the run is one of the progress learner.
     """
 
-    def __init__(self, rows: Rows, *, by_progress: bool) -> None:
-        self._rows, self._by_progress, self._stream = rows, by_progress, -1
+    def __init__(self, writer: ViewWriter, *, by_progress: bool) -> None:
+        self._writer, self._by_progress, self._stream = writer, by_progress, -1
         self._phi: dict[int, FloatArray] = {}
 
     def take(self, batch: Batch) -> None:
@@ -106,26 +108,26 @@ class Weights:
             watched = columns["stream"]
             owners = np.where(columns["saved"], watched, columns["next_stream"])
             owners = owners if self._by_progress else watched
-            rows = (columns.frames, columns.iterations, watched, owners)
-            for t, iteration, s, owner in zip(*(row.tolist() for row in rows), strict=True):
+            signals = (columns.frames, columns.iterations, watched, owners)
+            for t, iteration, s, owner in zip(*(v.tolist() for v in signals), strict=True):
                 phi, visible = logged.get(t), None
                 if self._by_progress and s != self._stream and self._phi:
                     visible = self._phi.get(s, 0 * next(iter(self._phi.values())))
                 self._stream = s
                 if phi is not None:
                     if not self._phi:
-                        hang_weights(self._rows, PHI, _numbers(phi))
+                        hang_weights(self._writer, PHI, _numbers(phi))
                     self._phi[owner] = phi
                     visible = phi if owner == s else visible
                 if visible is not None:
-                    write_weights(self._rows, PHI, t, iteration, visible)
+                    write_weights(self._writer, PHI, t, iteration, visible)
 
 
 class ModulesView:
     """Writes the modules of a run.
 
     Args:
-        rows: of the recording.
+        writer: of the recording.
         modules: of the run, where they are known.
         by_progress: the run is one of the progress learner.
 
@@ -133,15 +135,15 @@ class ModulesView:
         sheets: modules with images of least to greatest output.
     """
 
-    def __init__(self, rows: Rows, modules: Sequence[Module], *, by_progress: bool) -> None:
+    def __init__(self, writer: ViewWriter, modules: Sequence[Module], *, by_progress: bool) -> None:
         self._by_progress = by_progress
-        self._rows, self._notes, self.sheets = rows, list[str](), set[int]()
-        known = [m for m in modules if m.stream_index < len(rows.spec.streams)]
-        self._known = {module.index: OwnStream(module, rows.spec) for module in known}
+        self._writer, self._notes, self.sheets = writer, list[str](), set[int]()
+        known = [m for m in modules if m.stream_index < len(writer.spec.streams)]
+        self._known = {module.index: ModuleOutputs(module, writer.spec) for module in known}
         self._stream_of: dict[int, int] = {}
         self._tau = 0
         self._truth: list[Frames] = []
-        numbers = sorted(self._known)[:FOLLOWED] if rows.spec.truth else []
+        numbers = sorted(self._known)[:FOLLOWED] if writer.spec.truth else []
         self._first: dict[int, list[tuple[int, FloatArray]]] = {n: [] for n in numbers}
 
     def take(self, batch: Batch) -> None:
@@ -188,10 +190,10 @@ class ModulesView:
             ]
             rgbs = [colour(module.stream_index) if is_slow else GREY for is_slow in slow]
             labels = labels or _numbers(module.phi)
-            hang_weights(self._rows, f"{place}/weights", labels, rgbs)
+            hang_weights(self._writer, f"{place}/weights", labels, rgbs)
             at = saved.get(number, outline.end), module.iteration
-            write_weights(self._rows, f"{place}/weights", *at, module.phi)
-            if self._rows.spec.images and stream.count:
+            write_weights(self._writer, f"{place}/weights", *at, module.phi)
+            if self._writer.spec.images and stream.count:
                 self.sheets.add(number)
                 self._write_sheet(place, stream.sheet())
         return self._notes
@@ -202,11 +204,11 @@ class ModulesView:
             number, stream = int(columns["module"][i]), int(columns["stream"][i])
             t, iteration = int(columns.frames[i]), int(columns.iterations[i])
             self._stream_of[number], place = stream, f"modules/{number}"
-            self._rows.log(f"{place}/saved", saved_mark())
-            self._rows.log_at(f"{place}/saved", t + columns.tau, iteration, rr.Scalars([0.0]))
+            self._writer.log(f"{place}/saved", saved_mark())
+            self._writer.log_at(f"{place}/saved", t + columns.tau, iteration, rr.Scalars([0.0]))
             if number not in self._known and t in weights:
-                hang_weights(self._rows, f"{place}/weights", _numbers(weights[t]))
-                write_weights(self._rows, f"{place}/weights", t, iteration, weights[t])
+                hang_weights(self._writer, f"{place}/weights", _numbers(weights[t]))
+                write_weights(self._writer, f"{place}/weights", t, iteration, weights[t])
 
     def _output(self, number: int, t: IntArray, iterations: IntArray, y: FloatArray) -> None:
         """Draw the (n, J) outputs of a module at n frames; only slow ones where any is slow."""
@@ -217,7 +219,7 @@ class ModulesView:
         names = [f"output {j + 1}" for j in visible.tolist()]
         rgbs: list[Colour] = [colour(stream), *(faint(colour(stream)) for _ in visible[1:])]
         path = f"modules/{number}/output"
-        self._rows.lines(path, names, (t, iterations), y[:, visible], rgbs, gap=self._tau)
+        self._writer.lines(path, names, (t, iterations), y[:, visible], rgbs, gap=self._tau)
 
     def _keep_first(self, columns: SignalColumns) -> None:
         """Keep first outputs in blocks of their own streams, of learning ones the last blocks."""
@@ -237,7 +239,7 @@ class ModulesView:
         Returns:
             A panel for each module that follows any true quantity.
         """
-        spec, panels = self._rows.spec, list[Panel]()
+        spec, panels = self._writer.spec, list[Panel]()
         if not self._truth:
             return panels
         parts = zip(*self._truth, strict=True)
@@ -247,27 +249,27 @@ class ModulesView:
             t = np.ravel([start + np.arange(len(y)) for start, y in blocks]).astype(np.int64)
             known = np.isin(t, frames)
             t, y = t[known], np.ravel([y for _, y in blocks])[known]
-            best = next(iter(fits(spec.truth, values[np.searchsorted(frames, t)], y)), None)
+            best = next(iter(truth_fits(spec.truth, values[np.searchsorted(frames, t)], y)), None)
             if best is None:
                 continue
             s, root = self._known[number].module.stream_index, f"learned/{number}"
             stream, line = spec.streams[s], best(values[:, best.column])[:, None]
             name, where = f"{best.function}, fitted", outline.blocks.iteration(t)
-            self._rows.lines(f"{root}/followed", [name], at, line, [GREY], width=BROAD, gap=1)
+            self._writer.lines(f"{root}/followed", [name], at, line, [GREY], width=BROAD, gap=1)
             name, rgbs = f"module {number} on {stream}", [colour(s)]
-            self._rows.lines(f"{root}/output", [name], (t, where), y[:, None], rgbs, gap=1)
+            self._writer.lines(f"{root}/output", [name], (t, where), y[:, None], rgbs, gap=1)
             function, r = drawable(best.function), f"|r| = {best.r:.2f}"
             title = f"Module {number} ({drawable(stream)}) follows {function} (grey), {r}"
             entities = f"/{root}/followed", f"/{root}/output"
-            panels.append(Panel(title, entities, "near", fit=True, legend=False))
-        self._rows.flush()
+            panels.append(Panel(title, entities, "recent", fit=True, legend=False))
+        self._writer.flush()
         return panels
 
-    def _write_sheet(self, place: str, sheet: Mapping[str, Sequence[Pick]]) -> None:
+    def _write_sheet(self, place: str, sheet: Mapping[str, Sequence[SampledFrame]]) -> None:
         """Hang frames of least, middle and greatest output below one another."""
-        height, width = self._rows.spec.frame_shape
+        height, width = self._writer.spec.frame_shape
         gap = np.full((height, BETWEEN), DARK[0], dtype=np.uint8)
-        corners = places_of(len(sheet), *sheet_size(height, width), columns=1)
+        corners = grid_positions(len(sheet), *sheet_size(height, width), columns=1)
         for number, ((name, picks), corner) in enumerate(
             zip(sheet.items(), corners, strict=True), 1
         ):
@@ -276,5 +278,5 @@ class ModulesView:
                 strip = np.hstack([part for pick in picks for part in (pick.frame, gap)])
                 strip = strip[:, :-BETWEEN]
                 words = f"{name}: {picks[0].y:.2f} to {picks[-1].y:.2f}"
-                hang(self._rows, path, corner, strip.shape[::-1], words, GREY)
-                self._rows.log(path, rr.Image(strip))
+                place_image(self._writer, path, corner, strip.shape[::-1], words, GREY)
+                self._writer.log(path, rr.Image(strip))

@@ -21,10 +21,10 @@ from replay.palette import GREY, Colour, colour, faint, packed_all, pale
 from replay.runs.columns import SignalColumns, has_values
 from replay.runs.log import Batch, RunHeader
 from replay.runs.run import Outline, rules_of
-from replay.view.lanes import Lanes
 from replay.view.modules import ModulesView, Weights, saved_mark
-from replay.view.rows import WIDTH, Rows, changes, drawable, part, power_of_ten
 from replay.view.scene import world_of_run
+from replay.view.state_timelines import StateTimelines
+from replay.view.writer import WIDTH, ViewWriter, changes, drawable, part, power_of_ten
 
 # Signals that are the timelines.
 TIMELINES = ("iteration", "t", "log_time")
@@ -54,13 +54,13 @@ class RunView:
     """Writes a run into a recording.
 
     Args:
-        rows: of the recording.
+        writer: of the recording.
         header: of the run's log.
         streams: those that get lines and lanes of their own.
         folder: of the run.
         every: frames from one pose of the scene to the next.
         modules: of the run, where they are known.
-        piece: see `Lanes`.
+        piece: see `StateTimelines`.
 
     Attributes:
         modules: the view of the modules.
@@ -69,7 +69,7 @@ class RunView:
 
     def __init__(
         self,
-        rows: Rows,
+        writer: ViewWriter,
         header: RunHeader,
         streams: Sequence[int],
         folder: Path,
@@ -78,20 +78,20 @@ class RunView:
         modules: Sequence[Module] = (),
         piece: int | None = None,
     ) -> None:
-        self._rows, by_progress = rows, header.by_progress
-        self._lanes = Lanes(rows, streams, by_progress=by_progress, piece=piece)
-        self.modules = ModulesView(rows, modules, by_progress=by_progress)
-        self.world, notes = world_of_run(rows, header, folder, streams, every)
+        self._writer, by_progress = writer, header.by_progress
+        self._timelines = StateTimelines(writer, streams, by_progress=by_progress, piece=piece)
+        self.modules = ModulesView(writer, modules, by_progress=by_progress)
+        self.world, notes = world_of_run(writer, header, folder, streams, every)
         self._writers: list[Any] = [
-            SignalCurves(rows, header, streams),
-            Inputs(rows),
-            self._lanes,
-            Weights(rows, by_progress=by_progress),
+            SignalCurves(writer, header, streams),
+            Inputs(writer),
+            self._timelines,
+            Weights(writer, by_progress=by_progress),
             self.modules,
             *([] if self.world is None else [self.world]),
         ]
         for note in notes:
-            rows.event(0, 0, note, "WARN")
+            writer.event(0, 0, note, "WARN")
 
     def take(self, batch: Batch) -> None:
         """Write the messages of some iterations."""
@@ -101,38 +101,38 @@ class RunView:
     def finish(self, outline: Outline) -> None:
         """Write the end of lanes and the modules, and send all rows that wait."""
         if outline.iterations:
-            self._lanes.end(outline.end, int(outline.blocks.iterations[-1]))
+            self._timelines.end(outline.end, int(outline.blocks.iterations[-1]))
         for note in self.modules.finish(outline):
-            self._rows.event(outline.end, outline.iterations, note, "WARN")
-        self._rows.flush()
+            self._writer.event(outline.end, outline.iterations, note, "WARN")
+        self._writer.flush()
 
 
 class Inputs:
     """Writes the watched frames, the ground truth, and events in words.
 
     Args:
-        rows: of the recording.
+        writer: of the recording.
     """
 
-    def __init__(self, rows: Rows) -> None:
-        self._rows, self._spec, self._named = rows, rows.spec, -1
+    def __init__(self, writer: ViewWriter) -> None:
+        self._writer, self._spec, self._named = writer, writer.spec, -1
         if self._spec.images:
             height, width = self._spec.frame_shape
             frame = rr.Boxes2D(mins=[[0, 0]], sizes=[[width, height]], show_labels=True)
-            rows.log(WATCHED_NAME, frame)
+            writer.log(WATCHED_NAME, frame)
 
     def take(self, batch: Batch) -> None:
         """Write the messages of some iterations."""
         for frames, values in batch.watched:
             at = frames, batch.blocks.iteration(frames)
-            self._rows.frames("world/watched", at, values)
+            self._writer.frames("world/watched", at, values)
         for frames, truth in batch.truth if self._spec.truth else ():
             at = frames, batch.blocks.iteration(frames)
-            self._rows.lines("world/truth", self._spec.truth, at, truth, gap=1)
+            self._writer.lines("world/truth", self._spec.truth, at, truth, gap=1)
         for columns in batch.signals if self._spec.images else ():
             self._name(columns)
         for event in batch.events:
-            self._rows.event(event.t, event.iteration, event.text, event.level)
+            self._writer.event(event.t, event.iteration, event.text, event.level)
 
     def _name(self, columns: SignalColumns) -> None:
         """Frame the watched image in the colour and with the name of its stream."""
@@ -143,7 +143,7 @@ class Inputs:
         self._named = streams[-1]
         labels = [drawable(self._spec.streams[s]) for s in streams]
         boxes = rr.Boxes2D.columns(labels=labels, colors=packed_all([colour(s) for s in streams]))
-        self._rows.send(WATCHED_NAME, (columns.frames[turns], columns.iterations[turns]), boxes)
+        self._writer.send(WATCHED_NAME, (columns.frames[turns], columns.iterations[turns]), boxes)
 
 
 class Curve(NamedTuple):
@@ -162,13 +162,13 @@ class SignalCurves:
     """Writes the signals of a run as curves.
 
     Args:
-        rows: of the recording.
+        writer: of the recording.
         header: of the run's log.
         streams: those that get lines of their own.
     """
 
-    def __init__(self, rows: Rows, header: RunHeader, streams: Sequence[int]) -> None:
-        self._rows, self._names, self._streams = rows, header.spec.streams, list(streams)
+    def __init__(self, writer: ViewWriter, header: RunHeader, streams: Sequence[int]) -> None:
+        self._writer, self._names, self._streams = writer, header.spec.streams, list(streams)
         self._by_progress, self._rules = header.by_progress, rules_of(header)
         self._thresholds = list(thresholds_of(header))
         self._recent = np.zeros((0, len(streams)), dtype=bool)
@@ -182,17 +182,17 @@ class SignalCurves:
                 values = curve.values.reshape(len(frames), -1)
                 gap = 1 if curve.per_frame else columns.tau
                 how = curve.path, curve.names, (frames, iterations), values, curve.rgbs
-                self._rows.lines(*how, width=curve.width, gap=gap)
+                self._writer.lines(*how, width=curve.width, gap=gap)
             for path, name, value in self._thresholds:
                 ends = columns.frames[[0, -1]], columns.iterations[[0, -1]]
-                self._rows.lines(path, [name], ends, np.full((2, 1), value), [GREY])
+                self._writer.lines(path, [name], ends, np.full((2, 1), value), [GREY])
             saved = np.flatnonzero(columns["saved"])
             if len(saved):  # the value that must come down is marked where a module was saved
                 falls = "learning_error" if self._by_progress else "eta_dot"
                 place = "streams/saved" if self._by_progress else "abstraction/saved"
                 values = power_of_ten(columns[falls]).reshape(len(columns), -1)[saved, :1]
                 at = columns.frames[saved], columns.iterations[saved]
-                self._rows.buffer(place, at, values, saved_mark())
+                self._writer.buffer(place, at, values, saved_mark())
 
     def _curves(self, columns: SignalColumns) -> Iterator[Curve]:
         yield from self._signals(columns)

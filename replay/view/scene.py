@@ -30,9 +30,9 @@ from replay.logs.formats.views import first_pose
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, RunHeader
-from replay.storage.opening import log_files
-from replay.view.rows import Rows, changes, drawable, part
-from replay.view.wall import WallView
+from replay.storage.paths import log_files
+from replay.view.image_grid import ImageGridView
+from replay.view.writer import ViewWriter, changes, drawable, part
 
 # The entity whose frame is the robot's root frame.
 SCENE = "scene"
@@ -64,12 +64,12 @@ PRESET = "the run's recording was not found: the 3D scene is that of its preset"
 
 
 def world_of_run(
-    rows: Rows, header: RunHeader, folder: Path, streams: Sequence[int], every: int
-) -> tuple[SceneView | WallView | None, list[str]]:
+    writer: ViewWriter, header: RunHeader, folder: Path, streams: Sequence[int], every: int
+) -> tuple[SceneView | ImageGridView | None, list[str]]:
     """Return a run's world, and its uncertain parts.
 
     Args:
-        rows: of the recording.
+        writer: of the recording.
         header: of the run's log.
         folder: of the run.
         streams: that are shown.
@@ -90,10 +90,10 @@ def world_of_run(
     except LogDamagedError as error:
         notes = [str(error)]
     if scenery is not None:
-        scene = SceneView(rows, scenery, every)
+        scene = SceneView(writer, scenery, every)
         return scene, [*notes, *scene.notes]
     if header.spec.images:
-        return WallView(rows, streams, by_progress=header.by_progress), notes
+        return ImageGridView(writer, streams, by_progress=header.by_progress), notes
     return None, notes
 
 
@@ -140,7 +140,7 @@ class SceneView:
     """Writes the scene of a run, or of a recording, into a Rerun recording.
 
     Args:
-        rows: of the recording.
+        writer: of the recording.
         scenery: the robot and the objects around it.
         every: frames from one pose to the next.
 
@@ -148,25 +148,25 @@ class SceneView:
         notes: why the robot's body is not shown.
     """
 
-    def __init__(self, rows: Rows, scenery: Scenery, every: int) -> None:
-        self._rows, self._spec, self._every = rows, rows.spec, every
+    def __init__(self, writer: ViewWriter, scenery: Scenery, every: int) -> None:
+        self._writer, self._spec, self._every = writer, writer.spec, every
         self._scenery, self._watched, self._is_posed = scenery, -1, False
         self._looks: Gaze | None = None
         self._joints: UrdfTree | None = None
         self.notes: list[str] = []
-        rows.log(SCENE, rr.ViewCoordinates.BRU)
-        rows.log(f"{SCENE}/table", rr.Transform3D(translation=scenery.table.place))
-        rows.log(f"{SCENE}/table", _shape(scenery.table))
+        writer.log(SCENE, rr.ViewCoordinates.BRU)
+        writer.log(f"{SCENE}/table", rr.Transform3D(translation=scenery.table.place))
+        writer.log(f"{SCENE}/table", _shape(scenery.table))
         self._objects = [t for t in scenery.objects if set(t.truth) <= set(self._spec.truth)]
         for thing in self._objects:
-            rows.log(f"{SCENE}/{thing.name}", _shape(thing, LIGHT))
+            writer.log(f"{SCENE}/{thing.name}", _shape(thing, LIGHT))
         gazes = {gaze.name: gaze for gaze in scenery.gazes}
         self._gazes = [gazes.get(name) for name in self._spec.streams]
         for s, gaze in enumerate(self._gazes):
             if gaze is not None:
                 self._write_pyramid(s, gaze)
         try:
-            self._joints = write_body(rows.recording, scenery.robot)
+            self._joints = write_body(writer.recording, scenery.robot)
         except ImportError:
             self.notes = ["the robot's body is not shown: run `pip install icub-models`"]
         except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:
@@ -186,7 +186,7 @@ class SceneView:
         frames, truth = frames[drawn], truth[drawn]
         for thing in self._objects:
             places = thing.places(self._spec.truth, truth)
-            self._rows.buffer(f"{SCENE}/{thing.name}", (frames, None), places, encode=_places)
+            self._writer.buffer(f"{SCENE}/{thing.name}", (frames, None), places, encode=_places)
 
     def _turn(self, columns: SignalColumns) -> None:
         """Turn the head to the view that is watched."""
@@ -223,7 +223,7 @@ class SceneView:
         if not self._is_posed:
             self._is_posed = True  # the eyes are the same in every view, and the arms never move
             edges = rr.LineStrips3D(pyramid(gazes[0].middle), radii=[THICK])
-            self._rows.log(f"{WATCHING}/edges", edges)
+            self._writer.log(f"{WATCHING}/edges", edges)
             for name, angle in {**self._scenery.arms, NECK_PITCH: gazes[0].pitch}.items():
                 if angle:
                     self._pose(name, name, (at[0][:1], at[1][:1]), [angle])
@@ -231,9 +231,9 @@ class SceneView:
             translation=[gaze.middle.place for gaze in gazes],
             quaternion=[gaze.middle.turn for gaze in gazes],
         )
-        self._rows.send(WATCHING, at, turned)
+        self._writer.send(WATCHING, at, turned)
         colours = rr.LineStrips3D.columns(colors=packed_all(rgbs))
-        self._rows.send(f"{WATCHING}/edges", at, colours)
+        self._writer.send(f"{WATCHING}/edges", at, colours)
         self._pose("neck", NECK, at, [gaze.yaw for gaze in gazes])
 
     def _pose(
@@ -243,18 +243,18 @@ class SceneView:
         joint = None if self._joints is None else self._joints.get_joint_by_name(name)
         if joint is not None:
             turned = joint.compute_transform_columns([math.radians(angle) for angle in angles])
-            self._rows.send(f"{SCENE}/{place}", at, turned)
+            self._writer.send(f"{SCENE}/{place}", at, turned)
 
     def _write_pyramid(self, s: int, gaze: Gaze) -> None:
         """Write where a view looks from, its edges, and its name."""
         path, eye = f"{SCENE}/gaze/{part(self._spec.streams, s)}", gaze.middle
         turn = rr.Quaternion(xyzw=eye.turn)
-        self._rows.log(path, rr.Transform3D(translation=eye.place, quaternion=turn))
+        self._writer.log(path, rr.Transform3D(translation=eye.place, quaternion=turn))
         edges, rgbs = pyramid(eye), packed_all([colour(s)] * EDGES)
-        self._rows.log(path, rr.LineStrips3D(edges, colors=rgbs, radii=[THIN]))
+        self._writer.log(path, rr.LineStrips3D(edges, colors=rgbs, radii=[THIN]))
         end, names = [np.mean(edges[-1][2:4], axis=0)], [drawable(self._spec.streams[s])]
         name = rr.Points3D(end, labels=names, colors=rgbs[:1], radii=[THICK], show_labels=True)
-        self._rows.log(f"{path}/name", name)
+        self._writer.log(f"{path}/name", name)
 
 
 def _places(values: NDArray[Any]) -> Any:

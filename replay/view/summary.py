@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from cdmisfa.core.names import counted
 from cdmisfa.core.signals import ACTIONS, STATE_WORDS, STATES
 from replay.runs.run import Outline
-from replay.view.rows import MOST_STREAMS
+from replay.view.writer import MOST_STREAMS
 
 # Start of the event that says why a run ended.
 ENDED = "ended:"

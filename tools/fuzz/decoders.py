@@ -34,7 +34,7 @@ from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import IMAGES
 from recorder.images.videos import VideoPackets
 from recorder.mcap.records import MalformedRecord
-from replay.logs.opening import open_stream
+from replay.logs.open_logs import open_stream
 from replay.runs.codec import decode_matrices, decode_signals, encode_matrix, encode_signals
 from replay.runs.folders import RUN_JSON, read_run_json
 from replay.runs.keyframes import decode_keyframe, encode_keyframe

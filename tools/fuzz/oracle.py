@@ -18,11 +18,11 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MAX_CHUNK
-from replay.inputs import open_recording
 from replay.integrity.info import describe
 from replay.integrity.recover import recover_log
 from replay.integrity.verify import check_log
 from replay.logs.formats.recording import ViewFile
+from replay.open_sources import open_recording
 
 from .mutations import Case, bases
 

@@ -139,7 +139,7 @@ def _logs(source: Sequence[str]) -> list[list[str]]:
     from recorder.cameras.words import is_live
     from recorder.world.scenes import SCENES
     from replay.corpus.index import logs_of_corpus
-    from replay.inputs import locations
+    from replay.open_sources import locations
 
     if any(map(is_live, source)):
         return [list(source)]

@@ -185,7 +185,9 @@ def _opened(
     for folder in filter(None, (output, record_to) if live else ()):
         refuse_existing(folder, force=force, goes_on=False)
     with bar("opening", "logs") as shown:
-        frames, configuration = open_source(words, told=shown.update, say=printing.status, **how)
+        frames, configuration = open_source(
+            words, progress=shown.update, say=printing.status, **how
+        )
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.closing(frames))
         if not live:

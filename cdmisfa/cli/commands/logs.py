@@ -18,7 +18,8 @@ from cdmisfa.core.names import counted, lasting
 
 if TYPE_CHECKING:
     from replay.corpus.index import Indexed
-    from replay.integrity.report import ChannelInfo, LogReport, SizeInfo
+    from replay.integrity.report import LogReport, SizeInfo
+    from replay.logs.stream import ChannelInfo
 
 # Number of streams of a run that `info` names.
 MOST_STREAMS = 8
@@ -268,7 +269,7 @@ def export_command(
         cdmisfa export recordings/kitchen --to mp4 -o films
         cdmisfa export monday.mcap tuesday.mcap --to lerobot --lossless -o dataset
     """
-    from replay.export.forms import export
+    from replay.export.formats import export
     from replay.export.tables import CSV_LEAVES_OUT, TABLES
 
     form = form or output.suffix.removeprefix(".")

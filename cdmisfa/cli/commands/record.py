@@ -211,12 +211,12 @@ def convert_command(
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
     from recorder.recording import record
-    from replay.inputs import locations, open_external, refuse_what_is_no_log
+    from replay.open_sources import locations, open_external, refuse_non_logs
 
     if live := next(filter(is_live, source), None):
         raise UsageError(f"{live} is a live stream: cdmisfa record {shlex.join(source)} -o REC")
     paths = locations(source)
-    refuse_what_is_no_log(paths)
+    refuse_non_logs(paths)
     if not resume:
         refuse_existing(output, force=force)
     opened = open_external(paths, inputs, skip_damaged=skip_damaged)

@@ -14,7 +14,7 @@ from cdmisfa.cli import options, printing
 from cdmisfa.core.errors import NotReproducedError
 
 if TYPE_CHECKING:
-    from replay.runs.compare import Row
+    from replay.runs.compare import ComparedRun
 
 
 @options.command("compare")
@@ -49,7 +49,7 @@ def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_j
         raise click.UsageError("name two runs, or more")
     rows = side_by_side(runs)
     if save is not None:
-        from replay.view.overlay import build_overlay  # takes half a second
+        from replay.view.comparison import build_overlay  # takes half a second
 
         build_overlay(runs, rows, save, force=force)
     different = [row.difference for row in rows if row.difference is not None]
@@ -68,7 +68,7 @@ def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_j
     return NotReproducedError.exit_code if different and len(runs) == 2 else 0
 
 
-def _print_comparison(rows: Sequence[Row]) -> None:
+def _print_comparison(rows: Sequence[ComparedRun]) -> None:
     """Print how runs compare, and for two runs the signals that differ first."""
     from replay.runs.compare import HEAD, differing_outcomes
 

@@ -38,8 +38,8 @@ from cdmisfa.studies.paper.experiment import (
 )
 from cdmisfa.studies.paper.oscillatory import GAIN, gains, stay_rewards
 from recorder.world.icub.config import IcubConfig
-from replay.inputs import open_recording
 from replay.logs.source import LoggedSource
+from replay.open_sources import open_recording
 
 # Stream and policy of both modules, as the paper gives them.
 OPTIMAL = ((0, "011"), (2, "110"))

@@ -20,7 +20,7 @@ from recorder.images.framing import pixels_of
 from recorder.images.options import InputOptions
 from recorder.images.pixels import raw_image
 from replay.logs.formats.messages import NoTopicError, fits_topic
-from replay.logs.stream import ChannelFacts, LogStream, Rows, picked
+from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, Rows, picked
 from replay.storage.arrays import NOT_ARRAYS
 
 ENDINGS: Final = (".npy", ".npz")
@@ -116,15 +116,16 @@ def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def array_channels(path: Path) -> list[ChannelFacts]:
+def array_channels(path: Path) -> list[ExternalChannel]:
     """Return the arrays of a file; raises as `load_numbers`."""
-    facts = []
+    channels = []
     for name, array in load_numbers(path).items():
         shape = "x".join(map(str, array.shape[1:]))
         rows = len(array) if array.ndim else 1
         kind = f"{array.dtype} {shape}".rstrip()
-        facts.append(ChannelFacts(name, "numpy", kind, rows, images=False))
-    return facts
+        info = ChannelInfo(name, "numpy", kind, rows)
+        channels.append(ExternalChannel(info, images=False))
+    return channels
 
 
 def array_hash(name: str, array: NDArray[Any]) -> dict[str, Any]:

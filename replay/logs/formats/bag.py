@@ -21,7 +21,7 @@ from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import InputOptions
 from recorder.mcap.records import MAX_CHUNK
 from replay.logs.formats.messages import choose_topics, message_stream
-from replay.logs.stream import ChannelFacts, LogStream, limited
+from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, limited
 
 ENDINGS: Final = (".bag", ".db3")
 
@@ -125,7 +125,7 @@ def streams(
     return opened_streams
 
 
-def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
+def bag_channels(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
     """Return the topics of a bag, by the index of a .bag or the columns of a database.
 
     Args:
@@ -149,14 +149,14 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
                 messages = bag.messages if whole else bag.stamps
                 for name, stamp, *_ in messages(list(kinds)):
                     stamps[name].append(stamp)
-    facts = []
+    channels = []
     for name, kind in kinds.items():
         times = stamps[name]
         ends = min(times, default=None), max(times, default=None)
         images = decoder_of(kind, InputOptions()) is not None
-        about = (kind.encoding, kind.schema, len(times), *ends, images)
-        facts.append(ChannelFacts(name, *about, remarks=(_remark(path),)))
-    return facts
+        info = ChannelInfo(name, kind.encoding, kind.schema, len(times), *ends)
+        channels.append(ExternalChannel(info, images, remarks=(_remark(path),)))
+    return channels
 
 
 def _remark(path: Path) -> str:

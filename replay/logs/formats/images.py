@@ -15,7 +15,7 @@ from recorder.images.pixels import MalformedImage
 from recorder.mcap.records import Problem
 from replay.logs.formats.messages import check_topics
 from replay.logs.stream import LogStream
-from replay.storage.opening import natural_order
+from replay.storage.paths import natural_order
 
 ENDINGS: Final = (".jpeg", ".jpg", ".png")
 

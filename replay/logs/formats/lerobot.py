@@ -23,7 +23,7 @@ from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic
 from replay.logs.formats.table import number_stream
 from replay.logs.formats.video import VideoFile
-from replay.logs.stream import ChannelFacts, LogStream, explained, limited
+from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, explained, limited
 
 INFO: Final = "meta/info.json"
 
@@ -200,14 +200,14 @@ def is_dataset(path: Path) -> bool:
     return (path / INFO).is_file()
 
 
-def dataset_channels(path: Path) -> list[ChannelFacts]:
+def dataset_channels(path: Path) -> list[ExternalChannel]:
     """Return the features of a dataset, one value a frame."""
-    info, facts = _info(path), []
+    info, channels = _info(path), []
     for name, feature in info["features"].items():
         kind, shape = feature.get("dtype"), "x".join(map(str, feature.get("shape", ())))
-        about = str(kind), shape, int(info["total_frames"])
-        facts.append(ChannelFacts(name, *about, images=kind in _IMAGES))
-    return facts
+        channel = ChannelInfo(name, str(kind), shape, int(info["total_frames"]))
+        channels.append(ExternalChannel(channel, images=kind in _IMAGES))
+    return channels
 
 
 def features(path: Path) -> tuple[list[str], list[str]]:

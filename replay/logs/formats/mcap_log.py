@@ -18,7 +18,7 @@ from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
 from replay.logs.formats.messages import choose_topics, message_stream
 from replay.logs.stream import LogStream, NothingLoggedError
-from replay.storage.opening import natural_order
+from replay.storage.paths import natural_order
 
 
 def streams(

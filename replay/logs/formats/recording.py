@@ -38,7 +38,7 @@ from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Segment
 from replay.logs.clock import intersection
 from replay.logs.stream import explained
-from replay.stored import Span
+from replay.stored_source import Span
 
 
 class NoRecordingError(LogDamagedError):

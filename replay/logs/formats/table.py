@@ -16,7 +16,7 @@ from cdmisfa.core.untrusted import check_regular
 from recorder.images.fields import EXACT, Field, bounded, is_path
 from recorder.images.options import NUMBERS_RECIPE, InputOptions
 from replay.logs.formats.messages import check_topics
-from replay.logs.stream import LAST_NS, ChannelFacts, LogStream, limited, picked
+from replay.logs.stream import LAST_NS, ChannelInfo, ExternalChannel, LogStream, limited, picked
 
 ENDINGS: Final = (".csv", ".parquet")
 
@@ -132,14 +132,14 @@ def number_stream(
     )
 
 
-def table_channels(path: Path) -> list[ChannelFacts]:
+def table_channels(path: Path) -> list[ExternalChannel]:
     """Return the columns of a table; raises as `streams`."""
-    table, kind, facts = _read(path), path.suffix[1:], []
+    table, kind, channels = _read(path), path.suffix[1:], []
     remarks = (f"{path}: a table has no checksums, changed numbers would go unnoticed",)
     for name, column in zip(table.column_names, table.columns, strict=True):
-        about = kind, str(column.type), len(column) - column.null_count
-        facts.append(ChannelFacts(name, *about, images=False, remarks=remarks))
-    return facts
+        info = ChannelInfo(name, kind, str(column.type), len(column) - column.null_count)
+        channels.append(ExternalChannel(info, images=False, remarks=remarks))
+    return channels
 
 
 def _read(path: Path) -> Any:

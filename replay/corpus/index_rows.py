@@ -16,11 +16,12 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.log.messages import view_topic
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord
-from replay.corpus.finding import ListedLog, size_and_time
+from replay.corpus.listing import ListedLog, size_and_time
 from replay.integrity.info import describe_log, describe_reader
-from replay.integrity.report import ChannelInfo, failed
+from replay.integrity.report import failed
 from replay.logs.clock import missing
-from replay.logs.opening import identity_of, image_topics, only_external, open_stream
+from replay.logs.open_logs import identity_of, image_topics, is_external_format, open_stream
+from replay.logs.stream import ChannelInfo
 from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import is_url, location
 
@@ -105,7 +106,7 @@ def read_rows(logs: Sequence[ListedLog], deep: bool) -> tuple[pa.Table, list[str
 
 def _streams_of(place: Path, log: ListedLog, deep: bool) -> Iterator[dict[str, Any]]:
     """Yield a row for each stream of a log, or one for a log without streams."""
-    if only_external(place):
+    if is_external_format(place):
         report, sha256 = describe_log(place, decode=deep), _hash_of(identity_of(place))
         topics = [c.topic for c in report.channels if deep and c.encoding != "numpy"]
     else:

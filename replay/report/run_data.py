@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.modules import Module
-from replay.following import Fit, fits
-from replay.outputs import OwnStream, Thinned
+from replay.module_outputs import ModuleOutputs, Subsample
 from replay.runs.folders import read_run_json
 from replay.runs.log import (
     EVENT_TOPIC,
@@ -25,6 +24,7 @@ from replay.runs.log import (
     read_batches,
 )
 from replay.runs.run import Run, Tally
+from replay.truth_fits import TruthFit, truth_fits
 
 TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 
@@ -57,8 +57,8 @@ class ModuleData:
 
     def __init__(self, frozen: Module, spec: SourceSpec, frames: int) -> None:
         self.frozen, self._spec = frozen, spec
-        self.stream = OwnStream(frozen, spec)
-        self.outputs, self.frames = Thinned(MOST_OUTPUTS), Thinned(frames)
+        self.stream = ModuleOutputs(frozen, spec)
+        self.outputs, self.frames = Subsample(MOST_OUTPUTS), Subsample(frames)
         outputs = np.empty((0, len(frozen.eta)))
         self.recent: tuple[NDArray[Any], NDArray[Any]] = np.empty(0, np.int64), outputs
 
@@ -75,13 +75,13 @@ class ModuleData:
             old_t, old_y = self.recent
             self.recent = np.append(old_t, t)[-RECENT:], np.concatenate([old_y, y])[-RECENT:]
 
-    def fits(self) -> list[Fit]:
+    def truth_fits(self) -> list[TruthFit]:
         """Return which true quantities the first output follows, the best first."""
         if not self._spec.truth or not self.outputs.columns:
             return []
         _, y, truth = self.outputs.columns
         known = np.isfinite(truth).all(axis=1)
-        return fits(self._spec.truth, truth[known], y[known, 0])
+        return truth_fits(self._spec.truth, truth[known], y[known, 0])
 
     def correlation(self, other: ModuleData) -> float:
         """Return |r| of the first outputs of this module and another one, on this one's frames."""
@@ -133,7 +133,7 @@ class RunData:
                 self.problems.append(str(error))
         few = min(max(frames // max(len(modules), 1), 24), 96)
         self.modules = [ModuleData(module, self.spec, few) for module in modules]
-        self.watched, self.last = Thinned(frames), dict[int, NDArray[Any]]()
+        self.watched, self.last = Subsample(frames), dict[int, NDArray[Any]]()
         self.events: list[Event] = []
         tally = Tally(self.header)
         try:

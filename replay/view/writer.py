@@ -1,9 +1,9 @@
-"""Writes rows of numbers, images and texts into a Rerun recording, many at a time.
+"""Write numbers, images and texts into a Rerun recording, many rows at a time.
 
-Every part of a view writes through `Rows`, which knows the clock of the frames, buffers the rows of
-each entity, and remembers the range of its values. To send rows one by one costs a hundred times
-more. Rerun reads an array after the call that sends it, so arrays are copied, except images that
-nobody may write to.
+Every part of a view writes through `ViewWriter`, which knows the clock of the frames, buffers the
+rows of each entity, and remembers the range of its values. Sending rows one by one would cost a
+hundred times more. Rerun reads an array after the call that sends it, so arrays are copied, except
+read-only images.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ MAX_BYTES = 4 * 1024 * 1024
 WIDTH = 1.5
 
 # Least and greatest value.
-Span = tuple[float, float]
+Range = tuple[float, float]
 
 # Frames of n rows, and their iterations where the source has any, (n,) each.
 At = tuple[IntArray, IntArray | None]
@@ -123,7 +123,7 @@ class _Buffer:
     bytes: int = 0
 
 
-class Rows:
+class ViewWriter:
     """Writes the rows of a view into a Rerun recording.
 
     Args:
@@ -136,7 +136,7 @@ class Rows:
 
     def __init__(self, recording: rr.RecordingStream, spec: SourceSpec) -> None:
         self.recording, self.spec = recording, spec
-        self.spans: dict[str, Span] = {}
+        self.spans: dict[str, Range] = {}
         self._buffers: dict[str, _Buffer] = {}
 
     def log(self, path: str, value: Any) -> None:
@@ -243,7 +243,7 @@ class Rows:
         for path, waiting in self._buffers.items():
             self._send_buffer(path, waiting)
 
-    def covered(self, entity: str) -> Span | None:
+    def covered(self, entity: str) -> Range | None:
         """Return the least and the greatest value of an entity that is written, or of many (**)."""
         spans = [self.spans[path] for path in self.matching(entity)]
         return (min(low for low, _ in spans), max(high for _, high in spans)) if spans else None

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.stored import StoredSource
+from replay.stored_source import StoredSource
 
 # Frames at the beginning that are looked at.
 LOOKED: Final = 2000

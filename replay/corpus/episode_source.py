@@ -12,12 +12,12 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.names import counted
 from recorder.images.options import InputOptions
-from replay.corpus.logs import Episode, Log, are_alike, by_numbers, episode_of, names_of, sampled
-from replay.inputs import open_log
+from replay.corpus.episode import Episode, Log, are_alike, by_numbers, episode_of, names_of, sampled
 from replay.logs.formats.lerobot import PAUSE
 from replay.logs.source import LoggedSource
+from replay.open_sources import open_log
 from replay.storage.identity import Identity
-from replay.stored import Span, StoredSource
+from replay.stored_source import Span, StoredSource
 
 # Number of warnings of a kind, as of logs that are left out, that are printed.
 MOST_LINES: Final = 5
@@ -57,7 +57,7 @@ class EpisodeSource(StoredSource):
         *,
         loop: bool = False,
         skip_damaged: bool = False,
-        told: Progress = lambda done, total: None,
+        progress: Progress = lambda done, total: None,
     ) -> None:
         """Open every log once, for its frames and its identity.
 
@@ -66,7 +66,7 @@ class EpisodeSource(StoredSource):
             inputs: how images of external logs become frames.
             loop: begin again at the end.
             skip_damaged: skip damaged parts of a log; else the rest of the log is left out.
-            told: called with the number of opened logs, and of all.
+            progress: called with the number of opened logs, and of all.
 
         Raises:
             UsageError: none of them has frames.
@@ -93,7 +93,7 @@ class EpisodeSource(StoredSource):
                     warnings.extend(source.warnings)
             except CdmisfaError as error:
                 errors.append(error)
-            told(done, len(logs))
+            progress(done, len(logs))
         if not episodes:
             raise errors[0]
         episodes.sort(key=lambda episode: episode.spec.start_ns)

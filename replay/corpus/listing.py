@@ -9,9 +9,9 @@ from typing import Final, NamedTuple
 
 from cdmisfa.core.errors import CdmisfaError
 from recorder.mcap.store import PARTIAL
-from replay.inputs import locations
 from replay.logs.formats.images import ENDINGS as IMAGE_ENDINGS
-from replay.logs.opening import ENDINGS, log_format
+from replay.logs.open_logs import ENDINGS, log_format
+from replay.open_sources import locations
 from replay.runs.folders import RUN_FILE
 from replay.storage.location import is_url
 

@@ -13,7 +13,8 @@ from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.signals import STATES
-from replay.integrity.report import ChannelInfo, ModuleInfo
+from replay.integrity.report import ModuleInfo
+from replay.logs.stream import ChannelInfo
 from replay.runs.folders import RUN_FILE, read_run_json, run_log
 from replay.runs.log import SIGNALS_TOPIC, read_header
 from replay.runs.modules import load_modules

@@ -15,19 +15,19 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import InputOptions
 from recorder.mcap.records import no_log
 from replay.logs.aligning import UnequalError, join_parts
+from replay.logs.color_choice import CHOSEN, shows_hue
 from replay.logs.formats import views
 from replay.logs.formats.arrays import array_streams
 from replay.logs.formats.recording import NoRecordingError, ViewFile
 from replay.logs.formats.views import SeveralRecordingsError
-from replay.logs.hue import CHOSEN, shows_hue
-from replay.logs.opening import ALL, OpenLogs, image_logs, only_external
+from replay.logs.open_logs import ALL, OpenLogs, image_logs, is_external_format
 from replay.logs.source import LoggedSource
 from replay.runs.folders import RUN_FILE, is_run
 from replay.storage.location import is_url, location
-from replay.storage.opening import log_files, natural_order, no_such, starts_as_log
+from replay.storage.paths import log_files, natural_order, no_such, starts_as_log
 
 # Called with logs that were opened to be shown, to print what they are.
-About = Callable[[LoggedSource], None]
+Announce = Callable[[LoggedSource], None]
 
 Source = TypeVar("Source")
 
@@ -52,14 +52,14 @@ def open_log(
         LogDamagedError: a log is damaged.
     """
     inputs = inputs or InputOptions()
-    refuse_what_is_no_log(paths)
-    if not inputs.external and not any(map(only_external, paths)):
+    refuse_non_logs(paths)
+    if not inputs.external and not any(map(is_external_format, paths)):
         with contextlib.suppress(NoRecordingError):
             return open_recording(paths, loop=loop, skip_damaged=skip_damaged)
     return open_external(paths, inputs, loop=loop, skip_damaged=skip_damaged)
 
 
-def open_to_look(
+def open_for_viewing(
     paths: Sequence[Path], inputs: InputOptions | None = None, *, skip_damaged: bool = False
 ) -> LoggedSource:
     """Open logs to view or export them: every topic of images, aligned by time if need be.
@@ -71,9 +71,9 @@ def open_to_look(
         LogDamagedError: a log is damaged.
     """
     inputs = inputs or InputOptions()
-    refuse_what_is_no_log(paths)
+    refuse_non_logs(paths)
     source = None
-    if not (inputs.topics or inputs.fields or any(map(only_external, paths))):
+    if not (inputs.topics or inputs.fields or any(map(is_external_format, paths))):
         with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
             source = open_recording(paths, skip_damaged=skip_damaged)
     if source is None:
@@ -204,7 +204,7 @@ def holds_run(path: Path) -> bool:
         UsageError: it does not exist.
         LogDamagedError: it is no log, or a damaged one.
     """
-    return not only_external(path) and is_run(path)
+    return not is_external_format(path) and is_run(path)
 
 
 def is_recording(words: Sequence[str]) -> bool:
@@ -215,20 +215,20 @@ def is_recording(words: Sequence[str]) -> bool:
         LogDamagedError: a log is damaged.
     """
     places = locations(words)
-    if not any(map(only_external, places)):
+    if not any(map(is_external_format, places)):
         with contextlib.suppress(NoRecordingError):
             open_recording(places).close()
             return True
     return False
 
 
-def refuse_what_is_no_log(paths: Sequence[Path]) -> None:
+def refuse_non_logs(paths: Sequence[Path]) -> None:
     """Refuse runs, and files that are no logs, with a UsageError."""
     for path in paths:
         if not path.exists():
             raise no_such(path)
         starts = path.is_file() and starts_as_log(path)
-        if not (starts or path.is_dir() or only_external(path) or ".mcap" in path.suffixes):
+        if not (starts or path.is_dir() or is_external_format(path) or ".mcap" in path.suffixes):
             raise no_log(path)
         if (path.is_dir() or (starts and path.name.startswith(RUN_FILE))) and is_run(path):
             raise UsageError(

@@ -9,13 +9,13 @@ import numpy as np
 import rerun as rr
 
 from cdmisfa.core.signals import STATE_WORDS
-from replay.outputs import EACH
+from replay.module_outputs import SAMPLE_FRAMES
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
-from replay.view.rows import Rows, Span, changes, drawable, part
+from replay.view.writer import Range, ViewWriter, changes, drawable, part
 
-WALL = "wall"
+GRID = "latest_frames"
 
 # Width of the wall over its height, as near as whole images allow.
 SHAPE = 1.7
@@ -27,7 +27,7 @@ ROOM, SPACE = 0.5, 0.06
 BETWEEN = 4
 
 
-def places_of(
+def grid_positions(
     count: int, width: int, height: int, columns: int | None = None
 ) -> list[tuple[float, float]]:
     """Return corners (x, y) of images of a size on a wall, in rows of so many, or as fit."""
@@ -40,53 +40,60 @@ def places_of(
     return [(i % columns * across, i // columns * down) for i in range(count)]
 
 
-def bounds(count: int, height: int, width: int, columns: int | None = None) -> tuple[Span, Span]:
-    """Return ranges of x and y that hold a wall of images of a size; see `places_of`."""
-    x, y = map(max, zip(*places_of(count, width, height, columns), strict=True))
+def grid_bounds(
+    count: int, height: int, width: int, columns: int | None = None
+) -> tuple[Range, Range]:
+    """Return ranges of x and y that hold a wall of images of a size; see `grid_positions`."""
+    x, y = map(max, zip(*grid_positions(count, width, height, columns), strict=True))
     margin = SPACE * height
     return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
 
 
 def sheet_size(height: int, width: int) -> tuple[int, int]:
     """Return width and height of a strip of frames of a size."""
-    return EACH * (width + BETWEEN) - BETWEEN, height
+    return SAMPLE_FRAMES * (width + BETWEEN) - BETWEEN, height
 
 
-def hang(
-    rows: Rows, path: str, corner: Sequence[float], size: Sequence[int], words: str, rgb: Rgb
+def place_image(
+    writer: ViewWriter,
+    path: str,
+    corner: Sequence[float],
+    size: Sequence[int],
+    words: str,
+    rgb: Rgb,
 ) -> None:
     """Write where an image of a size (width, height) hangs, with a frame, and words below it."""
     width, height = size
-    rows.log(path, rr.Transform3D(translation=[*corner, 0.0]))
+    writer.log(path, rr.Transform3D(translation=[*corner, 0.0]))
     rgbs = packed_all([rgb])
     frame = rr.Boxes2D(mins=[[0, 0]], sizes=[size], colors=rgbs, show_labels=False)
-    rows.log(f"{path}/frame", frame)
+    writer.log(f"{path}/frame", frame)
     place, texts = [[width / 2, (1 + ROOM / 8) * height]], [drawable(words)]
     text = rr.Points2D(place, labels=texts, colors=rgbs, radii=[0.0], show_labels=True)
-    rows.log(f"{path}/words", text)
+    writer.log(f"{path}/words", text)
 
 
-class WallView:
+class ImageGridView:
     """Writes the streams of a run as images on a wall.
 
     Each shows the last image of the last block in which its stream was watched. The stream that
     is watched is framed.
 
     Args:
-        rows: of the recording.
+        writer: of the recording.
         streams: that are shown.
         by_progress: the run is one of the progress learner.
     """
 
-    def __init__(self, rows: Rows, streams: Sequence[int], *, by_progress: bool) -> None:
-        self._rows, self._by_progress = rows, by_progress
-        height, width = rows.spec.frame_shape
+    def __init__(self, writer: ViewWriter, streams: Sequence[int], *, by_progress: bool) -> None:
+        self._writer, self._by_progress = writer, by_progress
+        height, width = writer.spec.frame_shape
         self._size = width, height
-        self._corners = dict(zip(streams, places_of(len(streams), width, height), strict=True))
-        self._paths = {s: f"{WALL}/{part(rows.spec.streams, s)}" for s in streams}
+        self._corners = dict(zip(streams, grid_positions(len(streams), width, height), strict=True))
+        self._paths = {s: f"{GRID}/{part(writer.spec.streams, s)}" for s in streams}
         self._framed, self._words = -1, dict.fromkeys(streams, "")
         for s, corner in self._corners.items():
-            rows.log(self._paths[s], rr.Transform3D(translation=[*corner, 0.0]))
+            writer.log(self._paths[s], rr.Transform3D(translation=[*corner, 0.0]))
 
     def take(self, batch: Batch) -> None:
         """Write the messages of some iterations."""
@@ -102,7 +109,7 @@ class WallView:
             for s in self._paths.keys() & set(streams.tolist()):
                 rows = last[streams == s]
                 at = frames[rows], blocks.iterations[places[rows]]
-                self._rows.frames(self._paths[s], at, images[rows])
+                self._writer.frames(self._paths[s], at, images[rows])
 
     def _frame(self, columns: SignalColumns) -> None:
         """Put the frame around the watched stream; around one that is not shown it has no size."""
@@ -119,11 +126,11 @@ class WallView:
             radii=[self._size[1] / 80] * len(watched),
         )
         at = columns.frames[turns], columns.iterations[turns]
-        self._rows.send(f"{WALL}/frame", at, boxes)
+        self._writer.send(f"{GRID}/frame", at, boxes)
 
     def _write_words(self, columns: SignalColumns, s: int) -> None:
         """Write below an image its stream's name, and state or module, where they change."""
-        name, words = drawable(self._rows.spec.streams[s]), self._words[s]
+        name, words = drawable(self._writer.spec.streams[s]), self._words[s]
         texts: list[tuple[int, str]] = []
         if self._by_progress:
             codes = columns["state"][:, s]
@@ -149,4 +156,4 @@ class WallView:
             show_labels=[True] * count,
         )
         at = columns.frames[[*turns]], columns.iterations[[*turns]]
-        self._rows.send(f"{self._paths[s]}/state", at, points)
+        self._writer.send(f"{self._paths[s]}/state", at, points)

@@ -21,7 +21,7 @@ FREQUENCIES = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class TruthFit:
     """A function of a true quantity that an output follows.
 
     Attributes:
@@ -43,7 +43,7 @@ class Fit:
         return np.asarray(self.terms(truth) @ self.weights)
 
 
-def fits(names: Sequence[str], truth: FloatArray, y: FloatArray) -> list[Fit]:
+def truth_fits(names: Sequence[str], truth: FloatArray, y: FloatArray) -> list[TruthFit]:
     """Return how an output follows each true quantity, the one that it follows most first.
 
     Args:
@@ -64,7 +64,7 @@ def fits(names: Sequence[str], truth: FloatArray, y: FloatArray) -> list[Fit]:
 
 def simplest_fit(
     truth: FloatArray, y: FloatArray, column: int, name: str, *, angle: bool
-) -> Fit | None:
+) -> TruthFit | None:
     """Return the simplest function of a true quantity that an output follows.
 
     Of an angle these are its sines, of all others a straight line or, where
@@ -88,14 +88,14 @@ def simplest_fit(
             (f"sin({name if k == 1 else f'{k} {name}'} + c)", partial(_sines, frequency=k))
             for k in range(1, FREQUENCIES + 1)
         ]
-    best: Fit | None = None
+    best: TruthFit | None = None
     for function, terms in tried:
         table = terms(truth)
         weights: FloatArray = np.linalg.lstsq(table, y, rcond=None)[0].astype(np.float64)
         fit = table @ weights
         r = float(np.corrcoef(fit, y)[0, 1]) if np.std(fit) > 0 else 0.0
         if best is None or r > best.r + BETTER:
-            best = Fit(column, function, r, weights, terms)
+            best = TruthFit(column, function, r, weights, terms)
     return best
 
 

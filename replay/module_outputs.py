@@ -20,13 +20,13 @@ from cdmisfa.modules import CHUNK, Module
 from replay.runs.log import Batch
 
 # Frames of a contact sheet with the least output, and of those with the greatest.
-EACH = 5
+SAMPLE_FRAMES = 5
 
 # Frames from which those of middle output are picked.
-MIDDLE = 64
+MIDDLE_CANDIDATES = 64
 
 
-class Thinned:
+class Subsample:
     """Selects at most `most` rows, spread evenly over all that come, with no period of their own.
 
     Every second or third row of something periodic would show one phase of it alone; so row i is
@@ -78,7 +78,7 @@ class Thinned:
 
 
 @dataclass(frozen=True, slots=True)
-class Pick:
+class SampledFrame:
     """A logged frame, (height, width) or (I,), with the module's first output on it."""
 
     t: int
@@ -86,7 +86,7 @@ class Pick:
     y: float
 
 
-class OwnStream:
+class ModuleOutputs:
     """A frozen module on the logged frames of its own stream, in memory that does not grow.
 
     Args:
@@ -100,9 +100,9 @@ class OwnStream:
     def __init__(self, module: Module, spec: SourceSpec) -> None:
         self.module, self.count, self._shape = module, 0, spec.frame_shape
         self._sum, self._squares = np.zeros(prod(self._shape)), np.zeros(prod(self._shape))
-        self._low: list[Pick] = []
-        self._high: list[Pick] = []
-        self._thinned = Thinned(MIDDLE)
+        self._low: list[SampledFrame] = []
+        self._high: list[SampledFrame] = []
+        self._thinned = Subsample(MIDDLE_CANDIDATES)
 
     def take(self, batch: Batch) -> Iterator[tuple[IntArray, NDArray[Any], FloatArray]]:
         """Yield the stream's frames in a batch, and the outputs on them.
@@ -133,13 +133,15 @@ class OwnStream:
         parts = np.split(np.arange(len(t)), starts[1:])
         for picks, sign in ((self._low, 1), (self._high, -1)):
             rows = np.array([part[np.argmin(sign * y[part])] for part in parts])
-            first = rows[np.unique(sign * y[rows], return_index=True)[1][:EACH]]
+            first = rows[np.unique(sign * y[rows], return_index=True)[1][:SAMPLE_FRAMES]]
             known = {pick.y for pick in picks}  # a log that is repeated has the same frames again
             picks += [
-                Pick(int(t[i]), frames[i].copy(), float(y[i])) for i in first if y[i] not in known
+                SampledFrame(int(t[i]), frames[i].copy(), float(y[i]))
+                for i in first
+                if y[i] not in known
             ]
             picks.sort(key=lambda pick: sign * pick.y)
-            del picks[EACH:]
+            del picks[SAMPLE_FRAMES:]
 
     @property
     def mean(self) -> FloatArray:
@@ -167,18 +169,18 @@ class OwnStream:
         weights = self.weights()
         return None if weights is None else weights * self.deviation * self.module.scale
 
-    def sheet(self) -> dict[str, list[Pick]]:
+    def sheet(self) -> dict[str, list[SampledFrame]]:
         """Return frames of least, middle and greatest first output, none of them twice."""
         if not self.count:
             return {}
         used = {pick.t for pick in (*self._low, *self._high)}
         t, frames, y = self._thinned.columns
         nearest = np.argsort(np.abs(y - np.median(y)), kind="stable")
-        middle = [i for i in nearest.tolist() if int(t[i]) not in used][:EACH]
+        middle = [i for i in nearest.tolist() if int(t[i]) not in used][:SAMPLE_FRAMES]
         middle.sort(key=lambda i: (float(y[i]), int(t[i])))
         least = {pick.t for pick in self._low}
         return {
             "least": self._low,
-            "middle": [Pick(int(t[i]), frames[i], float(y[i])) for i in middle],
+            "middle": [SampledFrame(int(t[i]), frames[i], float(y[i])) for i in middle],
             "greatest": [pick for pick in reversed(self._high) if pick.t not in least],
         }

@@ -186,11 +186,11 @@ class StoredSource(ClockedSource):
         """Return a line for each stream of which damaged parts were replaced or left out so far."""
         return []
 
-    def describe(self, told: Progress = lambda done, size: None) -> Mapping[str, Any]:
+    def describe(self, progress: Progress = lambda done, size: None) -> Mapping[str, Any]:
         """Return the logs with the SHA-256 of all their bytes, and how they became frames.
 
         Args:
-            told: called with the bytes that were hashed and all bytes, if there are many.
+            progress: called with the bytes that were hashed and all bytes, if there are many.
 
         Raises:
             LogDamagedError: a log is damaged, or was changed since it was opened.
@@ -202,7 +202,7 @@ class StoredSource(ClockedSource):
             nonlocal done
             done += count
             if size > AT_ONCE:
-                told(done, size)
+                progress(done, size)
 
         return self._with_centre([log.whole(counted) for log in logs])
 

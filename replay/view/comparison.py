@@ -11,12 +11,12 @@ import rerun.blueprint as rrb
 
 from replay.palette import colour
 from replay.runs.columns import SignalColumns
-from replay.runs.compare import HEAD, Row
+from replay.runs.compare import HEAD, ComparedRun
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
 from replay.view.layouts import blueprint, curve_view
-from replay.view.rows import ITERATION, MOST_STREAMS, Rows, drawable, part, power_of_ten
 from replay.view.summary import text_table
+from replay.view.writer import ITERATION, MOST_STREAMS, ViewWriter, drawable, part, power_of_ten
 
 # Signals that are overlaid where a run has them, with the titles of their panels.
 CURVES = {
@@ -34,7 +34,7 @@ ERROR = "learning_error"
 
 def build_overlay(
     runs: Sequence[Path],
-    compared: Sequence[Row],
+    compared: Sequence[ComparedRun],
     out: Path,
     *,
     force: bool = False,
@@ -64,23 +64,28 @@ def build_overlay(
         recording.log("summary", table, static=True)
         for number, (run, row, root) in enumerate(zip(runs, compared, roots, strict=True)):
             header, selected = row.outline.header, row.outline.streams(MOST_STREAMS)
-            rows = Rows(recording, header.spec)
+            writer = ViewWriter(recording, header.spec)
             for signals in read_columns(run, header):
-                _write_curves(rows, root, signals, selected, number, row.name)
-            rows.flush()
-            written |= rows.spans.keys()
+                _write_curves(writer, root, signals, selected, number, row.name)
+            writer.flush()
+            written |= writer.spans.keys()
         recording.send_blueprint(_layout(compared, roots, written, tab))
 
 
 def _write_curves(
-    rows: Rows, root: str, signals: SignalColumns, selected: Sequence[int], number: int, name: str
+    writer: ViewWriter,
+    root: str,
+    signals: SignalColumns,
+    selected: Sequence[int],
+    number: int,
+    name: str,
 ) -> None:
     """Write the curves of a run, and its learning error in the blocks of each stream."""
     for signal in CURVES:
         values = signals[signal].astype(np.float64).reshape(len(signals), -1)
         values = power_of_ten(values) if signal == "eta_dot" else values
         count = values.shape[1]
-        rows.lines(
+        writer.lines(
             f"{root}/{signal}", [name] * count, signals.times(), values, [colour(number)] * count
         )
     for s in selected:
@@ -89,12 +94,12 @@ def _write_curves(
             untested = np.isnan(signals["tested"][watched])
             errors = np.where(untested, np.nan, signals[ERROR][watched])[:, None]
             at = signals.frames[watched], signals.iterations[watched]
-            path = f"{root}/{ERROR}/{part(rows.spec.streams, s)}"
-            rows.lines(path, [name], at, errors, [colour(number)], gap=signals.tau)
+            path = f"{root}/{ERROR}/{part(writer.spec.streams, s)}"
+            writer.lines(path, [name], at, errors, [colour(number)], gap=signals.tau)
 
 
 def _layout(
-    compared: Sequence[Row], roots: Sequence[str], written: Collection[str], tab: str | None
+    compared: Sequence[ComparedRun], roots: Sequence[str], written: Collection[str], tab: str | None
 ) -> rrb.Blueprint:
     """Return a panel for each curve and each stream's error that a run has."""
     outline, length = compared[0].outline, max(row.outline.iterations for row in compared)

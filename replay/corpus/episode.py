@@ -13,11 +13,11 @@ from typing import Any, Final
 
 from cdmisfa.core.blocks import SourceSpec
 from replay.logs.clock import UNEVEN
-from replay.logs.opening import log_format
+from replay.logs.open_logs import log_format
 from replay.logs.source import LoggedSource
 from replay.storage.identity import Identity
-from replay.storage.opening import natural_order
-from replay.stored import Span
+from replay.storage.paths import natural_order
+from replay.stored_source import Span
 
 # A log with at most this many bytes is hashed as a whole when it is opened first.
 SMALL: Final = 1 << 20

@@ -13,8 +13,8 @@ from recorder.log.files import atomic_write, refuse_existing, refuse_taken
 from replay.export.frames import write_images, write_video, write_videos
 from replay.export.lerobot import write_dataset
 from replay.export.tables import TABLES
-from replay.inputs import About, holds_run, is_recording, open_to_look
 from replay.logs.source import LoggedSource
+from replay.open_sources import Announce, holds_run, is_recording, open_for_viewing
 
 # Forms of the signals of a run, and forms of frames.
 FORMS: Final = (*TABLES, "images", "mp4", "lerobot")
@@ -32,7 +32,7 @@ def export(
     lossless: bool = False,
     inputs: InputOptions | None = None,
     task: str | None = None,
-    about: About = lambda source: None,
+    about: Announce = lambda source: None,
 ) -> int:
     """Write a run's signals, or the frames of a recording or of other logs, in another form.
 
@@ -90,19 +90,19 @@ def export(
 
 
 def _opened(
-    paths: list[Path], form: str, inputs: InputOptions | None, about: About, *, single: bool
+    paths: list[Path], form: str, inputs: InputOptions | None, about: Announce, *, single: bool
 ) -> Generator[LoggedSource]:
     """Yield each log, open until the next one.
 
     Raises:
         UsageError: its frames do not fit the form or are unlike those of the first log, or as for
-            `open_to_look`.
+            `open_for_viewing`.
         LogDamagedError: one is damaged.
     """
     separate = form == "lerobot" and all(p.is_dir() and is_recording([str(p)]) for p in paths)
     first = None
     for log in [[path] for path in paths] if separate else [paths]:
-        with contextlib.closing(open_to_look(log, inputs)) as source:
+        with contextlib.closing(open_for_viewing(log, inputs)) as source:
             spec, why = source.spec, ""
             first = first or spec
             if form != "lerobot" and not spec.images:

@@ -9,9 +9,9 @@ import rerun.blueprint as rrb
 from replay.runs.log import PHI_EVERY
 from replay.runs.run import Outline
 from replay.view import layouts
-from replay.view.layouts import NEAR, Panel, Tab, Views, beside, curve_view, images
-from replay.view.rows import MOST_STREAMS, Rows, Span, drawable
-from replay.view.wall import WALL, bounds, sheet_size
+from replay.view.image_grid import GRID, grid_bounds, sheet_size
+from replay.view.layouts import RECENT_FRAMES, Panel, Tab, Views, beside, curve_view, images
+from replay.view.writer import MOST_STREAMS, Range, ViewWriter, drawable
 
 # Modules that have a page each; of more, those that stand on one page.
 PAGES, MOST_MODULES = 12, 6
@@ -34,7 +34,7 @@ MARGIN = 0.05
 
 def run_layout(
     outline: Outline,
-    rows: Rows | None = None,
+    writer: ViewWriter | None = None,
     *,
     has_scene: bool = False,
     followed: Sequence[Panel] = (),
@@ -47,7 +47,7 @@ def run_layout(
 
     Args:
         outline: the run in short.
-        rows: the written rows; None before there are any.
+        writer: the written rows; None before there are any.
         has_scene: the world is there in 3D.
         followed: panels of what each module has learned.
         sheets: modules whose images of least to greatest output are there.
@@ -56,7 +56,7 @@ def run_layout(
     Raises:
         UsageError: there is no such tab.
     """
-    layout = RunLayout(outline, rows, has_scene=has_scene)
+    layout = RunLayout(outline, writer, has_scene=has_scene)
     tabs = [layout.world(followed)] if has_scene or followed else []
     tabs += map(layout.tab, layouts.tabs_of("progress" if outline.header.by_progress else "paper"))
     return layouts.blueprint(*tabs, layout.modules(sheets), name="Run", length=outline.end, tab=tab)
@@ -67,13 +67,13 @@ class RunLayout:
 
     Args:
         outline: the run in short.
-        rows: the written rows; None before there are any: then every panel is there.
+        writer: the written rows; None before there are any: then every panel is there.
         has_scene: the world is there in 3D.
     """
 
-    def __init__(self, outline: Outline, rows: Rows | None, *, has_scene: bool) -> None:
+    def __init__(self, outline: Outline, writer: ViewWriter | None, *, has_scene: bool) -> None:
         self._outline, self._header, self._end = outline, outline.header, outline.end
-        self._rows, self._spec, self._has_scene = rows, outline.header.spec, has_scene
+        self._writer, self._spec, self._has_scene = writer, outline.header.spec, has_scene
         keys = ("roc_error", "delta", "novel_share", "min_variance")
         self._facts = {key: f"{self._header.number(key) or 0.0:g}" for key in keys}
         self._facts["colours"] = " (blue < 0, orange > 0)" if self._spec.images else ""
@@ -100,7 +100,7 @@ class RunLayout:
 
     def _heights(self, panels: Sequence[Panel]) -> list[float]:
         """Return the heights of rows, so that a small screen shows each lane."""
-        counts = [p.lanes + (len(self._spec.streams) if p.per_stream else 0) for p in panels]
+        counts = [p.state_rows + (len(self._spec.streams) if p.per_stream else 0) for p in panels]
         high = [ROW + LANE * min(count, MOST_LANES) if count else 0 for count in counts]
         plots = sum(p.height for p, count in zip(panels, counts, strict=True) if not count)
         left = max(HEIGHT - sum(high), LEAST * counts.count(0))
@@ -117,12 +117,12 @@ class RunLayout:
         if not when.get(panel.when, True):
             return []
         title = panel.title.format(i="{i}", **self._facts)
-        if panel.kind == "lanes":
-            return [layouts.lanes(title, panel.entities, self._end)]
-        if panel.kind == "near lanes":
-            title = f"{title}, last {layouts.NEAR_BLOCKS} blocks"
-            blocks = layouts.NEAR_BLOCKS * max(self._outline.tau, 1)
-            return [layouts.lanes(title, panel.entities, near=blocks, room=False)]
+        if panel.kind == "states":
+            return [layouts.state_rows(title, panel.entities, self._end)]
+        if panel.kind == "recent states":
+            title = f"{title}, last {layouts.RECENT_BLOCKS} blocks"
+            blocks = layouts.RECENT_BLOCKS * max(self._outline.tau, 1)
+            return [layouts.state_rows(title, panel.entities, recent=blocks, room=False)]
         if panel.kind == "summary":
             return [rrb.TextDocumentView(origin="/summary", name=title)]
         if panel.kind == "streams":
@@ -135,7 +135,7 @@ class RunLayout:
         views: Views = []
         for i in range(1, count + 1):
             entities = [entity.format(i=i) for entity in panel.entities]
-            written = [e for e in entities if self._rows is None or self._rows.matching(e)]
+            written = [e for e in entities if self._writer is None or self._writer.matching(e)]
             if entities[0] in written:
                 views.append(self._plot(panel, title.format(i=i), written))
         return views
@@ -148,16 +148,16 @@ class RunLayout:
             title,
             entities,
             self._end,
-            near=NEAR if panel.kind == "near" else 0,
+            recent=RECENT_FRAMES if panel.kind == "recent" else 0,
             span=self._span(panel, entities),
             legend=panel.legend and several,
         )
 
-    def _span(self, panel: Panel, entities: Sequence[str]) -> Span | None:
+    def _span(self, panel: Panel, entities: Sequence[str]) -> Range | None:
         """Return the range of a panel's axis; None leaves it to the viewer."""
         if panel.low is not None and panel.high is not None:
             return panel.low, panel.high
-        spans = [self._rows.covered(entity) for entity in entities if self._rows is not None]
+        spans = [self._writer.covered(entity) for entity in entities if self._writer is not None]
         values = [value for span in spans if span for value in span]
         if not panel.fit or not values:
             return None
@@ -181,7 +181,7 @@ class RunLayout:
     def modules(self, sheets: Collection[int]) -> rrb.Container:
         """Return the modules, each on a page of its own; many share pages."""
         count = max(self._outline.modules, len(self._outline.saved))
-        truth = Panel("Ground truth", ("/world/truth",), "near")
+        truth = Panel("Ground truth", ("/world/truth",), "recent")
         known: Views = [*(self._views(truth) if self._spec.truth else ()), layouts.events("Events")]
         if not count:
             return rrb.Vertical(*known, name="Modules")
@@ -202,7 +202,9 @@ class RunLayout:
         if has_sheet:
             title = "Frames with the least, middle and greatest output 1"
             width, height = sheet_size(*self._spec.frame_shape)
-            left.append(images(f"/modules/{i}/sheet", title, bounds(3, height, width, columns=1)))
+            left.append(
+                images(f"/modules/{i}/sheet", title, grid_bounds(3, height, width, columns=1))
+            )
         for save in (save for save in self._outline.saved if save.module == i):
             name += f": {drawable(self._spec.streams[save.stream])}"
             blocks, saved = self._outline.blocks, save.t + self._outline.tau
@@ -213,7 +215,10 @@ class RunLayout:
             entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
             windows: Views = [
                 curve_view(
-                    f"Output in the last {NEAR} frames {words}", entities, end, start=end - NEAR
+                    f"Output in the last {RECENT_FRAMES} frames {words}",
+                    entities,
+                    end,
+                    start=end - RECENT_FRAMES,
                 )
                 for words, end in ends.items()
             ]
@@ -235,8 +240,8 @@ class RunLayout:
         if self._has_scene or not self._spec.images:
             return self._input(title)
         count = min(len(self._spec.streams), MOST_STREAMS)
-        wall = bounds(count, *self._spec.frame_shape)
-        return images(f"/{WALL}", "Latest attended frame of each stream", wall)
+        wall = grid_bounds(count, *self._spec.frame_shape)
+        return images(f"/{GRID}", "Latest attended frame of each stream", wall)
 
     def _input(self, name: str) -> rrb.View | rrb.Container:
         """Return the learner's input: an image with the name of its stream, or the last values."""
@@ -244,8 +249,10 @@ class RunLayout:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
-        values = curve_view(name, ["/world/watched"], near=NEAR)
-        whose = layouts.lanes("Attended stream", ["/attended/each_block"], near=NEAR)
+        values = curve_view(name, ["/world/watched"], recent=RECENT_FRAMES)
+        whose = layouts.state_rows(
+            "Attended stream", ["/attended/each_block"], recent=RECENT_FRAMES
+        )
         return rrb.Vertical(values, whose, row_shares=[3, 2])
 
     def _weights(self, path: str, name: str) -> rrb.View:
@@ -253,4 +260,6 @@ class RunLayout:
         if not self._spec.images:
             hidden = rrb.PlotLegend(visible=False)
             return rrb.BarChartView(origin=path, name=name, plot_legend=hidden)
-        return images(path, name, bounds(outputs, *self._spec.frame_shape) if outputs > 1 else None)
+        return images(
+            path, name, grid_bounds(outputs, *self._spec.frame_shape) if outputs > 1 else None
+        )

@@ -14,10 +14,10 @@ from recorder.images.options import InputOptions
 from recorder.mcap.reader import LogReader
 from replay.logs.formats import arrays, bag, images, lerobot, mcap_log, table, video
 from replay.logs.formats.messages import NoTopicError, fits_topic
-from replay.logs.stream import ChannelFacts, LogStream
+from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream
 from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import location
-from replay.storage.opening import log_files
+from replay.storage.paths import log_files
 
 Format = Literal["mcap", "split", "bag", "dataset", "pictures", "video", "table", "arrays"]
 
@@ -65,7 +65,7 @@ def log_format(path: Path) -> Format:
     return known if known == "bag" or path.is_file() else "mcap"
 
 
-def only_external(path: Path) -> bool:
+def is_external_format(path: Path) -> bool:
     """Return whether a path cannot be one of our recordings, by its format."""
     return log_format(path) not in ("mcap", "split")
 
@@ -183,7 +183,7 @@ def image_topics(path: Path) -> list[str]:
         return mcap_log.topics_in(reader)
 
 
-def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
+def channels_of(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
     """Return the contents of each topic of a log that is not in MCAP files.
 
     Args:
@@ -205,6 +205,6 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
         return arrays.array_channels(path)
     with open_stream(path) as stream:
         first, last = (None, None) if stream.times is None else map(int, stream.times[[0, -1]])
-        schema, about = "picture" if kind == "pictures" else "video", (stream.count, first, last)
-        doubts = stream.missing, tuple(stream.remarks)
-        return [ChannelFacts(stream.topic, stream.encoding, schema, *about, True, *doubts)]
+        schema = "picture" if kind == "pictures" else "video"
+        info = ChannelInfo(stream.topic, stream.encoding, schema, stream.count, first, last)
+        return [ExternalChannel(info, True, stream.missing, tuple(stream.remarks))]
