@@ -11,13 +11,20 @@ from typing import Any
 
 import pytest
 
+from benchmarks.estimators import WHITENED
+
 ROOT = Path(__file__).parents[1]
 EVIDENCE = ROOT / "docs" / "evidence"
 DATA = EVIDENCE / "data"
+RESULTS_OF_BENCHMARKS = ROOT / "benchmarks" / "results"
 
 
 def load(name: str) -> Any:
     return json.loads((DATA / f"{name}.json").read_text("utf-8"))
+
+
+def benchmark(name: str) -> Any:
+    return json.loads((RESULTS_OF_BENCHMARKS / f"{name}.json").read_text("utf-8"))
 
 
 def arena(learner: str, *sets: str) -> list[Any]:
@@ -82,6 +89,40 @@ def scenes(column: int) -> tuple[int, int]:
     return sum(int(cell[0]) for cell in cells), sum(int(cell[1]) for cell in cells)
 
 
+def estimator(values: int, name: str) -> list[Any]:
+    """Return the row of an estimator on 20,000 samples of so many values."""
+    table = benchmark("estimators")["tables"][0]["rows"]
+    [row] = [row for row in table if row[:2] == [f"20,000 x {values}", name]]
+    return list(row)
+
+
+def slowest(values: int, name: str) -> str:
+    return str(estimator(values, name)[5])
+
+
+def time(values: int, name: str) -> float:
+    """Return how much more CPU time an estimator takes than RecursiveSFA."""
+    return float(estimator(values, name)[3].rstrip("x"))
+
+
+def same_slowness() -> list[str]:
+    """Return the slowness that RecursiveSFA and TICA find among 20 values, if it is the same."""
+    return [" and ".join({slowest(20, name) for name in ("RecursiveSFA", "TICA")})]
+
+
+def microseconds() -> float:
+    """Return the CPU time of a frame that the preset `icub` learns without a log."""
+    table = benchmark("learn")["tables"][0]["rows"]
+    [row] = [row for row in table if row[:2] == ["all threads", "no log"]]
+    return float(row[2] / 40)
+
+
+def decoding() -> float:
+    """Return the microseconds of a frame of a video."""
+    rows = benchmark("applying")["tables"][0]["rows"]
+    return float(next(row[2] for row in rows if row[0].startswith("video")))
+
+
 OTHERS = ("games", "light", "oscillatory-noise")
 RULES = ("progress", "robin", "random")
 CHOICE = ("reported-photographs", "reported-grids", "reported-many")
@@ -138,6 +179,19 @@ RESULTS: dict[str, Figures] = {
             lambda: [mean("in_vain", each, *CHOICE) for each in RULES],
         ),
     ],
+    "Is its estimator better than other libraries?": [
+        ("With 20 values it finds the same slowness as TICA of deeptime ({})", same_slowness),
+        ("{} times as fast", lambda: [round(time(20, "RecursiveSFA") / time(20, "TICA"))]),
+        ("With 300 values it finds {}", lambda: [slowest(300, "RecursiveSFA")]),
+        ("instead of {}", lambda: [slowest(300, "TICA")]),
+        ("or {} without", lambda: [slowest(300, "RecursiveSFA, all")]),
+        ("reduction to {} components", lambda: [WHITENED]),
+        ("{} times the time", lambda: [round(time(300, "RecursiveSFA, all"))]),
+    ],
+    "How fast is it?": [
+        ("less than {} µs for a frame of 48x128", lambda: [20 if microseconds() < 20 else "?"]),
+        ("about {:.0f} ms for a frame of a 640x480 video", lambda: [decoding() / 1000]),
+    ],
     "Is the paper reproduced?": [
         ("{} of {} trials", lambda: detail("oscillatory", 0)),
         ("{} of {} on the iCub", lambda: detail("icub", 0)),
@@ -190,8 +244,8 @@ def test_readme_repeats_figures_of_the_results() -> None:
 
 
 def test_results_name_the_commit_of_their_data() -> None:
-    for row in list(rows(EVIDENCE / "results.md"))[1:]:
-        files = re.findall(r"\]\(([^)]*\.json)\)", row[3])
-        commits = {json.loads((EVIDENCE / f).read_text("utf-8"))["commit"] for f in files}
-        assert files
-        assert commits == {row[3].rsplit(" ", 1)[-1]}
+    for *_, source in list(rows(EVIDENCE / "results.md"))[1:]:
+        for file in re.findall(r"\]\(([^)]*\.json)\)", source):
+            document = json.loads((EVIDENCE / file).read_text("utf-8"))
+            commit = document["commit"] if "commit" in document else document["code"]
+            assert commit.removesuffix("-dirty") == source.rsplit(" ", 1)[-1]
