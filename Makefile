@@ -29,7 +29,7 @@ lint: $(TESTED)
 bench: .venv/.with-bench
 	$(BIN)/python -m benchmarks
 
-# The site, in build/site: its tutorials are executed, and nothing is fetched.
+# The site, in build/site; nothing is fetched.
 docs: .venv/.with-docs
 	$(BIN)/sphinx-build -W -b html docs build/site
 

@@ -39,9 +39,6 @@ napoleon_use_ivar = True
 
 # The copy button of a console block takes the commands, without the prompt and the output.
 copybutton_prompt_text = "$ "
-
-# Pages of the former outline: they leave with the page that takes their place.
-exclude_patterns += ["tutorials"]
 suppress_warnings = ["toc.not_included", "myst.xref_missing"]
 
 # Files beside docs/ that pages include, and their pages on the site.

@@ -18,10 +18,10 @@ from conftest import Cdmisfa
 
 ROOT = Path(__file__).parents[1]
 # Pages that are about to be replaced.
-OLD = "python tour"
+OLD = "tour"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PAGES = [page for page in PAGES if page.stem not in OLD.split() or page.parent.name != "how-to"]
-PAGES = [page for page in PAGES if page.parent.name not in ("tutorials", "explanation", "results")]
+PAGES = [page for page in PAGES if page.parent.name not in ("explanation", "results")]
 BLOCK = re.compile(r"^```(console|sh|python|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 # Packages without which the code of a page cannot run.
