@@ -249,3 +249,61 @@ def test_results_name_the_commit_of_their_data() -> None:
             document = json.loads((EVIDENCE / file).read_text("utf-8"))
             commit = document["commit"] if "commit" in document else document["code"]
             assert commit.removesuffix("-dirty") == source.rsplit(" ", 1)[-1]
+
+
+def numbers(value: Any) -> Iterator[float]:
+    """Yield all numbers of a document, also of its texts."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        for each in value:
+            yield from numbers(each)
+    elif isinstance(value, str):
+        yield from map(float, re.findall(r"[-+]?\d+(?:\.\d+)?", value))
+    elif isinstance(value, int | float):
+        yield value
+
+
+def test_claims_of_the_paper_have_figures_of_their_data() -> None:
+    checked = 0
+    for row in rows(EVIDENCE / "paper.md"):
+        if len(row) == 4 and (link := re.search(r"\]\(data/(\w+)\.json\)", row[3])):
+            stored = list(numbers(load(link[1])))
+            text = re.sub(r"(\d),(\d{3})\b", r"\1\2", row[2])
+            for number in re.findall(r"-?\d+(?:\.\d+)?", text):
+                digits = len(number.partition(".")[2])
+                assert any(round(x, digits) == float(number) for x in stored), (row[0], number)
+                checked += 1
+    assert checked > 50
+
+
+def test_tables_of_the_learners_are_those_of_their_data() -> None:
+    page = (EVIDENCE / "learners.md").read_text("utf-8")
+    for entry in arena("progress"):
+        found, of = entry["measures"], learned("progress", entry["point"]["set"])
+        state = [f"{found[name]['mean']:.2f}" for name in ("probe", "probe_components")]
+        blocks = (
+            "{mean:.0f} [{low:.0f}, {high:.0f}]".format(**found["blocks"])
+            if found["blocks"]["n"]
+            else "-"
+        )
+        assert f"| {of[0]} of {of[1]} | 0 | {blocks} | {' | '.join(state)} |" in page
+    for name in OTHERS:
+        shares = [learned(learner, name) for learner in ("progress", "2.0")]
+        noise = [noise_modules(learner, name) for learner in ("progress", "2.0")]
+        cells = [*(f"{x} of {n}" for x, n in shares), *map(str, noise)]
+        assert f"| {' | '.join(cells)} |" in page
+    for rule in (
+        "progress",
+        "robin",
+        "alp",
+        "prediction",
+        "rnd",
+        "lpm",
+        "learning-progress",
+        "random",
+    ):
+        share, frames, noise = (
+            mean(m, rule, *CHOICE) for m in ("learned", "frames_learned", "in_vain")
+        )
+        assert percent(f"| {share:.0%} | {round(frames, -2):,.0f} | {noise:.0%} |") in page
