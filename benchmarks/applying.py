@@ -152,12 +152,12 @@ def main(*, quick: bool = False) -> None:
         cpu, wall = throughput(Path(place), rounds)
         late = latency(Path(place), 5 if quick else 30)
     head = "log", "outputs a module"
-    forms = [f"to {form}" if form else "to nothing" for form in FORMS]
+    forms = [f"to {form}" if form else "no output" for form in FORMS]
     save(
         "applying",
         "Apply modules to a log",
         "CPU time of a frame (all threads) for ten modules on frames of 128x48: reading "
-        'alone, with the modules ("to nothing"), and with output to a file. Second table: '
+        'alone, with the modules ("no output"), and with output to a file. Second table: '
         "frames a second by wall time, and the share of the reading speed that remains. "
         "Third: delay of live results after the end of a block.",
         [

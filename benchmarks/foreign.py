@@ -251,7 +251,7 @@ def main(*, quick: bool = False) -> None:
         [
             *((["reader alone, " + clock, *reading], rows) for clock, rows in read.items()),
             *(
-                (["frames, " + clock, "mcap, µs a frame", "cdmisfa"], rows)
+                (["frames, " + clock, "mcap, µs a frame", "cdmisfa, times as fast"], rows)
                 for clock, rows in shown.items()
             ),
         ],

@@ -86,8 +86,8 @@ def fixed(brief: list[float], each: list[float], short: int) -> float:
 def main(*, quick: bool = False) -> None:
     """Measure, and write results/learn.json."""
     rounds, short, long = (2, 10, 60) if quick else (5, 10, 1000)
-    head = ["CPU of", "logs", "µs an iteration", "more than no log"]
-    head += ["µs a further iteration", "more than no log", "fixed ms"]
+    head = ["CPU of", "logs", "µs an iteration", "increase"]
+    head += ["µs a further iteration", "increase", "fixed ms"]
     tables = []
     for name, config in CONFIGS.items():
         rows = table(config, rounds, short, long)

@@ -114,7 +114,7 @@ def main(*, quick: bool = False) -> None:
         projected = middle(ours) if count else ""
         more = f"{ratio(step, times['step 0']):.2f}x"
         rows.append([count, middle(step), more, projected, share, middle(digest, 1)])
-    head = ["modules", "µs an iteration", "of no module", "µs to project", "vs matrix product"]
+    head = ["modules", "µs an iteration", "relative", "µs to project", "vs matrix product"]
     save(
         "modules",
         "Learning with many modules",

@@ -140,9 +140,9 @@ PARTS = {
         "Estimators against other libraries",
         "Five features of an array of sines and noise, one thread. The last column is the slowness "
         "of the slowest output on further samples: smaller is better. RecursiveSFA and IncSFA "
-        "first reduce the values to 20 principal components, which is fast and with 300 values "
-        "loses half of the slowness; `RecursiveSFA, all` keeps them. IncrementalPCA does not look "
-        "for slow features.",
+        "first reduce the values to 20 principal components, which is fast; with 300 values their "
+        "features change twice as fast as the slowest ones. `RecursiveSFA, all` keeps all values. "
+        "IncrementalPCA does not look for slow features.",
         (0, 1, 2, 3, 4, 5),
     ),
     "foreign": Part(

@@ -69,7 +69,7 @@ def main(*, quick: bool = False) -> None:
         "CPU time of whole processes. `learn` runs one iteration.",
         [
             (
-                ("process", "CPU ms", "of importing numpy"),
+                ("process", "CPU ms", "relative"),
                 [(n, middle(t), f"{ratio(t, least):.2f}x") for n, t in times.items()],
             ),
             (
