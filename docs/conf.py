@@ -30,6 +30,7 @@ html_title = f"cdmisfa {release}"
 html_show_sourcelink = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 templates_path = ["templates"]
 exclude_patterns = ["decisions", "images/README.md"]
 smartquotes = False
@@ -87,6 +88,13 @@ def escape_markup(*event: Any) -> None:
             lines[at], code = lines[at] + ":", True
 
 
+def name_levels(app: Any, page: str, template: str, context: dict[str, Any], tree: Any) -> None:
+    """Give the captions of the sidebar, which furo calls headings, a level."""
+    sidebar = context.get("furo_navigation_tree", "")
+    sidebar = sidebar.replace('role="heading"', 'role="heading" aria-level="2"')
+    context["furo_navigation_tree"] = sidebar
+
+
 def add_demonstrations(app: Any, failure: Exception | None) -> None:
     """Put the reports of the gallery, and one run in Rerun's viewer, beside the pages."""
     if failure is None:
@@ -99,4 +107,5 @@ def setup(app: Any) -> None:
     app.connect("source-read", replace_tables)
     app.connect("include-read", link_within_the_site)
     app.connect("autodoc-process-docstring", escape_markup, priority=100)
+    app.connect("html-page-context", name_levels, priority=900)
     app.connect("build-finished", add_demonstrations)
