@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import tempfile
+import tomllib
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,8 @@ PAGES = {
     "SECURITY.md": "/evidence/security.md",
 }
 
+SEARCH_WORDS = tomllib.loads(Path(__file__).with_name("search_words.toml").read_text("utf-8"))
+
 _folder = tempfile.TemporaryDirectory()
 
 
@@ -64,6 +67,16 @@ def replace_tables(app: Any, name: str, text: list[str]) -> None:
         table = demonstrations.index_table(Path(_folder.name))
         text[0] = text[0].replace("{{ index_of_logs }}", table)
     text[0] = generated.replaced(text[0]).replace("../README.md)", "index.md)")
+
+
+def add_search_words(app: Any, name: str, text: list[str]) -> None:
+    """Put index entries, which the search rates highest, below the title of a page."""
+    if words := SEARCH_WORDS.get(name):
+        entries = ", ".join(f"! {word}" for word in words.split(", "))
+        directive = f"```{{index}} {entries}\n```\n"
+        title = re.search(r"^# .*\n", text[0], re.MULTILINE)
+        end = title.end() if title else 0
+        text[0] = f"{text[0][:end]}\n{directive}\n{text[0][end:]}"
 
 
 def link_within_the_site(app: Any, path: Path, page: str, text: list[str]) -> None:
@@ -105,6 +118,7 @@ def add_demonstrations(app: Any, failure: Exception | None) -> None:
 def setup(app: Any) -> None:
     app.connect("builder-inited", make_runs)
     app.connect("source-read", replace_tables)
+    app.connect("source-read", add_search_words)
     app.connect("include-read", link_within_the_site)
     app.connect("autodoc-process-docstring", escape_markup, priority=100)
     app.connect("html-page-context", name_levels, priority=900)
