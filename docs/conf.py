@@ -39,8 +39,9 @@ highlight_language = "none"
 myst_heading_anchors = 4
 napoleon_use_ivar = True
 
-# The copy button of a console block takes the commands, without the prompt and the output.
-copybutton_prompt_text = "$ "
+# The copy button of a block takes the commands or statements, without prompts and output.
+copybutton_prompt_text = r"\$ |>>> |\.\.\. "
+copybutton_prompt_is_regexp = True
 suppress_warnings = ["toc.not_included", "myst.xref_missing"]
 
 # Files beside docs/ that pages include, and their pages on the site.
