@@ -70,6 +70,17 @@ def platform_facts() -> dict[str, Any]:
     }
 
 
+def commit() -> str:
+    """Return the commit of the code that is measured, `-dirty` if it has changes since."""
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(RESULTS.parents[1]), *words]
+        return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+
+    changed = git("status", "--porcelain", "--", "cdmisfa", "recorder", "replay")
+    return git("rev-parse", "--short=8", "HEAD") + ("-dirty" if changed else "")
+
+
 def save(
     name: str,
     title: str,
@@ -84,12 +95,11 @@ def save(
         note: what was measured.
         tables: each its header and its rows.
     """
-    git = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty"]
     document = {
         "benchmark": name,
         "title": title,
         "note": note,
-        "code": subprocess.run(git, capture_output=True, text=True).stdout.strip(),
+        "code": commit(),
         "platform": platform_facts(),
         "tables": [{"header": list(header), "rows": list(rows)} for header, rows in tables],
     }

@@ -15,7 +15,6 @@ from benchmarks import (
     live_streams,
     long_recordings,
     modules,
-    reader,
     recorder,
     report,
     scaling,
@@ -64,8 +63,7 @@ def test_readers_of_external_logs_read_the_same(tmp_path: Path, case: foreign.Ca
 def test_results_make_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
     monkeypatch.setattr(report, "PAGE", tmp_path / "page.md")
-    reader.main(quick=True)
     modules.main(quick=True)
     page = report.write_page().read_text(encoding="utf-8")
-    assert "## Reading a recording" in page
+    assert "## Learning with many modules" in page
     assert "(results/modules.json)" in page
