@@ -132,10 +132,12 @@ def open_recording(
                 broken.append(error)
         if not files:
             raise (
-                broken[0] if broken else NoRecordingError(f"{named[0]}: no frame was recorded yet")
+                broken[0]
+                if broken
+                else NoRecordingError(f"{named[0]}: the recording has no frames yet")
             )
         streams = views.streams(files, skip_damaged=skip_damaged)
-        left_out = [f"{error}: this log is left out" for error in broken]
+        left_out = [f"{error}: this log is skipped" for error in broken]
         return LoggedSource(streams, loop=loop, opened=failed.pop_all(), left_out=left_out)
 
 
@@ -232,8 +234,8 @@ def refuse_non_logs(paths: Sequence[Path]) -> None:
             raise no_log(path)
         if (path.is_dir() or (starts and path.name.startswith(RUN_FILE))) and is_run(path):
             raise UsageError(
-                f"{path} is a run, not a recording: look at it with cdmisfa view "
-                f"{shlex.quote(str(path))}, or learn from what it learned from"
+                f"{path} is a run, not a recording: open it with cdmisfa view "
+                f"{shlex.quote(str(path))}, or give the recording that it learned from"
             )
 
 
@@ -253,6 +255,6 @@ def locations(words: Sequence[str | Path]) -> list[Path]:
         matched = map(Path, glob.glob(str(word), recursive=True))
         logs = sorted((p for p in matched if p.suffix not in (".rrd", ".json")), key=natural_order)
         if not logs:
-            raise UsageError(f"{word}: no file or folder matches")
+            raise UsageError(f"{word}: no file or folder matches this pattern")
         found += logs
     return found

@@ -76,7 +76,7 @@ class StoredSource(ClockedSource):
             UsageError: the source loops, or no frame would be left.
         """
         if self._loop or not 0 <= count < self.frames:
-            raise UsageError(f"{self._name()}: no {count} frames of {self.frames} can be held out")
+            raise UsageError(f"{self._name()}: {count} of {self.frames} frames cannot be held out")
         self.held_out = count
         self._spec = replace(self._spec, length=self.frames - count)
 
@@ -165,8 +165,8 @@ class StoredSource(ClockedSource):
             raise ValueError(f"frame {t} lies before the first, {self.first_frame}")
         if not self._loop and t > self.end:
             raise LogExhaustedError(
-                f"{self._name()}: it ends at frame {self.end}, before frame {t}; begin again at "
-                "its end with --loop"
+                f"{self._name()}: it ends at frame {self.end}, before frame {t}; repeat it "
+                "with --loop"
             )
         self._t = t
 
@@ -280,10 +280,10 @@ class StoredSource(ClockedSource):
     def _exhausted(self, n: int) -> LogExhaustedError:
         left = max(self.end - self._t, 0)
         unbroken = " without a gap" if self.gaps else ""
-        held = f", before {self.held_out} held out" if self.held_out else ""
+        held = f", before {self.held_out} held-out frames" if self.held_out else ""
         return LogExhaustedError(
-            f"{self._name()}: {left} frames are left at frame {self._t}{held}, {n} are needed"
-            f"{unbroken}; {self.more}begin again at its end with --loop"
+            f"{self._name()}: {left} frames are left at frame {self._t}{held}, but {n} are needed"
+            f"{unbroken}; {self.more}repeat it with --loop"
         )
 
 
@@ -298,8 +298,8 @@ def centre_as(centre: Centre, source: FrameSource, name: str) -> FrameSource:
     elif centre == "episode":
         source.close()
         raise UsageError(
-            f"{name} is live: the modules learned from frames without the mean of their episode, "
-            "which is known when it is over: record it first"
+            f"{name} is live: the modules need the mean of each episode, which is unknown until "
+            "the episode ends; record it first"
         )
     return source
 

@@ -84,7 +84,7 @@ class Program(subprocess.Popen[bytes]):
     def _failure(self) -> CdmisfaError:
         self._output.seek(0)
         lines = self._output.read().decode("utf-8", "replace").strip().splitlines()
-        why = [line for line in lines if "panicked" in line] + lines[-1:] + ["it does not say why"]
+        why = [line for line in lines if "panicked" in line] + lines[-1:] + ["no reason given"]
         return CdmisfaError(f"the viewer ended with code {self.returncode}: {why[0].strip()}")
 
     def ask(self, question: Callable[[], Any]) -> Any:
@@ -101,7 +101,7 @@ class Program(subprocess.Popen[bytes]):
                 if answer := question():
                     return answer
             time.sleep(0.05)
-        raise CdmisfaError(f"the viewer does not answer within {SECONDS:.0f} s")
+        raise CdmisfaError(f"the viewer did not respond within {SECONDS:.0f} s")
 
     def shown(self, port: str, frame: int | None) -> Any:
         """Return Rerun's client of the viewer once that shows its view, at a frame.
@@ -134,7 +134,7 @@ def open_window(view: Path, frame: int | None = None) -> None:
         CdmisfaError: there is no display, or the viewer ends with an error.
     """
     if not has_display():
-        raise CdmisfaError("there is no display: use --web, --save or --screenshot")
+        raise CdmisfaError("no display is available: use --web, --save or --screenshot")
     port = str(free_port())
     with Program("--port", port, str(view)) as viewer:
         if frame is not None:
@@ -177,7 +177,7 @@ def live_window(data: str, say: Callable[[str], None]) -> Iterator[None]:
         yield
         return
     with _page(0, data, data) as (_, address):
-        say(f"live view {address}    look at it in a browser of this machine")
+        say(f"live view {address}    open it in a browser on this machine")
         yield
 
 
@@ -207,7 +207,7 @@ def screenshot(view: Path, out: Path, frame: int | None = None) -> None:
         CdmisfaError: there is no driver, or the viewer fails.
     """
     if sys.platform.startswith("linux") and not vulkan_drivers():
-        raise UsageError(f"{out} cannot be drawn, no Vulkan driver is installed: {INSTALL}")
+        raise UsageError(f"{out} cannot be drawn: no Vulkan driver is installed; {INSTALL}")
     port = str(free_port())
     words = ("--headless", "--hide-welcome-screen", "--window-size", WINDOW)
     with Program(*words, "--port", port, str(view)) as viewer:
@@ -243,7 +243,7 @@ def frame_at(path: Path, at: str) -> int:
             for event in batch.events:
                 if words.search(event.text):
                     return int(event.t)
-    raise UsageError(f"--at {at!r} is no frame, iteration or event of {path}")
+    raise UsageError(f"--at {at!r} is not a frame, iteration or event of {path}")
 
 
 def free_port(port: int = 0) -> int:
@@ -259,7 +259,7 @@ def free_port(port: int = 0) -> int:
         try:
             probe.bind((HOST, port))
         except OSError as error:
-            raise CdmisfaError(f"--port {port}: {error.strerror}, choose another one") from error
+            raise CdmisfaError(f"--port {port}: {error.strerror}; choose another port") from error
         return int(probe.getsockname()[1])
 
 

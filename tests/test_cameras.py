@@ -27,19 +27,17 @@ def logs(tmp_path: Path) -> Path:
 BOTH = ("--topic", "/cam_left", "--topic", "/cam_right")
 
 
-NO_IMAGES = "holds no images; numbers are taken with --field"
+NO_IMAGES = "it has no images; for numbers use --field"
 REFUSED = {
     "learn oscillatory --topic /left": "is a scene: --topic is for logs and cameras",
     "learn pictures": "--rate",
-    "learn a.mcap --topic /cam_* --rate 25": "50 images a second, not 25",
-    "learn a.mcap --topic /cam_* --start 12 --end 5": "has no images there",
-    "learn uneven.mcap --topic /cam_*": "choose images by their times with --align time --rate 50",
+    "learn a.mcap --topic /cam_* --rate 25": "50 images per second, not 25",
+    "learn a.mcap --topic /cam_* --start 12 --end 5": "has no images between --start and --end",
+    "learn uneven.mcap --topic /cam_*": "align them by time with --align time --rate 50",
     "view t.csv uneven.mcap --set input.time=s --save v": "these show 1 number and images",
-    "view apart.mcap --save v.rrd": (
-        "the streams have no time in common: take each by itself, with --topic"
-    ),
+    "view apart.mcap --save v.rrd": ("the streams do not overlap in time: choose one with --topic"),
     "learn joints.mcap": NO_IMAGES,
-    "view joints.mcap --save v.rrd": "it holds no images",
+    "view joints.mcap --save v.rrd": "it has no images",
 }
 
 

@@ -176,7 +176,7 @@ class TestRuns:
     ) -> None:
         cdmisfa("record", "oscillatory", "-o", tmp_path / "short", "--frames", 80)
         done = cdmisfa("learn", tmp_path / "short")
-        assert_one_line(done, 1, "80 frames are left at frame 0, 100 are needed", "--loop")
+        assert_one_line(done, 1, "80 frames are left at frame 0, but 100 are needed", "--loop")
 
 
 class TestErrors:

@@ -12,7 +12,7 @@ from test_cli import assert_one_line
 
 LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
 
-A_RUN = "is a run, not a recording: look at it with cdmisfa view"
+A_RUN = "is a run, not a recording: open it with cdmisfa view"
 NO_MCAP = "numbers.h5 is no log that is read: logs are .mcap, .bag and .db3 files"
 VAIN = "is for live scenes, and this source is none"
 TAKEN = "taken exists: choose another folder"
@@ -48,7 +48,7 @@ CASES: dict[str, tuple[str, ...]] = {
     # a file of another kind is a wrong word and no damage
     **{f"{command} numbers.h5": (NO_MCAP,) for command in ("info", "verify", "check")},
     "view --save out.rrd numbers.h5": (NO_MCAP,),
-    "recover numbers.csv -o out.mcap": ("numbers.csv is no MCAP file", "--skip-damaged"),
+    "recover numbers.csv -o out.mcap": ("numbers.csv is not an MCAP file", "--skip-damaged"),
     "learn RUN": (A_RUN,),
     # results are not written to URLs, and a secret in one is not printed
     "learn oscillatory -o s3://lab/x": ("s3://lab/x is a URL: name a path on this machine",),

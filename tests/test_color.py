@@ -147,7 +147,7 @@ def pictures(folder: Path, frames: NDArray[np.uint8]) -> Path:
 @pytest.mark.parametrize(
     ("frames", "said", "word", "width"),
     [
-        (COLOR["hue alone"], "frames show red, green and blue", "on", 3 * W),
+        (COLOR["hue alone"], "so frames have colour", "on", 3 * W),
         (GREY["coloured noise on grey"], "frames are grey", "off", W),
     ],
 )

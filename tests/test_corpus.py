@@ -158,20 +158,20 @@ class TestBadInput:
         names = [Path(log.file).name for log in find_logs([corpus])]
         assert len(names) == 11
         assert [log.problem for log in find_logs([corpus]) if log.file.endswith("lost.mcap")] == [
-            "it cannot be read: No such file or directory"
+            "cannot be read: No such file or directory"
         ]
 
     def test_what_is_no_index_is_left_alone(self, corpus: Path, tmp_path: Path) -> None:
         other = tmp_path / "other.parquet"
         pq.write_table(pa.table({"a": [1]}), other)
         before = other.read_bytes()
-        with pytest.raises(UsageError, match="is no index"):
+        with pytest.raises(UsageError, match="is not an index"):
             index_logs([corpus], other)
         assert other.read_bytes() == before
         other.write_bytes(before[:-9])
-        with pytest.raises(LogDamagedError, match="remove it, and index again"):
+        with pytest.raises(LogDamagedError, match="delete it and index again"):
             index_logs([corpus], other)
-        with pytest.raises(UsageError, match=r"robot.mcap is no index of logs"):
+        with pytest.raises(UsageError, match=r"robot.mcap is not an index of version"):
             read_index(corpus / "robot.mcap")
 
     def test_what_was_read_is_kept_when_it_is_stopped(

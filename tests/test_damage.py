@@ -75,7 +75,7 @@ WITHIN = "cut short: the file ends within a record"
 NO_END = "cut short: the end of the file and its index are missing"
 ALL_THERE = "cut short: its summary is not all there, every message is"
 BAD = "its CRC does not match"
-FEW = "cut short: the file ends within a record|nothing in it can be saved"
+FEW = "cut short: the file ends within a record|no message can be recovered"
 BARE = "it has no checksums, nothing vouches for its bytes"
 HEAD = "it is not the chunk that the summary names|a chunk's length is not that of its data"
 NO_PNG = "its JPEG or PNG is broken|it does not begin as a PNG|its PNG is cut short"
@@ -165,12 +165,12 @@ TABLE: dict[str, dict[str, tuple[str, str, str]]] = {
     },
     "npz": {
         "none": ("0 - 0 0 - 0", "", ""),
-        "empty": ("3 - 3 3 - 3", "", "is no file of NumPy's arrays"),
-        "another format": ("3 - 3 3 - 3", "", "is no file of NumPy's arrays"),
-        "cut at the start": ("3 - 3 3 - 3", "", "is no file of NumPy's arrays"),
-        "cut in the middle": ("3 - 3 3 - 3", "", "is no file of NumPy's arrays"),
-        "cut at the end": ("3 - 3 3 - 3", "", "is no file of NumPy's arrays"),
-        "bit flip": ("3 - 3 3 - 3", "", "is no file of NumPy's arrays"),
+        "empty": ("3 - 3 3 - 3", "", "is not a file of NumPy arrays"),
+        "another format": ("3 - 3 3 - 3", "", "is not a file of NumPy arrays"),
+        "cut at the start": ("3 - 3 3 - 3", "", "is not a file of NumPy arrays"),
+        "cut in the middle": ("3 - 3 3 - 3", "", "is not a file of NumPy arrays"),
+        "cut at the end": ("3 - 3 3 - 3", "", "is not a file of NumPy arrays"),
+        "bit flip": ("3 - 3 3 - 3", "", "is not a file of NumPy arrays"),
     },
 }
 NOT_MCAP = [name for name in FORMATS if name not in ("recording", "ROS 2", "ROS 2, no checksums")]
@@ -271,9 +271,9 @@ def test_recover_names_what_was_lost_and_what_was_repaired(
     cdmisfa: Cdmisfa, logs: Path, tmp_path: Path
 ) -> None:
     for damage, code, words in (
-        ("message index", 0, "made again from its messages"),
-        ("head of a chunk", 0, "made again from the summary"),
-        ("data end", 3, "every message is there, metadata may be wrong"),
+        ("message index", 0, "rebuilt from its messages"),
+        ("head of a chunk", 0, "restored from the summary"),
+        ("data end", 3, "all messages are readable, metadata may be wrong"),
     ):
         _, file = damaged(logs, tmp_path, "ROS 2", damage)
         done = cdmisfa("recover", file, "-o", tmp_path / "out.mcap", "--force")
@@ -314,6 +314,6 @@ def test_what_cannot_be_read_is_left_out_of_the_rest(
     assert not (tmp_path / "out").exists()
     done = cdmisfa(use, one, bad, two, *how, "--skip-damaged")
     assert done.code == 3
-    assert f"warning: {bad}: {EMPTY}: this log is left out\n" in done.err
+    assert f"warning: {bad}: {EMPTY}: this log is skipped\n" in done.err
     streams = "streams" if use == "learn" else "views"
     assert [own.get("stream", own.get("name")) for own in done.json[streams]] == ["one", "two"]

@@ -74,7 +74,7 @@ def test_episodes_are_learned_as_one_log_with_pauses_is(cdmisfa: Cdmisfa, tmp_pa
     alike = cdmisfa("learn", one, *QUICK, "--json")
     assert (learned.code, learned.json["iterations"]) == (0, 16)
     assert learned.json["signals_sha256"] == alike.json["signals_sha256"]
-    assert "4 episodes, by when each begins, then by its path: ep0.mcap to ep3.mcap" in learned.err
+    assert "4 episodes, ordered by start time, then by path: ep0.mcap to ep3.mcap" in learned.err
     source = json.loads((run / "run.json").read_text())["source"]
     assert [(file["file"], file["frames"]) for file in source["files"]] == [
         (f"ep{i}.mcap", [at, at + 45]) for i, at in enumerate(first)
@@ -153,7 +153,7 @@ def test_bad_logs_are_left_out_and_said_and_the_rest_is_learned(
     assert done.json["signals_sha256"] == whole["signals_sha256"]
     for name in ("large.mcap", "table.csv", "gone.mcap", "text.mcap"):
         assert f"{name}" in done.err
-    assert done.err.count("left out") == 4
+    assert done.err.count("skipped") == 4
     assert "Traceback" not in done.err
 
 
@@ -166,13 +166,13 @@ def test_a_log_damaged_in_the_middle_is_left_out_from_there_on(
     run = tmp_path / "run"
     done = cdmisfa("learn", folder, *QUICK, "--json", "-o", run)
     assert done.code == 3, done.err
-    assert "what follows in it is left out" in done.err
+    assert "the rest of this log is skipped" in done.err
     assert 18 <= done.json["iterations"] < 24
     assert cdmisfa("check", run).code == 0
     centre = ("--set", "input.centre=episode", "--json")
     without = cdmisfa("learn", folder, *QUICK, *centre)
     assert (without.code, without.json["iterations"]) == (3, 18)  # its mean is not known
-    assert "the log is left out" in without.err
+    assert "this log is skipped" in without.err
 
 
 # Stopped and resumed
@@ -265,7 +265,7 @@ def test_centred_episodes_show_what_moves_before_backgrounds_that_change(
     assert rest.var() < 0.2 * y.var()  # it tells where the square is
     live = cdmisfa("apply", run, "av:lavfi:testsrc=size=24x16")
     assert live.code == 2
-    assert "without the mean of their episode, which is known when it is over" in live.err
+    assert "the modules need the mean of each episode" in live.err
 
 
 def test_apply_takes_each_log_of_a_corpus_as_an_episode(

@@ -79,7 +79,7 @@ def test_an_existing_file_is_replaced_only_by_force(run):
     (folder / "run.csv").write_text("mine")
     with pytest.raises(UsageError, match="--force"):
         export(folder, folder / "run.csv", "csv")
-    with pytest.raises(UsageError, match="one run: name a run"):
+    with pytest.raises(UsageError, match="one run: give one run"):
         export([folder, folder], folder / "two.csv", "csv")
     assert (folder / "run.csv").read_text() == "mine"
     assert export(folder, folder / "run.csv", "csv", force=True) == 20

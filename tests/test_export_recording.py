@@ -210,13 +210,18 @@ def test_a_dataset_of_a_task_has_states_actions_and_episodes(cdmisfa, tmp_path, 
 
 
 REFUSED = {
-    "has 2 streams: name a folder": ("r", "mp4", "one.mp4", {}),
+    "has 2 streams: choose a folder": ("r", "mp4", "one.mp4", {}),
     "convert --rate": ("r", "lerobot", "out", {}),
     r"there\.mp4 exists": ("r", "mp4", "there.mp4", {}),
     "did you mean npz": ("r", "npy", "out", {}),
-    r"mine holds other files, such as thesis\.tex": ("r", "lerobot", "mine", {"force": True}),
+    r"mine has files that no export wrote, as thesis\.tex": (
+        "r",
+        "lerobot",
+        "mine",
+        {"force": True},
+    ),
     r"pip install 'cdmisfa\[video\]'": ("r", "mp4", "out", {}),
-    "other has the frame_shape": ("r other", "lerobot", "out", {}),
+    "other has frame_shape": ("r other", "lerobot", "out", {}),
 }
 
 

@@ -70,7 +70,7 @@ def test_a_run_is_whole_wherever_it_lies(copy: Path) -> None:
     found = check_log(copy)
     assert found.ok, found.problems
     (note,) = found.notes
-    assert note.startswith(f"{copy / 'run.rrd'} is not checked: make it again with cdmisfa view")
+    assert note.startswith(f"{copy / 'run.rrd'} is not verified: write it again with cdmisfa view")
     assert check_log(copy / "run.mcap").ok
 
 

@@ -73,8 +73,8 @@ def test_a_part_that_was_cut_before_its_first_message_is_left_out_and_said(
     with external(parts[0].parent, ["/r*"], **options) as source:
         assert source.alignment["right"]["messages"] == 110
         assert f"{parts[3]}: " in source.warnings[1]
-        assert source.warnings[1].endswith("there is no message before: left out")
+        assert source.warnings[1].endswith("before the first message: skipped")
     for part in parts:
         os.truncate(part, 42)
-    with pytest.raises(LogDamagedError, match="there is no message before"):
+    with pytest.raises(LogDamagedError, match="before the first message"):
         external(parts[0].parent, ["/right"], size=SIZE)

@@ -150,7 +150,7 @@ def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -
         with external(tmp_path, rate=5, skip_damaged=skip_damaged) as source:
             source.hold_out(20)
             source.take(0, 100)
-            with pytest.raises(LogExhaustedError, match="before 20 held out"):
+            with pytest.raises(LogExhaustedError, match="before 20 held-out"):
                 source.take(0, 1)
             if skip_damaged:
                 found = judged(source, [replace(learned, expansion="none")], components=2)

@@ -45,7 +45,7 @@ FORMATS = (
 COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "index")
 REFUSED = {
     ("export", "run"): "is a run, not a recording",
-    ("export", "table"): "holds no images",
+    ("export", "table"): "has no images",
     ("learn", "run"): "is a run, not a recording",
     ("convert", "run"): "is a run, not a recording",
     **{("record", kind): "cdmisfa convert" for kind in FORMATS},

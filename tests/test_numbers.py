@@ -219,7 +219,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
     path = write_table(tmp_path / "t.parquet", {"state": angles().tolist(), "n": range(COUNT)})
     with external(path, fields=["state[1:3]", "n"], rate=5) as source:
         assert (source.take(0, 2).frames == np.c_[angles()[:2, 1:3], [0, 1]]).all()
-    with pytest.raises(UsageError, match="state holds 2 or 3 numbers in a row: choose"):
+    with pytest.raises(UsageError, match="state has 2 or 3 numbers in a row: choose"):
         external(
             write_table(tmp_path / "u.parquet", {"state": [[1, 2, 3], [1, 2]]}),
             fields=["state"],
@@ -230,13 +230,13 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ({}, "set one with --rate, or name the column of its times.* --set input.time"),
-        ({"fields": ["z"], "rate": 5}, "there is no column z; it has s, a, word"),
+        ({}, "set --rate in frames per second, or the column of times.* --set input.time"),
+        ({"fields": ["z"], "rate": 5}, "no column z; it has s, a, word"),
         ({"fields": ["word"], "rate": 5}, "t.csv: --field word: it is no number but a text"),
-        ({"time": "word"}, "word, of string, holds no times since 1970"),
-        ({"time": "s:h"}, r"there is no column s:h; .* a unit \(s, ms, us, ns\)"),
-        ({"time": "big"}, "big, of int64, holds no times .* counted in s: say what they count"),
-        ({"time": "us"}, r"say what they count \(s, ms, us, ns\), as --set input.time=us:ns"),
+        ({"time": "word"}, r"word \(string\) has no times after 1970"),
+        ({"time": "s:h"}, r"no column s:h; .* a unit \(s, ms, us, ns\)"),
+        ({"time": "big"}, r"big \(int64\) has no times .* or in s: state the unit"),
+        ({"time": "us"}, r"state the unit \(s, ms, us, ns\), as in --set input.time=us:ns"),
         ({"rate": 5, "size": (4, 4)}, "as they are: --size is for images"),
     ],
 )

@@ -97,14 +97,20 @@ def test_pictures_of_any_type_are_the_same_frames() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ([[1.0, 2.0], [3.0, np.nan]], "stream: row 1, counted from 0, holds NaN"),
-        ({"cam": np.zeros((9, 3, 20, 30))}, r"cam: .* np.moveaxis\(x, 1, -1\) moves colours last"),
+        (
+            [[1.0, 2.0], [3.0, np.nan]],
+            "stream: 1 of 2 rows have NaN or infinity, the first is row 1",
+        ),
+        (
+            {"cam": np.zeros((9, 3, 20, 30))},
+            r"cam: .* np.moveaxis\(x, 1, -1\) moves the colours to the end",
+        ),
         (1000 * numbers().reshape(-1, 4, 5), "scale them to 0 to 1"),
-        (["one", 2], "an array .* of <U21: give"),
-        (np.zeros((0, 3)), "an array .0, 3. of float64: give"),
+        (["one", 2], "shape .* of <U21 is not supported: use"),
+        (np.zeros((0, 3)), "shape .0, 3. of float64 is not supported: use"),
         ({"a": numbers(), "b": pictures(4, 5)}, "these show 3 numbers and images"),
         ("nowhere.npz", "no such file"),
-        (numbers()[:10], "10 frames are left at frame 0, 40 are needed"),
+        (numbers()[:10], "10 frames are left at frame 0, but 40 are needed"),
     ],
 )
 def test_what_cannot_be_learned_from_is_one_line(

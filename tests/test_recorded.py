@@ -138,9 +138,9 @@ def test_files_may_be_named_in_any_order(vectors: Path) -> None:
 
 
 def test_what_does_not_belong_together_is_refused(vectors: Path, pictures: Path) -> None:
-    with pytest.raises(UsageError, match="are recordings of their own: name one"):
+    with pytest.raises(UsageError, match="are different recordings: give one"):
         open_recording([vectors, pictures])
-    with pytest.raises(LogDamagedError, match="a part is missing or doubled"):
+    with pytest.raises(LogDamagedError, match="a part is missing or duplicated"):
         open_recording([vectors / "x1.mcap", vectors / "x1.mcap"])
     with pytest.raises(UsageError, match="no such"):
         open_recording(vectors / "nothing")

@@ -66,7 +66,7 @@ def test_what_the_server_does_not_give_is_one_line_with_the_url(
 ) -> None:
     web.files["/short.mcap"], web.missing = bytes(100), 10
     for url, words in (
-        (web.url("/none.mcap"), "there is no such file"),
+        (web.url("/none.mcap"), "no such file"),
         (web.url("/short.mcap"), "not completed"),
         ("http://127.0.0.1:9/a.mcap", "Cannot connect"),
     ):
@@ -79,7 +79,7 @@ def test_what_the_server_does_not_give_is_one_line_with_the_url(
 def test_no_secret_is_printed(cdmisfa: Cdmisfa, web: WebServer) -> None:
     url = web.url("/none.mcap?signature=feed").replace("://", "://me:hidden@")
     done = cdmisfa("info", url)
-    assert done.err == f"cdmisfa: {web.url('/none.mcap')}: there is no such file\n"
+    assert done.err == f"cdmisfa: {web.url('/none.mcap')}: no such file\n"
 
 
 def test_a_name_leads_to_no_other_folder(web: WebServer) -> None:

@@ -162,8 +162,8 @@ def test_the_report_of_a_killed_or_damaged_run_shows_what_is_readable(
     at = len(data) * 4 // 5
     (damaged / "run.mcap").write_bytes(data[:at] + bytes(2000) + data[at + 2000 :])
     for folder, problem in (
-        (tmp_path / "killed", "cdmisfa learn --resume continues it"),
-        (damaged, "The log is damaged. This page shows what is readable"),
+        (tmp_path / "killed", "Continue it with cdmisfa learn --resume"),
+        (damaged, "The log is damaged; this page shows its readable part"),
     ):
         text = Page(write_report([folder])).text
         assert problem in text

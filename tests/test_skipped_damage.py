@@ -56,7 +56,7 @@ def test_a_broken_image_is_refused_with_the_remedy_and_passed_over_with_it(tmp_p
         np.testing.assert_array_equal(frame, images[stands_for.get(row % 40, row % 40)])
     with external(path, skip_damaged=True) as source:
         assert source.take(0, 8).frames.shape[0] == 8
-        assert "2 broken of 40 images" in source.skipped_damage()[0]
+        assert "2 of 40 images are broken" in source.skipped_damage()[0]
     with pytest.raises(LogDamagedError, match=r"/cam.*its PNG is cut short$"):
         external(write(tmp_path / "b.mcap", range(3), 3), skip_damaged=True)
 
@@ -67,7 +67,7 @@ def test_images_after_skipped_damage_are_learned_from_and_converted_alike(
     path = write(tmp_path / "a.mcap", [5, 25])
     assert cdmisfa("learn", path, "--max-iterations", "3", "--set", "learner.tau=10").code == 3
     for said in learned_alike(cdmisfa, tmp_path, path, "--skip-damaged")["said"]:
-        assert "2 broken of 40 images: the last whole one is taken" in said
+        assert "2 of 40 images are broken and replaced" in said
 
 
 def test_a_video_is_shown_again_from_the_next_whole_picture(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Pa
     with (
         external(path) as source,
         pytest.raises(
-            LogDamagedError, match=r"other messages than the summary names.*--skip-damaged"
+            LogDamagedError, match=r"other messages than the summary states.*--skip-damaged"
         ),
     ):
         source.take(0, 8)

@@ -29,7 +29,7 @@ def written(folder: Path, rows: Mapping[int, str], *, names: str = "t,a,b") -> P
 def taken(path: Path, **options: Any) -> tuple[list[list[float]], tuple[str, ...]]:
     """All frames of a table, and what is said of it but of its times: see test_gaps."""
     with external(path, **{"time": "t", **options}) as source:
-        said = tuple(line for line in source.warnings if "is taken by number" not in line)
+        said = tuple(line for line in source.warnings if "is read one image a frame" not in line)
         return source.take(0, source.frames).frames.tolist(), said
 
 
@@ -38,7 +38,7 @@ def test_words_for_what_is_missing_are_no_words(tmp_path: Path, cell: str) -> No
     frames, said = taken(written(tmp_path, {7: f"0.7,7,{cell}"}))
     assert frames == [[i, 2 * i + 0.5] for i in range(ROWS) if i != 7]
     assert len(said) == 1
-    lack = "1 of 12 rows lack a finite number or their time and are left out, the first is line 9"
+    lack = "1 of 12 rows have no finite number or no time and are skipped, the first is line 9"
     assert said[0].endswith(f"t.csv: {lack}")
 
 
@@ -66,11 +66,11 @@ def test_what_is_not_finite_is_left_out_by_its_name_or_kept_in_a_range(
     path = write_table(tmp_path / name, {"t": np.arange(ROWS) / 10, "a": values})
     frames, said = taken(path)
     assert [a for (a,) in frames] == [*range(-4, -1), *range(8)]
-    assert said[0].endswith(f"left out, the first is {place}")
+    assert said[0].endswith(f"skipped, the first is {place}")
     kept, said = taken(path, range=(-3.0, 5.0))
     assert [a for (a,) in kept] == [-3, -3, -2, -3, *range(6), 5, 5]
     assert said == ()
-    with pytest.raises(UsageError, match=f"{place} lacks a finite number of t, a: name"):
+    with pytest.raises(UsageError, match=f"{place} has no finite number in t, a: to skip"):
         taken(path, time=None, rate=5)
 
 
@@ -88,18 +88,23 @@ def test_semicolons_and_tabs_separate_cells(tmp_path: Path, separator: str) -> N
     ("text", "options", "error", "why"),
     [
         ("", {}, LogDamagedError, "Empty CSV file"),
-        ("t,a\n", {"time": None, "rate": 5}, UsageError, "no column of numbers with rows, but t"),
-        ("t;a\n0,5;1\n", {}, UsageError, "t, of string, holds no times since 1970, dates or"),
+        (
+            "t,a\n",
+            {"time": None, "rate": 5},
+            UsageError,
+            "no column has numbers; its columns are t",
+        ),
+        ("t;a\n0,5;1\n", {}, UsageError, r"t \(string\) has no times after 1970, as dates or"),
         ("t,a\xb5\n0,1\n", {}, LogDamagedError, "PyArrow cannot read it .UnicodeDecodeError"),
-        ("t,a\nx,y\n", {"time": None, "rate": 5}, UsageError, "but t of string, a of string"),
-        ("0.0,1\n0.1,2\n", {}, UsageError, "its first line must have the names"),
-        ("t,a,a\n0,1,2\n", {}, UsageError, "its first line must have the names"),
+        ("t,a\nx,y\n", {"time": None, "rate": 5}, UsageError, "columns are t of string, a of s"),
+        ("0.0,1\n0.1,2\n", {}, UsageError, "the first line must have unique column names"),
+        ("t,a,a\n0,1,2\n", {}, UsageError, "the first line must have unique column names"),
         ("t,a\n0,1\n1,2,3", {}, LogDamagedError, "Row #3: Expected 2 columns, got 3: 1,2,3"),
         ("t,a\n0,1\n1", {}, LogDamagedError, "Row #3: Expected 2 columns, got 1: 1"),
         ("t,a\n0,1\n\xff,2,3\n", {}, LogDamagedError, "Row #3: Expected 2 columns, got 3"),
         ("# a log\nt,a\n0,1\n", {}, LogDamagedError, "Row #2: Expected 1 columns, got 2: t,a"),
-        ("t,a\n0,\n1,\n", {"fields": ["a"]}, UsageError, "a holds no numbers"),
-        ("t,a\n0,1\n1,2\n2,3\n", {"time": "t:ns"}, UsageError, "tells no rate: .*what they count"),
+        ("t,a\n0,\n1,\n", {"fields": ["a"]}, UsageError, "a has no numbers"),
+        ("t,a\n0,1\n1,2\n2,3\n", {"time": "t:ns"}, UsageError, "has no frame rate: .*its unit"),
     ],
 )
 def test_what_is_wrong_with_a_table_is_said(
@@ -117,8 +122,8 @@ def test_an_empty_column_and_rows_out_of_order_are_said(tmp_path: Path) -> None:
     frames, said = taken(written(tmp_path, rows))
     assert [b for (b,) in frames] == [i for i in range(ROWS) if i != 9]
     assert [line.partition("t.csv: ")[2] for line in said[:2]] == [
-        "1 of 12 rows lack a finite number or their time and are left out, the first is line 11",
-        "3 rows are after later ones: they are sorted by their times",
+        "1 of 12 rows have no finite number or no time and are skipped, the first is line 11",
+        "3 rows are out of order: rows are sorted by time",
     ]
 
 
@@ -127,4 +132,4 @@ def test_distances_in_a_list_that_were_not_measured_are_the_end_of_a_range(tmp_p
     path = write_table(tmp_path / "t.parquet", {"t": np.arange(4) / 10, "r": lists})
     kept, said = taken(path, fields=["r"], range=(0.5, 9.0), align="index")
     assert kept == [[1, 0.5], [0.5, 2], [3, 0.5]]
-    assert said[0].endswith("left out, the first is row 2")
+    assert said[0].endswith("skipped, the first is row 2")

@@ -13,7 +13,7 @@ pytest.importorskip("av")
 
 FRAMES = 40
 FRAGMENTS = {"movflags": "frag_keyframe+empty_moov", "g": "5"}
-UNKNOWN = "it does not state where it ends, a missing end would go unnoticed"
+UNKNOWN = "it does not state its length, so a missing end cannot be detected"
 
 STATED: dict[str, tuple[str, str, str, Mapping[str, str]]] = {
     # kind: ending, codec, pixels, options of the container
@@ -69,7 +69,7 @@ def test_a_cut_video_is_cut_in_every_command(
     assert (check.code, check.json["ok"], info.code) == (3, False, 3)
     if plan.code == 3:  # without its index it holds no frame that can be found
         index = kind in ("mp4", "mov")
-        assert ("its index (moov), which is written last, is not all" in plan.err) == index
+        assert ("its index (moov), which cameras write last, is incomplete" in plan.err) == index
         assert plan.err.startswith(f"cdmisfa: {path}: ")
         assert " cut short: the file ends at byte " in plan.err
         assert (plan.err.count("\n"), info.err) == (1, plan.err)

@@ -204,7 +204,7 @@ def test_a_moment_is_a_frame_an_iteration_or_an_event(cdmisfa: Cdmisfa, tmp_path
     assert frame_at(tmp_path, "iteration 7") == 7 * 40
     assert (frame_at(tmp_path, "module 1"), frame_at(tmp_path, "Module 2")) == (first, second)
     for wrong in ("iteration 999999", "module 7", "odule 1"):
-        with pytest.raises(UsageError, match="no frame, iteration or event"):
+        with pytest.raises(UsageError, match="not a frame, iteration or event"):
             frame_at(tmp_path, wrong)
 
 

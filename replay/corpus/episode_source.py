@@ -48,7 +48,7 @@ class EpisodeSource(StoredSource):
     """
 
     gaps = to_judge = True
-    more = "name more logs, or "
+    more = "add more logs, or "
 
     def __init__(
         self,
@@ -73,9 +73,13 @@ class EpisodeSource(StoredSource):
             LogDamagedError: none can be read.
         """
         if inputs is not None and inputs.color == "auto":
-            raise UsageError("--color auto is for a single log: choose on or off for episodes")
+            raise UsageError(
+                "--color auto needs a single log: use --color on or --color off for several"
+            )
         if len(logs) > MOST_EPISODES:
-            raise UsageError(f"{len(logs):,} logs: a run has at most {MOST_EPISODES:,} episodes")
+            raise UsageError(
+                f"{len(logs):,} logs are too many for one run: choose at most {MOST_EPISODES:,}"
+            )
         self._inputs, self._loop, self._skip_damaged = inputs, loop, skip_damaged
         self._open_now: tuple[int, LoggedSource] | None = None
         self._reading = 0, 0
@@ -100,7 +104,7 @@ class EpisodeSource(StoredSource):
         damaged, unfit = list[str](), list[str]()
         for reason in errors:
             lines = damaged if isinstance(reason, LogDamagedError) else unfit
-            lines.append(f"{reason}: this log is left out")
+            lines.append(f"{reason}: this log is skipped")
         unfit += self._set_clock(episodes)
         self.left_out = tuple(damaged)
         self.warnings = tuple(line for lines in (damaged, unfit, warnings) for line in _few(lines))
@@ -129,13 +133,13 @@ class EpisodeSource(StoredSource):
         self._pixels = [streams[name][2] for name in names]
         self.turns = first.turns if len(first.turns) == len(names) else ()
         ends = f"{first.name} to {alike[-1].name}" if len(alike) > 1 else first.name
-        order = "by when each begins, then by its path"
+        order = "ordered by start time, then by path"
         self.notes = (f"{counted(len(alike), 'episode')}, {order}: {ends}",)
         for episode in episodes:
             if not are_alike(episode.spec, first.spec):
                 yield (
-                    f"{episode.name} has {_described(episode.spec)}, {first.name}, the first, "
-                    f"{_described(first.spec)}: it is left out; --size and --rate make logs alike"
+                    f"{episode.name} is skipped: it has {_described(episode.spec)}, but the first "
+                    f"log, {first.name}, has {_described(first.spec)}; choose --size and --rate"
                 )
 
     def pixels(self, stream: int) -> str:
@@ -237,7 +241,9 @@ class EpisodeSource(StoredSource):
                 raise LogDamagedError(str(error)) from None
             if sampled(source) != episode.identity.sampled:
                 source.close()
-                raise LogDamagedError(f"{episode.name}: it has changed since it was first opened")
+                raise LogDamagedError(
+                    f"{episode.name}: the file has changed since it was opened; start again"
+                )
             self._open_now = number, source
         return self._open_now[1]
 
@@ -249,8 +255,8 @@ class EpisodeSource(StoredSource):
         number, t = self._reading
         one = self._episodes[number]
         one.whole = 0 if self.centre == "episode" else min(t - one.start, one.whole)
-        rest = "what follows in it is" if one.whole else "the log is"
-        self._lost.append(f"{error}: {rest} left out")
+        rest = "the rest of this log is" if one.whole else "this log is"
+        self._lost.append(f"{error}: {rest} skipped")
         self.left_out = (*self.left_out, self._lost[-1])
 
     def _logs(self) -> Sequence[Identity]:
@@ -291,4 +297,4 @@ def _described(spec: SourceSpec) -> str:
 def _few(lines: Sequence[str]) -> Sequence[str]:
     """Return the first lines, and how many more there are."""
     more = len(lines) - MOST_LINES
-    return [*lines[:MOST_LINES], *([f"and {more} more, alike"] if more > 0 else [])]
+    return [*lines[:MOST_LINES], *([f"and {more} more like these"] if more > 0 else [])]

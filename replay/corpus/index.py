@@ -237,7 +237,7 @@ def logs_of_corpus(words: Sequence[str | Path]) -> list[list[Path]] | None:
     if place.is_dir() and [log.name for log in logs] == [os.curdir]:
         return None  # the folder is a single recording
     if not logs:
-        raise UsageError(f"{index} holds no log to learn from: index a folder of logs")
+        raise UsageError(f"{index} lists no log to learn from: index a folder that has logs")
     return [[location(file) for file in log.files] for log in logs]
 
 
@@ -277,11 +277,13 @@ def _check_index(path: Path) -> None:
         except (pa.ArrowException, OSError) as error:
             raise _damaged(path, error) from error
     if version != str(VERSION).encode():
-        raise UsageError(f"{path} is no index of logs of version {VERSION}: name another file")
+        raise UsageError(
+            f"{path} is not an index of version {VERSION}: choose another file, or index again"
+        )
 
 
 def _damaged(path: Path, error: Exception) -> LogDamagedError:
-    return LogDamagedError(f"{path} is damaged ({one_line(error)}): remove it, and index again")
+    return LogDamagedError(f"{path} is damaged ({one_line(error)}): delete it and index again")
 
 
 def _index_of(words: Sequence[str | Path], out: Path | None) -> Path:
@@ -295,7 +297,9 @@ def _index_of(words: Sequence[str | Path], out: Path | None) -> Path:
             return place / INDEX
         if not place.exists() and not set("*?[") & set(str(place)):
             raise no_such(place)
-    raise UsageError(f"{' '.join(map(str, words))}: name the index with -o F.parquet")
+    raise UsageError(
+        f"{' '.join(map(str, words))}: the index has no default file here; add -o FILE.parquet"
+    )
 
 
 def _logs_by_path(words: Sequence[str | Path], folder: Path) -> dict[str, ListedLog]:

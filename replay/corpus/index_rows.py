@@ -118,7 +118,7 @@ def _streams_of(place: Path, log: ListedLog, deep: bool) -> Iterator[dict[str, A
         topics = image_topics(place) if deep and report.kind == "foreign" else []
     problems = [f"{p.where}: {p.what}" for p in report.problems]
     if not is_url(log.file) and size_and_time(place) != (log.bytes, log.changed):
-        problems.append("it changed while it was indexed: index again")
+        problems.append("the file changed while it was indexed: index again")
     records = [record for file in report.metadata.values() for record in file.values()]
     metadata = {name: value for record in records for name, value in record.items()}
     folder = log.path.rpartition("/")[0] or "."

@@ -103,7 +103,7 @@ def _below(root: str, listed: set[tuple[int, int]]) -> Iterator[ListedLog]:
             if name != INDEX and (partial or ending in _LOGS):
                 yield _log_file(os.path.join(folder, name))
     for error in errors:
-        yield ListedLog(_escaped(error.filename), problem=f"it cannot be read: {error.strerror}")
+        yield ListedLog(_escaped(error.filename), problem=f"cannot be read: {error.strerror}")
 
 
 def _format_of_folder(folder: str, names: set[str]) -> str:
@@ -119,11 +119,11 @@ def _format_of_folder(folder: str, names: set[str]) -> str:
 
 def _log_file(name: str) -> ListedLog:
     if (escaped := _escaped(name)) != name:
-        return ListedLog(escaped, problem="its name is not UTF-8: give it another")
+        return ListedLog(escaped, problem="its name is not UTF-8: rename it")
     try:
         return ListedLog(name, *size_and_time(Path(name)))
     except OSError as error:
-        return ListedLog(name, problem=f"it cannot be read: {error.strerror}")
+        return ListedLog(name, problem=f"cannot be read: {error.strerror}")
 
 
 def _escaped(name: str) -> str:

@@ -58,13 +58,13 @@ def export(
     """
     paths = [path] if isinstance(path, Path) else list(path)
     if form not in FORMS:
-        raise UsageError(f"no form {form!r} for --to: {did_you_mean(form, FORMS)}")
+        raise UsageError(f"--to {form!r} is not a format: {did_you_mean(form, FORMS)}")
     if form in TABLES:
         refuse_taken(out, force=force)
         if len(paths) > 1 or not holds_run(paths[0]):
             raise UsageError(
-                f"{form} holds the signals of one run: name a run, or choose images, mp4 or "
-                "lerobot with --to"
+                f"{form} is a format for the signals of one run: give one run, or use --to images, "
+                "--to mp4 or --to lerobot for frames"
             )
         with atomic_write(out) as place:
             return TABLES[form](paths[0], place)
@@ -75,8 +75,8 @@ def export(
         refuse_existing(out, force=force, goes_on=False)
         for file in out.rglob("*"):
             if not file.is_dir() and file.suffix not in WRITTEN:
-                other = f"{out} holds other files, such as {file.relative_to(out)}"
-                raise UsageError(f"{other}: export into a new folder")
+                other = f"{out} has files that no export wrote, as {file.relative_to(out)}"
+                raise UsageError(f"{other}: choose a new folder")
     logs = _opened(paths, form, inputs, about, single=single)
     with contextlib.closing(logs), atomic_write(out) as place:
         if form == "lerobot":
@@ -106,12 +106,12 @@ def _opened(
             spec, why = source.spec, ""
             first = first or spec
             if form != "lerobot" and not spec.images:
-                why = "holds no images: its frames are numbers"
+                why = "has no images: its frames are numbers; use --to lerobot"
             elif single and len(spec.streams) > 1:
-                why = f"has {len(spec.streams)} streams: name a folder for their videos"
+                why = f"has {len(spec.streams)} streams: choose a folder instead of one .mp4 file"
             for name in ("streams", "frame_shape", "dtype", "truth", "fps"):
                 if (a := getattr(first, name)) != (b := getattr(spec, name)):
-                    why = f"has the {name} {b}, not {a} as {paths[0]}: export it separately"
+                    why = f"has {name} {b}, but {paths[0]} has {a}: export them separately"
             if why:
                 raise UsageError(f"{log[0]} {why}")
             about(source)

@@ -65,7 +65,7 @@ def shared_spans(source: LoggedSource) -> list[Span]:
     streams = range(len(source.spec.streams))
     shared = functools.reduce(intersection, (_spans(source, stream) for stream in streams))
     if not shared:
-        raise UsageError("its streams have gaps and no frame in common: export each separately")
+        raise UsageError("the streams have gaps and no common frame: export each stream separately")
     return shared
 
 

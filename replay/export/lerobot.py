@@ -113,8 +113,8 @@ def write_dataset(
 def _whole_rate(spec: SourceSpec) -> int:
     if spec.fps != round(spec.fps) or spec.fps < 1:
         raise UsageError(
-            f"LeRobot knows whole frame rates only, not {spec.fps:g} per second: "
-            "change it with cdmisfa convert --rate"
+            f"LeRobot needs a whole number of frames per second, not {spec.fps:g}: "
+            "resample with cdmisfa convert --rate first"
         )
     return round(spec.fps)
 

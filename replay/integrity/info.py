@@ -181,7 +181,7 @@ def report_on(reader: LogReader, counts: Mapping[int, ChannelCount]) -> LogRepor
     name = reader.path.name
     channels = []
     for number, count in sorted(counts.items()):
-        undefined = Channel(number, f"(channel {number}, never defined)", "", {}, 0)
+        undefined = Channel(number, f"(undefined channel {number})", "", {}, 0)
         channel = reader.channels.get(number, undefined)
         schema = reader.schemas.get(channel.schema_id)
         entry = (channel.topic, channel.message_encoding, schema.name if schema else "")

@@ -85,8 +85,8 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
     src, dst = location(src), Path(dst)
     if src.exists() and is_external_format(src):
         raise UsageError(
-            f"{src} is no MCAP file, and others are not recovered: learn and convert pass over "
-            "broken images of them with --skip-damaged"
+            f"{src} is not an MCAP file, and only these can be recovered: skip broken images with "
+            "--skip-damaged of learn and convert"
         )
     files, alone = log_files(src), not src.is_dir()
     if alone:
@@ -95,7 +95,7 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
     make_folder(dst.parent if alone else dst)
     for file, target in zip(files, targets, strict=True):
         if target.exists() and file.samefile(target):
-            raise UsageError(f"{target}: cannot be recovered into itself, name another file")
+            raise UsageError(f"{target}: input and output are the same file; choose another output")
     results = [_recover_file(f, t, force, alone) for f, t in zip(files, targets, strict=True)]
     return Recovery(
         out=str(dst),
@@ -116,7 +116,7 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
             reader = stack.enter_context(LogReader(store, skip_damaged=True))
         empty = not (reader.channels or reader.metadata or reader.attachments)
         if alone and reader.missing and empty:  # in a folder, other logs may hold something
-            raise LogDamagedError(f"{src}: nothing in it can be saved, and nothing was written")
+            raise LogDamagedError(f"{src}: no message can be recovered; no file was written")
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
             kept, unverified = _copy(reader, log)
@@ -186,7 +186,7 @@ def _lost(reader: LogReader) -> tuple[Problem, ...]:
         proven = all(segment.crc for segment in reader.segments if segment.size)
         if proven and {problem.where for problem in problems} == {data}:
             # Every chunk matches its own CRC: the changed byte is in a record between them.
-            what = "damaged between the chunks: every message is there, metadata may be wrong"
+            what = "damaged between chunks: all messages are readable, metadata may be wrong"
             problems = [Problem(data, f"its CRC does not match: {what}")]
     return tuple(problems)
 
@@ -249,14 +249,14 @@ def repair(reader: LogReader) -> RepairedStore:
             if chunk.stated:  # the summary says everything of a chunk's head but its CRC
                 crc_at = chunk.offset + CHUNK_HEADER.size - 4
                 chunk.crc = int.from_bytes(store.read(crc_at, 4), "little")
-                what = "its first bytes were damaged, and are made again from the summary"
+                what = "its header was damaged and is restored from the summary"
                 store.put(chunk.offset, chunk.head(chunk.crc), chunk.name, what)
             if not chunk.crc:
                 continue
             table, *_ = walked_table(chunk_records(store, replace(chunk, stated=False)))
         except MalformedRecord:
             continue  # the damage is in the chunk's own data, which nothing repeats
-        what = "its message index was damaged, and is made again from its messages"
+        what = "its message index was damaged and is rebuilt from its messages"
         store.put(chunk.data_end, _indexes(store, chunk, end, table), chunk.name, what)
     return store
 

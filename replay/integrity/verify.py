@@ -99,13 +99,13 @@ def _check_content(
     if content:
         content.finish()
     problems = [
-        Problem(str(path), f"holds messages of channel {number}, never defined")
+        Problem(str(path), f"has messages on channel {number}, which is not defined")
         for number in counts.keys() - reader.channels.keys()
     ]
     messages = sum(channel.messages for channel in counts.values())
     stated = reader.statistics.message_count if reader.statistics else messages
     if stated != messages and not reader.problems:
-        what = f"its summary states {stated} messages, there are {messages}"
+        what = f"its summary states {stated} messages, but it has {messages}"
         problems.append(Problem(str(path), what))
     report = report_on(reader, counts)
     notes = (f"{path}: {NO_CHECKSUMS}",) if report.crc == "absent" else ()
@@ -224,7 +224,7 @@ class _RunContent(_Content):
         with self.errors_kept():
             self._add_signals(self._batches.rest())
         if self.error is None and self._hash.hexdigest() != self._stated:
-            what = f"its {self._hash.count} iterations are not those that the run had"
+            what = f"the signals of its {self._hash.count} iterations differ from the final record"
             self._problems.append(Problem(str(self.path), what))
 
     def problems(self) -> Iterator[Problem]:
@@ -236,15 +236,15 @@ class _RunContent(_Content):
             return
         facts = self._folder / RUN_JSON
         if not self._document:
-            yield Problem(str(facts), "is missing, empty or no JSON")
+            yield Problem(str(facts), "is missing, empty or not JSON")
         elif facts_sha256(self._document) != self._final.get("facts_sha256"):
-            yield Problem(str(facts), "states something else than the run's final record")
+            yield Problem(str(facts), "differs from the run's final record")
         modules, stated = self._folder / MODULES_FILE, self._final.get("modules_sha256")
         try:
             if not modules.is_file():
                 yield Problem(str(modules), "is missing")
             elif hashlib.sha256(read_regular(modules, MAX_BYTES)).hexdigest() != stated:
-                what = "holds something else than the run's final record states"
+                what = "differs from the run's final record"
                 yield Problem(str(modules), what)
             else:
                 load_modules(modules)
@@ -257,9 +257,9 @@ class _RunContent(_Content):
     def notes(self) -> Iterator[str]:
         """Yield the files that nothing proves."""
         if self._folder is not None and (view := self._folder / VIEW_FILE).is_file():
-            yield f"{view} is not checked: {view_again(self._folder)}"
+            yield f"{view} is not verified: {view_again(self._folder)}"
         if self._final is None:
-            yield f"{self.path} holds no final record: nothing proves what is beside it"
+            yield f"{self.path} has no final record: the other files of the run cannot be verified"
 
     def _add_signals(self, batch: Batch) -> None:
         for signals in (record for columns in batch.signals for record in columns.records()):
@@ -273,7 +273,7 @@ class _RunContent(_Content):
 def view_again(run: Path) -> str:
     """Return the command that builds the view of a run, which holds nothing beyond its log."""
     command = ("cdmisfa", "view", str(run), "--save", str(run / VIEW_FILE), "--force")
-    return f"make it again with {shlex.join(command)}"
+    return f"write it again with {shlex.join(command)}"
 
 
 def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Problem]:
@@ -293,11 +293,11 @@ def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Probl
         facts = [view.facts for view in views]
         streams = {name for stated in facts for name in stated.streams if name}
         for name in sorted(streams - {stated.view for stated in facts}):
-            yield Problem(folder, f"the view {name!r} of the recording has no file")
+            yield Problem(folder, f"the file of view {name!r} is missing")
         count = max((stated.stream_count for stated in facts), default=0)
         if absent := set(range(count)) - {stated.stream_index for stated in facts}:
-            what = f"of the recording's views 0 to {count - 1} {len(absent)} have no file"
-            yield Problem(folder, f"{what}, the first is {min(absent)}")
+            what = f"{len(absent)} files of the recording's views 0 to {count - 1} are missing"
+            yield Problem(folder, f"{what}, the first of view {min(absent)}")
     if any(content.error is not None for content in contents):
         return
     try:
@@ -308,7 +308,7 @@ def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Probl
     ends = {name: ranges[-1][1] for name, ranges in source.coverage().items() if not source.gaps}
     for name, end in ends.items():
         if end > min(ends.values()):
-            what = f"the view {name!r} ends before frame {end}, another before "
+            what = f"view {name!r} ends before frame {end}, another view before "
             yield Problem(folder, f"{what}{min(ends.values())}")
 
 
@@ -348,7 +348,7 @@ def _check_topics(path: Path, topics: Iterable[str]) -> LogReport:
             problems.append(as_problem(path, error))
         except UsageError as error:  # it needs an option, or a package that is not installed
             reason = str(error).removeprefix(f"{path}: ")
-            notes[f"{path}: {topic} is not decoded: {reason}"] = None
+            notes[f"{path}: {topic} was not decoded: {reason}"] = None
     state: State = "damaged" if problems else "cut short" if missing else "whole"
     problems += [Problem(str(path), what) for what in missing]
     remarks = tuple(note for note in notes if note.removeprefix(f"{path}: ") not in missing)

@@ -74,11 +74,10 @@ def _rate(streams: Sequence[LogStream]) -> float:
     step = float("nan") if timed.times is None else clocks.step_of(timed.times)
     if not (step > 0 and (timed.read is None or 1 / step <= RECORDED_FPS[1])):
         column = (
-            ", or name the column of its times, and what they count (s, ms, us, ns), with "
-            "--set input.time=COLUMN:s"
+            ", or the column of times and its unit (s, ms, us, ns) with --set input.time=COLUMN:s"
         )
         hint = column if timed.read is not None else ""
-        raise UsageError(f"{timed.path} tells no rate: set one with --rate{hint}")
+        raise UsageError(f"{timed.path} has no frame rate: set --rate in frames per second{hint}")
     return float(f"{1 / step:.6g}")
 
 
@@ -92,15 +91,15 @@ def _excerpt(stream: LogStream, options: InputOptions, zero: int) -> LogStream:
     if low >= high:
         lasts = (int(times[-1]) - zero) / NANOSECONDS
         raise UsageError(
-            f"{stream.path}: {stream.topic} has no images there, its last is at {lasts:g} s: "
-            "choose another --start or --end"
+            f"{stream.path}: {stream.topic} has no images between --start and --end; its last is "
+            f"at {lasts:g} s"
         )
     return stream.part(np.arange(low, high), times[low:high])
 
 
 def _refuse_unequal(streams: Sequence[LogStream], times: Sequence[IntArray], fps: float) -> None:
     """Refuse streams that are not on one clock, or not of the rate asked for."""
-    by_time = f"choose images by their times with --align time --rate {fps:g}"
+    by_time = f"align them by time with --align time --rate {fps:g}"
     begins, ends = clocks.overlap(times)
     for stream, stamps in zip(streams, times, strict=True):
         two = f"{streams[0].topic} and {stream.topic}"
@@ -108,13 +107,13 @@ def _refuse_unequal(streams: Sequence[LogStream], times: Sequence[IntArray], fps
             if begins < ends:
                 raise UnequalError(f"{two} have {reason}: {by_time}")
             raise UnequalError(
-                f"{two} have no time in common: take the i-th image of each together with "
+                f"{two} do not overlap in time: align them by number with "
                 f"--align index --rate {fps:g}"
             )
         step = clocks.step_of(stamps)
         if step > 0 and abs(step * fps - 1) > clocks.UNEVEN:
             raise UnequalError(
-                f"{stream.topic} has {1 / step:g} images a second, not {fps:g}: {by_time}"
+                f"{stream.topic} has {1 / step:g} images per second, not {fps:g}: {by_time}"
             )
 
 
@@ -144,7 +143,7 @@ def names_of(streams: Sequence[LogStream]) -> tuple[str, ...]:
     places = [(stream.path.resolve(), stream.topic) for stream in streams]
     if len(set(places)) < len(places):
         place = next(place for place in places if places.count(place) > 1)
-        raise UsageError(f"{place[1]} of {place[0]} is named twice: leave one out")
+        raise UsageError(f"{place[1]} of {place[0]} is given twice: remove one")
     for folders in range(max(len(path.parts) for path, _ in places)):
         names = [_in_folders(stream, folders) for stream in streams]
         if len(set(names)) == len(names):

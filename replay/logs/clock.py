@@ -58,7 +58,7 @@ def by_time(streams: Sequence[IntArray], fps: float) -> Clock:
     """
     start, stop = overlap(streams)
     if stop < start:
-        raise UsageError("the streams have no time in common: take each by itself, with --topic")
+        raise UsageError("the streams do not overlap in time: choose one with --topic")
     ticks = (stop - start) * fps / NANOSECONDS + 1
     _refuse_many(ticks)
     clock = times_of(np.arange(int(ticks)), fps, start)
@@ -103,7 +103,7 @@ def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> Clock:
 def _refuse_many(frames: float) -> None:
     if frames > MAX_FRAMES:
         raise UsageError(
-            f"the log becomes {frames:.0f} frames: choose a lower --rate, or a part of it with "
+            f"{frames:.0f} frames are too many: choose a lower --rate, or a shorter part with "
             "--start and --end"
         )
 
@@ -129,7 +129,7 @@ def by_number(views: Iterable[Sequence[Span]], facts: ViewMetadata, name: str) -
             common = intersection(common, covered)
     common = merged(common)
     if not common:
-        raise LogDamagedError(f"{name}: no frame is there, whole, in every view")
+        raise LogDamagedError(f"{name}: no frame is readable in every view")
     begins, end = common[0][0], common[-1][1]
     parts = [np.arange(low, high) for low, high in common] if len(common) > 1 else []
     rows: Rows = np.concatenate(parts) if parts else range(begins, end)
@@ -207,7 +207,7 @@ def retimed(times: IntArray, rows: Rows, fps: float) -> str:
     if (np.abs(since - frame / fps) <= allowed).all():
         return ""
     lasts, become = since[-1] + 1 / fps, len(rows) / fps
-    return f"its rate uneven ({lost} missing): {lasts:.6g} s of it become {become:.6g} s of frames"
+    return f"at an uneven rate ({lost} missing): {lasts:.6g} s become {become:.6g} s of frames"
 
 
 def counts(count: int, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:

@@ -39,8 +39,8 @@ _LEAST = 0.25
 
 # What was chosen, in words.
 CHOSEN: Final = {
-    True: "--color auto: hue varies where brightness does not, frames show red, green and blue",
-    False: "--color auto: hue tells no more than brightness, frames are grey",
+    True: "--color auto: hue varies independently of brightness, so frames have colour",
+    False: "--color auto: hue adds nothing to brightness, so frames are grey",
 }
 
 

@@ -15,7 +15,7 @@ from recorder.images.compressed import AT_ONCE, compressed_image
 from recorder.images.pixels import Shown, UnknownPixels
 from replay.logs.stream import BROKEN, LogStream
 
-REMEDY: Final = "learn and convert replace broken images with --skip-damaged"
+REMEDY: Final = "skip broken images with --skip-damaged"
 
 # Images that are decoded at once.
 CORES: Final = thread_count()
@@ -133,7 +133,7 @@ class Images:
                 log, first = self._streams[stream], min(broken)
                 what = "messages" if log.fields else "images"
                 lines.append(
-                    f"{log.name_of(first)}: {broken[first]}: {len(broken)} broken of {log.count} "
-                    f"{what}: the last whole one is taken instead"
+                    f"{log.name_of(first)}: {broken[first]}: {len(broken)} of {log.count} "
+                    f"{what} are broken and replaced by the last readable one"
                 )
         return lines

@@ -130,7 +130,7 @@ class OpenLogs:
                 if not skip_damaged or len(files) == 1:
                     raise
                 broken.append(error)
-        self.left_out = [f"{error}: this log is left out" for error in broken]
+        self.left_out = [f"{error}: this log is skipped" for error in broken]
         if not self.streams:
             raise [*refused, *broken][0]
         if topics and not in_turn:

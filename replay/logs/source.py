@@ -233,26 +233,26 @@ class LoggedSource(StoredSource):
             end = int(clock.rows[0][-1]) + 1
             if not self.gaps and len(ends) > 1:
                 yield (
-                    f"{self._name()}: its views end at different frames; it ends with the "
-                    f"shortest, before frame {end}"
+                    f"{self._name()}: the views differ in length; the source ends with the "
+                    f"shortest view, before frame {end}"
                 )
             if left_out := end - self.first_frame - self.frames:
                 yield (
-                    f"{self._name()}: {left_out} frames are missing in a view and left out in all"
+                    f"{self._name()}: {left_out} frames that a view lacks are skipped in all views"
                 )
             return
-        held = "no block reaches across" if self.gaps else "the last image is shown"
+        handling = "no block spans a gap" if self.gaps else "the last image is repeated"
         for stream, gaps in zip(self.streams, clock.gaps, strict=True):
             if gaps:
                 line = clocks.gaps_in_words(gaps, self._fps)
-                yield f"{stream.path}: {stream.topic} has {line}: {held}"
+                yield f"{stream.path}: {stream.topic} has {line}: {handling}"
         one = self.streams[0]
         assert one.times is not None
         by_number = self._options.align is None and not self._arrays
         if by_number and (line := clocks.retimed(one.times, clock.rows[0], self._fps)):
             yield (
-                f"{one.path}: {one.topic} is taken by number, {line}; convert or learn it with "
-                f"--align time --rate {self._fps:g} to keep its times"
+                f"{one.path}: {one.topic} is read one image a frame, {line}; keep its timing with "
+                f"--align time --rate {self._fps:g}"
             )
 
     def skipped_damage(self) -> list[str]:

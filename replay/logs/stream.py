@@ -105,7 +105,7 @@ class LogStream:
             LogDamagedError: a time lies elsewhere.
         """
         if not self.count:
-            raise UsageError(f"{self.path}: there is no message or frame on {self.topic}")
+            raise UsageError(f"{self.path}: {self.topic} has no messages or frames")
         if self.times is not None:
             check_times(f"{self.path}: {self.topic}", self.times)
 
@@ -148,7 +148,7 @@ class LogStream:
 def check_times(where: object, times: IntArray) -> None:
     """Refuse sorted times before 1970 or beyond any clock, as damage of `where`."""
     if not 0 <= times[0] <= times[-1] < LAST_NS:
-        raise LogDamagedError(f"{where} has times beyond any clock")
+        raise LogDamagedError(f"{where} has times before 1970 or after 2116")
 
 
 def joined(parts: Sequence[LogStream]) -> LogStream:
@@ -171,7 +171,7 @@ def joined(parts: Sequence[LogStream]) -> LogStream:
         return function
 
     first = parts[0]
-    note = f"{first.path}: {first.topic} is joined from {len(parts)} logs, by time"
+    note = f"{first.path}: {first.topic} is joined from {len(parts)} logs in order of time"
     return replace(
         first,
         count=len(times),
@@ -204,9 +204,9 @@ def explained(path: object, program: str, remedy: str = "") -> Iterator[None]:
     except CdmisfaError:
         raise
     except MemoryError:
-        limit = f"{BUDGET >> 20} MiB of memory for it, the limit"
+        limit = f"the limit of {BUDGET >> 20} MiB of memory"
         hint = f": {remedy}" if remedy else ""
-        raise UnreadableError(f"{path}: {program} takes more than {limit}{hint}") from None
+        raise UnreadableError(f"{path}: {program} needs more than {limit}{hint}") from None
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise UnreadableError(f"{path}: {program} cannot read it ({reason})") from None

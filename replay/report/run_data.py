@@ -124,7 +124,7 @@ class RunData:
         if not run.result:
             self.problems.append(
                 "The run was interrupted or is still learning: it has no run.json. "
-                "cdmisfa learn --resume continues it."
+                "Continue it with cdmisfa learn --resume."
             )
         try:
             modules = run.modules[:MOST_MODULES]
@@ -142,7 +142,7 @@ class RunData:
                     tally.add(columns)
                 self._add(batch)
         except LogDamagedError as error:
-            self.problems.append(f"The log is damaged. This page shows what is readable: {error}")
+            self.problems.append(f"The log is damaged; this page shows its readable part: {error}")
         self.outline = tally.outline()
 
     def _add(self, batch: Batch) -> None:

@@ -111,13 +111,15 @@ def header_in(reader: LogReader) -> RunHeader:
     log = reader.path
     found = next((r.metadata for r in reader.metadata if r.name == RUN_METADATA), None)
     if found is None:
-        raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
+        raise UsageError(
+            f"{log} is not the log of a run: give the folder of a run or its {RUN_FILE}"
+        )
     schema = found.get("schema", "")[:20]
     if not (schema.isascii() and schema.isdigit() and 0 < int(schema) < 10**9):
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken (schema {schema!r})")
     if int(schema) != SCHEMA_VERSION:  # asked first: all else may look different in it
         written = f"{log} was written with version {schema} of the signals"
-        raise UsageError(f"{written}: read it with the cdmisfa that wrote it")
+        raise UsageError(f"{written}: read it with the version of cdmisfa that wrote it")
     try:
         spec = parse_json(found["spec"])
         for name in ("streams", "frame_shape", "truth"):
@@ -190,7 +192,9 @@ def read_batches(
             yield from batches.take(table)
         yield batches.rest()
         if not reader.complete and not log.name.endswith(PARTIAL):
-            raise LogDamagedError(f"{log} is cut short: save what is there with cdmisfa recover")
+            raise LogDamagedError(
+                f"{log} is cut short: save its readable part with cdmisfa recover"
+            )
 
 
 def read_columns(
@@ -290,7 +294,7 @@ class BatchReader:
                 or columns["Q"].shape[1:] != (streams, 2)
                 or (rewards.size and rewards.shape[1:] != (streams, 2, streams))
             ):
-                raise LogDamagedError(f"{where}: a record is about other streams than the run's")
+                raise LogDamagedError(f"{where}: a record has other streams than the run")
         return records
 
     def _images(self) -> tuple[Frames, ...]:

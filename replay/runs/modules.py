@@ -58,9 +58,9 @@ def load_modules(path: Path) -> tuple[Module, ...]:
     try:
         return tuple(_modules(read_arrays(path)))
     except FileNotFoundError as error:
-        raise UsageError(f"{path} does not exist: name a run's folder") from error
+        raise UsageError(f"{path} does not exist: give the folder of a run") from error
     except (OSError, ValueError, KeyError, TypeError, OverflowError, SystemError) as error:
-        raise LogDamagedError(f"{path} holds no modules ({one_line(error)})") from error
+        raise LogDamagedError(f"{path} is not a file of modules ({one_line(error)})") from error
 
 
 def _modules(stored: Mapping[str, NDArray[Any]]) -> Iterator[Module]:
@@ -76,7 +76,7 @@ def _modules(stored: Mapping[str, NDArray[Any]]) -> Iterator[Module]:
                 raise ValueError(f"{name} is not of type {kinds}")
             values[name] = array.item() if name in _SCALARS else array
         if values["index"] != index:
-            raise ValueError(f"module {index} is numbered {values['index']}")
+            raise ValueError(f"module {index} has number {values['index']}")
         values["frame_shape"] = tuple(map(int, values["frame_shape"].tolist()))
         values["recipe"] = Recipe.from_json(values["recipe"]) if values["recipe"] else None
         outputs, size = values["phi"].shape

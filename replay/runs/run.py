@@ -62,7 +62,9 @@ class Run:
         """
         modules, names = load_modules(self.log.parent), self.streams
         if any(module.stream_index >= len(names) for module in modules):
-            raise LogDamagedError(f"{self.log.parent} holds modules of streams it does not have")
+            raise LogDamagedError(
+                f"{self.log.parent} has modules of streams that the run does not have"
+            )
         shape = self.header.spec.frame_shape
         return tuple(
             replace(module, stream=names[module.stream_index], frame_shape=shape)

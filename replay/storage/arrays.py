@@ -51,7 +51,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         except NOT_ARRAYS as error:
             raise ValueError(one_line(error)) from error
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-        raise ValueError("not all of it are arrays")
+        raise ValueError("not all of its members are arrays")
     return arrays
 
 
@@ -77,13 +77,13 @@ def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
             dtype = _plain_type(kind)
             size = dtype.itemsize * math.prod(shape)
             if min(shape, default=0) < 0 or at + size > len(data):
-                raise ValueError(f"{str(name)[:40]!r} is no array of it")
+                raise ValueError(f"the data has no array {str(name)[:40]!r}")
             arrays[str(name)] = np.ndarray(shape, dtype, data, at).copy()
             at += size
     except NOT_ARRAYS as error:
         raise ValueError(f"an impossible array: {one_line(error)}") from error
     if at != len(data):
-        raise ValueError(f"its arrays have {at} bytes, and it has {len(data)}")
+        raise ValueError(f"its arrays have {at} bytes, but the data has {len(data)}")
     return arrays
 
 
@@ -91,5 +91,5 @@ def _plain_type(kind: Any) -> np.dtype[Any]:
     """Return the type that numpy describes so: numbers or text, or a record of such."""
     fields = [("", kind)] if isinstance(kind, str) else [tuple(field) for field in kind]
     if not all(_PLAIN.fullmatch(field[1]) for field in fields):
-        raise ValueError(f"{str(kind)[:40]!r} is no plain type")
+        raise ValueError(f"{str(kind)[:40]!r} is not a plain type")
     return np.dtype(kind if isinstance(kind, str) else fields)

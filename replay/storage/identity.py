@@ -90,7 +90,7 @@ class Identity:
         return hashlib.sha256(_encoded("".join(lines))).hexdigest()
 
     def _change_error(self) -> LogDamagedError:
-        return LogDamagedError(f"{self.path}: it was changed while it was read; begin again")
+        return LogDamagedError(f"{self.path}: the file changed while it was read; start again")
 
     def _sample_sha256(self) -> str:
         digest = hashlib.sha256()

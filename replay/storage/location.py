@@ -42,7 +42,7 @@ def location(word: str | Path) -> Path:
     """
     if not is_url(word):
         if word == "":
-            raise UsageError("a name is empty: name a path or a URL")
+            raise UsageError("an argument is empty: give a path or a URL")
         return Path(word)
     return _copied(str(word))
 
@@ -60,7 +60,7 @@ def _copied(address: str) -> Path:
     shown = _SECRET.sub("", address)
     scheme, _, place = shown.partition("://")
     if scheme not in SCHEMES:
-        raise UsageError(f"{scheme}:// is not read: use one of {', '.join(SCHEMES)}, or a path")
+        raise UsageError(f"{scheme}:// is not supported: use {', '.join(SCHEMES)}, or a path")
     key = hashlib.sha256(address.encode()).hexdigest()[:16]
     parts = [part for part in place.split("/") if part not in ("", ".", "..")]
     target = _folder().joinpath(key, scheme, *parts)
@@ -68,11 +68,11 @@ def _copied(address: str) -> Path:
         _copy(scheme, address, target)
     except ImportError as error:
         raise UsageError(
-            f"{shown}: reading URLs needs packages that are not installed ({one_line(error)}): "
+            f"{shown}: reading URLs needs further packages ({one_line(error)}): "
             "pip install 'cdmisfa[cloud]'"
         ) from None
     except FileNotFoundError:
-        raise CdmisfaError(f"{shown}: there is no such file") from None
+        raise CdmisfaError(f"{shown}: no such file") from None
     except Exception as error:  # whatever fsspec's file systems raise
         what = one_line(error).replace(address, shown)
         raise CdmisfaError(f"{shown}: {what}") from error

@@ -32,8 +32,8 @@ def log_files(path: str | Path) -> list[Path]:
     logs = whole + [p for p in cut if p.with_suffix("") not in whole]
     if not logs:
         raise UsageError(
-            f"{path}: no log in this folder; {KINDS}; record or learn first, or name each "
-            "video, bag, table or folder of pictures in it, or cdmisfa index all of them"
+            f"{path}: no log in this folder; {KINDS}; record or learn first, or give each video, "
+            "bag, table or folder of images by its path, or index all with cdmisfa index"
         )
     return logs
 

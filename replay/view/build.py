@@ -77,7 +77,7 @@ def build_view(
     if inputs is not None and (given := inputs.named()):
         raise UsageError(f"{path} is a run: {are_for(given, 'logs')}")
     if beside:
-        raise UsageError(f"{path}: one run is shown at a time; compare --save shows several")
+        raise UsageError(f"{path}: view shows one run at a time; for several use compare --save")
     log = run_log(path)
     with recording_to(out, log.resolve().parent.name, log, force=force) as recording:
         _write_run(recording, log, every, tab)
@@ -98,9 +98,9 @@ def view_of(path: Path, *, tab: str | None = None, **how: Any) -> Iterator[Path]
     if path.suffix == ".rrd":
         with opened_regular(path) as file:
             if file.read(4) != b"RRF2":  # for anything else the viewer shows nothing, without end
-                raise UsageError(f"{path} is no file of Rerun: name a run or a recording")
+                raise UsageError(f"{path} is not an .rrd file: give a run or a recording")
         if tab is not None:
-            raise UsageError(f"--tab {tab}: {path} is built already, name its run or recording")
+            raise UsageError(f"--tab {tab} does not apply to {path}: give its run or recording")
         yield path
         return
     with tempfile.TemporaryDirectory(prefix="cdmisfa-view-", ignore_cleanup_errors=True) as folder:
@@ -134,7 +134,9 @@ def recording_to(
         try:
             recording.save(partial)
             if not partial.exists():
-                raise CdmisfaError(f"{out}: Rerun writes nothing, unset the variable RERUN")
+                raise CdmisfaError(
+                    f"{out}: Rerun wrote nothing: unset the environment variable RERUN"
+                )
             recording.send_recording_name(drawable(name))
             yield recording
             recording.flush(timeout_sec=FLUSH_SECONDS)

@@ -35,8 +35,8 @@ RECIPE: Final = (
 )
 
 _FORMS: Final = (
-    "give (n,) or (n, values) numbers, or pictures as (n, height, width), or (n, height, width, 3) "
-    "in colours"
+    "use (n,) or (n, values) for numbers, (n, height, width) for grey images, or "
+    "(n, height, width, 3) for images in colour"
 )
 
 
@@ -52,7 +52,7 @@ def streams(
     arrays = load_numbers(path)
     chosen = [name for name in arrays if not options.topics or fits_topic(name, options.topics)]
     if not chosen:
-        raise NoTopicError(f"{path}: it has the arrays {', '.join(arrays)}: name of these")
+        raise NoTopicError(f"{path}: no such array; choose of {', '.join(arrays)} with --topic")
     try:
         return array_streams({name: arrays[name] for name in chosen}, options, path)
     except UsageError as error:
@@ -75,7 +75,7 @@ def array_streams(
         UsageError: an array has another form, or holds numbers that are not finite.
     """
     if not arrays:
-        raise UsageError("no array given: name one at least")
+        raise UsageError("no array is given: give at least one")
     opened_streams = []
     for name, given in arrays.items():
         array = _checked(str(name), given)
@@ -106,13 +106,13 @@ def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
             return {path.stem: np.lib.format.open_memmap(path, mode="r")}
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             if sum(member.file_size for member in stored.zip.infolist()) > BUDGET:
-                raise UsageError(f"{path}: more than {BUDGET >> 20} MiB of arrays: save it as .npy")
+                raise UsageError(f"{path}: the arrays exceed {BUDGET >> 20} MiB: save each as .npy")
             arrays = {name: stored[name] for name in stored.files}
     except NOT_ARRAYS as error:  # NumPy would advise to run what the file holds
-        why = "Python objects, or something else" if "pickle" in str(error) else one_line(error)
-        raise LogDamagedError(f"{path} is no file of NumPy's arrays: {why}") from error
+        why = "it has Python objects or other data" if "pickle" in str(error) else one_line(error)
+        raise LogDamagedError(f"{path} is not a file of NumPy arrays: {why}") from error
     if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
-        raise LogDamagedError(f"{path} is no file of NumPy's arrays: it holds none")
+        raise LogDamagedError(f"{path} is not a file of NumPy arrays: it has none")
     return arrays
 
 
@@ -163,19 +163,22 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
         array = array[..., 0] if array.shape[3] == 1 else array[..., :3]
     images = array.ndim == 3 or (array.ndim == 4 and array.shape[3] == 3)
     if array.dtype.kind not in "biuf" or not (images or array.ndim == 2) or not array.size:
-        hint = "; np.moveaxis(x, 1, -1) moves colours last" if array.ndim == 4 else ""
-        raise UsageError(f"{name}: an array {array.shape} of {array.dtype}: {_FORMS}{hint}")
+        hint = "; np.moveaxis(x, 1, -1) moves the colours to the end" if array.ndim == 4 else ""
+        raise UsageError(
+            f"{name}: shape {array.shape} of {array.dtype} is not supported: {_FORMS}{hint}"
+        )
     high = 1 if array.dtype.kind == "f" else 255
     finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
     if not finite.all():
         row, count = int(np.argmin(finite)), int((~finite).sum())
         raise UsageError(
-            f"{name}: row {row}, counted from 0, holds NaN or infinity, {count} of {len(array)} do"
+            f"{name}: {count} of {len(array)} rows have NaN or infinity, the first is row {row} "
+            "(from 0): remove them"
         )
     scaled = array.dtype in (np.uint8, np.uint16, np.bool_)
     if images and not scaled and not 0 <= array.min() <= array.max() <= high:
         raise UsageError(
-            f"{name}: pictures of {array.dtype} hold {array.min():g} to {array.max():g}: scale "
-            f"them to 0 to {high}, or give rows of numbers, as x.reshape(len(x), -1)"
+            f"{name}: images of {array.dtype} range from {array.min():g} to {array.max():g}: scale "
+            f"them to 0 to {high}, or give rows of numbers as x.reshape(len(x), -1)"
         )
     return array.astype(array.dtype.newbyteorder("="), copy=False)

@@ -92,7 +92,7 @@ class Bag(NamedTuple):
                 following += 1
             if not isinstance(data, bytes):  # SQLite keeps anything in any column
                 at = f"{self.path}: {topic} at {times[row]} ns"
-                raise LogDamagedError(f"{at}: the message has no bytes")
+                raise LogDamagedError(f"{at}: the message is not stored as bytes")
             return data
 
         return fetch
@@ -117,7 +117,7 @@ def streams(
             times = np.array([stamp for _, stamp in bag.stamps([topic])], np.int64)
         if (times[1:] < times[:-1]).any():
             raise LogDamagedError(
-                f"{path}: its messages are not in the order of time; convert it to MCAP"
+                f"{path}: its messages are not in order of time; convert it to MCAP first"
             )
         fetch = bag.fetcher(topic, times)
         about = {"program": "rosbags", "remarks": [_remark(path)]}
@@ -160,7 +160,7 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
 
 
 def _remark(path: Path) -> str:
-    return f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"
+    return f"{path}: a ROS bag has no checksums, so damaged pixels cannot be detected"
 
 
 @contextlib.contextmanager
@@ -171,7 +171,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         from rosbags.rosbag2 import Reader as Rosbag2
     except ImportError:
         raise CdmisfaError(
-            f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
+            f"{path} is a ROS bag: reading it needs rosbags; pip install 'cdmisfa[ros]'"
         ) from None
     ros1 = path.suffix == ".bag" and path.is_file()
     with _parts(path) as parts, ExitStack() as opened:
@@ -206,8 +206,8 @@ def _parts(path: Path) -> Iterator[Sequence[Path]]:
         packed, storage = info.get("compression_mode"), str(info["storage_identifier"])
     if storage != "sqlite3":
         raise LogDamagedError(
-            f"{path}: files of {storage[:40]} are read if they are MCAP and called .mcap: "
-            "unpack them with zstd -d"
+            f"{path}: storage {storage[:40]} is supported only as .mcap files: unpack them with "
+            "zstd -d"
         )
     for file in files:
         check_regular(file)
@@ -234,7 +234,7 @@ def _unpacked(packed: Path, folder: Path) -> Path:
             out.write(part)
             if out.tell() > most:
                 raise LogDamagedError(
-                    f"{packed} unpacks to more than {most} bytes, the limit: unpack it with "
-                    f"zstd -d, and take compression_mode out of {METADATA}"
+                    f"{packed} unpacks to more than the limit of {most} bytes: unpack it with "
+                    f"zstd -d, and remove compression_mode from {METADATA}"
                 )
     return target

@@ -49,11 +49,11 @@ def extent_of(path: Path) -> Extent:
 
 
 def _ended(what: str, stop: int, size: int) -> Extent:
-    return Extent(f"the file ends at byte {size}, {what} would at byte {stop}")
+    return Extent(f"the file ends at byte {size}, but {what} ends at byte {stop}")
 
 
 def _zeros(at: int) -> Extent:
-    return Extent(f"it holds zeros at byte {at}, where a part of it would begin")
+    return Extent(f"it has zeros at byte {at}, where its next part should begin")
 
 
 def _at(file: BinaryIO, place: int, count: int) -> bytes:
@@ -68,8 +68,8 @@ _FIRST_BOXES: Final = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"p
 
 
 _NO_INDEX: Final = (
-    "its index (moov), which is written last, is not all there, and no frame is read without: "
-    "tools like untrunc make one by that of a whole video of the same camera"
+    "its index (moov), which cameras write last, is incomplete, so no frame can be read: "
+    "restore it with untrunc and an intact video of the same camera"
 )
 
 
@@ -112,7 +112,7 @@ def _elements(file: BinaryIO, size: int) -> Extent:
         body = at + more + width
         holds = kind in (_SEGMENT, _CLUSTER)
         if unknown and not holds:
-            return Extent(f"it holds no length of its part at byte {at}")
+            return Extent(f"its part at byte {at} has no length")
         if not unknown and body + length > size:
             return _ended(_NAMES.get(kind, "a part"), body + length, size)
         if kind == _SEGMENT:

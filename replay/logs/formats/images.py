@@ -32,7 +32,7 @@ def streams(
     files = image_files(path)
     endings = {file.suffix.lower()[1:] for file in files}
 
-    remark = f"{path}: a JPEG has no checksums, damaged pixels may go unnoticed"
+    remark = f"{path}: JPEG has no checksums, so damaged pixels may be undetected"
     stream = LogStream(
         path=path,
         topic=topic,

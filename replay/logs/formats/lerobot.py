@@ -56,7 +56,7 @@ class Dataset:
     def notes(self, what: str) -> list[str]:
         """Return the warning that episodes are joined, if there are several."""
         many = len(self.rows)
-        note = f"{self.path}: {what} is of {many} episodes, with pauses between"
+        note = f"{self.path}: {what} has {many} episodes, with gaps between them"
         return [note] if many > 1 else []
 
 
@@ -74,7 +74,7 @@ def streams(
     cameras = features(path)[1]
     chosen = [c for c in cameras if not options.topics or fits_topic(c, options.topics)]
     if not chosen or (not options.topics and len(chosen) > 1):
-        wrong = f"no topic {', '.join(options.topics)}" if options.topics else "name one --topic"
+        wrong = f"no topic {', '.join(options.topics)}" if options.topics else "choose a --topic"
         raise NoTopicError(f"{path}: {wrong}; it has images on: {', '.join(cameras) or 'none'}")
     opened_streams = []
     for topic in chosen:
@@ -128,7 +128,7 @@ class _Camera:
         if self._file != file:
             self.close()
             if not file.is_file():
-                raise LogDamagedError(f"{file}: there is no such file, its dataset names it")
+                raise LogDamagedError(f"{file}: this file of the dataset is missing")
             self._images = self._table(file) if not self.video else VideoFile(file, self._color)
             self._file = file
         if not self.video:
@@ -169,7 +169,7 @@ class _Camera:
         value = table[self._topic][row].as_py() if 0 <= row < table.num_rows else None
         data = value.get("bytes") if isinstance(value, Mapping) else None
         if not isinstance(data, bytes):
-            raise MalformedRecord("its table holds no picture there")
+            raise MalformedRecord("its table has no image there")
         return data
 
 
@@ -179,11 +179,11 @@ def _numbers(path: Path, options: InputOptions) -> LogStream:
     check_topics(path, topic, options.topics)
     known = features(path)[0]
     if absent := [name for name in names if name not in known]:
-        raise UsageError(f"{path}: no numbers {absent[0]}; it has {', '.join(known)}")
+        raise UsageError(f"{path}: no field {absent[0]}; choose of {', '.join(known)}")
     dataset = Dataset(path, ["dataset_from_index"])
     files = sorted((path / "data").rglob("*.parquet"))
     if not files:
-        raise LogDamagedError(f"{path}: there is no table of its frames")
+        raise LogDamagedError(f"{path}: the tables of frames (data/*.parquet) are missing")
     numbers = np.concatenate([_columns(file, names) for file in files])
     with limited(path, "LeRobot's layout", held=numbers.nbytes):
         starts = dataset.starts
@@ -224,7 +224,7 @@ def _columns(file: Path, names: Sequence[str]) -> FloatArray:
 
     check_regular(file)
     columns = []
-    with limited(file, "PyArrow", remedy="take fewer, with --field"):
+    with limited(file, "PyArrow", remedy="choose fewer fields with --field"):
         table = pq.ParquetFile(file).read(columns=list(names), use_threads=False)
         for name in names:
             column = table[name].combine_chunks()
@@ -237,16 +237,16 @@ def _columns(file: Path, names: Sequence[str]) -> FloatArray:
 
 def _info(path: Path) -> Any:
     with explained(path / INFO, "LeRobot's layout"):
-        info = read_json(path / INFO, "it describes no LeRobot dataset")
+        info = read_json(path / INFO, "it does not describe a LeRobot dataset")
         version = str(info["codebase_version"])
         if not version.startswith("v3"):
             raise UsageError(
-                f"{path} is a LeRobot dataset {version}, v3.0 is read: convert it with LeRobot's "
-                "convert_dataset_v21_to_v30"
+                f"{path} is a LeRobot dataset {version}, but v3.0 is needed: convert it with "
+                "LeRobot's convert_dataset_v21_to_v30"
             )
         dicts = all(isinstance(feature, dict) for feature in info["features"].values())
         if not (dicts and info["fps"] > 0 and int(info["total_frames"]) >= 0):
-            raise LogDamagedError(f"{path / INFO}: it describes no LeRobot dataset")
+            raise LogDamagedError(f"{path / INFO}: it does not describe a LeRobot dataset")
         return info
 
 
@@ -257,7 +257,9 @@ def _episodes(path: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     files = sorted((path / "meta" / "episodes").rglob("*.parquet"))
     if not files:
-        raise LogDamagedError(f"{path}: there is no table of its episodes")
+        raise LogDamagedError(
+            f"{path}: the tables of episodes (meta/episodes/*.parquet) are missing"
+        )
     for file in files:
         check_regular(file)
         with limited(file, "PyArrow"):

@@ -52,8 +52,10 @@ def streams(
     opened_streams = []
     for topic, kind, members in choose_topics(path, channels, options):
         messages, parts = Messages(members, expected), len({reader for reader, _ in members})
-        joined = [f"{path}: {topic} is joined from {parts} logs, by time"] if parts > 1 else []
-        left_out = [f"{error}: left out" for error in empty]
+        joined = (
+            [f"{path}: {topic} is joined from {parts} logs in order of time"] if parts > 1 else []
+        )
+        left_out = [f"{error}: skipped" for error in empty]
         stream = message_stream(
             path,
             topic,
@@ -116,13 +118,13 @@ class Messages:
             self._expect(reader)
         table = reader.table(segment)
         if table is None:
-            raise MalformedRecord("it is damaged")
+            raise MalformedRecord("the message is damaged")
         if number != self._now[0]:
             self._now = number, _rows_of(table, self._channels[reader])
             self._bytes = table.data.nbytes
         own, place = self._now[1], int(self._row_in[row])
         if place >= len(own) or int(table.log_time[own[place]]) != int(self.times[row]):
-            raise MalformedRecord("its chunk holds other messages than the summary names")
+            raise MalformedRecord("its chunk has other messages than the summary states")
         return table.view(int(own[place]))
 
     def held(self) -> int:
@@ -167,7 +169,7 @@ def refuse_empty(reader: LogReader) -> None:
     """Refuse a log that was cut before its first message."""
     has_messages = reader.channels and any(segment.size for segment in reader.segments)
     if not reader.complete and not has_messages:
-        raise NothingLoggedError(f"{reader.path}: {reader.missing}: there is no message before")
+        raise NothingLoggedError(f"{reader.path}: {reader.missing}, before the first message")
 
 
 def topics_in(reader: LogReader) -> list[str]:

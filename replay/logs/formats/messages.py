@@ -43,7 +43,7 @@ def fits_topic(name: str, topics: Sequence[str]) -> bool:
 def check_topics(path: Path, name: str, topics: Sequence[str]) -> None:
     """Refuse topics of a log that has none, unless one is its name; a `NoTopicError`."""
     if topics and not fits_topic(name, topics):
-        raise NoTopicError(f"{path}: it has no topics, leave {', '.join(topics)} out")
+        raise NoTopicError(f"{path}: this format has no topics; remove --topic {', '.join(topics)}")
 
 
 def choose_topics(
@@ -80,7 +80,7 @@ def choose_topics(
         raise NoTopicError(f"{path}: {_why_none(readable, others, options)}")
     if mixed := next((topic for topic in chosen if len(readable[topic]) > 1), None):
         listed = ", ".join(f"{kind.schema} in {kind.encoding}" for kind in readable[mixed])
-        raise UsageError(f"{path}: {mixed} holds messages of several kinds: {listed}")
+        raise UsageError(f"{path}: {mixed} has messages of several types: {listed}")
     return [(topic, *next(iter(readable[topic].values()))) for topic in chosen]
 
 
@@ -89,12 +89,12 @@ def _why_none(readable: Iterable[str], others: Mapping[str, str], options: Input
     what = "messages with fields" if options.fields else "images"
     if not readable and not any(topic in others for topic in options.topics):
         if options.fields:
-            return "it holds no messages whose fields are known"
-        return "it holds no images; numbers are taken with --field"
-    wrong = "name one --topic or more"
+            return "it has no messages with known fields"
+        return "it has no images; for numbers use --field"
+    wrong = "choose one --topic or more"
     if topics := ", ".join(options.topics):
         kind = next((others[topic] for topic in options.topics if topic in others), "")
-        images = f"{topics} holds {kind}, which is no image that is read ({', '.join(SCHEMAS)})"
+        images = f"{topics} has {kind}, which is not a supported image ({', '.join(SCHEMAS)})"
         wrong = images if kind and not options.fields else f"no topic {topics}"
     return f"{wrong}; it has {what} on: {', '.join(sorted(readable)) or 'none'}"
 
@@ -161,7 +161,7 @@ def by_stamps(stream: LogStream) -> LogStream:
             raise LogDamagedError(f"{stream.name_of(row)}: {error}") from None
     if stream.stamp is None or (len(stamps) > 1 and stamps.min() == stamps.max()):
         raise UsageError(
-            f"{stream.path}: no headers on {stream.topic} state times: leave out "
+            f"{stream.path}: the headers on {stream.topic} have no times: remove "
             "--set input.stamp=header"
         )
     order = np.argsort(stamps, kind="stable")
@@ -187,14 +187,14 @@ class _Video:
         rows = range(messages.count)
         self._first = first = next((row for row in rows if self._begins(row)), messages.count)
         if first == messages.count:
-            why = "each picture of its video needs earlier ones"
+            why = "the video has no key frame, so no image can be decoded"
             try:
                 messages.taken(0, self._packets.begins)
             except (MalformedImage, MalformedRecord) as error:
                 why = str(error)
             raise UsageError(f"{messages.path}: {messages.topic}: {why}")
         stamp = messages.stamp
-        lost = f"{messages.path}: {first} pictures that need earlier ones are left out"
+        lost = f"{messages.path}: {first} images before the first key frame are skipped"
         video = replace(
             messages,
             fetch=int,

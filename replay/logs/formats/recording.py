@@ -76,7 +76,7 @@ class ViewFile:
         try:
             records = [m for m in self.reader.metadata if m.name == RECORDING_METADATA]
             if len(records) != 1:
-                raise NoRecordingError(f"{path}: no recording of cdmisfa")
+                raise NoRecordingError(f"{path}: not a recording of cdmisfa")
             self.facts = facts = ViewMetadata.parse(path, records[0].metadata)
             schema = IMAGE_SCHEMA if facts.spec.images else VECTOR_SCHEMA
             self._channels = [self._channel("a frame", view_topic(facts.view), schema)]
@@ -149,12 +149,12 @@ class ViewFile:
     def _channel(self, what: str, topic: str, schema: str) -> _ChannelRows:
         channels = [c for c in self.reader.channels.values() if c.topic == topic]
         if not channels and self.reader.missing:
-            raise LogDamagedError(f"{self.path}: {self.reader.missing}: there is no message before")
+            raise LogDamagedError(f"{self.path}: {self.reader.missing}, before the first message")
         known = [self.reader.schemas.get(c.schema_id) for c in channels]
         protobuf = [c.message_encoding == "protobuf" for c in channels]
         if protobuf != [True] or known[0] is None or known[0].name != schema:
             raise LogDamagedError(
-                f"{self.path}: {topic} is not one channel of {schema} in protobuf"
+                f"{self.path}: {topic} must be one protobuf channel of {schema}, and is not"
             )
         return _ChannelRows(what, self.reader, channels[0], self.facts)
 
@@ -168,7 +168,9 @@ class ViewFile:
                 image = RawImage.FromString(frames.payload(frames.ranges[0].start))
             stated = image.height, image.width, image.step, image.encoding
             if stated != (*facts.frame_shape, facts.frame_shape[1], IMAGE_ENCODING):
-                raise LogDamagedError(f"{self.path}: its frames are not as its metadata states")
+                raise LogDamagedError(
+                    f"{self.path}: its frames differ from its metadata in size or encoding"
+                )
             payload = image_payload(image.height, image.width, image.frame_id)
         else:
             frames.payload(frames.ranges[0].start)
@@ -284,7 +286,7 @@ class _ChannelRows:
         table, channel, rows = self._table(number), self._channel.id, (low, low + n)
         if gather(table.data, table.records, channel, rows, self.layout, out) is None:
             where = f"{self._reader.path}: {self.segments[number].name}"
-            raise LogDamagedError(f"{where}: {self._what} is laid out unlike the others")
+            raise LogDamagedError(f"{where}: {self._what} has another layout than the others")
 
     def _count_messages(self, segment: Segment) -> bool:
         """Count the channel's messages in the next chunk of the file; whether it has any."""
@@ -309,9 +311,9 @@ class _ChannelRows:
         if len(wrong):
             at = int(wrong[0])
             raise LogDamagedError(
-                f"{self._reader.path}: {self._channel.topic}: after frame "
-                f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
-                f"{frames[at]}: frames are missing or doubled; run cdmisfa recover"
+                f"{self._reader.path}: {self._channel.topic}: frame "
+                f"{int(frames[at]) - int(steps[at])} is followed by log time {times[at]} ns, frame "
+                f"{frames[at]}: frames are missing or duplicated; run cdmisfa recover"
             )
         edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
         for low, high in itertools.pairwise(edges):
@@ -343,8 +345,8 @@ class _ChannelRows:
         (row, stop), first = self.starts[number : number + 2], self._facts.first_frame
         if len(times) != stop - row:
             raise LogDamagedError(
-                f"{path}: {segment.name} holds {len(times)} messages of {self._channel.topic!r}, "
-                f"its index says {stop - row}; run cdmisfa recover"
+                f"{path}: {segment.name} has {len(times)} messages of {self._channel.topic!r}, but "
+                f"its index states {stop - row}; run cdmisfa recover"
             )
         expected = self._facts.times(np.arange(first + row, first + stop))
         if self._trusted and (times != expected).any():  # raises an error that names the frame

@@ -62,8 +62,8 @@ def streams(
     )
     if not fields or not table.num_rows:
         kinds = ", ".join(f"{name} of {table[name].type}" for name in table.column_names[:20])
-        raise UsageError(f"{path}: it has no column of numbers with rows, but {kinds}")
-    with limited(path, "PyArrow", remedy="take fewer columns, with --field"):
+        raise UsageError(f"{path}: no column has numbers; its columns are {kinds}")
+    with limited(path, "PyArrow", remedy="choose fewer columns with --field"):
         columns = [_column(path, table, name) for name in fields]
     numbers = dict(zip(fields, columns, strict=True))
 
@@ -103,22 +103,22 @@ def number_stream(
     first = where(int(np.argmin(whole)))
     if not whole.any() or (times is None and not whole.all()):
         raise UsageError(
-            f"{first} lacks a finite number of {', '.join(columns)}: name the column of times with "
-            "--set input.time=COLUMN, so that such rows can be left out, or fewer with --field"
+            f"{first} has no finite number in {', '.join(columns)}: to skip such rows, set the "
+            "column of times with --set input.time=COLUMN, or choose columns with --field"
         )
     rows, lines = np.flatnonzero(whole), []
     if left_out := len(whole) - len(rows):
         lines.append(
-            f"{left_out} of {len(whole)} rows lack a finite number or their time and are left "
-            f"out, the first is {first.removeprefix(f'{path}: ')}"
+            f"{left_out} of {len(whole)} rows have no finite number or no time and are skipped, "
+            f"the first is {first.removeprefix(f'{path}: ')}"
         )
     if times is not None:
         if late := int((times[rows] < np.maximum.accumulate(times[rows])).sum()):
-            lines.append(f"{late} rows are after later ones: they are sorted by their times")
+            lines.append(f"{late} rows are out of order: rows are sorted by time")
         rows = rows[np.argsort(times[rows], kind="stable")]
     frames = bounded(numbers, options.range)[rows]
     if (np.abs(frames) > EXACT).any():
-        lines.append("numbers beyond 2^53 may be rounded, to float64")
+        lines.append("numbers above 2^53 may be rounded to float64")
     return LogStream(
         path=path,
         topic=topic,
@@ -135,7 +135,7 @@ def number_stream(
 def table_channels(path: Path) -> list[ExternalChannel]:
     """Return the columns of a table; raises as `streams`."""
     table, kind, channels = _read(path), path.suffix[1:], []
-    remarks = (f"{path}: a table has no checksums, changed numbers would go unnoticed",)
+    remarks = (f"{path}: a table has no checksums, so changed numbers cannot be detected",)
     for name, column in zip(table.column_names, table.columns, strict=True):
         info = ChannelInfo(name, kind, str(column.type), len(column) - column.null_count)
         channels.append(ExternalChannel(info, images=False, remarks=remarks))
@@ -150,7 +150,7 @@ def _read(path: Path) -> Any:
         LogDamagedError: PyArrow cannot read it.
     """
     check_regular(path, MAX_BYTES)
-    with limited(path, "PyArrow", remedy="write fewer columns or rows into a file"):
+    with limited(path, "PyArrow", remedy="split the file into fewer columns or rows"):
         if path.suffix.lower() == ".csv":
             table = _read_csv(path)
         else:
@@ -159,11 +159,9 @@ def _read(path: Path) -> Any:
             table = parquet.ParquetFile(path).read()
         names = table.column_names  # not UTF-8 in some files
     if table.num_rows > max(MAX_ROWS, path.stat().st_size):
-        raise LogDamagedError(f"{path}: {table.num_rows} rows are too many for its few bytes")
+        raise LogDamagedError(f"{path}: {table.num_rows} rows are too many for a file of its size")
     if len(set(names)) < len(names) or all(re.match(_NUMBER, name) for name in names):
-        raise UsageError(
-            f"{path}: its first line must have the names of the columns, each another, not numbers"
-        )
+        raise UsageError(f"{path}: the first line must have unique column names, not numbers")
     return table
 
 
@@ -234,7 +232,7 @@ def _column(path: Path, table: Any, name: str) -> FloatArray:
     sizes = {len(row) for row in rows if row is not None}
     if len(sizes) != 1:
         counts = " or ".join(map(str, sorted(sizes))) or "no"
-        raise UsageError(f"{path}: {name} holds {counts} numbers in a row: choose a part of it")
+        raise UsageError(f"{path}: {name} has {counts} numbers in a row: choose one, as {name}[0]")
     (size,) = sizes
     return np.array([[np.nan] * size if row is None else row for row in rows], np.float64)
 
@@ -262,9 +260,8 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, 
     known = np.isfinite(rough)
     if not known.any() or (rough[known] < 0).any() or (rough[known] >= LAST_NS).any():
         raise UsageError(
-            f"{path}: {name}, of {table[name].type}, holds no times since 1970, dates or numbers "
-            f"counted in {unit}: say what they count ({', '.join(UNITS)}), as --set "
-            f"input.time={name}:ns"
+            f"{path}: {name} ({table[name].type}) has no times after 1970, as dates or in {unit}: "
+            f"state the unit ({', '.join(UNITS)}), as in --set input.time={name}:ns"
         )
     if kinds.is_floating(column.type):
         exact = np.round(np.where(known, rough, -1.0)).astype(np.int64)
@@ -275,6 +272,6 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, 
 
 def _no_column(path: Path, table: Any, name: str) -> UsageError:
     return UsageError(
-        f"{path}: there is no column {name}; it has {', '.join(table.column_names[:20])}; times "
-        f"may have a unit ({', '.join(UNITS)}), as --set input.time=COLUMN:ns"
+        f"{path}: no column {name}; it has {', '.join(table.column_names[:20])}; a column of times "
+        f"may have a unit ({', '.join(UNITS)}), as in --set input.time=COLUMN:ns"
     )

@@ -103,19 +103,21 @@ class VideoFile:
             raise
         self.held = data_bytes() - before
         self.warnings = [self.missing] if self.missing else []
-        self.remarks = ["a video has no checksums, damaged pixels may go unnoticed"]
+        self.remarks = ["a video has no checksums, so damaged pixels may be undetected"]
         if not self.missing and not extent.stated:
-            self.remarks.append("it does not state where it ends, a missing end would go unnoticed")
+            self.remarks.append("it does not state its length, so a missing end cannot be detected")
         last = int(self.times[-1]) / NANOSECONDS
         stated = (self._container.duration or 0) / self._av.time_base
         if stated > last + 1:
-            self.warnings.append(f"it states {stated:g} s, its last frame is at {last:g} s")
+            self.warnings.append(
+                f"its stated length is {stated:g} s, but its last frame is at {last:g} s"
+            )
 
     def _open(self) -> None:
         """Find the times of all frames, without decoding one."""
         videos = self._container.streams.video
         if not videos or videos[0].codec_context is None:
-            raise LogDamagedError(f"{self.path}: there is no video in it")
+            raise LogDamagedError(f"{self.path}: the file has no video stream")
         self._stream = stream = videos[0]
         stream.thread_type = "NONE"
         context = stream.codec_context
@@ -123,7 +125,7 @@ class VideoFile:
         context.options = {"err_detect": "explode"}  # rather than made up pixels
         if not 0 < context.width * context.height <= MAX_PIXELS:
             size = f"{context.width}x{context.height}"
-            raise LogDamagedError(f"{self.path}: images of {size} are not read")
+            raise LogDamagedError(f"{self.path}: images of {size} pixels are not supported")
         self.encoding = str(context.name)
         container = self._container.format.name
         self._unsure = container in _UNSURE
@@ -138,17 +140,17 @@ class VideoFile:
         waits = container in _UNTIMED and context.name in ("h264", "hevc") and context.has_b_frames
         if not timed or (waits and (np.diff(stamps) >= 0).all()):
             raise UsageError(
-                f"{self.path}: its frames have no times; copy it into an .mp4 file with some "
-                "(ffmpeg -fflags +genpts -i ... -c copy)"
+                f"{self.path}: its frames have no times; add them with "
+                "ffmpeg -fflags +genpts -i INPUT -c copy OUTPUT.mp4"
             )
         if self.missing and stamps:
             self._cut = stamps.pop()
         if not stamps:
             why = f", cut short: {self.missing}" if self.missing else ""
-            raise LogDamagedError(f"{self.path}: there is no frame in it{why}")
+            raise LogDamagedError(f"{self.path}: the video has no frames{why}")
         self.stamps = np.sort(np.array(stamps, np.int64))
         if (np.diff(self.stamps) == 0).any():
-            raise LogDamagedError(f"{self.path}: two of its frames have the same time")
+            raise LogDamagedError(f"{self.path}: two frames have the same time")
         # From the video's beginning, or its first frame if that is before.
         first = min(int(self.stamps[0]), 0)
         exact = (round((int(stamp) - first) * self.tick * NANOSECONDS) for stamp in self.stamps)

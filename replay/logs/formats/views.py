@@ -89,7 +89,9 @@ def _arrange(views: Sequence[ViewFile], *, skip_damaged: bool) -> list[list[View
         by_view.setdefault((view.facts.stream_index, view.facts.view), []).append(view)
     indexes, names = zip(*by_view, strict=True)
     if len(set(indexes)) < len(indexes) or len(set(names)) < len(names):
-        raise _unfit(views, views[0], "its files are not of one recording: two are one stream")
+        raise _unfit(
+            views, views[0], "two files have the same stream: they are of different recordings"
+        )
     first = views[0]
     for view in views[1:]:
         differ = [k for k in _SAME if getattr(first.facts, k) != getattr(view.facts, k)]
@@ -103,8 +105,8 @@ def _arrange(views: Sequence[ViewFile], *, skip_damaged: bool) -> list[list[View
             end = one.ranges[-1][1] if one.ranges else one.facts.first_frame
             begins = two.facts.first_frame
             if end > begins or (end < begins and not skip_damaged):
-                what = f"begins at frame {begins}, {one.path.name} ends before {end}"
-                raise _unfit(views, two, f"{what}: a part is missing or doubled")
+                what = f"begins at frame {begins}, but {one.path.name} ends before frame {end}"
+                raise _unfit(views, two, f"{what}: a part is missing or duplicated")
         arranged.append(parts)
     return arranged
 
@@ -114,12 +116,10 @@ def _unfit(views: Sequence[ViewFile], view: ViewFile, what: str) -> CdmisfaError
     folders = list(dict.fromkeys(str(view.path.parent) for view in views))
     if len(folders) < 2:
         return LogDamagedError(f"{view.path}: {what}")
-    refused = f"{folders[0]} and {folders[1]} are recordings of their own: name one of them"
+    refused = f"{folders[0]} and {folders[1]} are different recordings: give one of them"
     if not views[0].facts.spec.images:
         return UsageError(refused)
-    return SeveralRecordingsError(
-        f"{refused}, or put their streams on one clock with --align index"
-    )
+    return SeveralRecordingsError(f"{refused}, or align their streams with --align index")
 
 
 def only_begun(path: Path) -> bool:
