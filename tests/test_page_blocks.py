@@ -17,10 +17,7 @@ import pytest
 from conftest import Cdmisfa
 
 ROOT = Path(__file__).parents[1]
-# Pages that are about to be replaced.
-OLD = "tour"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PAGES = [page for page in PAGES if page.stem not in OLD.split() or page.parent.name != "how-to"]
 PAGES = [page for page in PAGES if page.parent.name not in ("explanation", "results")]
 BLOCK = re.compile(r"^```(console|sh|python|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
