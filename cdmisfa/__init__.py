@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-# The module of each public name. It is imported on first use, so that commands start quickly.
+# Module of each public name; it is imported on first use, so that commands start quickly.
 _MODULES = {
     "CdmisfaError": "cdmisfa.core.errors",
     "Sink": "cdmisfa.core.learning",
@@ -67,7 +67,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-# The package `recorder` or `replay` of another project may hide ours, or lie over it.
+# A package `recorder` or `replay` of another project may be found first, or be mixed with ours.
 _HOME = os.path.dirname(os.path.dirname(__file__))
 for _name in ("recorder", "replay"):
     if _spec := find_spec(_name):
@@ -77,5 +77,6 @@ for _name in ("recorder", "replay"):
                 _ours = b"cdmisfa" in _file.read()
         if not _ours:
             raise ImportError(
-                f"{_name} is not cdmisfa's: {_spec.origin}; give cdmisfa an environment of its own"
+                f"{_name} is a package of another project: {_spec.origin}: install cdmisfa in an "
+                "environment of its own"
             )

@@ -1,4 +1,4 @@
-"""A module: an abstraction that was learned, saved and frozen."""
+"""`Module`: slow features that a run learned and saved; `Stack`: several of them at once."""
 
 from __future__ import annotations
 
@@ -17,37 +17,38 @@ from cdmisfa.core.blocks import PIXEL, UINT8, Described
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, expanded_size
 
-if TYPE_CHECKING:  # the mind knows no images: who saves a module adds how they became frames
+if TYPE_CHECKING:  # learners must not import image code; who saves a module adds its recipe
     from recorder.images.framing import Recipe
 
-# Frames that are expanded at once: as few as to stay in the processor's cache.
+# Frames that are expanded at once, few enough to stay in the processor's cache. It changes the
+# speed only.
 CHUNK = 1024
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Module(Described):
-    """A frozen abstraction with the policy that led to it.
+    """Slow features that are saved and no longer change.
 
     Attributes:
-        index: order of learning, from 1.
-        stream: name of the stream that was watched when it was saved.
-        stream_index: that stream, from 0.
-        iteration: iteration at whose end it was saved.
-        phi: (J, I) weights; y = phi (x - mean), x after scaling and expansion.
+        index: number of the module, from 1.
+        stream: name of the stream from which it was saved.
+        stream_index: index of that stream, from 0.
+        iteration: iteration after which it was saved.
+        phi: (J, I) weights; y = phi (x - mean), where x is a frame after scaling and expansion.
         mean: (I,) mean of the input.
-        band_mean: (J,) running mean of eta_inst; centre of the novelty band.
-        band_sd: (J,) running standard deviation of eta_inst.
-        eta: (J,) slowness of each output when saved, cycles per frame.
-        policy: (S,) 0 stay, 1 switch, for each stream.
-        centres: (S, C, tau, J) centres of the clusters; empty but for CD-MISFA 1.0.
-        counts: (S, C) what each centre has seen; empty but for CD-MISFA 1.0.
-        expansion: how its input was expanded.
-        scale: what one step of a uint8 counts: 1/255, or 1 where it learned from values.
-        frame_shape: of the frames it learned from, (height, width) or (values,); empty where that
-            is not known, of a module made by hand.
-        slow: (J,) 1 where an output is slow on frames that it had not learned from, 0 where it is
-            not; empty but for the progress learner.
-        recipe: what became of a raw picture before; None of a learner in memory.
+        band_mean: (J,) running mean of the slowness in a block (cycles a frame).
+        band_sd: (J,) running standard deviation of it.
+        eta: (J,) slowness of each output when it was saved (cycles a frame).
+        policy: (S,) policy for each stream: 0 stay, 1 switch.
+        centres: (S, C, tau, J) cluster centres; empty except for CD-MISFA 1.0.
+        counts: (S, C) counts of the clusters; empty except for CD-MISFA 1.0.
+        expansion: expansion of the frames, a name in `EXPANSIONS`.
+        scale: value of one gray level: 1/255, or 1 if it learned from values.
+        frame_shape: shape of the frames, (height, width) or (values,); empty if unknown, for a
+            module that was not learned.
+        slow: (J,) 1 where an output is slow on frames that it had not learned from, else 0; empty
+            except for the progress learner.
+        recipe: how a raw image becomes a frame; None while the module is in a learner.
     """
 
     index: int
@@ -71,20 +72,20 @@ class Module(Described):
     def transform(
         self, frames: Any, outputs: int | slice | Sequence[int] | None = None
     ) -> NDArray[np.float64]:
-        """Return outputs on frames or raw images, y = phi (x - mean), the same bits everywhere.
+        """Return the outputs y = phi (x - mean) on frames or raw images, the same bits everywhere.
 
         Args:
-            frames: see `rows`; where the recipe centres episodes, one whole episode.
-            outputs: which of the outputs, from 0, the slowest first: the number of one, a slice, or
-                a list of some; all where it is not given.
+            frames: see `rows`; if the recipe centres episodes, give one whole episode.
+            outputs: indices of the outputs, the slowest first: a number, a slice or a list;
+                None: all.
 
         Returns:
-            (n, J), or as many columns as outputs were chosen, to the bit what the run that learned
-            it recorded as y_frozen.
+            (n, J), or one column for each chosen output; the same bits as the signal `y_frozen` of
+            the run.
 
         Raises:
-            UsageError: these are no frames as it learned from, or a value is no finite number.
-            IndexError: it has no such outputs.
+            UsageError: the frames have another shape or type, or a value is not finite.
+            IndexError: the module does not have such an output.
         """
         chosen = self.phi
         if outputs is not None:
@@ -99,27 +100,30 @@ class Module(Described):
         return np.ascontiguousarray(self.mean, np.float64)
 
     def rows(self, frames: Any, *, centre: bool = True) -> NDArray[Any]:
-        """Return frames or raw images as rows of what the module learned from, (n, values).
+        """Return frames or raw images as rows of the values that the module learned from.
 
         Args:
-            frames: (n, *frame_shape), or these as rows, uint8 or values, or a table. A module with
-                a recipe also takes images of any size as the source gave them; see `make_frame`.
-            centre: subtract the mean of the episode, where the recipe says so.
+            frames: (n, *frame_shape), or the same as rows, uint8 or float, or a table. A module
+                with a recipe also takes raw images of any size, see `make_frame`.
+            centre: True to subtract the mean of the episode if the recipe does so.
+
+        Returns:
+            (n, values).
 
         Raises:
-            UsageError: these are no frames as it learned from, or a value is no finite number.
+            UsageError: the frames have another shape or type, or a value is not finite.
         """
         array = as_array(frames if self.recipe is None else self._by_recipe(frames, centre))
-        own, shape = self.frame_shape, array.shape[1:]
-        if own:
-            fits = shape in (own, (prod(own),))
+        expected, shape = self.frame_shape, array.shape[1:]
+        if expected:
+            fits = shape in (expected, (prod(expected),))
         else:
             fits = expanded_size(self.expansion, prod(shape)) == self.phi.shape[1]
         if array.ndim < 2 or not fits or (array.dtype != UINT8 and array.dtype.kind != "f"):
-            wanted = ", ".join(map(str, own)) or "values"
+            sizes = ", ".join(map(str, expected)) or "values"
             raise UsageError(
-                f"frames of {array.dtype} {array.shape} given: give uint8 pixels or float values, "
-                f"(n, {wanted})"
+                f"frames are {array.dtype} {array.shape}: give uint8 pixels or float values, "
+                f"(n, {sizes})"
             )
         rows = array.reshape(len(array), prod(shape))
         if rows.dtype == UINT8:
@@ -127,31 +131,31 @@ class Module(Described):
         if not np.isfinite(rows).all():
             row, place = (int(indices[0]) for indices in np.nonzero(~np.isfinite(rows)))
             raise UsageError(
-                f"frame {row} holds {rows[row, place]} at place {place}, which is no finite "
-                "number: leave it out, or fill it in"
+                f"frame {row} holds {rows[row, place]} at index {place}, which is not finite: "
+                "leave the frame out, or fill the value in"
             )
         return rows.astype(np.float64)
 
-    def _by_recipe(self, given: Any, centre: bool) -> Any:
-        """Return frames from raw images; frames that the recipe made before stay as they are."""
-        recipe, own = self.recipe, self.frame_shape
+    def _by_recipe(self, data: Any, centre: bool) -> Any:
+        """Return frames from raw images; frames that the recipe made already do not change."""
+        recipe, expected = self.recipe, self.frame_shape
         assert recipe is not None
-        given = without_table(given)
-        shape = getattr(given, "shape", ())
+        data = without_table(data)
+        shape = getattr(data, "shape", ())
         if centre and recipe.centre != "run":
-            images = np.reshape(given, (-1, *own)) if shape[1:] == (prod(own),) else given
-            frames = recipe.frames(images)
+            rows = shape[1:] == (prod(expected),)
+            frames = recipe.frames(np.reshape(data, (-1, *expected)) if rows else data)
             return centred(frames, mean_of([frames])) if len(frames) else frames
         try:
-            array = np.asarray(given)
+            array = np.asarray(data)
         except ValueError:  # images of several sizes
-            return recipe.frames(given)
+            return recipe.frames(data)
         images = recipe.size is not None
         values = array.dtype == UINT8 or array.dtype.kind == "f"
         bounded = recipe.range is not None and not images and recipe.centre == "run"
-        made = array.shape[1:] in (own, (prod(own),)) or array.shape == own
-        if not made or not values or bounded:
-            return recipe.frames(array if array.dtype.kind in "biuf" else given)
+        framed = array.shape[1:] in (expected, (prod(expected),)) or array.shape == expected
+        if not framed or not values or bounded:
+            return recipe.frames(array if array.dtype.kind in "biuf" else data)
         if images and array.dtype.kind == "f" and (array > 1).any():
             raise UsageError(
                 f"frames of {array.dtype} hold {array.max():g}: scale them to 0 to 1, or give uint8"
@@ -171,35 +175,35 @@ class Module(Described):
 
 
 def columns_of(modules: Sequence[Module]) -> Iterator[tuple[Module, slice]]:
-    """Yield each module with its columns among the outputs of all."""
+    """Yield each module with the slice of its columns among the outputs of all modules."""
     ends = accumulate((len(module.phi) for module in modules), initial=0)
     for module, (low, high) in zip(modules, pairwise(ends), strict=True):
         yield module, slice(low, high)
 
 
 class Stack:
-    """Several modules of one run side by side, whose outputs are computed in one pass.
+    """Several modules of one run, whose outputs are computed in one pass.
 
     Args:
-        modules: at least one.
+        modules: at least one module.
 
     Attributes:
-        modules: the same.
+        modules: the modules.
     """
 
     def __init__(self, modules: Sequence[Module]) -> None:
         self.modules = tuple(modules)
-        self._phi = np.ascontiguousarray(np.concatenate([m.phi for m in modules]), np.float64)
-        each = [np.ascontiguousarray(m.phi, np.float64) for m in modules]
-        means = [kernels.mean_output(p, m._mean) for p, m in zip(each, modules, strict=True)]
+        weights = [np.ascontiguousarray(m.phi, np.float64) for m in modules]
+        self._phi = np.concatenate(weights)
+        means = [kernels.mean_output(p, m._mean) for p, m in zip(weights, modules, strict=True)]
         self._offset = np.concatenate(means)
 
     def transform(self, frames: Any) -> NDArray[np.float64]:
-        """Return the outputs of all modules side by side, (n, R), each to the bit its own.
+        """Return the outputs of all modules side by side, (n, R), equal to those of each module.
 
         Args:
-            frames: see `Module.rows`; without the mean of their episode, where the modules
-                learned from such.
+            frames: see `Module.rows`; without the mean of their episode if the modules learned
+                from centred frames.
         """
         rows = self.modules[0].rows(frames, centre=False)
         return _projected(rows, self.modules[0].expansion, self._phi, self._offset)

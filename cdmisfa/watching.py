@@ -1,4 +1,4 @@
-"""Learning as an environment of Gymnasium: actions are streams to watch, rewards are curiosity."""
+"""`WatchEnv`: a Gymnasium environment whose actions choose the stream that a learner attends to."""
 
 from __future__ import annotations
 
@@ -29,41 +29,42 @@ except ImportError:
 
 
 class WatchEnv(Env):
-    """A learner whose streams are chosen from outside.
+    """Learner whose next stream is chosen by the actions of an agent.
 
     A step is an iteration: the learner learns from a block of the stream that the action names. The
-    reward is the learner's own: the fall of the learning error with that block of the progress
-    learner, the paper's of 2.0 and 1.0; 0 where there is none. An episode is a run. It is
-    terminated when the learner ends by itself, and truncated after `max_iterations` or where the
-    source ends.
+    reward is the learner's own: for the progress learner the fall of the learning error with that
+    block, for 2.0 and 1.0 the reward of the paper; 0 if there is none. An episode is a run. It is
+    terminated when the learner ends, and truncated after `max_iterations` or at the end of the
+    source.
 
-    `info["stream"]` is what the learner itself would watch next. Actions that always follow it give
-    the signals of a run of the same learner, source and seed, to the bit.
+    `info["stream"]` is the stream that the learner itself would choose next. Actions that always
+    follow it give the signals of a run with the same learner, source and seed, bit for bit.
 
     Args:
-        source: an open source of frames; `close` closes it. Each episode begins where it is now,
-            or, with one that cannot go back, where the one before ended.
-        algorithm: the learner's name, "progress", "2.0" or "1.0".
-        observe: "block": the frames watched; "outputs": those of what is being learned there,
-            NaN as 0. Zeros before the first step.
-        max_iterations: steps of an episode at most.
-        settings: keys of the learner, `tau=20`; see docs/reference/configuration.md.
+        source: an open source of frames; `close` closes it. Each episode begins at its present
+            frame or, if the source cannot go back, where the previous episode ended.
+        algorithm: name of the learner, "progress", "2.0" or "1.0".
+        observe: "block" to observe the frames, "outputs" to observe the outputs of the features
+            being learned, with 0 for NaN. The first observation is all zeros.
+        max_iterations: largest number of steps in an episode.
+        settings: configuration keys of the learner, such as `tau=20`.
 
     Attributes:
-        action_space: the streams' indices.
+        action_space: indices of the streams.
         observation_space: (tau, *frame_shape), or (tau, outputs).
-        learner: the episode's; None before the first.
-        signals: of the last step (docs/reference/signals.md); None before the first of an episode.
+        learner: learner of the episode; None before the first one.
+        signals: `BlockSignals` of the last step; None before the first one of an episode.
 
     Raises:
+        UsageError: Gymnasium is missing, or the learner or a setting does not exist.
         UsageError: Gymnasium is missing, or there is no such learner, setting or observation.
 
     Example:
         >>> from recorder.world.oscillatory import OscillatorySource
         >>> env = WatchEnv(OscillatorySource(), max_iterations=100)
-        >>> seen, info = env.reset(seed=0)
-        >>> seen, reward, terminated, truncated, info = env.step(info["stream"])
-        >>> seen.shape
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(info["stream"])
+        >>> observation.shape
         (40, 2)
     """
 
@@ -84,7 +85,7 @@ class WatchEnv(Env):
         layers = base, {"algorithm": algorithm}, settings
         self._config = build(entry.configuration, "learner", *layers)
         self._source, self._start, self._observe = source, source.t, observe
-        self._most = max_iterations
+        self._max_iterations = max_iterations
         spec = source.spec
         first = open_learner(self._config, spec, 0)
         shape: tuple[int, ...] = (first.tau, len(first.phi))
@@ -96,18 +97,18 @@ class WatchEnv(Env):
         self.action_space = Discrete(len(spec.streams))
         self.learner: Learner | None = None
         self.signals: BlockSignals | None = None
-        self._seen: NDArray[Any] = np.zeros(shape, dtype)
-        self._watched = 0
+        self._observation: NDArray[Any] = np.zeros(shape, dtype)
+        self._stream = 0
         self._ended = True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Begin an episode with a learner that has learned nothing.
+        """Begin an episode with a new learner.
 
         Args:
-            seed: of the learner's random choices; by default drawn.
-            options: none.
+            seed: seed of the learner; None: draw one.
+            options: ignored.
 
         Returns:
             Zeros, and `info`.
@@ -117,32 +118,33 @@ class WatchEnv(Env):
         if isinstance(self._source, SeekableSource):
             self._source.seek(self._start)
         self.learner = open_learner(self._config, self._source.spec, seed)
-        self.signals, self._seen, self._ended = None, np.zeros_like(self._seen), False
-        self._watched = self.learner.stream
-        return self._seen.copy(), {"stream": self._watched}
+        self.signals, self._ended = None, False
+        self._observation = np.zeros_like(self._observation)
+        self._stream = self.learner.stream
+        return self._observation.copy(), {"stream": self._stream}
 
     def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
-        """Watch a stream for a block, and learn from it.
+        """Learn from a block of a stream.
 
         Args:
-            action: the stream's index.
+            action: index of the stream.
 
         Returns:
-            What was seen, the reward, whether the learner has ended, whether it was stopped, and
+            The observation, the reward, whether the learner has ended, whether it was stopped, and
             `info`.
 
         Raises:
-            ResetNeeded: there is no episode.
-            ValueError: there is no such stream.
-            LogExhaustedError: the source has not enough for a single block.
+            ResetNeeded: no episode has begun.
+            ValueError: the stream does not exist.
+            LogExhaustedError: the source is shorter than one block.
         """
         learner: Any = self.learner
         if self._ended:
-            raise ResetNeeded("there is no episode, or it is over: call reset()")
+            raise ResetNeeded("no episode has begun, or it has ended: call reset()")
         reward, terminated = 0.0, False
-        turn_to(self._source, self._watched, int(action))
-        self._watched = int(action)
-        learner.watch(self._watched)
+        turn_to(self._source, self._stream, int(action))
+        self._stream = int(action)
+        learner.watch(self._stream)
         try:
             block = self._source.take(learner.stream, learner.tau)
         except LogExhaustedError:
@@ -151,14 +153,15 @@ class WatchEnv(Env):
             truncated = True
         else:
             self.signals = signals = learner.step(block)
-            shown = block.frames if self._observe == "block" else np.nan_to_num(signals.y)
-            self._seen = np.asarray(shown)
+            observation = block.frames if self._observe == "block" else np.nan_to_num(signals.y)
+            self._observation = np.asarray(observation)
             reward = 0.0 if isnan(signals.reward) else float(signals.reward)
-            most = learner.max_modules
-            terminated = bool(learner.over) or (most is not None and len(learner.modules) >= most)
-            truncated = self._most is not None and learner.iteration >= self._most
+            limit = learner.max_modules
+            terminated = bool(learner.over) or (limit is not None and len(learner.modules) >= limit)
+            limit = self._max_iterations
+            truncated = limit is not None and learner.iteration >= limit
         self._ended = terminated or truncated
-        return self._seen.copy(), reward, terminated, truncated, {"stream": learner.stream}
+        return self._observation.copy(), reward, terminated, truncated, {"stream": learner.stream}
 
     def close(self) -> None:
         """Close the source."""

@@ -115,12 +115,12 @@ def test_incsfa_follows_what_is_slow() -> None:
 @pytest.mark.parametrize(
     ("parameters", "X", "message"),
     [
-        ({"n_components": 3}, np.ones((9, 2)), "n_components=3 .* at most 2"),
+        ({"n_components": 3}, np.ones((9, 2)), "n_components is 3.* at most 2"),
         ({"n_components": 5, "n_whitened": 4}, np.ones((9, 9)), "at most 4"),
-        ({"n_components": 0}, np.ones((9, 2)), "n_components=0 given: it is a whole number"),
-        ({"n_whitened": 2.5}, np.ones((9, 2)), "n_whitened=2.5 given"),
-        ({"window": None}, np.ones((9, 2)), "window=None given"),
-        ({}, np.full((9, 2), 1e200), "holds 1e[+]200, more than 1e[+]100: scale it"),
+        ({"n_components": 0}, np.ones((9, 2)), "n_components is 0: give a whole number"),
+        ({"n_whitened": 2.5}, np.ones((9, 2)), "n_whitened is 2.5"),
+        ({"window": None}, np.ones((9, 2)), "window is None"),
+        ({}, np.full((9, 2), 1e200), "holds 1e[+]200, above the limit of 1e[+]100: scale it"),
         ({}, np.full((9, 2), np.nan), "contains NaN"),
     ],
 )

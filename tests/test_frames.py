@@ -52,7 +52,7 @@ def test_frames_are_learned_from_or_refused(frames: np.ndarray, size: int, gap: 
         if fits:
             assert len(call()) == len(frames)
         else:
-            with pytest.raises(UsageError, match=r"^frames of .* given: give "):
+            with pytest.raises(UsageError, match=r"^frames are .*: give "):
                 call()
 
 
@@ -68,7 +68,7 @@ def test_frames_are_expanded_or_refused(frames: np.ndarray) -> None:
         np.testing.assert_array_equal(frames, before)
     else:
         for kind in ("none", "quadratic"):
-            with pytest.raises(UsageError, match=r"^frames of .* given: give "):
+            with pytest.raises(UsageError, match=r"^frames are .*: give "):
                 expand(kind, frames)
 
 

@@ -41,8 +41,8 @@ def test_a_huge_picture_is_refused_unread(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (os.mkfifo, "no regular file"),
-        (lambda path: path.symlink_to("/dev/zero"), "no regular file"),
+        (os.mkfifo, "not a regular file"),
+        (lambda path: path.symlink_to("/dev/zero"), "not a regular file"),
         (lambda path: (path.touch(), os.truncate(path, 1 << 33)), "above the limit"),
     ],
 )

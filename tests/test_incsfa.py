@@ -244,7 +244,7 @@ def test_any_numbers_are_learned_within_the_arrays_alike_by_both_modules(
 def test_a_state_that_no_kernel_left_is_refused(what):
     sfa = IncrementalFeature(config_of(4, 1), 300, np.random.default_rng(0))
     sfa.state.counts[what] = -1
-    with pytest.raises(UsageError, match="not a state"):
+    with pytest.raises(UsageError, match="damaged state"):
         sfa.update(np.zeros((3, 300)))
 
 

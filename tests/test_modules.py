@@ -60,7 +60,7 @@ def with_width(width: int, **values: Any) -> Module:
 @pytest.mark.parametrize("shape", [(5, 3, 2), (5, 2, 3, 1), (5, 1, 6), (5, 2), (5,), (2, 3)])
 def test_frames_have_the_shape_that_the_module_learned_from(shape: tuple[int, ...]) -> None:
     module = with_width(6, expansion="none", frame_shape=(2, 3))
-    with pytest.raises(UsageError, match=r"given: give uint8 pixels .* \(n, 2, 3\)"):
+    with pytest.raises(UsageError, match=r": give uint8 pixels .* \(n, 2, 3\)"):
         module.transform(np.zeros(shape))
     assert module.transform(np.zeros((5, 6))).shape == (5, 1)  # as rows
     assert module.transform(np.zeros((0, 2, 3))).shape == (0, 1)
@@ -71,7 +71,7 @@ def test_the_expansion_decides_the_width_and_only_pixels_and_values_are_taken() 
     module = with_width(5, expansion="none")
     assert module.transform(np.zeros((3, 5))).shape == (3, 1)
     for frames in (np.zeros((3, 2)), *(np.ones((3, 5)).astype(k) for k in ("int8", "bool", "U1"))):
-        with pytest.raises(UsageError, match=r"given: give uint8 pixels or float values"):
+        with pytest.raises(UsageError, match=r": give uint8 pixels or float values"):
             module.transform(frames)
 
 

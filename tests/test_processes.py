@@ -14,7 +14,7 @@ import pytest
 from engine_tasks import die_while_sending, sleep_for, trace
 from waiting import wait_for
 
-from cdmisfa.core.processes import ONE_THREAD, WorkersError, run_all, workers
+from cdmisfa.core.processes import WORKER_ENVIRONMENT, WorkersError, run_all, workers
 
 SCRIPT = """
 import sys
@@ -98,7 +98,7 @@ def test_they_have_their_environment_before_anything_is_imported(tmp_path: Path)
     with workers(1) as submit:
         assert submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
         assert submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result() >= {signal.SIGINT}
-    assert ONE_THREAD["OPENBLAS_NUM_THREADS"] == "1"
+    assert WORKER_ENVIRONMENT["OPENBLAS_NUM_THREADS"] == "1"
     assert trace((str(tmp_path), 2, "")) == 4
 
 

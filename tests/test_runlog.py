@@ -105,7 +105,7 @@ def test_the_log_opens_without_us_and_tells_its_units(tmp_path):
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("fps", 0.0, "has no clock"),
+        ("fps", 0.0, "frames a second: give"),
         ("fps", "often", "not supported"),
         ("streams", 3, "not iterable"),
         ("colour", 1, "unexpected keyword"),

@@ -1,4 +1,4 @@
-"""The curiosity-driven agent: its memory, its rules, and its gate of frozen modules."""
+"""The paper's agent: its memory, its rules, and the stack of saved modules that its gate uses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cdmisfa.modules import Module
 
 
 def _record_type(kind: str) -> np.dtype[np.void]:
-    """Return the type of arrays of records, as C has them."""
+    """Return the numpy type of a C record."""
     types = {"int64_t": "i8", "double": "f8", "_Bool": "?"}
     fields = dict(kernels.ffi.typeof(kind).fields)
     layout: Any = {
@@ -28,43 +28,43 @@ def _record_type(kind: str) -> np.dtype[np.void]:
         "offsets": [field.offset for field in fields.values()],
         "itemsize": kernels.ffi.sizeof(kind),
     }
-    made: np.dtype[np.void] = np.dtype(layout)
-    return made
+    record: np.dtype[np.void] = np.dtype(layout)
+    return record
 
 
-# Numbers that the agent remembers:
-# iteration    iterations so far
-# module       abstraction being learned, from 1
-# stream       stream to watch next
-# last_stream, last_action   before and at the last decision; -1 before the first
+# Scalars of the agent's memory:
+# iteration    number of iterations done
+# module       number of the module being learned, from 1
+# stream       index of the next stream
+# last_stream, last_action   stream and action of the last decision; -1 before the first
 # fed_stream, fed_until      stream of the last novel block (-1: none), and the frame after it
-# novel_blocks since the abstraction was created
-# rewards      t of the running reward function
-# scale        divides the sums to give R; 0 before the first reward
+# novel_blocks number of novel blocks since the last module was saved
+# rewards      number of rewards in the running reward function
+# scale        divides the reward sums to give R; 0 before the first reward
 # roc_error    CD-MISFA 1.0: running mean of the clustering error
 # xi           mean change of the weights in the last novel block
-# share        running share of novel blocks of the stream of the block before
+# share        running share of blocks that were novel and of the same stream as the block before
 # epsilon      probability of a random action
-# idle         iterations with epsilon practically 0
+# idle         number of iterations with epsilon practically 0
 MEMORY = _record_type("memory")
 
-# Outcome of an iteration: signals of `BlockSignals` by their names.
+# Outcome of an iteration: the scalar signals of `BlockSignals`, by name.
 OUTCOME = _record_type("outcome")
 
-# Verdicts of the gate: no frozen module knows the block, or it carries nothing to learn. Positive
-# verdicts are the module's index.
+# Results of the gate: no saved module explains the block, or the block is constant. Positive
+# results are the number of the module that explains it.
 NOVEL: int = kernels.lib.NOVEL
 CONSTANT: int = kernels.lib.CONSTANT
 
 
 class Agent(NamedTuple):
-    """The agent's memory, as arrays only: saving them saves everything.
+    """The agent's memory; it consists of arrays only, so that saving them saves everything.
 
-    memory: (1,) of `MEMORY`. Per output (J,): eta, eta_dot, eta_inst, gate_mean, gate_variance,
-    the running E(ydot^2) derivative, the sums y_sum and square_sum over y_frames (1,) frames, and
-    the recent moments recent_mean, recent_square. Per stream: stay_sum, switch_sum, policy (S,),
-    dense (S, 2, S) or (0, 2, 0). CD-MISFA 1.0 only, else empty: the clustering's
-    centres (S, C, tau, J) and counts (S, C).
+    `memory` is (1,) of `MEMORY`. For each output (J,): eta, eta_dot, eta_inst, gate_mean,
+    gate_variance, the running E(ydot^2) `derivative`, the sums y_sum and square_sum over y_frames
+    (1,) frames, and the recent moments recent_mean and recent_square. For each stream: stay_sum,
+    switch_sum and policy (S,), dense (S, 2, S) or (0, 2, 0). For CD-MISFA 1.0, else empty: cluster
+    centres (S, C, tau, J) and their counts (S, C).
     """
 
     memory: NDArray[np.void]
@@ -88,7 +88,7 @@ class Agent(NamedTuple):
 
 
 def rules(config: LearnerConfig, n_streams: int) -> SimpleNamespace:
-    """Return the values of a configuration that an iteration with n streams needs, by name."""
+    """Return the values of a configuration that an iteration needs, by name."""
     beta, tabular = config.reward_beta(n_streams), int(config.algorithm == "1.0")
     names = {name for name, _ in kernels.ffi.typeof("rules").fields} - {"beta", "tabular"}
     values = {name: float(getattr(config, name)) for name in names}
@@ -96,16 +96,19 @@ def rules(config: LearnerConfig, n_streams: int) -> SimpleNamespace:
 
 
 def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent:
-    """Return an agent that has seen nothing and will watch `first_stream`.
+    """Return an agent before its first block, which takes that block from `first_stream`.
 
     Raises:
-        UsageError: more streams than CD-MISFA 1.0's table of rewards is kept for.
+        UsageError: CD-MISFA 1.0 has more streams than its table of rewards holds.
     """
     tabular, dense = config.algorithm == "1.0", n_streams
     if n_streams > DENSE_STREAMS:
         dense = 0
         if tabular:
-            raise UsageError(f"learner.algorithm 1.0 takes at most {DENSE_STREAMS} streams")
+            raise UsageError(
+                f"learner.algorithm 1.0 cannot learn from {n_streams} streams: give at most "
+                f"{DENSE_STREAMS}"
+            )
     clusters = (n_streams, config.roc_centres) if tabular else (0, 0)
     arrays: dict[str, Any] = {
         "memory": np.zeros(1, MEMORY),
@@ -124,7 +127,7 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
 
 
 def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
-    """Forget everything that belongs to the abstraction before; all statistics start again."""
+    """Reset the memory of the previous module, and start all statistics again."""
     for array in agent[1:]:
         array[...] = 0
     for array in (agent.eta, agent.eta_dot, agent.eta_inst):
@@ -140,12 +143,12 @@ def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
 
 
 def as_struct(agent: Agent, rules: SimpleNamespace, out: NDArray[np.void]) -> kernels.Struct:
-    """Return an agent as the kernels take it: its arrays, its rules, and where its outcome goes.
+    """Return an agent as C takes it: its arrays, its rules, and the record of the outcome.
 
     Args:
-        agent: changed in place.
+        agent: the agent, changed in place by the kernels.
         rules: see `rules`.
-        out: (1,) of `OUTCOME`, written.
+        out: (1,) of `OUTCOME`, written by the kernels.
     """
     sizes = {
         "streams": len(agent.policy),
@@ -163,15 +166,15 @@ def as_struct(agent: Agent, rules: SimpleNamespace, out: NDArray[np.void]) -> ke
 
 
 class Frozen(NamedTuple):
-    """All frozen modules in one stack, so that one pass over a block serves them all.
+    """The saved modules in one stack, so that one pass over a block computes all outputs.
 
     Attributes:
         phi: (M J, I) weights.
-        offset: (M J,) phi times the mean.
-        band_mean: (M, J) centres of the bands of known slowness.
-        band_sd: (M, J) their standard deviations.
-        centres: (M, S, C, n, J) clusters; (M, 0, 0, n, J) but for CD-MISFA 1.0.
-        counts: (M, S, C).
+        offset: (M J,) outputs on the mean of the frames.
+        band_mean: (M, J) mean of the slowness in a block, when the module was saved.
+        band_sd: (M, J) standard deviation of it.
+        centres: (M, S, C, tau, J) cluster centres; (M, 0, 0, tau, J) except for CD-MISFA 1.0.
+        counts: (M, S, C) counts of the clusters.
     """
 
     phi: FloatArray
@@ -183,14 +186,14 @@ class Frozen(NamedTuple):
 
     @property
     def struct(self) -> kernels.Struct:
-        """The stack as the kernels take it."""
+        """The stack as C takes it."""
         arrays = {n: kernels.pointer(n, a, a.shape) for n, a in self._asdict().items()}
         sizes = {"modules": len(self.band_mean), "inputs": self.phi.shape[1]}
         return kernels.Struct("frozen", sizes, arrays)
 
 
 def frozen_modules(modules: Sequence[Module], agent: Agent, n_inputs: int) -> Frozen:
-    """Return the modules of an agent whose abstractions have I = `n_inputs`."""
+    """Return the stack of an agent's modules, whose frames have I = `n_inputs` values."""
     count, outputs = len(modules), len(agent.eta)
     return Frozen(
         phi=np.array([m.phi for m in modules]).reshape(count * outputs, n_inputs),

@@ -1,6 +1,6 @@
-"""Blocks in, signals out: what all learners of this package share.
+"""Input and output that the learners share.
 
-`count_inputs` and `rows_of` check the input of a learner; `signals_of_block` makes the record of
+`count_inputs` and `rows_of` check the input of a learner; `signals_of_block` creates the record of
 an iteration for learners that have only some of the signals.
 """
 
@@ -17,10 +17,11 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expanded_size
 from cdmisfa.core.signals import DENSE_STREAMS, NO_STATE, SIGNALS, BlockSignals
 
-# Squares and products of values up to this, and their sums, are finite.
+# Largest absolute value of a frame: squares of such values, and their sums, stay finite in float64.
 LARGEST_VALUE = 1e100
 
-# An abstraction of more inputs than this (a grey image of 1400 x 1400) is refused.
+# Largest number of inputs, a gray image of 1400 x 1400. A progress learner with 16 components then
+# takes 0.7 GB for each candidate.
 MAX_INPUTS = 2_000_000
 
 
@@ -28,59 +29,63 @@ def count_inputs(expansion: str, spec: SourceSpec) -> int:
     """Return the number of inputs after expansion.
 
     Raises:
-        UsageError: there is no such expansion, or there are too many inputs to hold.
+        UsageError: the expansion does not exist, or it makes more than `MAX_INPUTS` inputs.
     """
     values = math.prod(spec.frame_shape)
     inputs = expanded_size(expansion, values)
     if inputs > MAX_INPUTS:
-        made = f"learner.expansion {expansion} makes {inputs:,} inputs of {values:,}"
-        raise UsageError(f"{made}, more than {MAX_INPUTS:,}: take smaller frames")
+        fact = f"learner.expansion {expansion} makes {inputs:,} inputs of {values:,} values"
+        raise UsageError(f"{fact}, more than {MAX_INPUTS:,}: use smaller frames")
     return inputs
 
 
 def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[Any]:
-    """Return the frames of a block as rows, (tau, values).
+    """Check a block, and return its frames as rows, (tau, values).
 
     Args:
-        block: the block that the source returned.
-        spec: of that source.
-        stream: the stream that the learner asked for.
-        tau: the number of frames that it asked for.
+        block: block of the source.
+        spec: properties of the source.
+        stream: index of the stream that the learner asked for.
+        tau: number of frames that the learner asked for.
 
     Raises:
-        ValueError: the block is of another stream, length, frame shape or type.
-        CdmisfaError: it holds a value that would spoil every estimate.
+        ValueError: the block has a different stream, length, frame shape or type.
+        CdmisfaError: the block holds a value that is not finite or above `LARGEST_VALUE`.
     """
     frames = block.frames
-    given = len(frames), block.stream, frames.shape[1:], frames.dtype
-    wanted = tau, stream, spec.frame_shape, np.dtype(spec.dtype)
-    if given != wanted:
-        words = (
-            f"{n} frames of stream {s}, {shape} {dtype}" for n, s, shape, dtype in (wanted, given)
+    actual = len(frames), block.stream, frames.shape[1:], frames.dtype
+    expected = tau, stream, spec.frame_shape, np.dtype(spec.dtype)
+    if actual != expected:
+        texts = (
+            f"{n} frames of stream {s}, {shape} {dtype}"
+            for n, s, shape, dtype in (expected, actual)
         )
-        raise ValueError(f"the learner asked for {', not '.join(words)}")
+        raise ValueError(f"the learner asked for {', not '.join(texts)}")
     if frames.dtype.kind == "f" and not (  # also true of NaN; without an array as large as frames
         frames.max(initial=0) <= LARGEST_VALUE and frames.min(initial=0) >= -LARGEST_VALUE
     ):
         finite = np.isfinite(frames).all()
-        what = f"larger than {LARGEST_VALUE:g}" if finite else "no finite number"
-        where = f"in frames {block.t} to {block.t + tau - 1}"
-        raise CdmisfaError(f"stream {spec.streams[stream]} holds a value that is {what} {where}")
+        problem = f"larger than {LARGEST_VALUE:g}" if finite else "not finite"
+        place = f"in frames {block.t} to {block.t + tau - 1}"
+        raise CdmisfaError(
+            f"stream {spec.streams[stream]} holds a value that is {problem} {place}: leave these "
+            "frames out, or fill the value in"
+        )
     return frames.reshape(tau, -1)
 
 
 def signals_of_block(
-    block: Block, spec: SourceSpec, iteration: int, *, outputs: int, modules: int, **given: Any
+    block: Block, spec: SourceSpec, iteration: int, *, outputs: int, modules: int, **values: Any
 ) -> BlockSignals:
-    """Return the signals of a block; numbers that are not given are NaN.
+    """Return the signals of a block; signals without a value are NaN, 0 or False.
 
     Args:
-        block: the watched block.
-        spec: of its source.
-        iteration: from 0.
-        outputs: J of the learner's abstraction.
-        modules: M, the number of modules saved before.
-        given: signals by their names.
+        block: the block of the iteration.
+        spec: properties of the source.
+        iteration: number of the iteration, from 0.
+        outputs: number of outputs J.
+        modules: number of modules M saved before.
+        values: values of signals by name.
     """
     n = {"T": len(block), "J": outputs, "M": modules, "S": len(spec.streams), "A": 2}
     signals: dict[str, Any] = {
@@ -98,4 +103,4 @@ def signals_of_block(
         signals.setdefault(signal.name, np.full(shape, value) if shape else value)
     if len(spec.streams) > DENSE_STREAMS:
         signals["R"] = np.empty((0, 2, 0))
-    return BlockSignals(**{**signals, **given})
+    return BlockSignals(**{**signals, **values})

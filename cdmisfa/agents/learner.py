@@ -1,7 +1,7 @@
-"""`CuriousLearner`: blocks in, signals out.
+"""`CuriousLearner`: the paper's learners, CD-MISFA 2.0 and 1.0.
 
-The learner knows neither the origin of its blocks nor the destination of its signals. The same
-blocks give the same signals, bit for bit.
+The learner takes blocks and returns signals; it knows neither the source of the blocks nor the use
+of the signals. The same blocks give the same signals, bit for bit.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from cdmisfa.core.signals import NO_STATE, BlockSignals
 from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.modules import Module
 
-# Spawn keys of the learner's two random generators, beneath the run's seed.
+# Spawn keys of the two random generators under the run's seed. Another value changes every run.
 POLICY_KEY, WEIGHTS_KEY = 1, 2
 
 
 class CuriousLearner:
-    """The paper's agent: adaptive abstraction, gating system and curiosity-driven learner.
+    """The paper's learner: features being learned, a gate of saved modules, and a curious agent.
 
     Args:
-        config: its configuration.
-        spec: the source it learns from.
-        seed: seed of its random generators.
+        config: the configuration.
+        spec: the streams and frames of the source.
+        seed: seed of the random generators.
 
     Attributes:
         modules: the saved modules.
-        events: what happened in the last iteration, one line each.
-        scale: factor from a frame's values to the learner's (1/255 for pixels).
-        policy_rng: three draws an iteration, whatever is done with them.
-        rules: the numbers of the configuration that the agent uses.
+        events: events of the last iteration, one line each.
+        scale: factor from a frame's values to the learner's: 1/255 for pixels, else 1.
+        policy_rng: generator of three draws in each iteration, whether or not they are used.
+        rules: values of the configuration that the agent uses.
         agent: memory of the agent; changed in place.
-        abstraction: the adaptive abstraction.
-        frozen: the modules in one stack.
-        out: (1,) of `OUTCOME`, of the last iteration.
+        abstraction: the features being learned.
+        frozen: the saved modules in one stack.
+        out: (1,) of `OUTCOME`, the outcome of the last iteration.
 
     Example:
         >>> from recorder.world.oscillatory import OscillatorySource
@@ -73,8 +73,8 @@ class CuriousLearner:
         self.events: tuple[str, ...] = ()
         self._n_inputs = inputs = count_inputs(config.expansion, spec)
         if config.components > inputs:
-            most = f"more than the {inputs} inputs"
-            raise UsageError(f"learner.components is {config.components}, {most}")
+            limit = f"more than the {inputs} inputs: set it to at most {inputs}"
+            raise UsageError(f"learner.components is {config.components}, {limit}")
         self.scale = PIXEL if spec.dtype == "uint8" else 1.0
         self.policy_rng = np.random.Generator(
             np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,)))
@@ -85,26 +85,26 @@ class CuriousLearner:
         self.agent = new_agent(config, n_streams, first)
         self.out = np.zeros(1, OUTCOME)
         self._agent = as_struct(self.agent, self.rules, self.out)
-        # Signals of the progress learner, which this one does not have.
+        # Signals that only the progress learner has.
         scalars = ("change", "tested", "fitted", "learning_error", "typical", "regret")
-        self._of_progress: dict[str, Any] = dict.fromkeys(scalars, math.nan)
-        self._of_progress["interest"] = freeze(np.full(n_streams, np.nan))
-        self._of_progress["state"] = freeze(np.full(n_streams, NO_STATE))
-        self._freeze()
+        self._progress_signals: dict[str, Any] = dict.fromkeys(scalars, math.nan)
+        self._progress_signals["interest"] = freeze(np.full(n_streams, np.nan))
+        self._progress_signals["state"] = freeze(np.full(n_streams, NO_STATE))
+        self._stack_modules()
         self.abstraction = self._new_abstraction()
 
     @property
     def tau(self) -> int:
-        """Frames the learner wants in each block."""
+        """Number of frames in each block."""
         return self.config.tau
 
     @property
     def stream(self) -> int:
-        """Stream the learner wants to watch next."""
+        """Index of the stream of the next block."""
         return int(self.agent.memory["stream"][0])
 
     def watch(self, stream: int) -> None:
-        """Have it watch another stream next than it chose."""
+        """Take the next block from `stream` instead of the stream that the agent chose."""
         memory = self.agent.memory[0]
         if stream != memory["stream"]:
             memory["stream"] = stream
@@ -112,7 +112,7 @@ class CuriousLearner:
 
     @property
     def iteration(self) -> int:
-        """Iterations so far."""
+        """Number of iterations done."""
         return int(self.agent.memory["iteration"][0])
 
     @property
@@ -122,32 +122,32 @@ class CuriousLearner:
 
     @property
     def policy(self) -> NDArray[np.int64]:
-        """The policy being learned, (S,): 0 stay, 1 switch."""
+        """(S,) the policy being learned: 0 stay, 1 switch."""
         return self.agent.policy.copy()
 
     @property
     def phi(self) -> FloatArray:
-        """Weights of the adaptive abstraction, (J, I), a copy."""
+        """(J, I) weights of the features being learned, a copy."""
         return self.abstraction.phi.copy()
 
     @property
     def arithmetic(self) -> int:
-        """Version of how it computes; see `arithmetic_of`."""
+        """Version of the kernels; see `arithmetic_of`."""
         return kernels.ARITHMETIC
 
     @property
     def over(self) -> str:
-        """Whether exploration has ended long ago and still nothing converged; see `Learner`."""
+        """Reason to end: "nothing_left" after `patience` iterations without exploration."""
         return "nothing_left" if self.agent.memory["idle"][0] > self.config.patience else ""
 
     @property
     def max_modules(self) -> int:
-        """Modules after which a run ends where nothing else is said: as many as streams."""
+        """Number of modules after which a run ends by default: one for each stream."""
         return len(self.spec.streams)
 
     @property
     def state(self) -> LearnerState:
-        """The learner's state, a copy."""
+        """A copy of the learner's state."""
         return LearnerState(
             arrays={name: array.copy() for name, array in self._arrays().items()},
             modules=tuple(self.modules),
@@ -155,37 +155,37 @@ class CuriousLearner:
         )
 
     def restore(self, state: LearnerState) -> None:
-        """Go to a state of a learner with the same configuration, spec and seed.
+        """Restore the state of a learner with the same configuration, spec and seed.
 
         Raises:
-            ValueError: an array is missing or of another shape or type.
+            ValueError: an array is missing or has a different shape or type.
         """
         self.modules = [
             dataclasses.replace(module, expansion=self.config.expansion, scale=self.scale)
             for module in state.modules
         ]
-        self._freeze()
+        self._stack_modules()
         self.abstraction = self._new_abstraction()
         overwrite(self._arrays(), state.arrays)
         self.policy_rng.bit_generator.state = dict(state.policy_rng)
 
     def step(self, block: Block) -> BlockSignals:
-        """Do one iteration: look at tau frames, learn, and choose the next stream.
+        """Do one iteration: learn from a block if it is novel, and choose the next stream.
 
         Args:
-            block: tau frames of the stream the learner asked for.
+            block: `tau` frames of the stream `stream`.
 
         Raises:
-            ValueError: the block is of another stream, length, frame shape or type.
-            CdmisfaError: it holds a value that is no finite number.
+            ValueError: the block has a different stream, length, frame shape or type.
+            CdmisfaError: the block holds a value that is not finite.
         """
         frames = rows_of(block, self.spec, self.stream, self.tau)
-        shown = x = kernels.frames_of(frames)
+        raw = x = kernels.frames_of(frames)
         expanded = expand(self.config.expansion, frames)
         if expanded is not frames:
             x = kernels.frames_of(expanded, self._n_inputs)
         uniforms, kernel = self.policy_rng.random(3), self.abstraction.kernel
-        results = kernels.iterate(self._agent, self._frozen, kernel, shown, x, block.t, uniforms)
+        results = kernels.iterate(self._agent, self._frozen, kernel, raw, x, block.t, uniforms)
         signals = self._signals(block, *results)
         self.events = ()
         if self.out["saved"][0]:
@@ -199,27 +199,30 @@ class CuriousLearner:
 
     def repeat(
         self,
-        shown: kernels.Struct,
+        raw: kernels.Struct,
         x: kernels.Struct,
         uniforms: FloatArray,
         swap_below: float = -1.0,
-        kept: kernels.Struct | None = None,
+        curves: kernels.Struct | None = None,
     ) -> int:
-        """Iterate on streams that repeat, as `step` does, until something is to be done.
+        """Iterate on periodic streams as `step` does, without creating the signals.
+
+        It returns when a module is ready to be saved, when epsilon falls below `swap_below`, when
+        the learner is over, or after n iterations.
 
         Args:
-            shown: of each stream a period of frames and the tau that follow, one after the other.
-            x: the same, expanded.
+            raw: for each stream one period of frames and the first tau frames again.
+            x: the same frames, expanded.
             uniforms: (n, 3) draws of n iterations.
-            swap_below: return when epsilon is below this.
-            kept: what is kept of each iteration, if anything, `curves` of the kernels.
+            swap_below: value of epsilon to return at.
+            curves: record that receives the signals of each iteration; None for no record.
 
         Returns:
-            Iterations done: until an abstraction is to be saved, swap or end is due, or n.
+            Number of iterations done.
         """
         kernel = self.abstraction.kernel
         return kernels.iterations(
-            self._agent, self._frozen, kernel, shown, x, uniforms, swap_below, kept
+            self._agent, self._frozen, kernel, raw, x, uniforms, swap_below, curves
         )
 
     def summary(self) -> dict[str, Any]:
@@ -227,7 +230,7 @@ class CuriousLearner:
         return {"final_policy": self.agent.policy.tolist(), "epsilon": self.epsilon}
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """Return every array that changes in place, by name."""
+        """Return the arrays of the state, by name; not copies."""
         parts: dict[str, Any] = {"agent": self.agent, "abstraction": self.abstraction.state}
         return {
             f"{part}.{name}": array
@@ -266,11 +269,11 @@ class CuriousLearner:
             Q=kernels.action_values(self._agent),
             policy=agent.policy.copy(),
             **out,
-            **self._of_progress,
+            **self._progress_signals,
         )
 
     def save_abstraction(self) -> None:
-        """Freeze the abstraction that the last iteration found ready, and begin a new one."""
+        """Save the features that are ready as a module, and begin new features."""
         agent, memory = self.agent, self.agent.memory[0]
         self.modules.append(
             Module(
@@ -291,11 +294,11 @@ class CuriousLearner:
                 counts=agent.counts.copy(),
             )
         )
-        self._freeze()
+        self._stack_modules()
         begin_abstraction(self.agent, self.rules.epsilon_start)
         self.abstraction = self._new_abstraction()
 
-    def _freeze(self) -> None:
+    def _stack_modules(self) -> None:
         self.frozen = frozen_modules(self.modules, self.agent, self._n_inputs)
         self._frozen = self.frozen.struct
 

@@ -1,4 +1,4 @@
-"""The learners, by the name that `learner.algorithm` takes."""
+"""Registry of the learners, by their name in `learner.algorithm`."""
 
 from __future__ import annotations
 
@@ -19,27 +19,28 @@ LEARNERS: Registry[type[Any]] = Registry(
 
 
 def learner_class(algorithm: str) -> type[Any]:
-    """Return the learner of a name: one of `LEARNERS`, or a class as `package.module:Class`.
+    """Return the learner class of a name: one of `LEARNERS`, or `package.module:Class`.
 
-    A learner has the members of `Learner`, takes a configuration, a spec and a seed, and names
-    the dataclass of its keys `learner.*` in its attribute `configuration`. That has a field
-    `algorithm`. A learner may name its preset in an attribute `preset`.
+    A learner class has the members of `Learner` and takes a configuration, a spec and a seed. Its
+    attribute `configuration` is the dataclass of its keys `learner.*`, with a field `algorithm`.
+    Its attribute `preset`, if any, names its preset.
 
     Raises:
-        UsageError: there is no such learner, or its class cannot be used.
+        UsageError: the learner does not exist, or its class cannot be used.
     """
     module, colon, name = algorithm.partition(":")
     if not colon:
         return LEARNERS[algorithm]
     try:
-        # The name may come from a log: the standard library has modules that act when imported.
+        # The name may come from an untrusted log, and importing some modules of the standard
+        # library has effects.
         if module.partition(".")[0] in sys.stdlib_module_names:
-            raise ImportError(f"{module} is of the standard library")
+            raise ImportError(f"{module} belongs to the standard library")
         learner: type[Any] = getattr(importlib.import_module(module), name)
         configuration = getattr(learner, "configuration", None)
         if not (isinstance(configuration, type) and is_dataclass(configuration)):
-            raise TypeError("it has no attribute configuration, the dataclass of its keys")
-    except Exception as error:  # importing code of the user may raise anything
+            raise TypeError("it has no attribute `configuration`, the dataclass of its keys")
+    except Exception as error:  # a user's module may raise anything when it is imported
         raise UsageError(
             f"the learner {algorithm} cannot be imported ({type(error).__name__}: "
             f"{one_line(error)}): install its package, or name its folder in PYTHONPATH"
@@ -51,7 +52,7 @@ def open_learner(config: Any, spec: SourceSpec, seed: int) -> Learner:
     """Return the learner that a configuration names, for a source.
 
     Raises:
-        UsageError: there is no such learner, or it cannot learn from such a source.
+        UsageError: the learner does not exist, or cannot learn from such a source.
     """
     learner: Learner = learner_class(config.algorithm)(config, spec, seed)
     return learner

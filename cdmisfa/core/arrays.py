@@ -1,4 +1,4 @@
-"""Types of arrays, and frames from arrays and tables of a user."""
+"""Array types, and conversion of a user's arrays and tables to frames."""
 
 from __future__ import annotations
 
@@ -15,43 +15,45 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
 
+# The element types of frames: values and pixels.
 _TYPES = (np.dtype(np.float64), np.dtype(np.uint8))
 
-# Value of a pixel that is equal to the mean of its episode.
+# Gray level that stands for the episode's mean in a centred pixel: the middle of 0 to 255, so that
+# brighter and darker pixels have the same range.
 GRAY = 128
 
 
-def as_array(given: Any, name: str = "frames") -> NDArray[Any]:
-    """Return the frames of a user as an array, the columns of a table side by side.
+def as_array(data: Any, name: str = "frames") -> NDArray[Any]:
+    """Return a user's frames as an array; the columns of a table become the values of a frame.
 
     Args:
-        given: an array, nested lists, or a table of pandas, Polars, Arrow or DuckDB.
-        name: of the frames, for errors.
+        data: an array, nested lists, or a table of pandas, Polars, Arrow or DuckDB.
+        name: name of the frames in errors.
 
     Raises:
-        UsageError: rows differ in length, values are masked, or a column holds no numbers.
+        UsageError: rows differ in length, values are masked, or a column is not numeric.
     """
     try:
-        return np.asarray(without_table(given, name))
+        return np.asarray(without_table(data, name))
     except ValueError as error:
-        raise UsageError(f"{name} of unequal length given: give an array of them") from error
+        raise UsageError(f"{name} differ in length: give an array of equal frames") from error
 
 
-def without_table(given: Any, name: str = "frames") -> Any:
-    """Return what a user gave, the values of a table, NaN where it has none; see `as_array`."""
-    if np.ma.is_masked(given):
+def without_table(data: Any, name: str = "frames") -> Any:
+    """Return `data`, or the values of a table with NaN for missing ones; see `as_array`."""
+    if np.ma.is_masked(data):
         raise UsageError(f"{name}: some values are masked: fill them, or leave out the rows")
-    if hasattr(given, "to_frame"):  # one column of pandas or Polars
-        given = given.to_frame()
-    tabular = hasattr(given, "iloc") or hasattr(given, "__arrow_c_stream__")
-    if not tabular or not hasattr(given, "columns"):
-        return given.to_numpy() if hasattr(given, "to_numpy") else given
+    if hasattr(data, "to_frame"):  # one column of pandas or Polars
+        data = data.to_frame()
+    tabular = hasattr(data, "iloc") or hasattr(data, "__arrow_c_stream__")
+    if not tabular or not hasattr(data, "columns"):
+        return data.to_numpy() if hasattr(data, "to_numpy") else data
     import pyarrow
 
-    if hasattr(given, "iloc"):  # pandas
-        table = pyarrow.Table.from_pandas(given, preserve_index=False)
+    if hasattr(data, "iloc"):  # pandas
+        table = pyarrow.Table.from_pandas(data, preserve_index=False)
     else:
-        table = pyarrow.table(given)
+        table = pyarrow.table(data)
     columns = []
     for key, column in zip(table.column_names, table.columns, strict=True):
         kinds, kind = pyarrow.types, column.type
@@ -60,19 +62,22 @@ def without_table(given: Any, name: str = "frames") -> Any:
                 column = column.cast("float64")
         values: NDArray[Any] = column.to_numpy()
         if values.dtype.kind not in "biuf":
-            raise UsageError(f"{name}: the column {key} is of type {kind}, no numbers")
+            raise UsageError(
+                f"{name}: column {key} has the type {kind}, which is not numeric: leave it out"
+            )
         columns.append(values)
     return np.column_stack(columns) if columns else np.empty((len(table), 0))
 
 
 def mean_of(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
-    """Return the mean of the frames of an episode, the same bits however they are cut.
+    """Return the mean of an episode's frames; how the frames are cut changes no bit of it.
 
     Args:
-        pieces: (n, *frame_shape) each, one frame at least in all, uint8 pixels or float64 values.
+        pieces: arrays (n, *frame_shape) of uint8 pixels or float64 values, at least one frame
+            in all.
 
     Returns:
-        (*frame_shape) int16 of pixels, rounded, half of one up; float64 of values.
+        (*frame_shape) of pixels int16, rounded, halves up; of values float64.
     """
     total: Any = 0
     count = 0
@@ -81,7 +86,8 @@ def mean_of(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
         if frames.dtype == np.uint8:
             total = total + frames.sum(axis=0, dtype=np.int64)
         else:
-            for frame in frames:  # one after the other: in what order numpy adds is its own
+            # One frame after the other: the order in which numpy adds depends on the cut.
+            for frame in frames:
                 total = total + frame
     if total.dtype == np.int64:
         return np.asarray((2 * total + count) // (2 * count), np.int16)
@@ -89,19 +95,19 @@ def mean_of(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
 
 
 def centred(frames: NDArray[Any], mean: NDArray[Any]) -> NDArray[Any]:
-    """Return the frames of an episode without its mean.
+    """Return the frames of an episode without the episode's mean.
 
-    Of pixels that is `GRAY` and how far each is from the mean, no darker than black and no
-    brighter than white. Where it was neither, centred once more they stay as they are.
+    A centred pixel is `GRAY` plus its difference from the mean, limited to 0 to 255. If no pixel
+    was limited, centring the result again does not change it.
 
     Args:
         frames: (n, *frame_shape) uint8 or float64.
-        mean: of the whole episode, see `mean_of`.
+        mean: mean of the whole episode, see `mean_of`.
     """
     if frames.dtype != np.uint8:
         return np.asarray(frames - mean)
-    apart = frames - (mean - np.int16(GRAY))
-    return np.clip(apart, 0, 255, out=apart).astype(np.uint8)
+    difference = frames - (mean - np.int16(GRAY))
+    return np.clip(difference, 0, 255, out=difference).astype(np.uint8)
 
 
 def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
@@ -109,19 +115,19 @@ def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
 
     Args:
         frames: (n, I).
-        size: the I that there must be; None for any.
+        size: required number of values I; None for any.
 
     Returns:
-        The frames, a view, or a copy where they lie in another order.
+        The frames: a view, or a copy if they are not in C order.
 
     Raises:
-        UsageError: they are of another shape or type.
+        UsageError: the frames have a different shape or type.
     """
     array = frames if type(frames) is np.ndarray else as_array(frames)
     fits = array.ndim == 2 and size in (None, array.shape[1])
     if array.dtype not in _TYPES or not fits:
-        wanted = f"uint8 pixels or float64 values, (n, {'values' if size is None else size})"
-        raise UsageError(f"frames of {array.dtype} {array.shape} given: give {wanted}")
+        expected = f"uint8 pixels or float64 values, (n, {'values' if size is None else size})"
+        raise UsageError(f"frames are {array.dtype} {array.shape}: give {expected}")
     flags = array.flags
     if not (flags.c_contiguous and flags.aligned):
         array = array.copy(order="C")

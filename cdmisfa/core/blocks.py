@@ -1,7 +1,7 @@
-"""Frames on their way to the learner: `Block`, and where they come from: `FrameSource`.
+"""Blocks of frames, and the interfaces of the sources that deliver them.
 
-All streams share one clock: a frame counter t that runs on for every stream,
-whichever is watched, as the channels of a television do.
+All streams of a source share one clock: a frame counter t that advances for every stream,
+whichever the learner attends to.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from numpy.typing import NDArray
 from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time_of, times_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 
-# The only type whose values are pixels, and the value of one step of a pixel.
+# The only element type that holds pixels, and the value of one gray level.
 UINT8 = np.dtype(np.uint8)
 PIXEL = 1.0 / 255.0
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """The frames one stream shows from t on.
+    """Consecutive frames of one stream.
 
     Attributes:
         stream: index of the stream, from 0.
         t: global frame counter of the first frame.
         frames: (n, *frame_shape), uint8 pixels or float64 values; C-contiguous,
             read-only, and never written again by the source.
-        truth: (n, D) float64, what the world knows and the learner must not:
-            one column per name in `SourceSpec.truth`. D may be 0.
+        truth: (n, D) float64 true state of the world, which the learner does not see: one column
+            for each name in `SourceSpec.truth`. D may be 0.
     """
 
     stream: int
@@ -47,19 +47,19 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class SourceSpec:
-    """Specification of a source: what all its blocks have in common.
+    """Properties that all blocks of a source have in common.
 
     Attributes:
-        streams: a name for each stream (the view's name in a recording).
+        streams: name of each stream (of the view in a recording).
         frame_shape: (height, width) of an image, (I,) of a vector.
         dtype: "uint8" for pixels, "float64" for values.
-        truth: a name for each column of `Block.truth`.
+        truth: name of each column of `Block.truth`.
         fps: frames per second of the common clock.
-        start_ns: log time of frame 0, in nanoseconds.
-        length: number of frames, or None where the stream does not end.
+        start_ns: log time of frame 0 (ns).
+        length: number of frames, or None if the source is endless.
 
     Raises:
-        UsageError: there is no clock of so many frames a second.
+        UsageError: `fps` is outside of 1e-6 to 1e9.
     """
 
     streams: tuple[str, ...]
@@ -72,27 +72,27 @@ class SourceSpec:
 
     def __post_init__(self) -> None:
         if not SLOWEST <= self.fps <= NANOSECONDS:
-            raise UsageError(f"a source of {self.fps} frames a second has no clock")
+            raise UsageError(f"a source cannot have {self.fps} frames a second: give 1e-6 to 1e9")
 
     @property
     def images(self) -> bool:
-        """Whether frames are gray images, and not values."""
+        """Whether frames are gray images."""
         return self.dtype == "uint8" and len(self.frame_shape) == 2
 
     def time_ns(self, t: int) -> int:
-        """Log time of frame t, in nanoseconds."""
+        """Return the log time of frame t (ns)."""
         return time_of(t, self.fps, self.start_ns)
 
     def times(self, start: int, stop: int) -> Times:
-        """Log times of the frames [start, stop), (stop - start,) nanoseconds."""
+        """Return (stop - start,) log times of the frames [start, stop) (ns)."""
         return times_of(np.arange(start, stop), self.fps, self.start_ns)
 
     def frames_at(self, times: NDArray[Any]) -> Times:
-        """Return the frames nearest to log times, (n,) nanoseconds."""
+        """Return the numbers of the frames nearest to the log times (n,) (ns)."""
         return nearest_frames(times, self.fps, self.start_ns)
 
     def facts(self) -> dict[str, Any]:
-        """Return facts for a notebook, by names."""
+        """Return facts for the `repr`, by name."""
         return {
             "streams": ", ".join(self.streams),
             "frames": "without end" if self.length is None else self.length,
@@ -103,71 +103,71 @@ class SourceSpec:
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """Streams of frames on one clock: simulated, synthetic, live or recorded, all the same.
+    """Streams of frames on one clock: simulated, synthetic, live or recorded.
 
-    It only goes forward; what can also go back is a `SeekableSource`.
+    A source moves forward only; one that can also go back is a `SeekableSource`.
 
-    Blocks do not depend on how they are cut: `take(s, 40)` gives the frames of
-    `take(s, 15)` followed by `take(s, 25)`. Which stream is watched never changes
-    what the streams show.
+    Frames do not depend on the lengths of the blocks: `take(s, 40)` gives the frames of
+    `take(s, 15)` followed by `take(s, 25)`. Attending to a stream never changes the frames of any
+    stream.
 
-    Streams of cameras have gaps: frames that a stream lacks. Then `take` gives the next n frames
-    that follow one another, wherever they begin, and moves t behind them; `take_all` gives a
-    block for each unbroken stretch, and none for a stream that shows nothing.
+    Streams of cameras have gaps, that is missing frames. `take` then returns the next n consecutive
+    frames, wherever they begin, and moves t behind them; `take_all` returns a block for each
+    stretch without a gap, and none for a stream without frames.
     """
 
     @property
     def spec(self) -> SourceSpec:
-        """Specification of the source's blocks."""
+        """Properties of the source's blocks."""
 
     @property
     def t(self) -> int:
-        """Global counter of the next frame."""
+        """Number of the next frame."""
 
     def take(self, stream: int, n: int) -> Block:
-        """Return the n frames that `stream` shows at t .. t+n-1; moves t by n.
+        """Return the frames t to t + n - 1 of a stream, and move t by n.
 
         Raises:
-            LogExhaustedError: a recording has fewer than n frames left; t stays.
-            ValueError: no such stream, or n < 1.
+            LogExhaustedError: the recording has fewer than n frames left; t does not move.
+            ValueError: the stream does not exist, or n < 1.
         """
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """Return what every stream shows in the next n frames, in their order; moves t by n.
+        """Return the next n frames of every stream, in the streams' order, and move t by n.
 
         Raises:
-            LogExhaustedError: fewer than n frames are left; t stays.
+            LogExhaustedError: fewer than n frames are left; t does not move.
             ValueError: n < 1.
         """
 
     def describe(self) -> Mapping[str, Any]:
-        """Return what identifies the source, as JSON values: its kind, seed or file hashes.
+        """Return the identity of the source as JSON values: its kind, seed or file hashes.
 
         Raises:
-            LogDamagedError: it was replaced since it was opened, by others or in part.
+            LogDamagedError: another program replaced a file of it since it was opened.
         """
 
     def close(self) -> None:
-        """Let go of files and simulators; harmless when called twice."""
+        """Close files and simulators; a second call does nothing."""
 
 
 @runtime_checkable
 class SeekableSource(FrameSource, Protocol):
-    """A source that can show any frame again; deriving from it gives `spans` and `take_all`."""
+    """Source that can return any frame again; it inherits `spans` and `take_all`."""
 
     def seek(self, t: int) -> None:
-        """Move the clock to frame t, so that the next block starts there.
+        """Set t, so that the next block starts there.
 
         Raises:
-            ValueError: there is no frame before 0.
+            ValueError: t is negative.
         """
 
     def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
-        """Return the unbroken stretches [low, high) of a stream within the frames [start, stop)."""
+        """Return the stretches [low, high) of a stream without a gap, within [start, stop)."""
         return [(start, stop)]
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """Return what every stream shows in the next n frames; see `FrameSource`."""
+        """Return the next n frames of every stream; see `FrameSource`."""
         start = self.t
         blocks = []
         for stream in range(len(self.spec.streams)):
@@ -178,23 +178,27 @@ class SeekableSource(FrameSource, Protocol):
 
 @runtime_checkable
 class LongSource(FrameSource, Protocol):
-    """A source of files that take long to read: less is known of it until all of them were."""
+    """Source of files that take long to read, so that their hashes are optional."""
 
     def describe(self, progress: Callable[[int, int], None] = ...) -> Mapping[str, Any]:
-        """See `FrameSource`; tells how many bytes were read and how many there are, if many."""
+        """Return the identity of the source; see `FrameSource`.
+
+        Args:
+            progress: called with the number of bytes read and the total, if reading takes long.
+        """
 
     def describe_at_once(self) -> Mapping[str, Any]:
-        """Return what `describe` returns, with a sample of each file that takes long to read."""
+        """Return the identity of the source from a sample of each file that takes long to read."""
 
 
 class Described:
-    """An object whose `repr` states some facts about it."""
+    """Object whose `repr` shows facts about it."""
 
     __slots__ = ()
 
     @abstractmethod
     def _facts(self) -> Mapping[str, Any]:
-        """Return facts about the object, by names."""
+        """Return facts about the object, by name."""
 
     def __repr__(self) -> str:
         first, *rest = self._facts().items()
@@ -203,12 +207,12 @@ class Described:
 
 
 class ForwardSource(Described, FrameSource):
-    """A source that holds its spec and its clock, and need not be able to go back.
+    """Base of a source that moves forward only: it stores the spec and the clock.
 
-    A class that derives from it sets `_spec`, and `_t` where its first frame is not 0.
+    A derived class sets `_spec`, and `_t` if the first frame is not 0.
 
     Attributes:
-        gaps: whether streams may lack frames.
+        gaps: True if frames of a stream can be missing.
     """
 
     gaps: bool = False
@@ -217,38 +221,38 @@ class ForwardSource(Described, FrameSource):
 
     @property
     def spec(self) -> SourceSpec:
-        """Specification of the source's blocks."""
+        """Properties of the source's blocks."""
         return self._spec
 
     @property
     def t(self) -> int:
-        """Global counter of the next frame."""
+        """Number of the next frame."""
         return self._t
 
     def take(self, stream: int, n: int) -> Block:
-        """Return the next n frames of a stream that follow one another without a gap.
+        """Return the next n consecutive frames of a stream.
 
-        What the other streams show meanwhile is passed over.
+        Frames of the other streams in the meantime are skipped.
 
         Raises:
-            LogExhaustedError: the source ends before.
-            ValueError: no such stream, or n < 1.
+            LogExhaustedError: the source ends first.
+            ValueError: the stream does not exist, or n < 1.
         """
         check_request(self.spec, stream, n)
         run: list[Block] = []
-        held = 0
-        while held < n:
-            for block in self.take_all(n - held):
+        count = 0
+        while count < n:
+            for block in self.take_all(n - count):
                 if block.stream != stream:
                     continue
                 if run and run[-1].t + len(run[-1]) != block.t:
-                    run, held = [], 0
+                    run, count = [], 0
                 run.append(block)
-                held += len(block)
-        return _as_one(run)
+                count += len(block)
+        return _join(run)
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: there is nothing to close."""
 
     def __enter__(self) -> Self:
         return self
@@ -261,27 +265,33 @@ class ForwardSource(Described, FrameSource):
 
 
 class ClockedSource(ForwardSource, SeekableSource):
-    """A source of which any frame can be shown again, and so needs `take` and `describe` alone."""
+    """Base of a source that can return any frame again; it needs `take` and `describe` only."""
 
-    # The arguments with which `open_scene` opened it.
+    # Arguments of the `open_scene` call that opened the source.
     _scene_opened: Any = None
 
     def seek(self, t: int) -> None:
-        """Move the clock to frame t; see `SeekableSource.seek`."""
+        """Set t; see `SeekableSource.seek`."""
         if t < 0:
             raise ValueError(f"there is no frame {t}: the first is 0")
         self._t = t
 
 
 def turn_to(source: FrameSource, before: int, after: int) -> None:
-    """Pass over the frames that are lost as a head turns from one stream to another.
+    """Skip the frames that are lost while a head turns from one stream to another.
 
-    A source whose head has to turn says how many: `turns`, [from][to]. They depend on the two
-    alone, so that a recording gives the blocks that the scene gave.
+    A source whose head has to turn has the attribute `turns`: turns[from][to] is the number of lost
+    frames. It depends on the two streams only, so that a recording gives the same blocks as the
+    scene.
+
+    Args:
+        source: the source.
+        before: index of the stream of the last block.
+        after: index of the stream of the next block.
     """
     turns = getattr(source, "turns", ())
     if turns and isinstance(source, SeekableSource):
-        with contextlib.suppress(LogExhaustedError):  # which the next `take` says
+        with contextlib.suppress(LogExhaustedError):  # the next `take` raises it
             source.seek(source.t + turns[before][after])
 
 
@@ -290,8 +300,8 @@ class HeadPose:
     """Pose of the head in the robot's root frame.
 
     Attributes:
-        position: (x, y, z) of the neck yaw joint, metres.
-        quaternion: (x, y, z, w) of its turn about the vertical.
+        position: (x, y, z) of the neck yaw joint (m).
+        quaternion: (x, y, z, w) of the rotation about the vertical.
     """
 
     position: tuple[float, float, float]
@@ -304,12 +314,12 @@ def description(
     at_once: bool = False,
     progress: Callable[[int, int], None] = lambda done, size: None,
 ) -> dict[str, Any]:
-    """Return what identifies a source, its kind at least; see `FrameSource.describe`.
+    """Return the identity of a source, at least its kind; see `FrameSource.describe`.
 
     Args:
         source: the source.
-        at_once: with less of its files where they take long to read; see `LongSource`.
-        progress: of bytes that were read and that are to be read, where they take long to read.
+        at_once: True to use a sample of files that take long to read; see `LongSource`.
+        progress: called with the number of bytes read and the total, if reading takes long.
 
     Raises:
         LogDamagedError: as for `FrameSource.describe`.
@@ -320,10 +330,10 @@ def description(
 
 
 def check_request(spec: SourceSpec, stream: int, n: int) -> None:
-    """Refuse a block that no source can give.
+    """Check that a request for a block is valid.
 
     Raises:
-        ValueError: no such stream, or fewer than one frame.
+        ValueError: the stream does not exist, or n < 1.
     """
     if not 0 <= stream < len(spec.streams):
         raise ValueError(f"stream {stream} does not exist: there are {len(spec.streams)}")
@@ -332,22 +342,22 @@ def check_request(spec: SourceSpec, stream: int, n: int) -> None:
 
 
 def unbroken(blocks: Iterable[Block]) -> list[Block]:
-    """Return the unbroken stretches of streams that were read in pieces.
+    """Return the stretches without a gap of streams that were read in pieces.
 
     Args:
-        blocks: those of each stream in order of time.
+        blocks: pieces, those of each stream in order of time.
     """
-    found: dict[int, list[list[Block]]] = {}
+    by_stream: dict[int, list[list[Block]]] = {}
     for block in blocks:
-        runs = found.setdefault(block.stream, [[]])
+        runs = by_stream.setdefault(block.stream, [[]])
         if runs[-1] and runs[-1][-1].t + len(runs[-1][-1]) != block.t:
             runs.append([])
         runs[-1].append(block)
-    return [_as_one(run) for runs in found.values() for run in runs]
+    return [_join(run) for runs in by_stream.values() for run in runs]
 
 
-def _as_one(run: Sequence[Block]) -> Block:
-    """Return blocks of a stream that follow one another, as one."""
+def _join(run: Sequence[Block]) -> Block:
+    """Return consecutive blocks of a stream as one block."""
     if len(run) == 1:
         return run[0]
     frames = freeze(np.concatenate([block.frames for block in run]))
@@ -356,6 +366,6 @@ def _as_one(run: Sequence[Block]) -> Block:
 
 
 def freeze(array: NDArray[Any]) -> NDArray[Any]:
-    """Mark an array as never to be written again, and return it."""
+    """Mark an array as read-only, and return it."""
     array.flags.writeable = False
     return array

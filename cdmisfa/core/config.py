@@ -1,9 +1,9 @@
 """Configuration: frozen dataclasses, filled from TOML presets and `--set` words.
 
-Each package owns the dataclass of its own section: `learner` here and in `agents.progress`,
-`record` and `scene` in `recorder`, `input` in `recorder.images`. A key states its type, its default
-and the range of its values in one place, see `key`. `build` fills any section, and refuses a key
-that does not exist with the nearest one that does.
+Each package defines the dataclass of its own section: `learner` here and in `agents.progress`,
+`record` and `scene` in `recorder`, `input` in `recorder.images`. `key` declares the type, the
+default and the range of a key in one place. `build` fills a section; for an unknown key it raises
+an error with the nearest name.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from cdmisfa.core.untrusted import read_regular
 T = TypeVar("T")
 
 
-# More whitening components than this would take minutes a frame.
+# Largest number of whitened components; more would take minutes a frame.
 MAX_COMPONENTS = 1000
 
-# A block of more frames than this does not fit into memory beside its images.
+# Largest number of frames in a block; more do not fit into memory beside their images.
 MAX_TAU = 100_000
 
-# Largest preset in bytes: the time for keys of many parts grows with the square of their number.
+# Largest preset in bytes: parsing time grows with the square of the number of dots in a key.
 MAX_PRESET = 16 * 1024
 
-# Most characters of a value or key in an error.
-SHOWN = 120
+# Characters of a value or key in an error; longer ones are cut.
+MAX_TEXT = 120
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 3
 _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 8
-_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = SHOWN
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = MAX_TEXT
 
 
 def key(
@@ -59,13 +59,13 @@ def key(
     """Declare a key of a section.
 
     Args:
-        default: the value where nothing is set.
-        low: least value, or the key of the same section that holds it; of a tuple, of each number.
-        high: the same for the largest value. Infinity is always refused.
-        above: `low` itself is refused.
-        rising: the numbers of the tuple must not fall.
-        unstated: `section_table` leaves the default out, so that recordings of scenes without the
-            key keep their bytes.
+        default: the default value.
+        low: smallest value, or the name of the key that holds it; for a tuple, of each number.
+        high: largest value, in the same way. Infinity is always refused.
+        above: True if the value must be above `low`.
+        rising: True if the numbers of a tuple must not fall.
+        unstated: True if `section_table` leaves out the default, so that recordings of scenes that
+            are older than the key keep their bytes.
     """
     rule = {"low": low, "high": high, "above": above, "rising": rising, "unstated": unstated}
     return dataclasses.field(default=default, metadata=rule)
@@ -73,7 +73,7 @@ def key(
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A table of configuration: every value has the type of its key and lies in its range."""
+    """Section of the configuration: every value has the type of its key and is in its range."""
 
     prefix: ClassVar[str] = ""
 
@@ -94,12 +94,12 @@ class Section:
             value = convert_value(value, hints[field.name], self.key_name(field.name))
             object.__setattr__(self, field.name, value)
         for field in fields:
-            if field.metadata and (wanted := self._misfit(field.name, field.metadata)):
+            if field.metadata and (expected := self._misfit(field.name, field.metadata)):
                 value = _SHORT.repr(getattr(self, field.name))
-                raise UsageError(f"{self.key_name(field.name)} is {value}: it must be {wanted}")
+                raise UsageError(f"{self.key_name(field.name)} is {value}: it must be {expected}")
 
     def _misfit(self, name: str, rule: Mapping[str, Any]) -> str:
-        """Return what a value must be, or "" where it is."""
+        """Return the values that are allowed, or "" if the present value is."""
         low, high = (
             getattr(self, rule[bound]) if isinstance(rule[bound], str) else rule[bound]
             for bound in ("low", "high")
@@ -193,7 +193,7 @@ class LearnerConfig(Section):
     roc_error: float = key(0.1, 0)
 
     def reward_beta(self, n_streams: int) -> float:
-        """Weight of the expert reward: as set, or the paper's nu ln 2 / (2 (n-1)).
+        """Return the weight of the expert reward: `beta`, or the paper's nu ln 2 / (2 (n-1)).
 
         Source: paper, Hyper Parameters.
         """
@@ -206,16 +206,16 @@ _hints: Any = cache(typing.get_type_hints)
 
 
 def presets() -> tuple[str, ...]:
-    """Return the names of the presets that come with the package."""
+    """Return the names of the presets in the package."""
     folder = resources.files("cdmisfa.presets")
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml")))
 
 
 def load_preset(name: str) -> dict[str, dict[str, Any]]:
-    """Return the sections of a preset, or of a TOML file where `name` ends in .toml.
+    """Return the sections of a preset, or of a TOML file if `name` ends in .toml.
 
     Raises:
-        UsageError: no such preset or file, or it is not TOML.
+        UsageError: the preset or file does not exist, or is not TOML.
     """
     if name.endswith(".toml"):
         data = read_regular(Path(name), MAX_PRESET)
@@ -227,42 +227,44 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
         document = tomllib.loads(data.decode("utf-8").replace("\r\n", "\n"))
         for section, table in document.items():
             if not isinstance(table, dict):
-                raise ValueError(f"{shown(section)} is outside of any [section]")
+                raise ValueError(f"{short_text(section)} is outside of any [section]")
     except (ValueError, RecursionError) as error:
-        raise UsageError(f"{name}: no preset, which is TOML: {error}") from None
+        raise UsageError(f"{name}: not a preset, which is a TOML file: {error}") from None
     return document
 
 
-def shown(value: Any) -> str:
-    """Return a value as an error shows it: texts as they are, others as in Python, all short."""
+def short_text(value: Any) -> str:
+    """Return a value for an error: a text as it is, others as in Python, all shortened."""
     text = value if isinstance(value, str) else _SHORT.repr(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+    return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}..."
 
 
 def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Turn `section.key=value` words into sections of texts.
+    """Parse `section.key=value` words into sections.
 
     Raises:
-        UsageError: a word of another form.
+        UsageError: a word has another form.
     """
     sections: dict[str, dict[str, str]] = {}
     for word in words:
         path, equals, value = word.partition("=")
         section, dot, name = path.strip().partition(".")
         if not (equals and section and dot and name):
-            raise UsageError(f"--set {shown(word)}: write section.key=value, as learner.nu=0.02")
+            raise UsageError(
+                f"--set {short_text(word)}: write section.key=value, as learner.nu=0.02"
+            )
         sections.setdefault(section, {})[name] = value.strip()
     return sections
 
 
 def build(cls: type[T], prefix: str, *layers: Mapping[str, Any], base: T | None = None) -> T:
-    """Fill a section's dataclass from layers of values, the last one winning.
+    """Fill a section's dataclass from layers of values; later layers override earlier ones.
 
-    Values may be of the key's type or text of it (as given to `--set`); nested
-    dataclasses take tables or dotted names.
+    A value has the key's type or is a text of it, as given to `--set`. The values of nested
+    dataclasses are tables or have dotted names.
 
     Raises:
-        UsageError: an unknown key (with the nearest valid one) or a value that does not fit.
+        UsageError: a key is unknown, or a value does not fit.
     """
     hints = _hints(cls)
     names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
@@ -274,21 +276,21 @@ def build(cls: type[T], prefix: str, *layers: Mapping[str, Any], base: T | None 
             table = name in names and dataclasses.is_dataclass(hints[name])
             if name not in names or (dot and not table):
                 hint = did_you_mean(name, names, f"{prefix}.")
-                raise UsageError(f"unknown key {prefix}.{shown(path)}: {hint}")
+                raise UsageError(f"unknown key {prefix}.{short_text(path)}: {hint}")
             if table:
                 nested.setdefault(name, []).append({rest: value} if dot else value)
             else:
                 values[name] = convert_value(value, hints[name], f"{prefix}.{name}")
     for name, parts in nested.items():
         if not all(isinstance(part, Mapping) for part in parts):
-            raise UsageError(f"{prefix}.{name} is a table: set one of its keys")
+            raise UsageError(f"{prefix}.{name} is not a value but a table: set one of its keys")
         inner = getattr(base or cls(), name)
         values[name] = build(hints[name], f"{prefix}.{name}", *parts, base=inner)
     return dataclasses.replace(base, **values) if base else cls(**values)  # type: ignore[type-var]
 
 
 def convert_value(value: Any, hint: Any, key: str) -> Any:
-    """Return a value, or its text, as the type of a key.
+    """Return a value, or the value of a text, in the type of a key.
 
     Raises:
         UsageError: the value does not fit.
@@ -327,7 +329,7 @@ def _converted(value: Any, hint: Any) -> Any:
 
 
 def _words_of(hint: Any) -> str:
-    """Return what values of a type are, for an error."""
+    """Return a description of the values of a type, for an error."""
     kind, arguments = typing.get_origin(hint), typing.get_args(hint)
     if kind is Literal:
         return f"one of {', '.join(map(str, arguments))}"
@@ -360,7 +362,7 @@ def _text(value: Any) -> str:
     raise TypeError
 
 
-# For each type of a key: its words in errors, and its conversion from a value or text.
+# For each type of a key: its description in errors, and the conversion from a value or text.
 _SCALARS: Mapping[Any, tuple[str, Callable[[Any], Any]]] = {
     bool: ("true or false", lambda value: {"true": True, "false": False}[str(value).lower()]),
     int: ("a whole number", _whole),

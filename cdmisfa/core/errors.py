@@ -1,7 +1,7 @@
-"""Errors whose message a user can act on, and the words that messages share.
+"""Errors whose message tells a user what to do, and texts that several messages share.
 
-The message is built where the fact is known and names the file or key and the
-remedy. Only the command line turns these into exit codes.
+The code that detects a problem writes the message: what is wrong, in which file or key, and what
+to do. Only the command line turns an error into an exit code.
 """
 
 from __future__ import annotations
@@ -14,53 +14,54 @@ Entry = TypeVar("Entry")
 
 
 class CdmisfaError(Exception):
-    """Something the user can mend; the message is one line that says how."""
+    """Base of all errors that a user can correct; the message is one line."""
 
     exit_code = 1
 
 
 class UsageError(CdmisfaError):
-    """A wrong option, configuration key or value, or a path that must not be used."""
+    """Wrong option, configuration key or value, or a path that must not be used."""
 
     exit_code = 2
 
 
 class LogDamagedError(CdmisfaError):
-    """A log that is not what its format, its checksums or its own index say."""
+    """Log that contradicts its format, its checksums or its own index."""
 
     exit_code = 3
 
 
 class LogWriteError(CdmisfaError):
-    """A log could not be written: a full disk, a lost mount, missing rights."""
+    """Log that could not be written, for example because the disk is full."""
 
 
 class LogExhaustedError(CdmisfaError):
-    """A recording ended before the learner did, and looping was not asked for."""
+    """End of a recording before the learner finished, without looping."""
 
 
 class NotReproducedError(CdmisfaError):
-    """A result differs from the one it was compared with."""
+    """Difference between a result and the result that it must equal."""
 
     exit_code = 4
 
 
-def are_for(options: Sequence[str], what: str) -> str:
-    """Return the text "--a and --b are for WHAT", for an error."""
-    *before, last = options
-    return f"{', '.join(before)} and {last} are for {what}" if before else f"{last} is for {what}"
+def are_for(options: Sequence[str], purpose: str) -> str:
+    """Return the text "--a and --b are for PURPOSE", for an error."""
+    *first, last = options
+    verb = f"{', '.join(first)} and {last} are" if first else f"{last} is"
+    return f"{verb} for {purpose}"
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of a library's error, short and in one line."""
+    """Return the message of a library's error in one line of at most 200 characters."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 class Registry(dict[str, Entry]):
-    """Entries by name; looking up an unknown name raises a `UsageError` with the nearest name.
+    """Dictionary in which an unknown name raises a `UsageError` with the nearest name.
 
     Args:
-        kind: what an entry is, for the error: "expansion".
+        kind: kind of the entries in the error, such as "expansion".
         entries: the entries by name, in the order in which they are listed.
 
     Example:
@@ -74,17 +75,17 @@ class Registry(dict[str, Entry]):
         self._kind = kind
 
     def __missing__(self, name: str) -> Entry:
-        """Raise the error about an unknown name."""
+        """Raise the error for an unknown name."""
         raise UsageError(f"no {self._kind} {name!r}: {did_you_mean(name, self)}")
 
 
 def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """Return the end of an error about an unknown name: the nearest one, or all there are.
+    """Return the end of an error for an unknown name: the nearest name, or all names.
 
     Args:
-        name: as it was written.
-        known: the names there are.
-        prefix: text before each of them.
+        name: the name that was given.
+        known: the names that exist.
+        prefix: text before each name.
     """
     names = list(known)
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.5)

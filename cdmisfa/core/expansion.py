@@ -1,4 +1,4 @@
-"""Nonlinear expansions of the input, so that linear features of it are nonlinear ones."""
+"""Nonlinear expansions of frames: features linear in an expansion are nonlinear in the inputs."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from cdmisfa.core.errors import Registry
 
 @dataclass(frozen=True, slots=True)
 class Expansion:
-    """How frames are expanded.
+    """One way to expand frames.
 
     Attributes:
-        size: length of an expanded frame, from that of a frame.
-        function: (n, I) uint8 pixels, which count 1/255 each, or float64 values, in C order and
-            not to be written -> (n, size(I)) pixels or values. A row depends on its frame only.
+        size: returns the length of an expanded frame for the length of a frame.
+        function: expands frames (n, I) to (n, size(I)). Frames are uint8 pixels, which count
+            1/255 each, or float64 values, in C order and read-only. Each row of the result must
+            depend on its own frame only.
     """
 
     size: Callable[[int], int]
@@ -40,7 +41,7 @@ def _pairs(size: int) -> tuple[NDArray[np.intp], ...]:
     return np.triu_indices(size)
 
 
-# Every expansion, by the name that `learner.expansion` takes.
+# All expansions, by their name in `learner.expansion`.
 EXPANSIONS: Registry[Expansion] = Registry(
     "learner.expansion",
     {
@@ -51,32 +52,32 @@ EXPANSIONS: Registry[Expansion] = Registry(
 
 
 def expanded_size(kind: str, n_inputs: int) -> int:
-    """Length of an expanded frame.
+    """Return the length of an expanded frame.
 
     Args:
         kind: a name in `EXPANSIONS`.
         n_inputs: length I of a frame.
 
     Raises:
-        UsageError: there is no such expansion.
+        UsageError: the expansion does not exist.
     """
     return EXPANSIONS[kind].size(n_inputs)
 
 
 def expand(kind: str, frames: Any) -> NDArray[Any]:
-    """Expanded frames.
+    """Return expanded frames, (n, size(I)).
 
     Args:
         kind: a name in `EXPANSIONS`.
         frames: (n, I) uint8 pixels, which count 1/255 each, or float64 values.
 
     Raises:
-        UsageError: there is no such expansion, these are no frames, or it gives none.
+        UsageError: the expansion does not exist, or does not return frames of its size.
     """
     expansion, rows = EXPANSIONS[kind], as_frames(frames)
     return as_frames(expansion.function(rows), expansion.size(rows.shape[1]))
 
 
 def quadratic(frames: Any) -> NDArray[np.float64]:
-    """Return all inputs, then all products of two: (x1, x2, x1^2, x1 x2, x2^2) for two inputs."""
+    """Return all inputs and all products of two: (x1, x2, x1^2, x1 x2, x2^2) for two inputs."""
     return expand("quadratic", frames)

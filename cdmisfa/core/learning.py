@@ -1,7 +1,7 @@
-"""The interfaces of learners and of sinks, which take the results of a run.
+"""Interfaces of learners and of sinks, the consumers of a run's iterations.
 
-`cdmisfa.experiments.loop.learn_blocks` brings a source, a learner and sinks together, and
-uses these members alone.
+`cdmisfa.experiments.loop.learn_blocks` connects a source, a learner and sinks through these
+members only.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-if TYPE_CHECKING:  # sinks of the command line are imported without numpy
+if TYPE_CHECKING:  # the command line imports this module without numpy, to start quickly
     import numpy as np
     from numpy.typing import NDArray
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:  # sinks of the command line are imported without numpy
 
 @dataclass(frozen=True, slots=True)
 class LearnerState:
-    """Everything that changes in a learner, from which it can be restored.
+    """State of a learner, from which it can be restored.
 
     Attributes:
-        arrays: the learner's memory, by name.
+        arrays: the learner's arrays, by name.
         modules: the saved modules.
-        policy_rng: state of the policy's random generator, as its `bit_generator.state`.
+        policy_rng: state of the random generator, as its `bit_generator.state`.
     """
 
     arrays: Mapping[str, NDArray[Any]]
@@ -39,10 +39,10 @@ class Keyframe:
     """The state of a run after some iterations, from which it can be resumed.
 
     Attributes:
-        iteration: iterations done.
-        t: the source's next frame.
-        state: of the learner.
-        versions: of the packages that computed it.
+        iteration: number of iterations done.
+        t: number of the source's next frame.
+        state: state of the learner.
+        versions: versions of the packages that computed the run.
     """
 
     iteration: int
@@ -53,19 +53,19 @@ class Keyframe:
 
 @runtime_checkable
 class Learner(Protocol):
-    """Blocks in, signals out. The same blocks give the same signals, bit for bit."""
+    """Interface of a learner: the same blocks give the same signals, bit for bit."""
 
     @property
     def stream(self) -> int:
-        """The stream it wants to watch next."""
+        """Index of the stream of the next block."""
 
     @property
     def tau(self) -> int:
-        """Frames it wants in each block."""
+        """Number of frames in each block."""
 
     @property
     def iteration(self) -> int:
-        """Iterations so far."""
+        """Number of iterations done."""
 
     @property
     def modules(self) -> Sequence[Module]:
@@ -73,37 +73,37 @@ class Learner(Protocol):
 
     @property
     def events(self) -> Sequence[str]:
-        """Messages about the last iteration, one line each."""
+        """Events of the last iteration, one line each."""
 
     @property
     def phi(self) -> NDArray[np.float64]:
-        """Weights of the abstraction being learned, (J, I), a copy."""
+        """(J, I) weights of the feature being learned, a copy."""
 
     @property
     def over(self) -> str:
-        """Why it has nothing left to learn, a key of `loop.ENDINGS`; "" where it has."""
+        """Reason to end, a key of `loop.END_REASONS`; "" while there is something to learn."""
 
     @property
     def max_modules(self) -> int | None:
-        """Modules after which a run ends by default; None: when it is over."""
+        """Number of modules after which a run ends by default; None if only `over` ends it."""
 
     def step(self, block: Block) -> BlockSignals:
-        """Do one iteration: look at tau frames, learn, and choose the next stream.
+        """Do one iteration: learn from a block, and choose the next stream.
 
         Raises:
-            ValueError: it is not the block that was asked for.
-            CdmisfaError: it holds a value that is no finite number.
+            ValueError: the block is not the one that the learner asked for.
+            CdmisfaError: the block holds a value that is not finite.
         """
 
     @property
     def state(self) -> LearnerState:
-        """Everything that changes in it, a copy."""
+        """A copy of the learner's state."""
 
     def restore(self, state: LearnerState) -> None:
-        """Go to a state of a learner with the same configuration, spec and seed.
+        """Restore the state of a learner with the same configuration, spec and seed.
 
         Raises:
-            ValueError: the state is not one of such a learner.
+            ValueError: the state belongs to a different learner.
         """
 
     def summary(self) -> Mapping[str, Any]:
@@ -115,59 +115,59 @@ ARITHMETIC = "arithmetic"
 
 
 def arithmetic_of(learner: Learner) -> int:
-    """Version of how a learner computes: with another one all is the same but for the last bits.
+    """Return the version of a learner's arithmetic: a different version gives different last bits.
 
-    It is the learner's attribute `arithmetic`, 1 of a learner that has none.
+    It is the learner's attribute `arithmetic`, or 1 if there is none.
     """
     return int(getattr(learner, "arithmetic", 1))
 
 
 @runtime_checkable
 class Sink(Protocol):
-    """Takes the iterations and events of a run, in order: a log, a view, a hash, a progress bar.
+    """Consumer of a run's iterations and events, in order: a log, a view, a hash, a progress bar.
 
-    A class that derives from it needs `block`, and may define the others.
+    A derived class defines `block` and may define the other methods.
     """
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """Handle a finished iteration.
 
         Args:
-            block: the watched block.
-            signals: of the iteration.
-            learner: as it is now; not to be changed.
+            block: the block of the iteration.
+            signals: the signals of the iteration.
+            learner: the learner after the iteration; do not change it.
         """
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-        """Something happened that a person wants to read.
+        """Handle an event that a person wants to read.
 
         Args:
-            t: frame at which.
-            iteration: the last one before it.
+            t: number of the frame.
+            iteration: number of the last iteration.
             text: one line.
             level: "INFO" or "WARNING".
         """
         return
 
     def finish(self) -> None:
-        """Handle the end of a run that no error broke off."""
+        """Handle the end of a run that ended without an error."""
         return
 
 
 def overwrite(current: Mapping[str, NDArray[Any]], stored: Mapping[str, NDArray[Any]]) -> None:
-    """Write stored arrays into a learner's arrays of the same names, all of them or none.
+    """Copy stored arrays into a learner's arrays of the same names, all or none of them.
 
     Raises:
-        ValueError: an array is missing or of another shape or type.
+        ValueError: an array is missing or has a different shape or type.
     """
     for name, array in current.items():
         new = stored.get(name)
         if new is None or new.shape != array.shape or new.dtype != array.dtype:
-            raise ValueError(f"{name} is missing or of another shape or type")
+            raise ValueError(f"{name} is missing or has a different shape or type")
     for name, array in current.items():
         array[...] = stored[name]
 
 
 def weights_after(signals: BlockSignals, learner: Learner) -> NDArray[np.float64]:
-    """Return the weights (J, I) at the end of the last iteration, frozen where it saved them."""
+    """Return the weights (J, I) after the last iteration, those of the module if it was saved."""
     return learner.modules[-1].phi if signals.saved else learner.phi

@@ -1,4 +1,4 @@
-"""Names of streams and columns made from those in a log; counts and durations in words."""
+"""Names of streams and columns, and texts for counts and durations."""
 
 from __future__ import annotations
 
@@ -8,44 +8,54 @@ import unicodedata
 from collections.abc import Iterable
 from datetime import timedelta
 
-_OF_VIEWS = re.compile(r"(/view/|observation\.images\.)+(?=.)")
-_LONGEST = 64
+# Prefixes that mark a view in a topic of a recording or in a column of a LeRobot dataset.
+_VIEW_PREFIXES = re.compile(r"(/view/|observation\.images\.)+(?=.)")
 
-# How a column of truth is called that is the action for a frame, that is 1 where an episode of a
-# task begins, or that is a joint of the robot.
+# Longest name of a stream: with the endings of files it stays below the 255 bytes of file systems.
+_MAX_NAME = 64
+
+# Prefixes of the columns of truth that hold an action, mark the start of an episode with 1, or
+# hold a joint angle of the robot.
 ACTION, BEGINS, JOINT = "action_", "begins_", "head_"
 
 
-def counted(number: int, what: str, form: str = "") -> str:
-    """Return how many there are, as 1 block or 2 blocks; the number in such a format, as ','."""
-    return f"{number:{form}} {what}{'' if number == 1 else 's'}"
+def counted(number: int, noun: str, form: str = "") -> str:
+    """Return a count with its noun, such as "1 block" or "2 blocks".
+
+    Args:
+        number: the count.
+        noun: the noun in the singular.
+        form: format specification of the number, such as ",".
+    """
+    return f"{number:{form}} {noun}{'' if number == 1 else 's'}"
 
 
-def lasting(seconds: float | None) -> str:
-    """Return a length of time, as 1:02:03; a line where it is not known."""
+def duration_text(seconds: float | None) -> str:
+    """Return a duration such as "1:02:03", or "-" for None."""
     return "-" if seconds is None else str(timedelta(seconds=round(seconds)))
 
 
-def stream_name(said: str) -> str:
-    """Return the name of a stream, valid as one of a file, from what a log or a camera calls it.
+def stream_name(label: str) -> str:
+    """Return the name of a stream, valid as a file name, for its label in a log or of a camera.
 
-    The topic /cam/left is cam_left. A view has its own name also where it is a topic (/view/left)
-    or a column of a dataset (observation.images.left). Letters lose their accents, those of other
-    scripts stay.
+    The topic /cam/left becomes cam_left. A view keeps its name: the topic /view/left and the
+    dataset column observation.images.left both become left. Accents are removed from letters;
+    letters of other scripts stay.
     """
-    letters = unicodedata.normalize("NFKD", _OF_VIEWS.sub("", said))
+    letters = unicodedata.normalize("NFKD", _VIEW_PREFIXES.sub("", label))
     bare = "".join(c for c in letters if not unicodedata.combining(c))
-    return re.sub(r"[^\w.-]+", "_", bare).strip("._-")[:_LONGEST].rstrip("._-") or "stream"
+    return re.sub(r"[^\w.-]+", "_", bare).strip("._-")[:_MAX_NAME].rstrip("._-") or "stream"
 
 
-def stream_names(said: Iterable[str]) -> tuple[str, ...]:
-    """`stream_name` of each stream, distinct: a number behind those like an earlier one, as cam-2.
+def stream_names(labels: Iterable[str]) -> tuple[str, ...]:
+    """Return distinct `stream_name`s: a repeated name gets a number, as in cam-2.
 
-    One with which an earlier one begins, as cam after cam-left, counts as like it.
+    A name also counts as repeated if an earlier name continues it with a hyphen: cam after cam-left
+    becomes cam-2.
     """
-    found: list[str] = []
-    for name in map(stream_name, said):
-        like = sum(other == name or other.startswith(f"{name}-") for other in found)
-        numbered = (f"{name}-{number}" for number in itertools.count(like + 1))
-        found.append(next(n for n in numbered if n not in found) if like else name)
-    return tuple(found)
+    names: list[str] = []
+    for name in map(stream_name, labels):
+        similar = sum(other == name or other.startswith(f"{name}-") for other in names)
+        numbered = (f"{name}-{number}" for number in itertools.count(similar + 1))
+        names.append(next(n for n in numbered if n not in names) if similar else name)
+    return tuple(names)

@@ -1,4 +1,4 @@
-"""Computation in this process, in others of this machine, or on a dask cluster."""
+"""Computation of many tasks: in this process, in local worker processes, or on a dask cluster."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# Has a worker call a function with arguments.
+# Calls a function with arguments in a worker.
 Submit = Callable[..., Future[Any]]
 
-# How long a scheduler and its first worker may take to answer.
+# Seconds that a dask scheduler and its first worker may take to answer.
 CONNECT_SECONDS = 15
 
-# Tasks that a cluster has at a time: more than it has workers, few enough to hand out soon.
-IN_CLUSTER = 1000
+# Tasks that a cluster has at a time: more than its workers, and few enough to submit quickly.
+MAX_SUBMITTED = 1000
 
-# Environment of local workers: the processes are the parallelism.
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+# Environment of local workers: one thread each, since there are as many workers as processors.
+WORKER_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
 def thread_count() -> int:
-    """Return the number of threads that this process may use: OMP_NUM_THREADS, or processors."""
+    """Return the number of threads to use: OMP_NUM_THREADS, or the number of processors."""
     setting = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     return int(setting) if setting.isdecimal() and 0 < int(setting) < 1000 else os.cpu_count() or 1
 
 
 class WorkersError(CdmisfaError):
-    """Workers died or cannot be reached; what is finished is kept."""
+    """Workers that died or cannot be reached; results of finished tasks are kept."""
 
 
 def run_all(
@@ -58,13 +58,13 @@ def run_all(
     """Compute function(task) for every task, in any order.
 
     Args:
-        function: importable by name from every worker; an exception of its own ends the loop.
-        tasks: picklable.
-        jobs: local processes; with 1 everything is computed in this one.
-        scheduler: address of a dask scheduler, whose workers compute instead.
+        function: a function that every worker can import; an exception of it ends the iteration.
+        tasks: picklable tasks.
+        jobs: number of local processes; 1: compute in this process.
+        scheduler: address of a dask scheduler whose workers compute instead.
 
     Yields:
-        The task's index and its result, as they come.
+        Index and result of a task, as soon as it is finished.
 
     Raises:
         UsageError: dask is not installed.
@@ -76,10 +76,10 @@ def run_all(
             yield index, function(task)
         return
     waiting, running = iter(enumerate(tasks)), dict[Future[Result], int]()
-    most = jobs if scheduler is None else IN_CLUSTER
+    limit = jobs if scheduler is None else MAX_SUBMITTED
     with workers(jobs) if scheduler is None else _dask_workers(scheduler) as submit:
         while True:
-            for index, task in itertools.islice(waiting, most - len(running)):
+            for index, task in itertools.islice(waiting, limit - len(running)):
                 running[submit(function, task)] = index
             if not running:
                 return
@@ -92,22 +92,24 @@ def workers(jobs: int) -> Iterator[Submit]:
     """Start local processes; they end with the context, or with this process if it is killed.
 
     Args:
-        jobs: how many.
+        jobs: number of processes.
 
     Raises:
-        WorkersError: a worker died; nothing that was submitted is computed any more.
+        WorkersError: a worker died; no further task is computed.
     """
     from joblib.externals.loky import ProcessPoolExecutor
 
     _start_trackers()
-    # It warns of workers that it replaces as they have grown, and where pgrep is missing.
+    # loky warns when it replaces a worker whose memory has grown, and if pgrep is missing.
     warnings.filterwarnings("ignore", module=r"joblib\.externals\.loky")
     with tempfile.TemporaryDirectory(prefix="cdmisfa-workers-") as folder:
         begin = (os.getpid(), folder)
-        pool = ProcessPoolExecutor(jobs, env=ONE_THREAD, initializer=_end_with, initargs=begin)
+        pool = ProcessPoolExecutor(
+            jobs, env=WORKER_ENVIRONMENT, initializer=_end_with, initargs=begin
+        )
 
         def submit(function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-            # Processes start in here: a Ctrl-C of the terminal is for this process only.
+            # loky starts its processes here: they must not receive a Ctrl-C of the terminal.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
             try:
                 future: Future[Any] = pool.submit(_call, folder, function, arguments)
@@ -118,26 +120,28 @@ def workers(jobs: int) -> Iterator[Submit]:
         try:
             yield submit
         except BrokenProcessPool as error:
-            why = "a worker process was killed: repeat the command, what is finished is kept"
-            raise WorkersError(why) from error
+            raise WorkersError(
+                "a worker process was killed: repeat the command; finished results are kept"
+            ) from error
         finally:
             pool.shutdown(kill_workers=True)
 
 
 def _start_trackers() -> None:
-    """Start the processes that remove what killed ones left, so that they print nothing.
+    """Start the processes that remove resources of killed processes, without their warnings.
 
-    The start of Python's unblocks signals, also where a worker that starts it shall have none.
+    They start here, because starting Python's own unblocks signals, also in a worker that must not
+    receive any.
     """
-    import multiprocessing.resource_tracker as of_python
+    import multiprocessing.resource_tracker as python_tracker
 
-    import joblib.externals.loky.backend.resource_tracker as of_loky
+    import joblib.externals.loky.backend.resource_tracker as loky_tracker
 
     before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
-        of_python.ensure_running()
-        of_loky.ensure_running()
+        python_tracker.ensure_running()
+        loky_tracker.ensure_running()
     finally:
         del os.environ["PYTHONWARNINGS"]
         if before is not None:
@@ -145,7 +149,7 @@ def _start_trackers() -> None:
 
 
 def _end_with(parent: int, folder: str) -> None:
-    """End this worker when its parent is gone, also when that was killed."""
+    """End this worker when its parent has ended or was killed."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -157,10 +161,10 @@ def _end_with(parent: int, folder: str) -> None:
 
 
 def _call(folder: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """Call a function in a worker; what is large comes back through a file.
+    """Call a function in a worker, and return a large result through a file.
 
-    All workers send through one pipe. One that is killed in the midst of a message leaves a part
-    of it, for whose rest loky waits for ever. A write of up to `PIPE_BUF` bytes is never a part.
+    All workers of loky send through one pipe. A worker that is killed within a message leaves a
+    part of it, and loky waits for the rest forever. Writes of up to `PIPE_BUF` bytes are atomic.
     """
     result = function(*arguments)
     data = pickle.dumps(result)
@@ -173,7 +177,7 @@ def _call(folder: str, function: Callable[..., Any], arguments: tuple[Any, ...])
 
 
 class _Filed:
-    """A result in a file: what is unpickled of it is the result."""
+    """Result that is stored in a file; unpickling this object returns the result."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -190,28 +194,31 @@ def _read(path: str) -> Any:
 
 @contextlib.contextmanager
 def _dask_workers(scheduler: str) -> Iterator[Submit]:
-    """Connect to a dask cluster, whose other workers try a task again when one died of it.
+    """Connect to a dask cluster, which repeats a task on other workers if its worker died.
 
-    joblib's own backend for dask (1.6) waits for ever for a task that every worker died of.
+    joblib's own backend for dask (1.6) waits forever for a task that has killed every worker.
     """
     try:
         distributed: Any = importlib.import_module("distributed")
     except ImportError as error:
-        why = "--scheduler needs a package that is missing: pip install 'cdmisfa[dask]'"
-        raise UsageError(why) from error
-    # Else it logs a traceback of every lost connection; the errors that matter are raised.
+        raise UsageError(
+            "--scheduler needs a package that is missing: pip install 'cdmisfa[dask]'"
+        ) from error
+    # Otherwise it logs a traceback for every lost connection; errors that matter are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         try:
-            distributed.comm.resolve_address(scheduler)  # else a traceback after half a minute
+            distributed.comm.resolve_address(scheduler)  # without it: a traceback after 30 s
             client = distributed.Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
             stack.enter_context(contextlib.closing(client))
             client.wait_for_workers(1, timeout=CONNECT_SECONDS)
         except (OSError, TimeoutError, ValueError) as error:
-            why = f"no dask scheduler with workers answers at {scheduler}: {one_line(error)}"
-            raise WorkersError(why) from error
+            raise WorkersError(
+                f"no dask scheduler with workers answers at {scheduler}: {one_line(error)}"
+            ) from error
         try:
             yield client.get_executor(pure=False).submit
         except (distributed.KilledWorker, CancelledError) as error:
-            why = f"the dask cluster was lost, what is finished is kept: {one_line(error)}"
-            raise WorkersError(why) from error
+            raise WorkersError(
+                f"the dask cluster was lost; finished results are kept: {one_line(error)}"
+            ) from error

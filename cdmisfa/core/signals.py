@@ -26,24 +26,24 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 
 Show = Literal["line", "lane", "heat", "text", "hidden"]
 
-# Names of the codes of actions and policies, and of those of a stream's state.
+# Names of the codes of an action, and of a stream's state (see the signal `state`).
 ACTIONS = ("stay", "switch")
 STATES = ("learning", "learned", "known", "given_up")
 
 # Words of the states for people; `STATES` are the stored ones.
 STATE_WORDS = ("not decided", "learned", "explained", "rejected")
 
-# Code of a stream's state where the learner has none.
+# Code of a stream's state if the learner has no states.
 NO_STATE = -1
 
-# To be raised whenever a field of `BlockSignals` is added, dropped or changes its meaning. Runs of
-# another version are refused.
+# Version of the record. Raise it if a field of `BlockSignals` is added, removed or changes its
+# meaning; runs of another version are refused.
 SCHEMA_VERSION = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """The description of a field of `BlockSignals`.
+    """Description of a field of `BlockSignals`.
 
     Attributes:
         name: the field's name.
@@ -226,7 +226,7 @@ class BlockSignals:
     )
 
 
-# With more streams than this the signal R is left out: its size grows with their square.
+# Number of streams above which the signal R is left out, because its size grows with their square.
 DENSE_STREAMS = 64
 
 
@@ -253,7 +253,7 @@ class SignalsHash:
         self.count = 0
 
     def add(self, signals: BlockSignals) -> None:
-        """Take the next record in."""
+        """Add the next record to the hash."""
         self._hash.update(canonical_bytes(signals))
         self.count += 1
 
@@ -278,20 +278,20 @@ _SCALARS = [s for s in SIGNALS.values() if not s.dims]
 _ARRAYS = [s for s in SIGNALS.values() if s.dims]
 _NUMBERS_OF = attrgetter(*(s.name for s in _SCALARS))
 _ARRAYS_OF = attrgetter(*(s.name for s in _ARRAYS))
-# Made by this name, the type is numpy's own object, and comparing it costs nothing.
+# Made from this text, the type is numpy's shared object, so that comparing types takes no time.
 _ARRAY_TYPES = [np.dtype("<" + np.dtype(s.dtype).str[1:]) for s in _ARRAYS]
 
 
 class _Layout(NamedTuple):
-    """How the bytes lie of records whose arrays have some shapes.
+    """Layout of the canonical bytes of records whose arrays have the same shapes.
 
     Attributes:
-        struct: of all fields; an array is its shape and its elements.
-        placed: brings scalars, shapes and elements of the arrays into its order.
-        sizes: the shape of each array as bytes.
-        order: the arrays, those of float64 first.
-        floats: how many elements these have.
-        parts: where the elements of each array lie, one after the other in that order.
+        struct: format of all fields; an array is its shape and its elements.
+        placed: sorts scalars, shapes and elements of the arrays into the order of the format.
+        sizes: shape of each array as bytes.
+        order: indices of the arrays, those of float64 first.
+        floats: total number of elements of the float64 arrays.
+        parts: slice of the elements of each array in the concatenation in that order.
     """
 
     struct: struct.Struct

@@ -1,7 +1,7 @@
-"""Reading of files that others may have written: which files, how long, with how much memory.
+"""Safe reading of untrusted files: regular files only, with limits of size, time and memory.
 
-One memory budget is for what decodes files in libraries that know no limit. JSON is held to a
-length instead: its values take up to twenty times as much memory.
+`budget` limits the memory of libraries that decode files and have no limit of their own. For JSON a
+limit of the length serves instead: its values take up to twenty times as much memory.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from typing import Any, BinaryIO, Final
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 
-# Bytes that decoding may take; with those of a whole command these are less than 512 MB.
+# Memory that decoding may allocate, in bytes. Set so that a whole command stays below 512 MB. A
+# smaller budget refuses more logs as too large, a larger one lets a hostile file take more memory.
 BUDGET: Final = 336 * 1024 * 1024
 
-# Longest JSON text in bytes: in general, and of a list that grows with what was asked for.
+# Longest JSON text in bytes: in general, and for lists that grow with the number of logs or tasks.
 MAX_JSON: Final = 4 * 1024 * 1024
 MAX_LIST: Final = 16 * 1024 * 1024
 
 _LOCK: Final = threading.Lock()
 _THREAD: Final = threading.local()
-_budgets = 0
-_before = (0, 0)
+_budgets = 0  # number of bodies of `budget` that run now
+_before = (0, 0)  # limits of the process before the first of them
 
 
 def printable(text: str) -> str:
-    """Return a text of which a terminal shows every character and obeys none.
+    """Return a text in which every character is visible and no terminal control sequence is left.
 
-    Controls, line breaks and marks that turn text around are written as in a Python string.
+    Control characters, line breaks and marks of text direction are escaped as in a Python string.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextlib.contextmanager
 def budget(size: int = BUDGET) -> Iterator[None]:
-    """Limit the memory that this process may take while the body runs.
+    """Limit the memory that this process can allocate while the body runs.
 
-    An allocation beyond it raises a MemoryError, as where there is no more memory. A body within
-    another has what is left of the other's. Of bodies in several threads the largest limit holds.
-    On systems other than Linux, which know no such limit, there is none.
+    An allocation beyond the limit raises a MemoryError. A nested call keeps the limit of the outer
+    one. With calls in several threads the largest limit applies. Only Linux has such a limit.
 
     Args:
-        size: bytes beyond those that the process has.
+        size: bytes to allocate beyond the memory that the process has now.
     """
     global _budgets, _before
     if sys.platform != "linux" or getattr(_THREAD, "inside", False):
@@ -81,7 +81,7 @@ def budget(size: int = BUDGET) -> Iterator[None]:
 
 
 def data_bytes() -> int:
-    """Return the bytes of this process's memory that `budget` limits; 0 where there is no limit."""
+    """Return the bytes of this process's memory that `budget` limits; 0 if there is no limit."""
     if sys.platform != "linux":
         return 0
     pages = os.pread(_statm(os.getpid()), 200, 0).split()[5]
@@ -90,20 +90,20 @@ def data_bytes() -> int:
 
 @cache
 def _statm(process: int) -> int:
-    """Open the memory statistics of a process once: they are read for every image."""
+    """Open the memory statistics of a process, once, since they are read for every image."""
     return os.open("/proc/self/statm", os.O_RDONLY)
 
 
-def parse_json(text: str | bytes, most: int = MAX_JSON) -> Any:
+def parse_json(text: str | bytes, limit: int = MAX_JSON) -> Any:
     """Return the value of a JSON text.
 
     Raises:
-        ValueError: it is none, nested too deep or longer than `most`.
+        ValueError: the text is not JSON, nested too deep, or longer than `limit` bytes.
     """
-    if len(text) > most:
-        raise ValueError(f"{len(text)} bytes of JSON, above the limit of {most}")
+    if len(text) > limit:
+        raise ValueError(f"{len(text)} bytes of JSON, above the limit of {limit}")
     collecting = gc.isenabled()
-    gc.disable()  # values of JSON have no cycles, and looking for some takes most of the time
+    gc.disable()  # JSON values have no cycles, and looking for them takes most of the time
     try:
         return json.loads(text if isinstance(text, str) else text.decode("utf-8"))
     except RecursionError:
@@ -114,16 +114,16 @@ def parse_json(text: str | bytes, most: int = MAX_JSON) -> Any:
 
 
 def check_regular(path: Path, limit: int | None = None) -> None:
-    """Refuse a path that is no regular file, a file that is too large, or one without access.
+    """Check that a path is a regular file that can be read.
 
     Raises:
-        UsageError: so it is.
+        UsageError: it is not, or it has more than `limit` bytes.
     """
     os.close(_number_of(path, limit))
 
 
 def _number_of(path: Path, limit: int | None) -> int:
-    """Open a file as `open_regular`; a file that cannot be opened is a UsageError."""
+    """Open a file as `open_regular` does; raise a UsageError if it cannot be opened."""
     try:
         return open_regular(path, limit)
     except OSError as error:
@@ -131,15 +131,15 @@ def _number_of(path: Path, limit: int | None) -> int:
 
 
 def open_regular(path: Path, limit: int | None = None) -> int:
-    """Open a regular file to be read, by its number; nothing else is opened or waited for.
+    """Open a regular file for reading, and return its descriptor; never wait as for a pipe.
 
     Raises:
-        OSError: it cannot be opened.
-        UsageError: it is no regular file, or has more bytes.
+        OSError: the file cannot be opened.
+        UsageError: the path is not a regular file, or has more than `limit` bytes.
     """
-    status = os.stat(path)  # opening alone does something to some devices
+    status = os.stat(path)  # before opening, which has effects on some devices
     if not stat.S_ISREG(status.st_mode):
-        raise UsageError(f"{path}: no regular file")
+        raise UsageError(f"{path}: not a regular file")
     if limit is not None and status.st_size > limit:
         raise UsageError(f"{path}: {status.st_size} bytes, above the limit of {limit}")
     return os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -147,7 +147,7 @@ def open_regular(path: Path, limit: int | None = None) -> int:
 
 @contextlib.contextmanager
 def opened_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
-    """Open a regular file to be read; raises as `read_regular` does, in the body, too."""
+    """Open a regular file for reading; raise errors as `read_regular`, also in the body."""
     number = _number_of(path, limit)
     try:
         with open(number, "rb") as file:
@@ -160,27 +160,27 @@ def read_regular(path: Path, limit: int) -> bytes:
     """Return the bytes of a regular file; never wait as for a pipe, never read beyond the limit.
 
     Raises:
-        UsageError: it is no regular file that may be read, or has more bytes.
-        LogDamagedError: the disk does not give it.
+        UsageError: the path is not a readable regular file, or has more than `limit` bytes.
+        LogDamagedError: reading fails.
     """
     with opened_regular(path, limit) as file:
-        return file.read(limit) or b""  # None of files that never end, as in /proc
+        return file.read(limit) or b""  # read() returns None for endless files, as in /proc
 
 
-def read_json(path: Path, remedy: str, *, most: int = MAX_JSON) -> Any:
+def read_json(path: Path, remedy: str, *, limit: int = MAX_JSON) -> Any:
     """Return the document in a JSON file.
 
     Args:
         path: a regular file.
-        remedy: what to do where it is damaged.
-        most: bytes that it may have.
+        remedy: what to do if it is damaged, the end of the error.
+        limit: largest size (bytes).
 
     Raises:
-        UsageError: it is another file.
-        LogDamagedError: it holds something else, or the disk does not give it.
+        UsageError: the path is not a readable regular file, or it is too large.
+        LogDamagedError: the file is not JSON, or reading fails.
     """
-    data = read_regular(path, most)
+    data = read_regular(path, limit)
     try:
-        return parse_json(data, most)
+        return parse_json(data, limit)
     except ValueError as error:
         raise LogDamagedError(f"{path} is damaged: {remedy}") from error

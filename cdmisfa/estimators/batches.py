@@ -1,7 +1,7 @@
-"""Slow feature analysis as estimators of scikit-learn, which learn on from batch to batch.
+"""Slow feature analysis as scikit-learn estimators with `partial_fit`.
 
-The rows of X are samples that follow one another in time. Where a batch does not follow the one
-before, `gap=True` says so, and no difference is taken across it.
+The rows of X are samples that follow one another in time. `gap=True` marks a batch that does not
+follow the previous one; no difference is then taken across the gap.
 """
 
 from __future__ import annotations
@@ -42,12 +42,13 @@ else:
         pass
 
 
-# Samples that are made float64 at once: whole pieces, so that it does not matter.
+# Samples that are converted to float64 at once. It is a multiple of the pieces in which
+# `RecursiveFeature` learns, so that its value does not change the result.
 CHUNK = 16 * PIECE
 
 
 class _SlowFeatures(_Estimator):
-    """Base class of both estimators; derived classes define `_begin`."""
+    """Base of both estimators; derived classes define `_begin`."""
 
     n_components: int
     n_whitened: int
@@ -55,34 +56,34 @@ class _SlowFeatures(_Estimator):
     _feature: Any
 
     def fit(self, X: Any, y: Any = None) -> Self:
-        """Learn from one sequence, and forget what was learned before.
+        """Learn from one sequence; forget everything learned before.
 
         Args:
             X: (n, I) samples that follow one another in time.
-            y: not used.
+            y: ignored.
 
         Raises:
-            ValueError: X or a parameter cannot be used.
+            ValueError: X or a parameter is not valid.
         """
         vars(self).pop("_feature", None)
         return self._learn(X, False, fewest=2)
 
     def partial_fit(self, X: Any, y: Any = None, *, gap: bool = False) -> Self:
-        """Learn on from samples that follow those before, or from others after a gap.
+        """Continue learning with samples that follow the previous ones, or come after a gap.
 
         Args:
             X: (n, I) samples that follow one another in time.
-            y: not used.
-            gap: the first of them does not follow the last one learned from: it is another
-                sequence, or samples are missing.
+            y: ignored.
+            gap: True if the first sample does not follow the last one of the previous call, because
+                samples are missing or another sequence begins.
 
         Raises:
-            ValueError: X or a parameter cannot be used.
+            ValueError: X or a parameter is not valid.
         """
         return self._learn(X, gap, fewest=1)
 
     def transform(self, X: Any) -> FloatArray:
-        """Outputs (X - mean_) @ components_.T, the same bits on every machine.
+        """Return the outputs (X - mean_) @ components_.T, the same bits on every machine.
 
         Args:
             X: (n, I) samples, in any order.
@@ -91,8 +92,8 @@ class _SlowFeatures(_Estimator):
             (n, n_components), the slowest first.
 
         Raises:
-            NotFittedError: nothing was learned yet.
-            ValueError: X cannot be used.
+            NotFittedError: the estimator has not learned yet.
+            ValueError: X is not valid.
         """
         check_is_fitted(self)
         X = validate_data(self, X, reset=False, dtype="numeric")
@@ -102,7 +103,7 @@ class _SlowFeatures(_Estimator):
 
     @property
     def components_(self) -> FloatArray:
-        """(n_components, I) weights of the centred sample; 0 where too few samples were seen."""
+        """(n_components, I) weights of the centred sample; 0 for features not learned yet."""
         return np.array(self._feature.phi)
 
     @property
@@ -121,14 +122,14 @@ class _SlowFeatures(_Estimator):
         raise NotImplementedError
 
     def _follow(self, x: FloatArray, gap: bool) -> None:
-        """Samples were learned from."""
+        """Handle samples that the estimator has learned from."""
 
     def _learn(self, X: Any, gap: bool, fewest: int) -> Self:
         first = not self.__sklearn_is_fitted__()
         X = validate_data(self, X, reset=first, dtype="numeric", ensure_min_samples=fewest)
         largest = max(abs(float(X.max())), abs(float(X.min())))
         if largest > LARGEST_VALUE:
-            raise ValueError(f"X holds {largest:g}, more than {LARGEST_VALUE:g}: scale it")
+            raise ValueError(f"X holds {largest:g}, above the limit of {LARGEST_VALUE:g}: scale it")
         if first:
             self._check(X.shape[1])
             self._feature = self._begin(X.shape[1])
@@ -144,35 +145,36 @@ class _SlowFeatures(_Estimator):
         sizes = {"n_components": self.n_components, "n_whitened": self.n_whitened}
         for name, value in {**sizes, "window": self.window}.items():
             if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
-                raise ValueError(f"{name}={value!r} given: it is a whole number from 1")
-        most = min(self.n_whitened, n_features, MAX_COMPONENTS)
-        if self.n_components > most:
+                raise ValueError(f"{name} is {value!r}: give a whole number from 1")
+        limit = min(self.n_whitened, n_features, MAX_COMPONENTS)
+        if self.n_components > limit:
             raise ValueError(
-                f"n_components={self.n_components} given: with n_whitened={self.n_whitened} and "
-                f"n_features={n_features} it is at most {most}"
+                f"n_components is {self.n_components}: with n_whitened={self.n_whitened} and "
+                f"n_features={n_features} give at most {limit}"
             )
 
 
 class RecursiveSFA(_SlowFeatures):
-    """The slowest features of all samples so far, without a learning rate.
+    """Slow feature analysis of all samples so far, without a learning rate.
 
-    It keeps the largest principal components and the covariance of the differences along them, and
-    solves for the slowest directions with every batch. Where X has at most `n_whitened` features,
-    and up to as many samples as the window has, that is batch SFA but for rounding, however they
+    It stores the largest principal components and the covariance of the differences along them, and
+    solves for the slowest directions after every batch. If X has at most `n_whitened` features and
+    at most `window` samples, the result is that of batch SFA up to rounding, however the samples
     are cut into batches.
 
     Args:
-        n_components: features to find.
-        n_whitened: principal components that they are found among, at most the features of X.
-        window: samples of the exponential window; the first so many all count the same.
+        n_components: number of slow features.
+        n_whitened: number of principal components among which they are found, at most the number
+            of features of X.
+        window: exponential window (samples); the first `window` samples have equal weights.
 
     Attributes:
         components_: (n_components, n_features_in_) weights of the centred sample.
         mean_: (n_features_in_,) mean of the samples.
-        slowness_: (n_components,) of each feature.
-        n_samples_seen_: samples learned from.
-        n_features_in_: features of X.
-        feature_names_in_: their names, where X has names.
+        slowness_: (n_components,) slowness of each feature (cycles a sample).
+        n_samples_seen_: number of samples learned from.
+        n_features_in_: number of features of X.
+        feature_names_in_: names of the features of X, if X has names.
 
     Example:
         >>> t = np.arange(2000.0)
@@ -189,26 +191,26 @@ class RecursiveSFA(_SlowFeatures):
 
     @property
     def slowness_(self) -> FloatArray:
-        """(n_components,) in cycles a sample, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN: no such yet."""
+        """(n_components,) slowness, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN before it is learned."""
         return np.array(self._feature.state.spectrum[: self._n_features_out])
 
     def inverse_transform(self, Y: Any) -> FloatArray:
-        """Return the samples with the least mean square error, given their outputs.
+        """Return the samples that have these outputs with the least mean square error.
 
         Args:
             Y: (n, n_components) outputs.
 
         Returns:
-            (n, I).
+            (n, I) samples.
 
         Raises:
-            NotFittedError: nothing was learned yet.
-            ValueError: these are not so many outputs.
+            NotFittedError: the estimator has not learned yet.
+            ValueError: Y has another shape.
         """
         check_is_fitted(self)
         Y, state = np.asarray(Y, np.float64), self._feature.state
         if Y.ndim != 2 or Y.shape[1] != self._n_features_out:
-            raise ValueError(f"Y of shape {Y.shape} given: give (n, {self._n_features_out})")
+            raise ValueError(f"Y has the shape {Y.shape}: give (n, {self._n_features_out})")
         patterns = multiply(state.weights * state.variance, state.basis)
         return np.asarray(multiply(np.ascontiguousarray(Y), patterns) + self.mean_)
 
@@ -220,24 +222,25 @@ class RecursiveSFA(_SlowFeatures):
 class IncSFA(_SlowFeatures):
     """Incremental slow feature analysis, sample by sample, with a learning rate.
 
-    That is what the paper's learner learns with: candid covariance-free PCA, and minor component
-    analysis of the whitened differences (Kompella, Luciw and Schmidhuber 2012). It follows a stream
-    that changes, and needs thousands of samples to converge; `RecursiveSFA` needs fewer.
+    This is the algorithm of the paper's learner: candid covariance-free PCA, and minor component
+    analysis of the whitened differences (Kompella, Luciw and Schmidhuber 2012). It follows streams
+    that change, and needs thousands of samples to converge; `RecursiveSFA` needs fewer.
 
     Args:
-        n_components: features to find.
-        n_whitened: principal components that they are found among, at most the features of X.
-        nu: learning rate, from 0 to 1.
-        window: samples of the running mean, and of the slowness.
-        random_state: where the first weights are drawn from.
+        n_components: number of slow features.
+        n_whitened: number of principal components among which they are found, at most the number
+            of features of X.
+        nu: learning rate, 0 to 1.
+        window: window of the running mean and of the slowness (samples).
+        random_state: seed or generator of the initial weights.
 
     Attributes:
         components_: (n_components, n_features_in_) weights of the centred sample.
-        mean_: (n_features_in_,) mean of the samples, over the window.
-        slowness_: (n_components,) of each feature over the window.
-        n_samples_seen_: samples learned from.
-        n_features_in_: features of X.
-        feature_names_in_: their names, where X has names.
+        mean_: (n_features_in_,) running mean of the samples.
+        slowness_: (n_components,) slowness of each feature over the window (cycles a sample).
+        n_samples_seen_: number of samples learned from.
+        n_features_in_: number of features of X.
+        feature_names_in_: names of the features of X, if X has names.
 
     Example:
         >>> t = np.arange(20000.0)
@@ -268,14 +271,14 @@ class IncSFA(_SlowFeatures):
 
     @property
     def slowness_(self) -> FloatArray:
-        """(n_components,) in cycles a sample, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN: no such yet."""
+        """(n_components,) slowness, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN before it is learned."""
         mean, square, moves = self._moments
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.sqrt(moves / (square - mean * mean)) / (2 * np.pi))
 
     def _begin(self, n_features: int) -> Any:
         if not isinstance(self.nu, Real) or not 0 <= self.nu <= 1:
-            raise ValueError(f"nu={self.nu!r} given: it is a learning rate, from 0 to 1")
+            raise ValueError(f"nu is {self.nu!r}: give a learning rate of 0 to 1")
         config = LearnerConfig(
             outputs=self.n_components,
             components=min(self.n_whitened, n_features),
@@ -287,7 +290,7 @@ class IncSFA(_SlowFeatures):
         return IncrementalFeature(config, n_features, np.random.default_rng(seed))
 
     def _follow(self, x: FloatArray, gap: bool) -> None:
-        """Measure the outputs of the samples that follow others; see `slowness_`."""
+        """Update the moments of the outputs, from which `slowness_` follows."""
         weights = self._feature.phi
         before = x[:0] if gap or not self.n_samples_seen_ else self._last
         self._last = x[-1:].copy()
@@ -302,6 +305,6 @@ class IncSFA(_SlowFeatures):
 
 
 def _chunks(X: Any) -> Iterator[FloatArray]:
-    """Yield rows as float64, some at a time."""
+    """Yield the rows as float64 arrays of at most `CHUNK` rows."""
     for start in range(0, len(X), CHUNK):
         yield np.ascontiguousarray(X[start : start + CHUNK], np.float64)

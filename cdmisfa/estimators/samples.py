@@ -1,4 +1,4 @@
-"""Slow feature analysis in river's interface, which learns on from sample to sample."""
+"""Slow feature analysis as a river transformer, which learns sample by sample."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ except ImportError:
 
 
 class OnlineSFA(Transformer):  # type: ignore[misc]
-    """The slowest features of all samples so far: `RecursiveSFA`, a sample at a time.
+    """Slow feature analysis of all samples so far, in river's interface; see `RecursiveSFA`.
 
-    The features of x are those of the first sample learned from. One that lacks some of them, or
-    holds no finite number, is a gap: nothing is learned from it, nor from the difference across it.
-    Its outputs are those of the means in place of what it lacks.
+    The features of x are those of the first sample. A sample that lacks one of them, or holds a
+    value that is not finite, counts as a gap: nothing is learned from it. In `transform_one` the
+    mean replaces a missing value.
 
     Args:
-        n_components: slow features to find; those beyond the features of x are 0.
-        n_whitened: principal components that they are found among.
-        window: samples of the exponential window; the first so many all count the same.
+        n_components: number of slow features; those beyond the features of x are 0.
+        n_whitened: number of principal components among which they are found.
+        window: exponential window (samples); the first `window` samples have equal weights.
 
     Example:
         >>> from math import sin
@@ -58,10 +58,10 @@ class OnlineSFA(Transformer):  # type: ignore[misc]
         self._gap = False
 
     def learn_one(self, x: Mapping[Any, float]) -> None:
-        """Learn from a sample that follows the one before.
+        """Learn from a sample that follows the previous one.
 
         Raises:
-            UsageError: no such features can be found.
+            UsageError: a parameter is not valid.
         """
         if self._feature is None and x:
             self._names = tuple(sorted(x, key=str))
@@ -75,7 +75,7 @@ class OnlineSFA(Transformer):  # type: ignore[misc]
         self._gap = False
 
     def transform_one(self, x: Mapping[Any, float]) -> dict[str, float]:
-        """Outputs of a sample, the slowest first; 0 where there is no such feature yet."""
+        """Return the outputs of a sample, the slowest first; 0 for features not learned yet."""
         y = np.zeros(self.n_components)
         if self._feature is not None:
             sample, mean, phi = self._sample(x), self._feature.mean, self._feature.phi
@@ -85,11 +85,11 @@ class OnlineSFA(Transformer):  # type: ignore[misc]
 
     @property
     def slowness(self) -> float:
-        """Slowness of the slowest feature, in cycles a sample; NaN where there is none yet."""
+        """Slowness of the slowest feature (cycles a sample); NaN before it is learned."""
         return nan if self._feature is None else self._feature.slowness
 
     def _sample(self, x: Mapping[Any, Any]) -> FloatArray:
-        """Return the features in their order, NaN where there is no number to learn from."""
+        """Return the features in their order, NaN for a value that is missing or not finite."""
         values = (x.get(name, nan) for name in self._names)
         return np.array([float(v) if _is_number(v) else nan for v in values])
 

@@ -1,8 +1,8 @@
-"""`IncrementalFeature`: the adaptive abstraction of the paper's learner.
+"""`IncrementalFeature`: incremental slow feature analysis (IncSFA), as in the paper's learner.
 
-Sources: candid covariance-free incremental PCA (CCIPCA): Weng, Zhang and Hwang 2003;
-minor component analysis (MCA) by sequential addition: Peng and Yi 2006; the two joined
-as IncSFA: Kompella, Luciw and Schmidhuber 2012. How it is computed: `kernels/incsfa.c`.
+Sources: candid covariance-free incremental PCA (CCIPCA): Weng, Zhang and Hwang 2003; minor
+component analysis (MCA) by sequential addition: Peng and Yi 2006; both combined as IncSFA:
+Kompella, Luciw and Schmidhuber 2012. `kernels/incsfa.c` has the computation.
 """
 
 from __future__ import annotations
@@ -17,23 +17,27 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
 
+# Standard deviation of the initial CCIPCA vectors. Set by hand; it is small against the variance of
+# the inputs, so that the first frames replace the initial vectors.
+INITIAL_SD = 0.1
+
 
 class IncSFAState(NamedTuple):
-    """An adaptive abstraction: arrays only, changed in place by the kernels.
+    """State of incremental SFA, as arrays that the kernels change in place.
 
-    I inputs, K whitening components, J outputs. Saving these arrays saves everything.
+    I inputs, K whitening components, J outputs.
 
     Attributes:
         mean: (I,) running mean of the input.
         v: (K, I) CCIPCA vectors; their lengths are the variances.
         d: (K,) lengths of `v`.
-        gram: (K, K) inner products of `v`; kept for many inputs only.
+        gram: (K, K) inner products of `v`; stored for many inputs only.
         w: (J, K) MCA rows of length 1.
-        z_prev: (K,) whitened previous frame.
+        z_prev: (K,) the previous frame, whitened.
         phi: (J, I) slow features as weights of the centred input, after the last frame
             that changed them.
-        counts: (3,) int64: frames seen; 1 where the last frame followed a gap, so that
-            `phi` is older than `v`; frames since `gram` was computed from `v`.
+        counts: (3,) number of frames; 1 if the last frame followed a gap, so that `phi` is older
+            than `v`; number of frames since `gram` was computed from `v`.
     """
 
     mean: FloatArray
@@ -47,16 +51,16 @@ class IncSFAState(NamedTuple):
 
 
 def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) -> IncSFAState:
-    """Draw an abstraction: CCIPCA vectors .1 x standard normal, MCA rows normalised.
+    """Return a random initial state: CCIPCA vectors of `INITIAL_SD`, MCA rows of length 1.
 
     Args:
-        rng: where the K*I, then J*K normal numbers are drawn from.
-        n_inputs: I, length of an expanded frame.
-        config: gives K = `components` and J = `outputs`.
+        rng: generator from which K*I, then J*K standard normal numbers are drawn.
+        n_inputs: length I of an expanded frame.
+        config: configuration with K = `components` and J = `outputs`.
     """
     K, J = config.components, config.outputs
     v, w = kernels.normal(rng, (K, n_inputs), (J, K))
-    v *= 0.1
+    v *= INITIAL_SD
     w /= np.sqrt((w * w).sum(axis=1))[:, None]
     return IncSFAState(
         mean=np.zeros(n_inputs),
@@ -74,7 +78,7 @@ class IncrementalFeature:
     """Incremental slow feature analysis, frame by frame: y = phi (x - mean).
 
     Attributes:
-        state: every array of it; write into them to restore another state.
+        state: the arrays of the state; write into them to restore another state.
 
     Example:
         >>> sfa = IncrementalFeature(LearnerConfig(), 5, np.random.default_rng(0))
@@ -88,11 +92,11 @@ class IncrementalFeature:
 
     @cached_property
     def kernel(self) -> kernels.Struct:
-        """The state with the constants of the rule, as the kernels take it."""
+        """State and constants as C takes them."""
         return kernels.incsfa(self.state, self._nu, self._window)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without `kernel`, whose pointers are of this process."""
+        """Return all attributes but `kernel`, which holds pointers."""
         return {name: value for name, value in vars(self).items() if name != "kernel"}
 
     def update(self, frames: NDArray[Any], gap: bool = False) -> FloatArray:
@@ -100,22 +104,22 @@ class IncrementalFeature:
 
         Args:
             frames: (n, I) float64 values, or uint8 pixels, which count 1/255 each.
-            gap: the first frame does not follow the last one learned from.
+            gap: True if the first frame does not follow the last frame of the previous call.
 
         Returns:
-            xi, (n,): change of phi at each frame, NaN at the first after a gap.
+            (n,) change xi of phi at each frame, NaN at the first frame after a gap.
 
         Raises:
-            UsageError: these are no frames of I values.
+            UsageError: the array does not have the shape (n, I) or the type of frames.
         """
         return kernels.incsfa_update(self.kernel, frames, gap)
 
     @property
     def phi(self) -> FloatArray:
-        """Slow features as weights of the centred input, (J, I)."""
+        """(J, I) slow features as weights of the centred input."""
         return self.state.phi
 
     @property
     def mean(self) -> FloatArray:
-        """Running mean of the input, (I,)."""
+        """(I,) running mean of the input."""
         return self.state.mean

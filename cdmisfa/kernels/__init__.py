@@ -1,8 +1,8 @@
-"""The kernels: C, compiled ahead of time, behind one boundary.
+"""Numeric kernels in C, compiled in advance, with Python functions that check their arguments.
 
-Every function checks the type, shape and order of its arrays and passes pointers on; C trusts them.
-The same arguments give the same bits with every compiler and on every x86-64 and 64-bit Arm
-processor: see `lanes.h`. The C files say how each result is computed.
+C trusts its arguments: every function here checks the type, shape and order of its arrays and
+passes pointers. The same arguments give the same bits with every compiler and on every x86-64 and
+64-bit Arm processor, see `lanes.h`. The C files describe how each result is computed.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ try:
     import cdmisfa.kernels._plain as _plain
 except ImportError as error:
     raise CdmisfaError(
-        f"{__path__[0]} holds no compiled kernels: install cdmisfa with make clean install or "
-        "pip, and run it in another folder than its sources where these are not what is installed"
+        f"{__path__[0]} has no compiled kernels: install cdmisfa with `make clean install` or pip; "
+        "if it is installed elsewhere, run it outside of this folder"
     ) from error
 
 
 FLOAT64, INT64 = np.dtype(np.float64), np.dtype(np.int64)
 _POINTERS = {FLOAT64: "double[]", INT64: "int64_t[]", UINT8: "uint8_t[]"}
 
-# Version of the order in which the kernels compute, to be raised with every change of their bits:
-# runs of another version are neither continued nor checked.
+# Version of the order in which the kernels compute. Raise it with every change of their bits: runs
+# of another version are then neither resumed nor verified.
 ARITHMETIC = 3
 
-# The same bits come from both modules; the second is for processors with AVX2 and FMA.
+# Both modules give the same bits; the second one needs a processor with AVX2 and FMA.
 WIDE: bool = bool(_plain.lib.has_wide_lanes())
 _module: Any = import_module("cdmisfa.kernels._wide") if WIDE else _plain
 lib: Any = _module.lib
@@ -43,28 +43,28 @@ ffi: Any = _module.ffi
 _buffer = ffi.from_buffer
 
 
-def expect(name: str, given: object, wanted: object) -> None:
-    """Refuse an argument that C could not use.
+def expect(name: str, actual: object, expected: object) -> None:
+    """Check a property of an argument.
 
     Raises:
-        UsageError: the argument differs.
+        UsageError: the property differs.
     """
-    if given != wanted:
-        raise UsageError(f"{name} given as {given}: give {wanted}")
+    if actual != expected:
+        raise UsageError(f"{name} is {actual}: give {expected}")
 
 
 def pointer(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] = FLOAT64) -> Any:
     """Return the address of an array for C to read and write; it keeps the array alive.
 
     Raises:
-        UsageError: it is of another type or shape, does not lie in C order, or is read-only.
+        UsageError: the array has another type or shape, is not in C order, or is read-only.
     """
     fits = type(array) is np.ndarray and array.dtype == dtype and array.shape == shape
-    if not (fits and array.flags.carray):  # names of types take longer than small blocks
-        given: object = type(array)
-        if given is np.ndarray:
-            given = str(array.dtype), array.shape, "C" if array.flags.carray else "other order"
-        expect(name, given, (str(dtype), shape, "C"))
+    if not (fits and array.flags.carray):  # the texts take longer than small blocks, so only here
+        actual: object = type(array)
+        if actual is np.ndarray:
+            actual = str(array.dtype), array.shape, "C" if array.flags.carray else "other order"
+        expect(name, actual, (str(dtype), shape, "C"))
     return _buffer(_POINTERS[dtype], array, True)
 
 
@@ -72,7 +72,7 @@ def readable(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any]
     """Return the address of an array, or of a copy in C order, for C to read.
 
     Raises:
-        UsageError: it is of another shape.
+        UsageError: the array has another shape.
     """
     if type(array) is not np.ndarray or array.dtype != dtype or not array.flags.c_contiguous:
         array = np.array(array, dtype, order="C")
@@ -83,66 +83,66 @@ def readable(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any]
 
 
 def records(kind: str, array: NDArray[np.void]) -> Any:
-    """Return the address of an array of records, which C has by that name."""
+    """Return the address of an array of C records of a type."""
     return _buffer(f"{kind}[]", array, True)
 
 
 class Struct:
-    """A record of C whose arrays live as long as it does.
+    """C record that keeps its arrays alive.
 
     Attributes:
-        pointer: to the record.
+        pointer: pointer to the record.
     """
 
-    __slots__ = ("_kept", "pointer")
+    __slots__ = ("_arrays", "pointer")
 
     def __init__(self, kind: str, numbers: Mapping[str, float], arrays: Mapping[str, Any]) -> None:
-        self._kept = arrays
+        self._arrays = arrays
         self.pointer = ffi.new(f"{kind} *", {**numbers, **arrays})
 
 
 def frames_of(frames: Any, size: int | None = None) -> Struct:
     """Return frames as C takes them; see `as_frames`."""
     rows = as_frames(frames, size)
-    held = "pixels" if rows.dtype == UINT8 else "values"
-    data = _buffer("uint8_t[]" if held == "pixels" else "double[]", rows)
-    return Struct("frames", {"n": rows.shape[0], "size": rows.shape[1]}, {held: data})
+    field = "pixels" if rows.dtype == UINT8 else "values"
+    data = _buffer("uint8_t[]" if field == "pixels" else "double[]", rows)
+    return Struct("frames", {"n": rows.shape[0], "size": rows.shape[1]}, {field: data})
 
 
-def check(code: int, what: str) -> None:
+def check(code: int, owner: str) -> None:
     """Raise the error of a kernel's return code.
 
     Raises:
-        MemoryError: there was not enough.
-        UsageError: `what` is no state that a kernel left.
+        MemoryError: C could not allocate memory.
+        UsageError: the state of `owner` was not written by a kernel.
     """
     if code == lib.NO_MEMORY:
         raise MemoryError
     if code == lib.NOT_A_STATE:
-        raise UsageError(f"{what} holds an index that points nowhere: it is not a state of one")
+        raise UsageError(f"{owner} has a damaged state, an index is out of range: load another one")
 
 
 def exp(x: float) -> float:
-    """Exp of a number."""
+    """Return the exponential of a number."""
     return float(lib.exp_of(x))
 
 
 def log(x: float) -> float:
-    """Natural logarithm of a number."""
+    """Return the natural logarithm of a number."""
     return float(lib.log_of(x))
 
 
 def sin(x: Any) -> FloatArray:
-    """Sines of an array of numbers up to a million."""
-    return _of_each(lib.sines, x)
+    """Return the sines of numbers with an absolute value of at most a million."""
+    return _elementwise(lib.sines, x)
 
 
 def cos(x: Any) -> FloatArray:
-    """Cosines of the same."""
-    return _of_each(lib.cosines, x)
+    """Return the cosines of numbers with an absolute value of at most a million."""
+    return _elementwise(lib.cosines, x)
 
 
-def _of_each(function: Any, x: Any) -> FloatArray:
+def _elementwise(function: Any, x: Any) -> FloatArray:
     shape = np.shape(x)
     out = np.empty(shape)
     function(readable("x", x, shape), out.size, pointer("out", out, shape))
@@ -150,10 +150,10 @@ def _of_each(function: Any, x: Any) -> FloatArray:
 
 
 def normal(rng: np.random.Generator, *shapes: tuple[int, ...]) -> list[FloatArray]:
-    """Standard normal draws of a generator, which is of no use afterwards, as arrays of shapes.
+    """Return arrays of standard normal draws; the generator cannot be used afterwards.
 
-    They are what `rng.standard_normal` gives one after the other, but for its rounding, which
-    depends on the C library.
+    The numbers equal those of `rng.standard_normal` up to rounding, which depends there on the C
+    library of the machine.
     """
     sizes = [math.prod(shape) for shape in shapes]
     out = np.empty(sum(sizes))
@@ -168,7 +168,7 @@ def normal(rng: np.random.Generator, *shapes: tuple[int, ...]) -> list[FloatArra
 
 
 def outputs(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
-    """Output y = phi x - offset of every row of phi on every frame; see `projection.project`."""
+    """Return y = phi x - offset of every row of phi on every frame; see `outputs.project`."""
     rows = len(phi)
     x = frames_of(frames, phi.shape[1])
     y = np.empty((x.pointer.n, rows))
@@ -184,7 +184,7 @@ def outputs(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
 
 
 def mean_output(phi: FloatArray, mean: FloatArray) -> FloatArray:
-    """Return what phi (J, I) gives out on the mean input (I,), as (J,)."""
+    """Return (J,) the outputs of phi (J, I) on the mean input (I,)."""
     rows, size = phi.shape
     out = np.empty(rows)
     lib.mean_output(
@@ -198,7 +198,7 @@ def mean_output(phi: FloatArray, mean: FloatArray) -> FloatArray:
 
 
 def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
-    """Return an abstraction as the kernels take it: the arrays of its `State`, its constants."""
+    """Return incremental SFA as C takes it: the arrays of `IncSFAState`, and its constants."""
     (K, size), J = state.v.shape, len(state.w)
     shapes = {
         "mean": (size,),
@@ -218,7 +218,8 @@ def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
 def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update") -> FloatArray:
     """Learn from consecutive frames; see `IncrementalFeature.update`.
 
-    What is faster is chosen by the number of inputs; `by` is "by_frame" or "by_gram" to say which.
+    `by` is "by_frame" or "by_gram" for one of two ways to compute, which give different last bits;
+    "update" chooses by the number of inputs.
     """
     x = frames_of(frames, abstraction.pointer.inputs)
     xi = np.empty(x.pointer.n)
@@ -229,7 +230,7 @@ def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update
 
 
 def instantaneous_slowness(y: Any) -> FloatArray:
-    """Slowness of each output within a block, (J,), from its values (n, J)."""
+    """Return (J,) the slowness of each output (n, J) within a block."""
     n, J = np.shape(y)
     eta = np.empty(J)
     lib.instantaneous_slowness(n, J, readable("y", y, (n, J)), _buffer("double[]", eta))
@@ -240,32 +241,32 @@ def iterate(
     agent: Struct,
     frozen: Struct,
     feature: Struct,
-    shown: Struct,
+    raw: Struct,
     x: Struct,
     t: int,
     uniforms: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Compute one iteration of a curious agent with an abstraction; see `CuriousLearner.step`.
+    """Compute one iteration of the paper's agent; see `CuriousLearner.step`.
 
     Args:
-        agent: changed in place, as is the outcome that it points to.
-        frozen: the frozen modules.
-        feature: learns from the block where it is novel.
-        shown: the block.
-        x: the same, expanded.
-        t: its first frame.
+        agent: the agent, changed in place together with the outcome that it points to.
+        frozen: the saved modules.
+        feature: the features being learned, which learn from the block if it is novel.
+        raw: the block.
+        x: the block, expanded.
+        t: number of its first frame.
         uniforms: (3,) draws from [0, 1): whether to explore, which action, which stream.
 
     Returns:
-        Outputs (n, J), NaN where the block is not novel; those of the frozen modules (M, n, J),
-        their slowness (M, J) and clustering error (M,).
+        Outputs of the features (n, J), NaN if the block is not novel; outputs of the saved modules
+        (M, n, J), their slowness (M, J) and their clustering error (M,).
     """
     n, J, M = agent.pointer.tau, agent.pointer.outputs, frozen.pointer.modules
-    expect("frames", (shown.pointer.n, x.pointer.n), (n, n))
+    expect("frames", (raw.pointer.n, x.pointer.n), (n, n))
     _expect_inputs(agent, frozen, feature, x)
     results = np.empty((n, J)), np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
     code = lib.iterate(
-        *(agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer),
+        *(agent.pointer, frozen.pointer, feature.pointer, raw.pointer, x.pointer),
         *(t, readable("uniforms", uniforms, (3,)), *(_buffer("double[]", r) for r in results)),
     )
     check(code, "the learner")
@@ -276,28 +277,28 @@ def iterations(
     agent: Struct,
     frozen: Struct,
     feature: Struct,
-    shown: Struct,
+    raw: Struct,
     x: Struct,
     uniforms: FloatArray,
     swap_below: float,
-    kept: Struct | None,
+    curves: Struct | None,
 ) -> int:
-    """Iterate on streams that repeat until something is to be done; see `CuriousLearner.repeat`."""
-    n, rows, streams = len(uniforms), shown.pointer.n, agent.pointer.streams
+    """Iterate on periodic streams until an abstraction is ready; see `CuriousLearner.repeat`."""
+    n, rows, streams = len(uniforms), raw.pointer.n, agent.pointer.streams
     enough = rows > streams * agent.pointer.tau
     expect("frames", (x.pointer.n, rows % streams, enough), (rows, 0, True))
     _expect_inputs(agent, frozen, feature, x)
-    draws, curves = readable("uniforms", uniforms, (n, 3)), kept.pointer if kept else ffi.NULL
+    draws, record = readable("uniforms", uniforms, (n, 3)), curves.pointer if curves else ffi.NULL
     done: int = lib.iterations(
-        *(agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer),
-        *(draws, n, swap_below, curves),
+        *(agent.pointer, frozen.pointer, feature.pointer, raw.pointer, x.pointer),
+        *(draws, n, swap_below, record),
     )
     check(done, "the learner")
     return done
 
 
 def action_values(agent: Struct) -> FloatArray:
-    """Return the values of both actions in every stream under the agent's policy, (S, 2)."""
+    """Return (S, 2) the values of both actions in every stream under the agent's policy."""
     Q = np.empty((agent.pointer.streams, 2))
     lib.action_values(agent.pointer, _buffer("double[]", Q))
     return Q
@@ -310,7 +311,7 @@ def _expect_inputs(agent: Struct, frozen: Struct, feature: Struct, x: Struct) ->
 
 
 def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
-    """Return a state of recursive SFA as C takes it, to be written to; see `recursive.State`."""
+    """Return a state of recursive SFA as C takes it; see `RecursiveState`."""
     (size, inputs), outputs = arrays["basis"].shape, len(arrays["weights"])
     components = len(arrays["spectrum"])
     shapes = {
@@ -322,10 +323,10 @@ def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
         "spectrum": (components,),
         "last": (inputs,),
     }
-    held = {name: pointer(name, arrays[name], shape) for name, shape in shapes.items()}
-    held["counts"] = pointer("counts", arrays["counts"], (3,), INT64)
+    pointers = {name: pointer(name, arrays[name], shape) for name, shape in shapes.items()}
+    pointers["counts"] = pointer("counts", arrays["counts"], (3,), INT64)
     sizes = {"inputs": inputs, "size": size, "components": components, "outputs": outputs}
-    return Struct("recursive", {**sizes, "window": window}, held)
+    return Struct("recursive", {**sizes, "window": window}, pointers)
 
 
 def recursive_update(state: Struct, frames: Any, gap: bool) -> FloatArray:
@@ -338,7 +339,7 @@ def recursive_update(state: Struct, frames: Any, gap: bool) -> FloatArray:
 
 
 def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a (n, k) times B (k, m)."""
+    """Return the product of a (n, k) and b (k, m), the same bits on every machine."""
     (rows, parts), width = a.shape, b.shape[1]
     first, second = readable("a", a, (rows, parts)), readable("b", b, (parts, width))
     out = np.empty((rows, width))

@@ -1,4 +1,4 @@
-"""Chunks of logs, as `frames.c` looks through them."""
+"""Access to the messages of an MCAP chunk, by the C of `frames.c`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cdmisfa.core.blocks import UINT8
 from cdmisfa.core.errors import UsageError
 from cdmisfa.kernels import INT64, Struct, pointer, readable, records
 
-# A message of a chunk: times in nanoseconds, and the place of its payload.
+# A message in a chunk: its times (ns), and offset (`at`) and size of its payload in bytes.
 MESSAGE = np.dtype(
     {
         "names": ["log_time", "publish_time", "at", "size", "sequence", "channel", "unused"],
@@ -21,43 +21,44 @@ MESSAGE = np.dtype(
     },
     align=True,
 )
-# Most messages of a chunk, and most other records, that are read.
-MOST_RECORDS = 1 << 20
+# Largest number of messages in a chunk, and of other records. A chunk of 1 MB holds 34,000 empty
+# messages; a hostile file could hold so many that their table does not fit into memory.
+MAX_RECORDS = 1 << 20
 
 
 def walk_records(data: ByteArray) -> tuple[NDArray[np.void], IntArray, int, tuple[int, int]]:
-    """Walk over the records of a chunk as far as they are sound.
+    """Walk over the records of a chunk up to the first invalid one.
 
     Args:
         data: (B,) the decompressed records.
 
     Returns:
-        (n,) of `MESSAGE`, in their order; (m, 2) first byte and end of the other records; the
-        place where the walk ends: B, or that of the first record that is none; and the earliest
-        and the latest log time, of no message 2**64 - 1 and 0.
+        Messages, (n,) of `MESSAGE`, in their order; first byte and end of each other record,
+        (m, 2); offset at which the walk ends, B or that of the first invalid record; earliest and
+        latest log time, 2**64 - 1 and 0 if there is no message.
 
     Raises:
-        UsageError: there are more than `MOST_RECORDS` of a kind.
+        UsageError: there are more than `MAX_RECORDS` of a kind.
     """
-    found, chunk = kernels.ffi.new("walked *"), kernels.ffi.from_buffer("uint8_t[]", data)
-    kernels.lib.walk_records(chunk, len(data), kernels.ffi.NULL, kernels.ffi.NULL, found)
-    if max(found.messages, found.others) > MOST_RECORDS:
-        raise UsageError(f"it holds more than {MOST_RECORDS} messages, the limit of a chunk")
-    messages, spans = np.empty(found.messages, MESSAGE), np.empty((found.others, 2), np.int64)
+    walk, chunk = kernels.ffi.new("walked *"), kernels.ffi.from_buffer("uint8_t[]", data)
+    kernels.lib.walk_records(chunk, len(data), kernels.ffi.NULL, kernels.ffi.NULL, walk)
+    if max(walk.messages, walk.others) > MAX_RECORDS:
+        raise UsageError(f"it holds more than {MAX_RECORDS} messages, the limit of a chunk")
+    messages, spans = np.empty(walk.messages, MESSAGE), np.empty((walk.others, 2), np.int64)
     rows = records("message", messages), kernels.ffi.from_buffer("int64_t[]", spans)
-    kernels.lib.walk_records(chunk, len(data), *rows, found)
-    return messages, spans, found.end, (found.earliest, found.latest)
+    kernels.lib.walk_records(chunk, len(data), *rows, walk)
+    return messages, spans, walk.end, (walk.earliest, walk.latest)
 
 
 def layout(least: int, places: Any, marks: Any, distances: Any, width: int) -> Struct:
-    """Return where the payloads of a channel hold their values, for `gather`.
+    """Return the layout of the payloads of a channel, for `gather`.
 
     Args:
-        least: fewest bytes of a payload.
-        places: (M,) distances from a payload's end of bytes that are the same in every message.
-        marks: (M,) those bytes.
-        distances: (R,) of each value.
-        width: bytes of a value.
+        least: smallest size of a payload (bytes).
+        places: (M,) distances, from the end of a payload, of bytes that are equal in all messages.
+        marks: (M,) these bytes.
+        distances: (R,) distances of the values from the end of a payload.
+        width: size of a value (bytes).
     """
     m, r = len(marks), len(distances)
     arrays = {
@@ -77,24 +78,24 @@ def gather(
     laid_out: Struct,
     out: ByteArray | None,
 ) -> int | None:
-    """Check how messages of a channel are laid out, and copy their values.
+    """Check that messages of a channel have a layout, and copy their values.
 
     Args:
         data: (B,) the decompressed records.
-        messages: (n,) of `MESSAGE`, one after the other, of any channels.
-        channel: the channel.
-        rows: those of its messages that are wanted, [start, stop).
-        laid_out: as `layout` says.
+        messages: (n,) of `MESSAGE`, in order, of any channels.
+        channel: number of the channel.
+        rows: range [start, stop) of the channel's messages to check and copy.
+        laid_out: the layout, from `layout`.
         out: (stop - start, R * width), written; None to check only.
 
     Returns:
-        How many messages of the channel there are; None where one that is wanted is not laid out
-        so, and `out` holds anything.
+        Number of messages of the channel; None if a message in the range has another layout, and
+        `out` is then undefined.
     """
-    held, (start, stop) = laid_out.pointer, rows
-    shape = stop - start, held.values * held.width
+    expected, (start, stop) = laid_out.pointer, rows
+    shape = stop - start, expected.values * expected.width
     into = kernels.ffi.NULL if out is None else pointer("out", out, shape, UINT8)
     chunk = kernels.ffi.from_buffer("uint8_t[]", data), len(data)
-    wanted = kernels.ffi.from_buffer("message[]", messages), len(messages)
-    found = int(kernels.lib.gather(*chunk, *wanted, channel, start, stop, held, into))
-    return None if found < 0 else found
+    table = kernels.ffi.from_buffer("message[]", messages), len(messages)
+    count = int(kernels.lib.gather(*chunk, *table, channel, start, stop, expected, into))
+    return None if count < 0 else count

@@ -22,7 +22,7 @@ from cdmisfa.experiments.sources import (
     open_source,
     read_inputs,
 )
-from cdmisfa.public.recording import Given, Recording, as_words
+from cdmisfa.public.recording import Recording, SourceLike, as_words
 from cdmisfa.public.run import Run
 from recorder.images.options import OPTIONS, Centre, InputOptions
 from replay.logs.source import LoggedSource
@@ -30,7 +30,7 @@ from replay.stored_source import centre_as
 
 
 def learn(
-    source: Given,
+    source: SourceLike,
     out: str | Path | None = None,
     *,
     algorithm: str | None = None,
@@ -55,33 +55,33 @@ def learn(
         run.modules[0].transform(array)
 
     Args:
-        source: arrays or tables (see `Recording`), or a mapping of them by the streams' names;
-            paths, URLs or patterns of logs, one or a list; a `Recording`, where a log needs
-            options; the name of a scene ("oscillatory", "icub"); words of live streams
-            ("camera:/dev/video0", "gym:CartPole-v1"); or an open source, which is left open.
-        out: the run's folder; by default a temporary one, removed with the run.
-        algorithm: "2.0", the default of scenes, "progress", that of other streams, "1.0", or a
-            class of yours as "package.module:Class".
-        seed: the seed of random choices, scenes and simulated tasks.
-        max_iterations: end after this many.
-        max_modules: end after this many; by default the learner ends by itself, and any learner
-            where the source ends.
-        preset: settings by name or from a .toml file.
-        holdout: the share of a log, at its end, that the progress learner does not learn from and
-            is judged on; by default a tenth.
-        loop: start logs or arrays again at their end.
+        source: arrays or tables (see `Recording`), or a mapping of them by stream name; paths,
+            URLs or patterns of logs, one or a list; a `Recording`, for logs with options; the name
+            of a scene ("oscillatory", "icub"); live streams ("camera:/dev/video0",
+            "gym:CartPole-v1"); or an open source, which stays open.
+        out: folder of the run; None: a temporary folder, removed with the returned object.
+        algorithm: "2.0" (default for scenes), "progress" (default for other streams), "1.0", or
+            a class as "package.module:Class".
+        seed: seed of random choices, scenes and simulated tasks.
+        max_iterations: largest number of iterations.
+        max_modules: largest number of modules; None: the learner decides when to end. Every run
+            ends with its source.
+        preset: name of a preset, or a .toml file.
+        holdout: share of a log, at its end, on which the progress learner is evaluated and does
+            not learn; None: 0.1.
+        loop: True to start logs or arrays again at their end.
         episodes: see `Recording`.
-        centre: "episode" learns from frames without the mean of their episode.
-        force: replace an existing run.
-        view: also write the view, run.rrd.
-        sinks: called with every iteration; one that raises ends the run.
-        stop: called before every iteration; true ends the run.
-        settings: keys of the learner: `tau=20`, `outputs=4`; see docs/reference/configuration.md.
+        centre: "episode" to learn from frames without the mean of their episode.
+        force: True to replace an existing run.
+        view: True to write the Rerun view, run.rrd.
+        sinks: receive every iteration; an exception of one ends the run.
+        stop: called before every iteration; True ends the run.
+        settings: configuration keys of the learner, such as `tau=20` or `outputs=4`.
 
     Raises:
-        UsageError: the source, a setting or the folder is wrong; the line names it.
+        UsageError: the source, a setting or the folder is wrong.
         LogDamagedError: a log is damaged.
-        LogExhaustedError: the source has not enough frames for a single block.
+        LogExhaustedError: the source is shorter than one block.
     """
     words = [f"learner.{name}={value}" for name, value in settings.items()]
     if algorithm is not None:
@@ -109,7 +109,7 @@ def learn(
         )
         run = Run(folder)
         if command is None and isinstance(frames, LoggedSource) and frames.in_memory:
-            run._learned_from = Recording.of(source)  # the folder has only hashes of arrays
+            run._source = Recording.of(source)  # the folder has only hashes of arrays
         if out is None:
             weakref.finalize(run, shutil.rmtree, folder.parent, ignore_errors=True)
     return run
@@ -121,21 +121,22 @@ def _folder(out: str | Path | None) -> Iterator[Path]:
     if out is not None:
         yield Path(out)
         return
-    made = Path(tempfile.mkdtemp(prefix="cdmisfa-"))
+    temporary = Path(tempfile.mkdtemp(prefix="cdmisfa-"))
     try:
-        yield made / "run"
+        yield temporary / "run"
     except BaseException:
-        shutil.rmtree(made, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
         raise
 
 
 @contextlib.contextmanager
 def _opened(
-    source: Given, logs: dict[str, Any], how: dict[str, Any]
+    source: SourceLike, logs: dict[str, Any], how: dict[str, Any]
 ) -> Iterator[tuple[FrameSource, Configuration, Any]]:
-    """Open a source; yield it with its configuration, and with the words and options of a command.
+    """Open a source, and yield it with its configuration and its command.
 
-    The command is None where the command line cannot name the source. An open source stays open.
+    The command is the words and options with which `cdmisfa learn` opens the source, None if no
+    command can. A source that is open already stays open.
     """
     if isinstance(source, FrameSource):
         yield source, _configured(source, how), None
@@ -144,8 +145,8 @@ def _opened(
     if isinstance(streams, Mapping) and any(isinstance(s, Iterator) for s in streams.values()):
         from recorder.cameras.stepped import ArraySource
 
-        with ArraySource(streams) as made:
-            yield made, _configured(made, how), None
+        with ArraySource(streams) as array_source:
+            yield array_source, _configured(array_source, how), None
         return
     if words := as_words(source):
         opened, configuration = open_source(words, **how, **logs)
@@ -166,9 +167,9 @@ def _opened(
 def _configured(
     source: FrameSource, how: dict[str, Any], inputs: InputOptions | None = None
 ) -> Configuration:
-    """Return the configuration of an open source, and centre its frames as `input.centre` says."""
-    given = Layers.read(how["preset"], how["settings"])
-    inputs = read_inputs(inputs, given)
+    """Return the configuration of an open source, and set the centring of its frames."""
+    layers = Layers.read(how["preset"], how["settings"])
+    inputs = read_inputs(inputs, layers)
     centre_as(inputs.centre, source, "this source")
     described = description(source, at_once=True)
-    return configure_for(source.spec, described, given, how["seed"], inputs)
+    return configure_for(source.spec, described, layers, how["seed"], inputs)

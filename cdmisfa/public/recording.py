@@ -1,4 +1,4 @@
-"""Sources in a program: recordings, external logs, and arrays."""
+"""`Recording`: recordings, external logs and arrays as the source of a run, or to look at."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from cdmisfa.experiments.sources import open_logs
 from recorder.images.options import InputOptions
 from replay.open_sources import open_arrays
 
-# A source for `learn`: arrays, tables, mappings of these by names of streams, paths and URLs of
-# logs, names of scenes, words of live streams, or an open source.
-Given: TypeAlias = Any
+# A source for `learn`: arrays, tables, mappings of these by stream name, paths and URLs of logs,
+# names of scenes, live streams, or an open source.
+SourceLike: TypeAlias = Any
 
 
-def as_words(given: Given) -> tuple[str, ...]:
-    """Return the words of paths, patterns or names; () of arrays."""
-    several = given if isinstance(given, list | tuple) else (given,)
-    return tuple(map(str, several)) if all(isinstance(w, str | Path) for w in several) else ()
+def as_words(source: SourceLike) -> tuple[str, ...]:
+    """Return paths, patterns or names as the words of a command; () for arrays."""
+    words = source if isinstance(source, list | tuple) else (source,)
+    return tuple(map(str, words)) if all(isinstance(w, str | Path) for w in words) else ()
 
 
 class Recording(Described):
-    """A recording, external logs, or arrays, to look at and to learn from.
+    """Recording, external logs, or arrays.
 
     Args:
-        given: paths, URLs or patterns: a recording's folder, MCAP files, ROS bags, videos, folders
-            of images, tables, LeRobot datasets, .npy and .npz files; or one array, table, or
-            mapping of them by the streams' names. Arrays hold numbers, (n,) or (n, values), or
-            images, (n, height, width) or (n, height, width, 3), the i-th of all at once.
-        loop: start again at the end.
-        skip_damaged: skip damaged parts.
-        episodes: each path is an episode, one after the other; the logs of a folder that
+        sources: paths, URLs or patterns: the folder of a recording, MCAP files, ROS bags, videos,
+            folders of images, tables, LeRobot datasets, .npy and .npz files; or one array, table,
+            or mapping of them by stream name. Arrays hold numbers, (n,) or (n, values), or images,
+            (n, height, width) or (n, height, width, 3); row i of all of them has the same time.
+        loop: True to start again at the end.
+        skip_damaged: True to skip damaged parts of files.
+        episodes: True if each path is an episode, one after the other. The logs of a folder that
             `cdmisfa index` indexed always are.
-        options: which streams, and how they become frames: the input options of `cdmisfa learn`,
-            `topics`, `fields`, `size`, `rate`, `start`, `end`, `align`, `color`, and the keys
-            `input.*`, as `fit="pad"` or `centre="episode"`; see docs/reference/configuration.md.
+        options: which streams, and how they become frames: the input options of `cdmisfa learn`
+            (`topics`, `fields`, `size`, `rate`, `start`, `end`, `align`, `color`) and the keys
+            `input.*`, such as `fit="pad"` or `centre="episode"`.
 
     Attributes:
-        spec: names of the streams, shape, type, rate and number of frames.
+        spec: names of the streams, frame shape, type, rate and number of frames.
         inputs: the options.
 
     Raises:
-        UsageError: there is no such log, or arrays hold no numbers.
+        UsageError: a log does not exist, or an array is not numeric.
         LogDamagedError: a log is damaged.
     """
 
     def __init__(
         self,
-        *given: Given,
+        *sources: SourceLike,
         loop: bool = False,
         skip_damaged: bool = False,
         episodes: bool = False,
@@ -68,32 +68,36 @@ class Recording(Described):
             raise UsageError(f"no option {unknown[0]}: {did_you_mean(unknown[0], known)}")
         self.inputs = InputOptions(**options)
         self.loop, self.skip_damaged, self.episodes = loop, skip_damaged, episodes
-        self.words = as_words(given)
-        if not self.words and len(given) != 1:
-            raise UsageError("give one array, or several by name: {'left': one, 'right': two}")
-        self._given = given[0]
+        self.words = as_words(sources)
+        if not self.words and len(sources) != 1:
+            raise UsageError(
+                f"{len(sources)} arrays have no names: give {{'left': array, 'right': array}}"
+            )
+        self._arrays = sources[0]
         with self.source() as source:
             self.spec: SourceSpec = source.spec
 
     @classmethod
-    def of(cls, given: Given) -> Self:
-        """Return a recording as it is, or one of paths in a list, of one path or of arrays."""
-        if isinstance(given, cls):
-            return given
-        return cls(*given) if isinstance(given, list | tuple) and as_words(given) else cls(given)
+    def of(cls, source: SourceLike) -> Self:
+        """Return a recording of a source; a `Recording` itself is returned unchanged."""
+        if isinstance(source, cls):
+            return source
+        return (
+            cls(*source) if isinstance(source, list | tuple) and as_words(source) else cls(source)
+        )
 
     def source(self, *, loop: bool = False) -> Any:
-        """Open its streams for a `with` statement: a `SeekableSource`.
+        """Open the streams as a `SeekableSource`, for a `with` statement.
 
         Args:
-            loop: start again at the end, also if the recording does not.
+            loop: True to start again at the end, also if the recording does not.
         """
         loop = loop or self.loop
         if self.words:
             how: dict[str, Any] = {"loop": loop, "skip_damaged": self.skip_damaged}
             return open_logs(self.words, inputs=self.inputs, episodes=self.episodes, **how)
-        given = self._given
-        streams = given if isinstance(given, Mapping) else {"stream": given}
+        arrays = self._arrays
+        streams = arrays if isinstance(arrays, Mapping) else {"stream": arrays}
         source = open_arrays(streams, self.inputs, loop=loop)
         source.centre = self.inputs.centre
         return source
@@ -104,12 +108,12 @@ class Recording(Described):
         """Return the frames [start, stop) of a stream without its gaps, (n, *frame_shape).
 
         Args:
-            stream: its name, or its number from 0.
-            start: counted from the first frame.
-            stop: by default the end; needed if it starts again at its end.
+            stream: name of the stream, or its index from 0.
+            start: number of the first frame, from 0.
+            stop: number after the last frame; None: the end. Needed if the recording loops.
 
         Raises:
-            ValueError: there is no such stream, or no such frames.
+            ValueError: the stream or the frames do not exist.
         """
         names, length = self.spec.streams, self.spec.length
         index = names.index(stream) if stream in names else stream
@@ -128,18 +132,18 @@ class Recording(Described):
         return np.concatenate(parts)
 
     def view(self, save: str | Path | None = None, *, tab: str | None = None) -> None:
-        """Show it in the Rerun viewer: in a notebook below the cell, else until a window is closed.
+        """Show the recording in the Rerun viewer: below the cell in a notebook, else in a window.
 
         Args:
-            save: write the view to this file, *.rrd, instead.
-            tab: the name of the tab that is open.
+            save: file to write the view to (.rrd) instead.
+            tab: name of the tab that is open at first.
 
         Raises:
-            UsageError: it is of arrays.
+            UsageError: the recording consists of arrays.
             CdmisfaError: there is no display, or the file cannot be written.
         """
         if not self.words:
-            raise UsageError("recordings and logs are shown: of arrays, view the run")
+            raise UsageError("arrays cannot be shown: learn from them, and view the run")
         view([Path(word) for word in self.words], save, tab=tab, inputs=self.inputs)
 
     def _facts(self) -> Mapping[str, Any]:
@@ -153,13 +157,13 @@ def view(
     tab: str | None = None,
     inputs: InputOptions | None = None,
 ) -> None:
-    """Show a run or a recording below a notebook's cell, else in a window; or write its view.
+    """Show a run or a recording: below the cell in a notebook, else in a window; or write its view.
 
     Args:
-        paths: the run's folder, or the files of the recording.
-        save: the file of the view.
-        tab: the name of the tab that is open.
-        inputs: the streams of logs, and how they become frames.
+        paths: the folder of the run, or the files of the recording.
+        save: file to write the view to (.rrd); None to show it.
+        tab: name of the tab that is open at first.
+        inputs: which streams of logs to show, and how they become frames.
     """
     from replay.view.build import build_view, view_of
 

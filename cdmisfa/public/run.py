@@ -1,4 +1,4 @@
-"""A run on disk: its signals as arrays and tables, its modules, its learner at any iteration."""
+"""`cdmisfa.Run`: a run on disk, its signals as arrays and tables, its modules and its learner."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from replay.runs.columns import whole_signals
 from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, RunHeader, read_batches, read_columns
 from replay.runs.run import read_outline
 
-# Signals of one number an iteration.
+# Signals that are one number in each iteration.
 SCALARS = tuple(signal.name for signal in SIGNALS.values() if not signal.dims)
 
 
 class UnknownSignalError(UsageError, KeyError):
-    """There is no signal of that name."""
+    """A signal name that does not exist."""
 
-    __str__ = Exception.__str__  # a KeyError's is quoted
+    __str__ = Exception.__str__  # KeyError would print the message in quotes
 
 
 class Signals(Described, Mapping[str, "NDArray[Any]"]):
-    """The signals of a run: arrays by name, and one table with a row per iteration.
+    """The signals of a run: arrays by name, and tables with one row for each iteration.
 
-    `signals["reward"]` is an array (iterations, ...), NaN where a value is missing. In tables
-    missing values are null. `cdmisfa.SIGNALS` explains each signal.
+    `signals["reward"]` is an array (iterations, ...) with NaN for missing values; in tables missing
+    values are null. `cdmisfa.SIGNALS` describes each signal.
     """
 
     def __init__(self, log: Path, header: RunHeader) -> None:
@@ -59,13 +59,14 @@ class Signals(Described, Mapping[str, "NDArray[Any]"]):
         return {"run": self._log.parent, "signals": ", ".join(self)}
 
     def to_arrow(self, *names: str) -> Any:
-        """Return a table of pyarrow with a row per iteration; missing values are null.
+        """Return a pyarrow table with one row for each iteration; missing values are null.
 
         Args:
-            names: signals; by default all of one number an iteration. Others become lists.
+            names: names of signals; none: all that are one number in each iteration. Arrays become
+                lists.
 
         Raises:
-            UsageError: there is no such signal; it is a KeyError, too.
+            UsageError: a signal does not exist; the error is also a KeyError.
             LogDamagedError: the log cannot be read.
         """
         from replay.export.tables import signals_table
@@ -75,12 +76,12 @@ class Signals(Described, Mapping[str, "NDArray[Any]"]):
         return signals_table(self._log, names or SCALARS)
 
     def to_pandas(self, *names: str) -> Any:
-        """Return the table as a DataFrame of pandas, indexed by the column `iteration`."""
+        """Return the table as a pandas DataFrame, indexed by the column `iteration`."""
         table = self.to_arrow(*names).to_pandas()
         return table.set_index("iteration") if "iteration" in table else table
 
     def to_polars(self, *names: str) -> Any:
-        """Return the table as a DataFrame of Polars."""
+        """Return the table as a Polars DataFrame."""
         import polars
 
         return polars.from_arrow(self.to_arrow(*names))
@@ -95,24 +96,24 @@ class Run(Described, replay.runs.run.Run):
     """A run on disk; each part is read when it is first used.
 
     Args:
-        path: the run's folder, or its log.
+        path: folder of the run, or its run.mcap.
 
     Attributes:
-        signals: a mapping of arrays by name; `signals.to_pandas()` is a table.
-        modules: the learned modules in order; `module.transform(frames)` gives its outputs.
-        streams: the names of the streams.
+        signals: mapping of arrays by name; `signals.to_pandas()` is a table.
+        modules: the saved modules; `module.transform(frames)` returns the outputs of one.
+        streams: names of the streams.
         result: the document of `cdmisfa learn --json`; None if the run was interrupted.
-        log: its run.mcap.
+        log: path of run.mcap.
 
     Raises:
-        UsageError: there is no such run, or it is of another version of the signals.
-        LogDamagedError: its log cannot be read, here or in any later access.
+        UsageError: the run does not exist, or has another version of the signals.
+        LogDamagedError: the log cannot be read, now or at a later access.
     """
 
     def __init__(self, path: str | Path) -> None:
         super().__init__(path)
         self.signals = Signals(self.log, self.header)
-        self._learned_from: Any = ()
+        self._source: Any = ()
 
     @property
     def path(self) -> Path:
@@ -121,22 +122,25 @@ class Run(Described, replay.runs.run.Run):
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """Configuration of the run by sections: `run.config["learner"]["tau"]`."""
+        """Configuration of the run by section: `run.config["learner"]["tau"]`."""
         return dict(self.header.manifest.get("config", {}))
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
-        """Events of the run in words: each has `t`, `iteration`, `text` and `level`."""
+        """Events of the run; each has `t`, `iteration`, `text` and `level`."""
         batches = read_batches(self.log, self.header, topics=(EVENT_TOPIC,))
         return tuple(event for batch in batches for event in batch.events)
 
     def frames(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Return the frames that were watched in the iterations [start, stop), (n, *frame_shape).
+        """Return the frames of the attended streams in the iterations [start, stop).
 
-        The log has every frame of numbers, and every tenth image; `Recording.frames` has all.
+        The log has every frame of vectors, and every tenth image; `Recording.frames` has all.
+
+        Returns:
+            (n, *frame_shape).
 
         Raises:
-            ValueError: there are no such iterations.
+            ValueError: the iterations do not exist.
         """
         count = len(self.signals["iteration"])
         stop = count if stop is None else stop
@@ -155,53 +159,53 @@ class Run(Described, replay.runs.run.Run):
         return np.concatenate(parts)
 
     def at(self, iterations: int, source: Any = ()) -> Learner:
-        """Return its learner after this many iterations, bit for bit.
+        """Return the learner as it was after some iterations, bit for bit.
 
         Args:
-            iterations: iterations done; 0 is the beginning.
-            source: its source, as `cdmisfa.learn` takes it, if the run does not state it or the
-                source has moved.
+            iterations: number of iterations; 0 is the beginning.
+            source: the source, as `cdmisfa.learn` takes it, if the run does not name it or it has
+                moved.
 
         Raises:
-            UsageError: the run has fewer iterations, or its source is missing. Right after a
-                keyframe of the log, one every some hundred iterations, no source is needed.
-            NotReproducedError: learning again gives other signals than its log holds.
+            UsageError: the run has fewer iterations, or the source is missing. No source is needed
+                right after a keyframe of the log, one in some hundred iterations.
+            NotReproducedError: learning again gives signals that differ from the log.
         """
         if isinstance(source, tuple) and not source:
-            source = self._learned_from
+            source = self._source
         words = as_words(source)
-        with contextlib.ExitStack() as opened:
+        with contextlib.ExitStack() as stack:
             if not words and not isinstance(source, tuple):
-                source = opened.enter_context(Recording.of(source).source())
-            with Recomputation.after(self.log, iterations, words or source) as again:
-                return again.learner
+                source = stack.enter_context(Recording.of(source).source())
+            with Recomputation.after(self.log, iterations, words or source) as recomputation:
+                return recomputation.learner
 
     def summary(self) -> str:
-        """Return its results in words, as Markdown: the first page of its view."""
+        """Return the results as Markdown, the first page of the view."""
         from replay.view.summary import summary_text
 
         return summary_text(read_outline(self.log), self.path.name, [e.text for e in self.events])
 
     def report(self, out: str | Path | None = None) -> Path:
-        """Write its results as one HTML page that needs no network and no other file.
+        """Write the results as one HTML page that needs no network and no other file.
 
         Args:
-            out: the file, *.html; by default report.html in its folder, replaced.
+            out: the file (.html); None: report.html in the run's folder, replaced.
 
         Raises:
             UsageError: the file exists.
-            LogWriteError: it cannot be written.
+            LogWriteError: the file cannot be written.
         """
         from cdmisfa.experiments.reports import write_report
 
         return write_report([self.path], None if out is None else Path(out))
 
     def view(self, save: str | Path | None = None, *, tab: str | None = None) -> None:
-        """Show it in the Rerun viewer: in a notebook below the cell, else until a window is closed.
+        """Show the run in the Rerun viewer: below the cell in a notebook, else in a window.
 
         Args:
-            save: write the view to this file, *.rrd, instead.
-            tab: the name of the tab that is open.
+            save: file to write the view to (.rrd) instead.
+            tab: name of the tab that is open at first.
 
         Raises:
             CdmisfaError: there is no display, or the file cannot be written.

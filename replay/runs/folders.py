@@ -71,7 +71,7 @@ def is_run(path: Path) -> bool:
 def read_run_json(folder: Path) -> Mapping[str, Any]:
     """Return the run.json of a run; empty if it is missing or cannot be read."""
     try:
-        document = read_json(folder / RUN_JSON, "learn again", most=MAX_LIST)
+        document = read_json(folder / RUN_JSON, "learn again", limit=MAX_LIST)
     except CdmisfaError:
         return {}
     return document if isinstance(document, Mapping) else {}
@@ -93,7 +93,7 @@ def read_request(folder: Path) -> list[tuple[str, dict[str, Any]]]:
         LogDamagedError: it is damaged, or cannot be read.
     """
     path, remedy = folder / REQUEST, "run the sweep again to write it"
-    request = read_json(path, remedy, most=MAX_LIST)
+    request = read_json(path, remedy, limit=MAX_LIST)
     try:
         return [(str(trial["id"]), dict(trial["point"])) for trial in request["trials"]]
     except (ValueError, KeyError, TypeError) as error:

@@ -14,7 +14,7 @@ from cdmisfa.cli import options, printing
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.names import counted, lasting
+from cdmisfa.core.names import counted, duration_text
 
 if TYPE_CHECKING:
     from replay.corpus.index import Indexed
@@ -354,7 +354,7 @@ def _print_index(indexed: Indexed) -> None:
     if indexed.kinds:
         head = "kind", "logs", "files", "streams", "length", "size"
         counts = [[row[name] for name in head[:4]] for row in indexed.kinds]
-        sizes = [[lasting(row["seconds"]), decimal(row["bytes"])] for row in indexed.kinds]
+        sizes = [[duration_text(row["seconds"]), decimal(row["bytes"])] for row in indexed.kinds]
         printing.table(head, [[*a, *b] for a, b in zip(counts, sizes, strict=True)])
     for row in indexed.problems:
         printing.line(f"{row['path']}: {row['problem']}")
