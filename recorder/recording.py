@@ -155,7 +155,7 @@ def record(
                 done = min(logs.starts().values())
                 progress(done)
                 if stop() and done < frames:
-                    raise RecordingStoppedError(f"{folder} is not finished: go on with --resume")
+                    raise RecordingStoppedError(f"{folder} is not finished: continue with --resume")
         if starts:
             source.describe()  # an error where it was replaced while it was read
         return logs.finish()

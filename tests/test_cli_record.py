@@ -33,7 +33,7 @@ def test_a_signal_says_how_to_go_on(
         recorder.send_signal(number)
         error = recorder.communicate(timeout=60)[1]
     assert recorder.returncode == code
-    line = f"cdmisfa: interrupted: {folder} is not finished: go on with --resume\n"
+    line = f"cdmisfa: interrupted: {folder} is not finished: continue with --resume\n"
     assert error.lstrip("\n") == line  # behind the terminal's ^C
     assert not list(folder.glob("*.mcap"))
     assert cdmisfa("info", folder, "--json").json["complete"] is False

@@ -14,7 +14,7 @@ LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
 
 A_RUN = "is a run, not a recording: open it with cdmisfa view"
 NO_MCAP = "numbers.h5 is no log that is read: logs are .mcap, .bag and .db3 files"
-VAIN = "is for live scenes, and this source is none"
+VAIN = "is for live scenes, and this source is not one"
 TAKEN = "taken exists: choose another folder"
 
 CASES: dict[str, tuple[str, ...]] = {
@@ -65,16 +65,16 @@ CASES: dict[str, tuple[str, ...]] = {
     "sweep taken --summary --seeds 0": ("--summary only prints results: leave out --seeds",),
     "sweep taken RUN --summary": ("--summary takes the folder of one sweep",),
     "sweep taken --summary --csv --json": ("choose one of --csv and --json",),
-    "sweep taken --summary": ("taken holds no sweep",),
+    "sweep taken --summary": ("taken has no sweep",),
     "doctor left.mcap": ("check files with cdmisfa verify left.mcap",),
     # a fork that cannot be
-    "fork RUN --iteration 3 -o x --set learner.tau=20": ("learner.tau stays as in the parent",),
+    "fork RUN --iteration 3 -o x --set learner.tau=20": ("learner.tau cannot change in a fork",),
     "fork RUN --iteration 16 -o x": ("holds 15 iterations",),
     # neither a file nor the folder one is in is replaced
     "fork RUN --iteration 3 --force -o file": ("file is a file: name a folder",),
     "learn oscillatory -o EMPTY": ("is empty: name a",),
     # resuming is advised only where it can be
-    "learn oscillatory -o taken": (TAKEN, "go on with --resume"),
+    "learn oscillatory -o taken": (TAKEN, "continue with --resume"),
     "fork RUN --iteration 3 -o taken": (TAKEN,),
 }
 
@@ -110,5 +110,5 @@ def test_it_is_refused_in_one_line(
     kept = contents(oscillatory_run)
     done = cdmisfa(*words.split(" "))
     assert_one_line(done, 2, *said)
-    assert "--resume" in "".join(said) or "go on with --resume" not in done.err
+    assert "--resume" in "".join(said) or "continue with --resume" not in done.err
     assert contents(oscillatory_run) == kept

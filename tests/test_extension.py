@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from test_trial import QUICK, assert_equal, step_by_step
 
 from cdmisfa.core.expansion import EXPANSIONS, Expansion
-from cdmisfa.experiments.trial import run_trial
+from cdmisfa.experiments.trial import run_oscillatory_trial
 from replay.runs.modules import load_modules
 
 STREAMS = ("x1", "x2", "x3")
@@ -45,7 +45,7 @@ def test_a_whole_trial_is_the_learner_with_an_expansion_of_ones_own(
     expansion: str, least: int
 ) -> None:
     config = dataclasses.replace(QUICK, expansion=expansion, delta=0.005)
-    trial = run_trial(config, seed=5, curves=True, max_iterations=600)
+    trial = run_oscillatory_trial(config, seed=5, curves=True, max_iterations=600)
     assert len(trial.modules) >= least
     assert all(m.expansion == expansion for m in trial.modules)
     assert_equal(trial, *step_by_step(config, STREAMS, 5, trial.iterations))

@@ -18,7 +18,7 @@ from PIL import Image
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError
-from cdmisfa.experiments.holdout import judged
+from cdmisfa.experiments.holdout import evaluate
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.features.sfa import batch_sfa, slowness
 from cdmisfa.modules import Module
@@ -94,7 +94,7 @@ def test_a_share_of_what_is_learned_from_once_is_held_out(
     done = cdmisfa("learn", log, *said, "--json", "--max-iterations", "3", *options)
     assert done.json["source"].get("held_out", 0) == held
     assert ("held_out" in done.json) == (held > 0)
-    few = "150 of 1500 frames are too few to judge on: none are held out (input.holdout)"
+    few = "150 of 1500 frames are too few to evaluate on: none are held out (input.holdout)"
     assert (few in done.err) == ("15" in options)
 
 
@@ -153,9 +153,9 @@ def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -
             with pytest.raises(LogExhaustedError, match="before 20 held-out"):
                 source.take(0, 1)
             if skip_damaged:
-                found = judged(source, [replace(learned, expansion="none")], components=2)
+                found = evaluate(source, [replace(learned, expansion="none")], components=2)
                 assert found is not None
                 assert found["frames"] == [100, 120]
             else:
                 with pytest.raises(LogDamagedError, match=r"110\.png.*--skip-damaged"):
-                    judged(source, [replace(learned, expansion="none")], components=2)
+                    evaluate(source, [replace(learned, expansion="none")], components=2)

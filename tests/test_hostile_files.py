@@ -19,7 +19,7 @@ from test_modules import with_width
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.results import results
-from cdmisfa.experiments.store import ROWS, read_rows
+from cdmisfa.experiments.store import ROWS, read_trial_rows
 from cdmisfa.modules import Module
 from recorder.log.logfile import LogFile
 from replay.integrity.info import describe
@@ -147,7 +147,7 @@ def test_deep_json_is_damage(tmp_path: Path) -> None:
         results(tmp_path)
     (tmp_path / ROWS).write_text(DEEP + "\n")
     with pytest.raises(LogDamagedError, match=ROWS):
-        list(read_rows(tmp_path))
+        list(read_trial_rows(tmp_path))
 
 
 WAYS = ("info", "verify", "learn", "convert -o out", "export -o out --to images")

@@ -48,7 +48,7 @@ def test_an_interrupted_run_is_resumed(
     out = tmp_path / "out"
     done = _signalled(cdmisfa, (*LEARN, "-o", out), last, 2, monkeypatch)
     assert done.code == 130
-    said = f"cdmisfa: interrupted: {out} is not finished: go on with --resume"
+    said = f"cdmisfa: interrupted: {out} is not finished: continue with --resume"
     assert done.err.splitlines()[-1] == said
     assert cdmisfa("learn", "-o", out, "--resume").code == 0
     assert (out / "run.rrd").is_file()

@@ -14,7 +14,7 @@ from cdmisfa.cli.progress import Bar
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn_blocks
+from cdmisfa.experiments.loop import END_REASONS, Digest, Keyframes, learn_blocks
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 
@@ -85,7 +85,10 @@ def test_every_sink_is_told_everything_in_order() -> None:
     saved, ended, finished = one.told[-3:]
     assert one.told[:-3] == list(range(9))
     assert saved == (320, 8, "module 1 saved on stream x2, policy [1, 1, 1]", "INFO")
-    assert (ended, finished) == ((360, 8, f"ended: {ENDINGS['max_modules']}", "INFO"), "finished")
+    assert (ended, finished) == (
+        (360, 8, f"ended: {END_REASONS['max_modules']}", "INFO"),
+        "finished",
+    )
     assert two.told == one.told
 
 
@@ -95,7 +98,7 @@ def test_the_end_of_a_recording_ends_the_run_and_is_told() -> None:
     (t, iteration, why, level), *last = notes.told[3:]
     assert (notes.told[:3], t, iteration, level) == ([0, 1, 2], 120, 2, "WARNING")
     assert "the streams end after 130 frames" in why
-    assert last == [(120, 2, f"ended: {ENDINGS['log_exhausted']}", "INFO"), "finished"]
+    assert last == [(120, 2, f"ended: {END_REASONS['log_exhausted']}", "INFO"), "finished"]
 
 
 class Seen(Bar):

@@ -141,7 +141,7 @@ def test_another_source_is_found_out(place: Path, tmp_path: Path, cdmisfa: Cdmis
     assert cdmisfa("record", "oscillatory", *scene, "-o", other, "--frames", 3000).code == 0
     run = place / "2.0-live"
     refused = cdmisfa("check", run, "--source", other)
-    assert (refused.code, "shows other streams" in refused.err) == (2, True)
+    assert (refused.code, "has other streams" in refused.err) == (2, True)
     short = cdmisfa("check", run, "--source", place / "log", "--json")
     assert short.code == 4
     assert short.json["first_difference"]["iteration"] == 1500 // 40

@@ -12,7 +12,7 @@ from contracts.learners import LearnerContract
 from cdmisfa.agents.learners import learner_class
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.learning import Learner
-from cdmisfa.experiments.store import read_rows
+from cdmisfa.experiments.store import read_trial_rows
 from cdmisfa.experiments.sweep import plan, sweep
 
 ROOT = Path(__file__).parents[1]
@@ -50,7 +50,7 @@ def test_a_sweep_uses_it_and_knows_its_code(
     settings = (f"learner.algorithm={OWN}", "learner.patience=4")
     grid = {"learner.tau": [10, 20]}
     sweep("oscillatory", tmp_path / "swept", seeds=[0], settings=settings, grid=grid, jobs=2)
-    rows = read_rows(tmp_path / "swept")
+    rows = read_trial_rows(tmp_path / "swept")
     assert sorted(row["result"]["frames"] for row in rows) == [40, 80]
     planned = [plan(["oscillatory"], grid={}, seeds=[0], settings=settings)[0].id for _ in range(2)]
     monkeypatch.setattr("inspect.getfile", lambda found: __file__)

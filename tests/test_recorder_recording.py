@@ -159,7 +159,7 @@ def test_a_stopped_recording_knows_how_long_it_was_to_be(oscillatory, tmp_path):
         assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
         return len(told) in (9, 20)
 
-    why = "a is not finished: go on with --resume"
+    why = "a is not finished: continue with --resume"
     with pytest.raises(RecordingStoppedError, match=why):
         record_scene("oscillatory", folder, frames=3000, progress=told.append, stop=stop)
     left = [whole_frames(partial_path(folder / f"{view}.mcap"), view) for view in STREAMS]

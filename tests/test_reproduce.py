@@ -14,7 +14,7 @@ from conftest import Cdmisfa
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.documents import versions
-from cdmisfa.experiments.trial import run_trial
+from cdmisfa.experiments.trial import run_oscillatory_trial
 from cdmisfa.studies.paper import icub, nonstationary, oscillatory
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Trial
 from cdmisfa.studies.paper.oscillatory import Oscillatory
@@ -144,7 +144,7 @@ def test_a_module_is_judged_by_frames_after_those_it_learned_from() -> None:
             return dataclasses.replace(block, truth=block.frames[:, ::-1])
 
     source = Moving()
-    module = run_trial(LearnerConfig(), seed=0, max_modules=1).modules[0]
+    module = run_oscillatory_trial(LearnerConfig(), seed=0, max_modules=1).modules[0]
     first = dataclasses.replace(module, phi=np.eye(5)[:1])
     assert icub.follows(first, source, 5000) == [pytest.approx(0, abs=0.2), pytest.approx(1)]
 

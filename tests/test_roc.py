@@ -12,7 +12,7 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
-from cdmisfa.experiments.trial import run_trial
+from cdmisfa.experiments.trial import run_oscillatory_trial
 from recorder.world.oscillatory import OscillatorySource
 
 
@@ -69,7 +69,7 @@ def test_1_0_learns_modules_and_its_reward_function_has_norm_1() -> None:
     for _ in range(60):
         signals = learner.step(source.take(learner.stream, learner.tau))
     assert np.linalg.norm(signals.R) == pytest.approx(1.0)
-    trial = run_trial(LearnerConfig(algorithm="1.0"), seed=0, max_iterations=3000)
+    trial = run_oscillatory_trial(LearnerConfig(algorithm="1.0"), seed=0, max_iterations=3000)
     assert trial.modules
     assert trial.modules[0].counts.any()
 
@@ -99,7 +99,9 @@ def test_the_clustering_errors_are_recorded_and_decide() -> None:
 
 def test_1_0_can_learn_the_paper_s_modules_too() -> None:
     config = LearnerConfig(algorithm="1.0")
-    trials = [run_trial(config, seed=seed, max_iterations=6000) for seed in range(1000, 1006)]
+    trials = [
+        run_oscillatory_trial(config, seed=seed, max_iterations=6000) for seed in range(1000, 1006)
+    ]
     assert sum([m.stream_index for m in trial.modules] == [0, 1, 2] for trial in trials) >= 3
 
 

@@ -15,7 +15,7 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SignalsHash
-from cdmisfa.experiments.loop import ENDINGS
+from cdmisfa.experiments.loop import END_REASONS
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run as run_it
 from recorder.world.oscillatory import OscillatorySource
@@ -50,7 +50,7 @@ def test_it_ends_when_every_stream_is_learned(tmp_path: Path) -> None:
         "module 1 saved on stream x1, policy [0, 1, 1]",
         "module 2 saved on stream x2, policy [1, 0, 1]",
         "module 3 saved on stream x3, policy [1, 1, 0]",
-        f"ended: {ENDINGS['max_modules']}",
+        f"ended: {END_REASONS['max_modules']}",
     ]
     for one, other in zip(load_modules(tmp_path / "run"), result.modules, strict=True):
         for field in dataclasses.fields(one):

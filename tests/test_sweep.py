@@ -25,8 +25,8 @@ from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import store
 from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.session import run
-from cdmisfa.experiments.store import ROWS, read_rows
-from cdmisfa.experiments.sweep import UNKEPT, plan, sweep
+from cdmisfa.experiments.store import ROWS, read_trial_rows
+from cdmisfa.experiments.sweep import DROPPED_KEYS, plan, sweep
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 
@@ -36,7 +36,9 @@ GRID = {"learner.sigma": [0, 0.0009]}
 
 def rows_of(folder: Path) -> dict[str, Any]:
     """Rows by trial, without where the logs are."""
-    return {row["id"]: {k: v for k, v in row.items() if k != "run"} for row in read_rows(folder)}
+    return {
+        row["id"]: {k: v for k, v in row.items() if k != "run"} for row in read_trial_rows(folder)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -79,13 +81,13 @@ def test_a_recording_is_named_by_its_bytes_and_swept_as_its_scene_is(tmp_path: P
     for source in (tmp_path / "a", "oscillatory"):
         folder = tmp_path / f"sweep{len(found)}"
         sweep(source, folder, seeds=[0, 1], max_iterations=30)
-        found.append([row["result"] for row in read_rows(folder)])
+        found.append([row["result"] for row in read_trial_rows(folder)])
     assert found[0] == found[1]
 
 
 def test_a_trial_is_a_run(tmp_path: Path) -> None:
     sweep("oscillatory", tmp_path, seeds=[5], max_iterations=600)
-    (row,) = read_rows(tmp_path)
+    (row,) = read_trial_rows(tmp_path)
     result = run(OscillatorySource(), LearnerConfig(), seed=5, max_iterations=600).as_json()
     assert row["result"] == {key: result[key] for key in row["result"]}
 
@@ -97,8 +99,10 @@ def test_logs_are_swept_as_the_options_say(tmp_path: Path, cdmisfa: Cdmisfa) -> 
     swept = ("sweep", log, "-o", tmp_path / "sweep", *short)
     learned = cdmisfa("learn", log, *LEFT, "--max-iterations", 2, "--json").json
     assert cdmisfa(*swept, *LEFT).code == 0
-    (row,) = read_rows(tmp_path / "sweep")
-    assert row["result"] == {key: value for key, value in learned.items() if key not in UNKEPT}
+    (row,) = read_trial_rows(tmp_path / "sweep")
+    assert row["result"] == {
+        key: value for key, value in learned.items() if key not in DROPPED_KEYS
+    }
     again = cdmisfa(*swept, *LEFT, "--json").json
     assert (again["skipped"], again["computed"]) == (1, 0)
     later = cdmisfa(*swept, "--topic", "/left", "--start", 0.2, "--json").json
@@ -128,18 +132,18 @@ def test_failed_trials_are_listed_and_retried_when_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     computed: list[int] = []
-    healthy = sweeping.run_one
+    healthy = sweeping.compute_trial
 
     def flaky(*what: Any, seed: int, **limits: Any) -> dict[str, Any]:
         computed.append(seed)
         return {"error": "no luck"} if seed == 1 else healthy(*what, seed=seed, **limits)
 
-    monkeypatch.setattr(sweeping, "run_one", flaky)
+    monkeypatch.setattr(sweeping, "compute_trial", flaky)
     first = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     assert [(row["seed"], row["error"]) for row in first.failed] == [(1, "no luck")]
     second = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     assert (second.skipped, len(second.failed)) == (3, 1)
-    monkeypatch.setattr(sweeping, "run_one", healthy)
+    monkeypatch.setattr(sweeping, "compute_trial", healthy)
     third = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30, retry_failed=True)
     assert (third.skipped, third.computed, third.failed) == (2, 1, ())
     assert computed == [0, 1, 2]
@@ -149,17 +153,17 @@ def test_a_row_that_was_cut_short_is_computed_again_and_a_damaged_one_named(tmp_
     sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     whole = (tmp_path / ROWS).read_bytes()
     (tmp_path / ROWS).write_bytes(whole[:-10])
-    assert len(list(read_rows(tmp_path))) == 2
+    assert len(list(read_trial_rows(tmp_path))) == 2
     assert sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30).computed == 1
     assert (tmp_path / ROWS).read_bytes() == whole
     (tmp_path / ROWS).write_text('{"id": "a", "status": "done", "point": {}}\n{"id": 3}\n')
     with pytest.raises(LogDamagedError, match=r"rows\.jsonl line 2"):
-        list(read_rows(tmp_path))
+        list(read_trial_rows(tmp_path))
 
 
 def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
     with started("sweep", "oscillatory", "--seeds", "0:40", "-o", tmp_path) as process:
-        wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
+        wait_for(lambda: len(list(read_trial_rows(tmp_path))) >= 2, seconds=200)
     assert process.returncode == -signal.SIGKILL
     before = rows_of(tmp_path)
     report = sweep("oscillatory", tmp_path, seeds=range(40))
@@ -204,7 +208,7 @@ def test_local_processes_give_the_same_rows_also_after_one_was_killed(
 def test_ctrl_c_of_a_terminal_ends_the_command_and_its_workers(tmp_path: Path) -> None:
     words = ("sweep", "oscillatory", "--seeds", "0:4000", "--jobs", "2", "-o", tmp_path)
     with running("-m", "cdmisfa", *words, start_new_session=True) as process:
-        wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
+        wait_for(lambda: len(list(read_trial_rows(tmp_path))) >= 2, seconds=200)
         children = psutil.Process(process.pid).children(recursive=True)
         os.killpg(process.pid, signal.SIGINT)
         complaint = process.communicate(timeout=10)[1]

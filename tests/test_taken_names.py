@@ -83,7 +83,7 @@ def test_a_run_and_a_recording_do_not_share_a_folder(
 ) -> None:
     before = names(made["rec"]), names(made["run"])
     learn = ("learn", "oscillatory", "--no-rerun", "--max-iterations", 2, "-o", made["rec"])
-    assert_one_line(cdmisfa(*learn, "--force"), 2, "x1.mcap is of no run")
+    assert_one_line(cdmisfa(*learn, "--force"), 2, "x1.mcap does not belong to a run")
     record = ("record", "oscillatory", "--frames", 20, "-o")
     for word in ("--force", "--resume"):
         assert_one_line(cdmisfa(*record, made["run"], word), 2, "run.mcap is of no recording")

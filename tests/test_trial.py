@@ -10,7 +10,7 @@ import pytest
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.trial import CHUNK, Swap, TrialResult, run_trial
+from cdmisfa.experiments.trial import CHUNK, Swap, TrialResult, run_oscillatory_trial
 from recorder.world.oscillatory import OscillatorySource
 
 QUICK = LearnerConfig(epsilon_decay=0.99, tau=50, eta_dot_window=20)
@@ -54,14 +54,16 @@ def assert_equal(trial: TrialResult, learner: CuriousLearner, signals: list[Bloc
 @pytest.mark.parametrize("algorithm", ["2.0", "1.0"])
 def test_trial_is_the_learner_bit_for_bit(algorithm: str) -> None:
     config = dataclasses.replace(QUICK, algorithm=algorithm, roc_error=0.3)
-    trial = run_trial(config, seed=5, curves=True, max_iterations=2 * CHUNK + 7)
+    trial = run_oscillatory_trial(config, seed=5, curves=True, max_iterations=2 * CHUNK + 7)
     assert trial.modules, "nothing was learned: the comparison would not cover a save"
     assert_equal(trial, *step_by_step(config, ("x1", "x2", "x3"), 5, trial.iterations))
 
 
 def test_trial_is_the_learner_across_a_swap() -> None:
     swap = Swap(0.9, 0, "x1")
-    trial = run_trial(QUICK, ("zero", "x2", "x3"), seed=1, curves=True, max_modules=2, swap=swap)
+    trial = run_oscillatory_trial(
+        QUICK, ("zero", "x2", "x3"), seed=1, curves=True, max_modules=2, swap=swap
+    )
     assert trial.swapped > 0
     assert trial.curves is not None
     epsilon = trial.curves["epsilon"]

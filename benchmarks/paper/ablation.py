@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.paper import Table, learn_and_judge, study
-from cdmisfa.experiments.trial import run_trial
+from cdmisfa.experiments.trial import run_oscillatory_trial
 from cdmisfa.studies.paper import icub, oscillatory
 from cdmisfa.studies.paper.experiment import (
     Settings,
@@ -73,7 +73,7 @@ def run(settings: Settings) -> dict[str, Any]:
     config = paper_config(scene, **settings["keys"])
     if scene == "oscillatory":
         most = oscillatory.MAX_ITERATIONS
-        return module_row(run_trial(config, seed=seed, max_iterations=most).modules)
+        return module_row(run_oscillatory_trial(config, seed=seed, max_iterations=most).modules)
     with contextlib.closing(open_recording(settings["recording"])) as source:
         return learn_and_judge(source, config, seed, source.frames - icub.HELD_OUT)
 

@@ -13,7 +13,7 @@ from benchmarks.paper import Table, study
 from cdmisfa import kernels
 from cdmisfa.agents.agent import OUTCOME, Frozen, as_struct, new_agent, rules
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.experiments.trial import run_trial
+from cdmisfa.experiments.trial import run_oscillatory_trial
 from cdmisfa.studies.paper.experiment import Settings, Trial, groups, mean_text, paper_config
 from cdmisfa.studies.paper.oscillatory import ALGORITHMS, ITERATIONS, NEVER, STREAMS
 
@@ -45,7 +45,7 @@ def run(settings: Settings) -> dict[str, Any]:
     if not modules:
         config, names = paper_config("oscillatory", **NEVER), STREAMS * (streams // 3)
         start = time.process_time_ns()
-        run_trial(config, names, seed=seed, max_iterations=ITERATIONS, max_modules=1)
+        run_oscillatory_trial(config, names, seed=seed, max_iterations=ITERATIONS, max_modules=1)
         row["whole"] = (time.process_time_ns() - start) / ITERATIONS / 1000
     return row
 

@@ -140,7 +140,7 @@ def source_changes(frames: FrameSource) -> None:
 def result(run: RunResult, *, as_json: bool) -> None:
     """Print the result of a run that has ended."""
     from cdmisfa.core.names import counted
-    from cdmisfa.experiments.loop import ENDINGS
+    from cdmisfa.experiments.loop import END_REASONS
     from replay.integrity.report import ModuleInfo
 
     if as_json:
@@ -154,7 +154,7 @@ def result(run: RunResult, *, as_json: bool) -> None:
         line(f"not decided: {', '.join(run.undecided)}")
     if run.held_out:
         held_out(run.held_out)
-    line(f"ended after {counted(run.iterations, 'iteration')}: {ENDINGS[run.ended]}")
+    line(f"ended after {counted(run.iterations, 'iteration')}: {END_REASONS[run.ended]}")
     line(f"signals sha256 {run.signals_sha256}")
     if run.run is not None:
         line(f"run {run.run}    look at it: cdmisfa view {quoted(run.run)}")

@@ -1,4 +1,4 @@
-"""Frozen modules applied to a source, block by block; `apply_logs` does that for many logs."""
+"""`Application`: apply the saved modules of a run to a source, block by block."""
 
 from __future__ import annotations
 
@@ -40,13 +40,16 @@ from replay.runs.run import Run
 from replay.storage.identity import file_sha256
 from replay.stored_source import StoredSource, centre_as
 
-# Standard deviations of a module's slowness within which it knows a block, as its learner says.
-KNOWN_WITHIN: Final = 2.0
+# Standard deviations of its slowness within which a module of 1.0 and 2.0 explains a block, as in
+# the paper and in `gate.c`.
+EXPLAINED_WITHIN_SD: Final = 2.0
 
-# Frames over which the variance is taken that decides whether a module is alive.
-WINDOW: Final = 2000
+# Exponential window, in frames, of the variance that decides whether a module is alive. It equals
+# the default of `learner.test_frames`, so that a module is judged as it was when it was saved.
+VARIANCE_WINDOW: Final = 2000
 
-# Approximate bytes of frames and outputs of a log that are read at once.
+# Approximate size in bytes of the frames and outputs that are read at once from a log. A larger
+# value takes more memory; the speed did not rise further.
 READ_BYTES: Final = 2**22
 
 # Consecutive frames within a block of the clock, and the outputs (n, R) on them.
@@ -57,11 +60,12 @@ class Application:
     """The modules of a run, ready to be applied.
 
     Args:
-        path: the run's folder.
+        path: folder of the run.
 
     Attributes:
-        modules: the modules in the order of learning.
-        tau: frames of a block of the run.
+        modules: the modules, in the order in which they were saved.
+        tau: number of frames in a block of the run.
+        recipe: recipe by which raw images become frames.
 
     Raises:
         UsageError: the run does not exist or has no modules.
@@ -81,13 +85,13 @@ class Application:
 
     @functools.cached_property
     def identity(self) -> str:
-        """The hash of the modules and of everything else that decides the outputs."""
+        """Hash of the modules and of everything else that the outputs depend on."""
         modules = file_sha256(self._folder / MODULES_FILE)
         text = json.dumps([modules, self.tau, self.recipe.as_json()])
         return hashlib.sha256(text.encode()).hexdigest()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let another process read the run by itself, once, instead of sending the modules."""
+        """Pickle as the path of the run: a worker reads the modules once, from the disk."""
         return _read_application, (os.path.abspath(self._path), self.identity)
 
     def open(
@@ -99,13 +103,13 @@ class Application:
         skip_damaged: bool = False,
         say: Callable[[str], None] = lambda line: None,
     ) -> FrameSource:
-        """Open a source whose frames are made as the modules' recipe says.
+        """Open a source, and make its frames by the modules' recipe.
 
         Args:
             words: the source, as `cdmisfa learn` takes it.
-            inputs: the part of logs that is used; size, fit and colour are the recipe's.
-            loop: start again at the end.
-            skip_damaged: skip damaged parts.
+            inputs: which part of logs to use; size, fit and colour come from the recipe.
+            loop: True to start again at the end.
+            skip_damaged: True to skip damaged parts.
             say: called with a line when the state of a camera changes.
 
         Raises:
@@ -122,8 +126,8 @@ class Application:
         if source.spec.frame_shape != self.recipe.shape:
             source.close()
             raise UsageError(
-                f"{words[0]} shows frames of {source.spec.frame_shape}, and the modules learned "
-                f"from {self.recipe.shape}: choose the streams with --topic, or numbers with "
+                f"frames of {words[0]} have the shape {source.spec.frame_shape}, but the modules "
+                f"learned from {self.recipe.shape}: choose streams with --topic, or values with "
                 "--field"
             )
         return centre_as(self.recipe.centre, source, words[0])
@@ -132,19 +136,19 @@ class Application:
         recipe, numbers_range = self.recipe, inputs.range or self.recipe.range
         if recipe.size is None:
             return replace(inputs, fields=inputs.fields or recipe.fields, range=numbers_range)
-        how: Any = {"size": recipe.size, "fit": recipe.fit, "color": recipe.color}
-        return replace(inputs, **how, range=numbers_range)
+        framing: Any = {"size": recipe.size, "fit": recipe.fit, "color": recipe.color}
+        return replace(inputs, **framing, range=numbers_range)
 
-    def _open_log(self, words: Sequence[str], inputs: InputOptions, **how: Any) -> FrameSource:
+    def _open_log(self, words: Sequence[str], inputs: InputOptions, **options: Any) -> FrameSource:
         places = locations(words)
         if not inputs.external and not any(map(is_external_format, places)):
             with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
-                recorded = open_recording(places, **how)
+                recorded = open_recording(places, **options)
                 if recorded.spec.frame_shape == self.recipe.shape or not recorded.spec.images:
                     return recorded
                 recorded.close()
         return with_every_topic(
-            lambda inputs: open_logs(words, inputs=inputs, **how), self._with_recipe(inputs)
+            lambda inputs: open_logs(words, inputs=inputs, **options), self._with_recipe(inputs)
         )
 
     def to(
@@ -155,39 +159,39 @@ class Application:
     ) -> Generator[Applied]:
         """Apply the modules to a source, from its current frame.
 
-        The results on a block depend on its frames and on those before it alone: a live stream
-        and its recording give the same.
+        The results on a block depend only on its frames and on earlier ones, so that a live stream
+        and its recording give the same results.
 
         Args:
-            source: frames of the shape that the modules learned from; left open.
-            frames: end after this many frames of each stream; by default where the source ends.
-            stop: called before every block; true ends the generator.
+            source: a source of frames in the shape that the modules learned from; it stays open.
+            frames: largest number of frames of each stream; None: up to the end of the source.
+            stop: called before every block; True ends the generator.
 
         Yields:
-            Each unbroken stretch of a stream within a block of the clock, in their order; the last
-            block may be shorter.
+            Each stretch of a stream without a gap within a block of the clock, in order of time;
+            the last block can be shorter.
 
         Raises:
             LogDamagedError: the log is damaged at the next frame; all frames before were yielded.
         """
         stored = isinstance(source, StoredSource)
         reads = _reads(source, self._step(source.spec) if stored else self.tau, self.tau, frames)
-        judges = [_Judge(self.modules) for _ in source.spec.streams]
+        trackers = [_ModuleTracker(self.modules) for _ in source.spec.streams]
         for parts in self._ahead(reads) if stored else map(self._projected, reads):
             for part, y in sorted(parts, key=lambda part: (part[0].t, part[0].stream)):
-                yield judges[part.stream].judge(part, y)
+                yield trackers[part.stream].update(part, y)
             if stop():
                 return
 
     def _step(self, spec: SourceSpec) -> int:
-        """Return frames of a log that are read at once, whole blocks."""
+        """Return the number of frames of a log to read at once, a multiple of tau."""
         pixels = math.prod(spec.frame_shape) * np.dtype(spec.dtype).itemsize
         outputs = sum(len(module.phi) for module in self.modules)
         frame_bytes = len(spec.streams) * (pixels + 8 * outputs)
         return max(READ_BYTES // frame_bytes // self.tau, 1) * self.tau
 
     def _ahead(self, reads: Iterator[Sequence[Block]]) -> Iterator[list[Part]]:
-        """Read in one thread, and compute outputs in as many threads as there are processors."""
+        """Read in one thread, and compute outputs in one thread for each processor."""
         cores = thread_count()
 
         def read() -> Future[list[Part]] | None:
@@ -195,13 +199,13 @@ class Application:
             return None if blocks is None else pool.submit(self._projected, blocks)
 
         with ThreadPoolExecutor(cores) as pool, ThreadPoolExecutor(1) as reader:
-            coming = deque(reader.submit(read) for _ in range(cores + 1))
-            while (parts := coming.popleft().result()) is not None:
-                coming.append(reader.submit(read))
+            futures = deque(reader.submit(read) for _ in range(cores + 1))
+            while (parts := futures.popleft().result()) is not None:
+                futures.append(reader.submit(read))
                 yield parts.result()
 
     def _projected(self, blocks: Sequence[Block]) -> list[Part]:
-        """Compute the outputs, and cut stretches where blocks of the clock begin."""
+        """Compute the outputs, and cut stretches at the beginnings of blocks of the clock."""
         parts = []
         for block in blocks:
             y, end = self._stack.transform(block.frames), block.t + len(block)
@@ -217,20 +221,20 @@ class Application:
 def _read_application(path: str, identity: str) -> Application:
     application = Application(path)
     if application.identity != identity:
-        raise CdmisfaError(f"{path} has other modules where a worker is: share one folder")
+        raise CdmisfaError(f"{path} has other modules on a worker: use a folder that all share")
     return application
 
 
 def _reads(
     source: FrameSource, step: int, tau: int, frames: int | None
 ) -> Iterator[Sequence[Block]]:
-    """Read a source piece by piece, each to where a block of the clock ends.
+    """Read a source piece by piece; each piece ends at the end of a block of the clock.
 
     Args:
-        source: read from its current frame.
-        step: frames that are read at once, whole blocks.
-        tau: frames of a block.
-        frames: end after this many.
+        source: the source, read from its current frame.
+        step: number of frames to read at once, a multiple of tau.
+        tau: number of frames in a block.
+        frames: largest number of frames; None: all.
     """
     counts = [n for n in (frames, source.spec.length) if n is not None]
     end = source.t + min(counts, default=math.inf)
@@ -244,11 +248,11 @@ def _reads(
             if step == tau:
                 yield _read_rest(source)
                 raise
-            step = tau  # up to the damaged block, and then frame by frame
+            step = tau  # read block by block up to the damage, and then frame by frame
 
 
 def _read_rest(source: FrameSource) -> Sequence[Block]:
-    """Read the last frames of a source that has too few for a block, or none that are whole."""
+    """Read the last frames of a source that has less than a block, or is damaged there."""
     blocks: list[Block] = []
     with contextlib.suppress(LogExhaustedError, LogDamagedError):
         while True:
@@ -256,18 +260,19 @@ def _read_rest(source: FrameSource) -> Sequence[Block]:
     return unbroken(blocks)
 
 
-class _Judge:
-    """Judges on one stream whether modules are alive and how novel a block is.
+class _ModuleTracker:
+    """Running statistics of the modules on one stream: whether they are alive, and novelty.
 
-    The novelty of a block is 1 at the bound of what the module's learner knows: by the band of its
-    slowness or, where the learner keeps none, by the logarithm of the ratio of the steps of its
-    first output from frame to frame to those while learning (its variance was 1 then).
+    The novelty of a block is 1 at the bound of what the learner counts as explained by the module.
+    For modules of 1.0 and 2.0 that is the band of their slowness. For those of the progress learner
+    it is |ln| of the ratio of the mean step of the first output to its step while learning (its
+    variance was 1 then).
     """
 
     def __init__(self, modules: Sequence[Module]) -> None:
         self._firsts = [columns.start for _, columns in columns_of(modules)]
         self._centre = np.concatenate([module.band_mean for module in modules])
-        self._width = KNOWN_WITHIN * np.concatenate([module.band_sd for module in modules])
+        self._width = EXPLAINED_WITHIN_SD * np.concatenate([module.band_sd for module in modules])
         self._step_sizes = {
             i: 2 * math.pi * float(module.eta[0])
             for i, module in enumerate(modules)
@@ -277,14 +282,15 @@ class _Judge:
         self._square = np.zeros(len(modules))
         self._frames = 0
 
-    def judge(self, block: Block, y: FloatArray) -> Applied:
-        """Return the outputs (n, R) on a block with their slowness, presence and novelty."""
+    def update(self, block: Block, y: FloatArray) -> Applied:
+        """Return the outputs (n, R) on a block with their slowness, liveness and novelty."""
         slowness = np.full(y.shape[1], np.nan)
         if len(y) > 1:
             slowness = kernels.instantaneous_slowness(y)
         first = y[:, self._firsts]
         self._frames += len(y)
-        rate = max(min(2 * len(y) / (WINDOW + len(y)), 1.0), len(y) / self._frames)
+        window = VARIANCE_WINDOW
+        rate = max(min(2 * len(y) / (window + len(y)), 1.0), len(y) / self._frames)
         self._mean += rate * (first.mean(axis=0) - self._mean)
         self._square += rate * ((first * first).mean(axis=0) - self._square)
         variance = self._square - self._mean * self._mean
@@ -300,15 +306,15 @@ class _Judge:
 
 
 class Totals:
-    """Sums of the outputs of modules over the streams of a source.
+    """Totals over the outputs of modules on all streams of a source.
 
     Args:
-        spec: the spec of the source.
-        modules: the modules in their order.
+        spec: properties of the source.
+        modules: the modules.
 
     Attributes:
-        frames: the number of frames of all streams.
-        damaged: why the log was not applied to its end; None where it was.
+        frames: total number of frames of all streams.
+        damaged: the error at which reading the log ended; None if it was read to its end.
     """
 
     def __init__(self, spec: SourceSpec, modules: Sequence[Module]) -> None:
@@ -332,7 +338,7 @@ class Totals:
         sums[4] += count * finite
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row per stream and module as JSON values: shares of frames, mean slowness."""
+        """Return shares of frames and mean slowness for each stream and module, as JSON values."""
         return [
             {
                 "stream": self._spec.streams[stream],
@@ -355,7 +361,7 @@ def follow(
     totals: Totals,
     progress: Callable[[], None] = lambda: None,
 ) -> None:
-    """Hand every block to sinks and totals; damage of the log ends that and is noted there."""
+    """Pass every block to sinks and totals; note damage of the log in `totals` and end there."""
     try:
         for block in applied:
             for sink in sinks:

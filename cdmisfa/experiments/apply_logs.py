@@ -1,4 +1,4 @@
-"""Modules applied to each of many logs, in many processes: one file per log, one table of all."""
+"""`apply_to_logs`: apply modules to each of many logs, in many processes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,14 @@ from cdmisfa.core.names import stream_name
 from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.apply import Application, Totals, follow
 from cdmisfa.experiments.documents import plain, write_json, writing
-from cdmisfa.experiments.store import FAILED, ROWS, Trial, make_trial, read_rows, run_trials
+from cdmisfa.experiments.store import (
+    FAILED,
+    ROWS,
+    PlannedTrial,
+    make_trial,
+    read_trial_rows,
+    run_trials,
+)
 from cdmisfa.modules import Module
 from recorder.images.options import InputOptions
 from recorder.log.files import (
@@ -38,14 +45,14 @@ from replay.export.applied import AppliedSink, written
 # Folder of the state of the logs; programs that read data sets skip names with an underscore.
 STORE: Final = "_applied"
 
-# File in it that states which modules were applied, and with which options.
+# File in it with the modules and options of the outputs.
 REQUEST: Final = "apply.json"
 
-# Modules of this package that decide the bytes of the files.
+# Source files of this package on which the bytes of the outputs depend.
 COMPUTED: Final = ("cdmisfa/modules", "cdmisfa/experiments/apply", "replay/export/applied")
 
-# Most letters of a log's name that become part of a file's name.
-_LONGEST: Final = 48
+# Characters of a log's name in the name of its output; longer names get a hash.
+_MAX_NAME: Final = 48
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +60,10 @@ class AppliedLogs:
     """Outcome of applying modules to many logs.
 
     Attributes:
-        out: the folder of the files.
-        logs: a row per log: `log`, `out`, `frames`, `error`, `warnings`, and `exit_code`.
-        computed: the number of logs that were tried now.
-        skipped: the number of logs that were finished, or had failed, before.
+        out: folder of the outputs.
+        logs: a row for each log: `log`, `out`, `frames`, `error`, `warnings`, and `exit_code`.
+        computed: number of logs to which the modules were applied now.
+        skipped: number of logs that had finished, or had failed, before.
     """
 
     out: Path
@@ -66,7 +73,7 @@ class AppliedLogs:
 
     @property
     def failed(self) -> list[Mapping[str, Any]]:
-        """The rows of logs with no outputs, or with outputs that end early."""
+        """Rows of the logs without outputs, or with outputs that end early."""
         return [row for row in self.logs if row["error"]]
 
     @property
@@ -87,29 +94,29 @@ def apply_to_logs(
     skip_damaged: bool = False,
     force: bool = False,
     indexing: Callable[[float, float | None], None] = lambda done, total: None,
-    **where: Any,
+    **execution: Any,
 ) -> AppliedLogs:
     """Apply the modules of a run to each of many logs that has no outputs in a folder yet.
 
-    The files are the same to the byte for any number of processes, and on dask. A log whose size
-    or time of change differs is applied to again.
+    The outputs are the same to the byte for any number of processes, and on dask. A log is
+    processed again if its size or time of change differs.
 
     Args:
-        run: the run's folder.
-        words: folders, patterns, files and URLs of logs, or indices of them.
-        out: the folder of the files; a shared one if workers run on other machines.
-        form: the ending of the files.
+        run: folder of the run.
+        words: folders, patterns, files and URLs of logs, or indices of logs.
+        out: folder of the outputs, which workers on other machines must share.
+        form: file name ending of the outputs, such as "parquet".
         inputs: see `Application.open`, as for `loop` and `skip_damaged`.
-        frames: end after this many frames of each stream.
-        loop: start a log again at its end.
-        skip_damaged: skip damaged parts.
-        force: replace outputs of other modules or options.
-        indexing: called with the number of logs that were indexed, and of all.
-        where: `jobs`, `scheduler`, `retry_failed` and `progress` of `run_trials`.
+        frames: largest number of frames of each stream; None: all.
+        loop: True to start a log again at its end.
+        skip_damaged: True to skip damaged parts.
+        force: True to replace outputs of other modules or options.
+        indexing: called with the number of indexed logs and the total.
+        execution: `jobs`, `scheduler`, `retry_failed` and `progress` of `run_trials`.
 
     Raises:
-        UsageError: there is no such run or log, or the folder holds something else.
-        LogWriteError: a file cannot be written; those before are kept.
+        UsageError: the run or a log does not exist, or the folder has other contents.
+        LogWriteError: an output cannot be written; those before are kept.
         WorkersError: a worker died, or no scheduler answers.
     """
     application, out = Application(run), Path(out).resolve()
@@ -125,29 +132,30 @@ def apply_to_logs(
             make_folder(folder)
         stack.enter_context(held(out))
         stack.callback(shutil.rmtree, parts, ignore_errors=True)
-        shutil.rmtree(parts, ignore_errors=True)  # files that a killed process left
+        shutil.rmtree(parts, ignore_errors=True)  # partial files of a killed process
         make_folder(parts)
         root = _earlier_root(folder, request, force=force) or _common_root(words, out)
         trials = []
-        for name, log in _find_logs(words, folder / INDEX, root, out, indexing, where):
-            file = stream_name(name)[:_LONGEST]
-            if file != name:  # other logs may have the same beginning
+        jobs = execution.get("jobs", 1)
+        for name, log in _find_logs(words, folder / INDEX, root, out, indexing, jobs):
+            file = stream_name(name)[:_MAX_NAME]
+            if file != name:  # names of other logs can have the same beginning
                 file += f"-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
             file = f"{file}.{form}"
             files = [f if "://" in f else os.path.normpath(f) for f in log.files]
             call = partial(apply_to_log, application, name, files, parts / file, options, frames)
             depends = [name, log.states, application.identity, chosen]
-            how: Any = {"point": {"log": name}, "modules": COMPUTED, "log": out / file}
-            trials.append(make_trial(call, *depends, **how))
+            options_of_trial: Any = {"point": {"log": name}, "modules": COMPUTED, "log": out / file}
+            trials.append(make_trial(call, *depends, **options_of_trial))
 
-        def begin(missing: Sequence[Trial]) -> None:
+        def begin(missing: Sequence[PlannedTrial]) -> None:
             write_json(folder / REQUEST, {**request, "root": relative_path(root, folder)})
             for trial in missing:
                 if trial.log is not None:
                     trial.log.unlink(missing_ok=True)  # the log or the code has changed
 
-        report = run_trials(trials, folder, begin=begin, **where)
-        rows = {row["id"]: row for row in read_rows(folder)}
+        report = run_trials(trials, folder, begin=begin, **execution)
+        rows = {row["id"]: row for row in read_trial_rows(folder)}
     outcome = [_outcome(rows[trial.id], trial.log) for trial in trials]
     return AppliedLogs(out, outcome, report.trials - report.skipped, report.skipped)
 
@@ -160,15 +168,18 @@ def apply_to_log(
     options: Mapping[str, Any],
     frames: int | None,
 ) -> dict[str, Any]:
-    """Apply modules to one log, write the file of its outputs, and return the outcome.
+    """Apply modules to one log, write the file of its outputs, and return the result.
 
     Args:
         application: the modules.
-        name: the log's name, relative to the folder of all logs; a column of a table.
-        files: the log's files.
-        part: where the file is written until it is complete; it moves two folders up.
+        name: name of the log, relative to the folder of all logs; a column of tables.
+        files: files of the log.
+        part: path of the file until it is complete; it then moves two folders up.
         options: arguments of `Application.open`.
-        frames: end after this many.
+        frames: largest number of frames; None: all.
+
+    Returns:
+        `frames`, the message of the damage or None, and the warnings.
     """
     column = name if part.suffix in (".parquet", ".csv") else None
     modules, out = application.modules, part.parents[2] / part.name
@@ -191,26 +202,26 @@ def apply_to_log(
 def written_to(
     place: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool, log: str | None = None
 ) -> AbstractContextManager[AppliedSink]:
-    """Open the sink that writes a file of outputs, by the ending of its name; see `written`."""
+    """Open the sink that writes outputs in the format of a file name; see `written`."""
     if place.suffix.lower() == ".rrd":
-        from replay.view.applied import written_view  # takes half a second
+        from replay.view.applied import written_view  # imports Rerun, which takes 0.5 s
 
         return written_view(place, spec, modules, force=force)
     return written(place, spec, modules, force=force, log=log)
 
 
 def _earlier_root(folder: Path, request: Mapping[str, Any], *, force: bool) -> str:
-    """Return the folder that names are relative to since the first outputs were written, or "".
+    """Return the folder to which the names of existing outputs are relative; "" without outputs.
 
-    With `force`, the outputs are removed; other files stay.
+    With `force`, the outputs are deleted; other files stay.
 
     Raises:
-        UsageError: the outputs are of other modules, or were made with other options.
-        LogDamagedError: the file that states it is damaged.
+        UsageError: the outputs belong to other modules or options.
+        LogDamagedError: the file that states them is damaged.
     """
     path, remedy = folder / REQUEST, "replace all of it with --force"
     if force and path.exists():
-        names = [Path(row["run"]).name for row in read_rows(folder) if row.get("run")]
+        names = [Path(row["run"]).name for row in read_trial_rows(folder) if row.get("run")]
         for output in (*(folder.parent / name for name in names), folder / ROWS, path):
             output.unlink(missing_ok=True)
     if not path.exists():
@@ -218,15 +229,16 @@ def _earlier_root(folder: Path, request: Mapping[str, Any], *, force: bool) -> s
     earlier = read_json(path, remedy)
     if not isinstance(earlier, dict) or not isinstance(earlier.get("root"), str):
         raise LogDamagedError(f"{path} is damaged: {remedy}")
-    if other := [name for name in request if earlier.get(name) != request[name]]:
+    if different := [name for name in request if earlier.get(name) != request[name]]:
         raise UsageError(
-            f"{folder.parent} holds outputs of other {other[0]}: choose another folder, or {remedy}"
+            f"{folder.parent} holds outputs of other {different[0]}: choose another folder, or "
+            f"{remedy}"
         )
     return found_path(earlier["root"], folder)
 
 
 def _common_root(words: Sequence[str], out: Path) -> str:
-    """Return the folder that holds all logs of this machine."""
+    """Return the folder on this machine that contains all logs."""
     folders = []
     for word in words:
         if "://" not in word:
@@ -243,14 +255,14 @@ def _find_logs(
     root: str,
     out: Path,
     indexing: Callable[[float, float | None], None],
-    where: Mapping[str, Any],
+    jobs: int,
 ) -> list[tuple[str, IndexedLog]]:
-    """Index the logs that words name; return their names and entries in the order of names."""
+    """Index the logs that words name; return their names and entries, sorted by name."""
     indices = [Path(word).resolve() for word in words if is_index(Path(word))]
-    if others := [word for word in words if not is_index(Path(word))]:
-        index_logs(others, index, jobs=where.get("jobs", 1), progress=indexing)
+    if logs := [word for word in words if not is_index(Path(word))]:
+        index_logs(logs, index, jobs=jobs, progress=indexing)
         indices.append(index)
-    found: dict[str, IndexedLog] = {}
+    by_name: dict[str, IndexedLog] = {}
     for path in indices:
         for log in indexed_logs(path):
             name = log.name
@@ -259,14 +271,14 @@ def _find_logs(
                 if name.startswith(os.path.join(out, "")):
                     continue
                 name = os.path.relpath(name, root) if name != root else os.path.basename(name)
-            found[name] = log
-    if not found:
-        raise UsageError(f"{' '.join(words)}: there is no log")
-    return sorted(found.items())
+            by_name[name] = log
+    if not by_name:
+        raise UsageError(f"{' '.join(words)}: no log is there: name other files or folders")
+    return sorted(by_name.items())
 
 
 def _outcome(row: Mapping[str, Any], out: Path | None) -> dict[str, Any]:
-    """Return the outcome of a log as `apply --json` prints it, and its exit code."""
+    """Return the result of a log as `apply --json` prints it, and its exit code."""
     name = row["point"]["log"]
     if row["status"] == FAILED:
         failed = {"error": row["error"], "exit_code": row.get("exit_code", 1)}

@@ -1,4 +1,4 @@
-"""How results are written: JSON values and files, Markdown tables, versions and machine."""
+"""Output of results: JSON values and files, Markdown tables, versions and machine."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from typing import Any
 from cdmisfa.core.errors import LogWriteError
 from recorder.log.files import atomic_write
 
+# Packages whose version can change a result.
 PACKAGES = ("cdmisfa", "numpy", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON has it: paths as texts, arrays as lists, None for NaN."""
+    """Return a value in JSON types: paths as texts, arrays as lists, None for NaN."""
     match value:
         case Mapping():
             return {str(k): plain(v) for k, v in value.items()}
@@ -36,7 +37,7 @@ def plain(value: Any) -> Any:
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Return rows of cells as a Markdown table, without a line end after the last line."""
+    """Return a Markdown table, without a line end after the last line."""
     lines = (head, ["---"] * len(head), *rows)
     cells = ([str(cell).replace("|", r"\|") for cell in line] for line in lines)
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
@@ -44,19 +45,19 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 @functools.cache
 def versions() -> Mapping[str, str]:
-    """Return the versions of Python and of the packages that any result may depend on."""
-    found = {"python": platform.python_version()}
+    """Return the versions of Python and of `PACKAGES`."""
+    result = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
+            result[name] = metadata.version(name)
+    return result
 
 
 @functools.cache
 def machine() -> dict[str, str]:
     """Return the system, the processor and the C library.
 
-    No signal depends on them; renderings of the simulator, batch SFA and times may.
+    Signals do not depend on them; simulated images, batch SFA and times can.
     """
     return {
         "system": platform.system(),
@@ -67,7 +68,7 @@ def machine() -> dict[str, str]:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Raise what the operating system refuses in the context as a LogWriteError of a path."""
+    """Convert an error of the operating system in the body to a LogWriteError about `path`."""
     try:
         yield
     except OSError as error:
@@ -75,7 +76,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document, whole or not at all.
+    """Write a JSON document completely or not at all.
 
     Raises:
         LogWriteError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Modules judged on the last frames of a log, which the learner does not see."""
+"""Evaluation of modules on the last frames of a log, which the learner does not see."""
 
 from __future__ import annotations
 
@@ -12,77 +12,79 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
-from cdmisfa.experiments.sources import OF_CAMERAS, Configuration
+from cdmisfa.experiments.sources import CAMERA_LEARNER, Configuration
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.modules import Module
 from replay.stored_source import StoredSource
 
-# Frames that are in memory at once.
+# Frames that are read at once. It limits memory and does not change the result.
 PIECE = 256
 
-
-# Default share of a camera log that is held out.
+# Default share of a camera log that is held out. Set by hand: a larger share leaves fewer frames to
+# learn from.
 HOLDOUT = 0.1
 
-# Fewest frames that estimate the slowness of an output; of a shorter share none are held out.
-FEWEST = 200
+# Smallest number of held out frames, for an estimate of slowness; below it none are held out. Set
+# by hand.
+MIN_HELD_OUT = 200
 
 
 class _StoppedError(Exception):
-    """The user stops the run."""
+    """Request of the user to stop the run."""
 
 
 def hold_out(source: FrameSource, configuration: Configuration) -> None:
-    """Keep the last frames of a log from the progress learner, which is judged on them at its end.
+    """Keep the last frames of a log from the progress learner, to evaluate its modules on them.
 
     Args:
         source: the source of the run.
-        configuration: its `input.holdout` is the share; without one `HOLDOUT`, where possible.
+        configuration: its key `input.holdout` is the share; None: `HOLDOUT`, if possible.
 
     Raises:
-        UsageError: a share is given, and nothing can be held out.
+        UsageError: a share is set, and nothing can be held out.
     """
     share = None if configuration.inputs is None else configuration.inputs.holdout
     if share == 0.0:
         return
-    by_progress = configuration.learner.algorithm == OF_CAMERAS
+    by_progress = configuration.learner.algorithm == CAMERA_LEARNER
     logged = isinstance(source, StoredSource) and source.to_judge
     if not by_progress or not logged or source.spec.length is None:
         if share is not None:
             raise UsageError(
-                "input.holdout is for camera logs that the progress learner learns from once: "
-                "leave it out, or leave out --loop and --algorithm"
+                "input.holdout needs logs from which the progress learner learns once: remove it, "
+                "or remove --loop and --algorithm"
             )
         return
     assert isinstance(source, StoredSource)
     count = int(source.frames * (HOLDOUT if share is None else share))
-    if count >= FEWEST:
+    if count >= MIN_HELD_OUT:
         source.hold_out(count)
     else:
-        few = f"{count} of {source.frames} frames are too few to judge on: none are held out"
-        source.notes = (*source.notes, f"{few} (input.holdout)")
+        note = f"{count} of {source.frames} frames are too few to evaluate on: none are held out"
+        source.notes = (*source.notes, f"{note} (input.holdout)")
 
 
-def judged(
+def evaluate(
     source: FrameSource,
     modules: Sequence[Module],
     components: int,
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any] | None:
-    """Judge each module by the slowness of its outputs on the frames that were held out.
+    """Compute the slowness of each module's outputs on the frames that were held out.
 
-    The result has beside them the slowness of batch SFA with as many outputs on the same frames;
+    For comparison the result has the slowness of batch SFA with as many outputs on the same frames;
     batch SFA is fitted to the frames of the module's stream that the run used.
 
     Args:
-        source: as the learner left it.
-        modules: the learned modules.
-        components: whitening components of the learner, and of batch SFA.
-        stop: called before every piece; true ends it without a result.
+        source: the source, as the learner left it.
+        modules: the saved modules.
+        components: number of whitened components of the learner, and of batch SFA.
+        stop: called before every piece; True ends the evaluation without a result.
 
     Returns:
-        The frames [start, stop) held out and those fitted to, and for each module its slowness and
-        batch SFA's, (J,) each, as JSON values. Empty if nothing was held out, None if stopped.
+        As JSON values: the ranges [start, stop) of the frames held out and of those fitted, and for
+        each module its slowness and that of batch SFA, (J,) each. Empty if nothing was held out,
+        None if stopped.
 
     Raises:
         LogDamagedError: the log is damaged there.
@@ -90,27 +92,27 @@ def judged(
     if not isinstance(source, StoredSource) or not source.held_out:
         return {}
     fitted = source.first_frame, source.t
-    judged_on = source.end, source.end + source.held_out
+    held_out = source.end, source.end + source.held_out
     rows: dict[int, dict[str, Any]] = {}
     try:
         for stream in sorted({module.stream_index for module in modules}):
-            ours = [module for module in modules if module.stream_index == stream]
-            pieces = functools.partial(_pieces, source, ours[0], stop)
-            count, outputs = fitted[1] - fitted[0], len(ours[0].phi)
+            of_stream = [module for module in modules if module.stream_index == stream]
+            pieces = functools.partial(_pieces, source, of_stream[0], stop)
+            count, outputs = fitted[1] - fitted[0], len(of_stream[0].phi)
             phi, mean, _ = batch_outputs(pieces(*fitted), count, components, outputs)
-            weights = [(module.phi, module.mean) for module in ours]
-            *slow, of_batch = following_slowness(pieces(*judged_on), [*weights, (phi, mean)])
-            for module, slowness in zip(ours, slow, strict=True):
+            weights = [(module.phi, module.mean) for module in of_stream]
+            *by_module, by_batch = following_slowness(pieces(*held_out), [*weights, (phi, mean)])
+            for module, slowness in zip(of_stream, by_module, strict=True):
                 rows[module.index] = {
                     "module": module.index,
                     "stream": module.stream,
                     "slowness": slowness.tolist(),
-                    "of_batch": of_batch.tolist(),
+                    "of_batch": by_batch.tolist(),
                 }
     except _StoppedError:
         return None
     return {
-        "frames": list(judged_on),
+        "frames": list(held_out),
         "fitted": list(fitted),
         "modules": [rows[index] for index in sorted(rows)],
     }
@@ -125,6 +127,6 @@ def _pieces(
         if stop():
             raise _StoppedError
         x = block.frames.reshape(len(block), -1)
-        if np.isfinite(x).all():  # a learner skips other blocks, too
+        if np.isfinite(x).all():  # the learner does not learn from other blocks either
             yield expand(module.expansion, x), block.t != after
             after = block.t + len(block)

@@ -1,4 +1,4 @@
-"""The loop of every run: take a block, learn, call the sinks; and the sinks of every run."""
+"""The loop of every run (take a block, learn, call the sinks), and two sinks of every run."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ if TYPE_CHECKING:
 INTERRUPTED: Final = "interrupted"
 EXHAUSTED: Final = "log_exhausted"
 
-# Why a run ended, in words.
-ENDINGS: Mapping[str, str] = {
-    "max_modules": "as many modules as asked for were learned",
-    "max_iterations": "the asked number of iterations is over",
-    "nothing_left": "exploration ended long ago and no further abstraction converged",
-    "all_decided": "every stream is learned, known or given up",
+# Descriptions of the reasons for which a run ends.
+END_REASONS: Mapping[str, str] = {
+    "max_modules": "the requested number of modules was learned",
+    "max_iterations": "the requested number of iterations was done",
+    "nothing_left": "no module was saved for a long time after exploration ended",
+    "all_decided": "every stream is decided",
     EXHAUSTED: "there were no more frames",
     INTERRUPTED: "it was interrupted",
 }
 
-# Default iterations between two keyframes, a compromise of log size and time to resume.
-EVERY = 100
+# Default number of iterations between two keyframes. Fewer make resuming faster and logs larger.
+KEYFRAME_INTERVAL = 100
 
-# A keyframe waits until the log has grown by this many times the size of the one before.
-SHARE = 5
+# A keyframe is delayed until the log has grown by this many times the size of the previous one, so
+# that keyframes take at most a sixth of a log.
+KEYFRAME_SPACING = 5
 
 
 def learn_blocks(
@@ -42,21 +43,21 @@ def learn_blocks(
     max_iterations: int | None = None,
     max_modules: int | None = None,
 ) -> str:
-    """Let a learner learn from a source until nothing is left to learn.
+    """Let a learner learn from a source until it ends.
 
     Args:
-        source: live or recorded; left open.
-        learner: continues from its current state.
-        sinks: called with everything, one after the other; one that raises ends the run.
-        stop: called before every block; true ends the run.
-        max_iterations: end after this many.
-        max_modules: end after this many modules; by default as the learner says.
+        source: a live or recorded source; it stays open.
+        learner: the learner, which continues from its current state.
+        sinks: receive every iteration and event, in this order; an exception of one ends the run.
+        stop: called before every block; True ends the run.
+        max_iterations: largest number of iterations.
+        max_modules: largest number of modules; None: the learner's default.
 
     Returns:
-        Why the run ended, a key of `ENDINGS`.
+        The reason for the end, a key of `END_REASONS`.
 
     Raises:
-        LogExhaustedError: the source has not enough frames for a single block.
+        LogExhaustedError: the source is shorter than one block.
     """
     modules = learner.max_modules if max_modules is None else max_modules
     while True:
@@ -66,7 +67,7 @@ def learn_blocks(
         try:
             block = source.take(learner.stream, learner.tau)
         except LogExhaustedError as error:
-            if stop():  # it ended while it waited for frames to be recorded
+            if stop():  # the source ended because `stop` interrupted its wait for new frames
                 continue
             if not learner.iteration:
                 raise
@@ -81,13 +82,13 @@ def learn_blocks(
             for text in learner.events:
                 sink.event(block.t, signals.iteration, text)
     for sink in sinks:
-        sink.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
+        sink.event(source.t, max(learner.iteration - 1, 0), f"ended: {END_REASONS[ended]}")
         sink.finish()
     return ended
 
 
 def ending(learner: Learner, max_modules: int | None, max_iterations: int | None) -> str:
-    """Return the key of `ENDINGS` for which a learner must stop now, or "" to continue."""
+    """Return the key of `END_REASONS` for which a learner must stop now, or "" to continue."""
     if max_modules is not None and len(learner.modules) >= max_modules:
         return "max_modules"
     if max_iterations is not None and learner.iteration >= max_iterations:
@@ -96,7 +97,7 @@ def ending(learner: Learner, max_modules: int | None, max_iterations: int | None
 
 
 class Digest(SignalsHash, Sink):
-    """The hash of a run's signals; see `SignalsHash`."""
+    """Sink that computes the hash of a run's signals; see `SignalsHash`."""
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
@@ -104,17 +105,17 @@ class Digest(SignalsHash, Sink):
 
 
 class Keyframes(Sink):
-    """Writes the learner's state into the log of its run, at intervals and at its end.
+    """Sink that writes the learner's state into the log, at intervals and at the end.
 
-    It follows the log among the sinks, so that the log holds every iteration before.
+    It must follow the log among the sinks, so that the log already has the iterations before.
 
     Args:
-        log: the run's log.
+        log: the log of the run.
         source: the source of the run.
         learner: the learner.
-        versions: versions of the packages that compute it.
-        every: iterations between two keyframes, 0 writes one at the end only; None for every
-            `EVERY` iterations, if a keyframe is smaller than the log before it by `SHARE`.
+        versions: versions of the packages that compute the run.
+        interval: iterations between two keyframes; 0: one at the end only; None:
+            `KEYFRAME_INTERVAL`, but no more often than `KEYFRAME_SPACING` allows.
     """
 
     def __init__(
@@ -123,31 +124,31 @@ class Keyframes(Sink):
         source: FrameSource,
         learner: Learner,
         versions: Mapping[str, str],
-        every: int | None = None,
+        interval: int | None = None,
     ) -> None:
         self._log, self._source, self._learner = log, source, learner
         self._versions = versions
-        self._every = EVERY if every is None else every
-        self._share = SHARE if every is None else 0
+        self._interval = KEYFRAME_INTERVAL if interval is None else interval
+        self._spacing = KEYFRAME_SPACING if interval is None else 0
         self._due = 0
         self._t: int | None = None
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
         self._t = self._source.t
-        if not self._every or learner.iteration % self._every:
+        if not self._interval or learner.iteration % self._interval:
             return
         self._log.flush()
         before = self._log.size
         if before < self._due:
             return
         keyframe = self._keyframe()
-        if not self._due:  # the size of the first one, compressed, is not known yet
-            self._due = self._share * sum(a.nbytes for a in keyframe.state.arrays.values())
+        if not self._due:  # the compressed size of the first keyframe is not known before
+            self._due = self._spacing * sum(a.nbytes for a in keyframe.state.arrays.values())
             if before < self._due:
                 return
         self._log.keyframe(keyframe)
-        self._due = self._log.size + self._share * (self._log.size - before)
+        self._due = self._log.size + self._spacing * (self._log.size - before)
 
     def finish(self) -> None:
         """See `Sink`."""
@@ -156,6 +157,6 @@ class Keyframes(Sink):
 
     def _keyframe(self) -> Keyframe:
         learner = self._learner
-        # A camera's own t may lie behind the last block, where it ended within the next one.
+        # The t of a live source can be behind the last block, if the source ended within the next.
         t = self._source.t if self._t is None else self._t
         return Keyframe(learner.iteration, t, learner.state, self._versions)

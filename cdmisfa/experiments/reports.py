@@ -1,4 +1,4 @@
-"""Reports of runs: one HTML page each, with the results."""
+"""Reports: one HTML page with the results of a run, or with a comparison of runs."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ def write_report(
     """Write the report of a run, of several runs or of a folder of runs.
 
     Args:
-        words: their paths.
-        out: the file; by default `report.html` in the folder of the one run, replaced.
-        force: replace an existing file.
+        words: paths of the runs.
+        out: the file (.html); None: `report.html` in the folder of the run, replaced.
+        force: True to replace an existing file.
 
     Returns:
         The file.
 
     Raises:
-        UsageError: there is no such thing, or the file exists.
-        LogDamagedError: not even its head can be read.
+        UsageError: a run does not exist, or the file exists.
+        LogDamagedError: not even the header of a log can be read.
         LogWriteError: the file cannot be written.
     """
     paths = [Path(word) for word in words]
     if out is None:
         if len(paths) != 1 or runs_in(paths[0]):
-            raise UsageError("name the file of the report: -o report.html")
+            raise UsageError("a report of several runs needs a file: add -o report.html")
         out, force = run_log(paths[0]).parent / REPORT_FILE, True
     refuse_unless(out, "a report is an HTML page", ".html", ".htm")
     refuse_taken(out, force=force)
@@ -41,8 +41,8 @@ def write_report(
 
     if len(paths) > 1:
         page = report_of_runs(paths, f"{len(paths)} runs compared")
-    elif found := runs_in(paths[0]):
-        page = report_of_runs(found, f"{paths[0].resolve().name}: {len(found)} runs")
+    elif runs := runs_in(paths[0]):
+        page = report_of_runs(runs, f"{paths[0].resolve().name}: {len(runs)} runs")
     else:
         page = report_of_run(paths[0], _reproducible(paths[0]), command_again(paths[0]))
     with atomic_write(out) as partial:
@@ -51,18 +51,18 @@ def write_report(
 
 
 def _reproducible(run: Path) -> str:
-    """Return whether learning a run again is expected to give the same bits.
+    """Return whether learning a run again is expected to give the same bits, as a sentence.
 
-    Nothing is learned. The check compares the version of the arithmetic, and the source as far as
-    that is possible without reading all of it.
+    The check compares the version of the arithmetic and the source, without learning and without
+    reading all of the source.
     """
     try:
-        with Recomputation(run, 0) as beginning:
-            beginning.source  # noqa: B018, opens the source
-            changed = beginning.other_files()
+        with Recomputation(run, 0) as recomputation:
+            recomputation.source  # noqa: B018, opens the source
+            changed = recomputation.other_files()
     except CdmisfaError as error:
-        why = str(error.__cause__ if isinstance(error.__cause__, CdmisfaError) else error)
-        return f"no: {why.partition(': did you mean')[0]}"
+        reason = str(error.__cause__ if isinstance(error.__cause__, CdmisfaError) else error)
+        return f"no: {reason.partition(': did you mean')[0]}"
     if changed:
         return f"no: {', '.join(changed)} changed since"
     return "yes: its source is present and looks unchanged"

@@ -1,7 +1,4 @@
-"""Play a run again up to an iteration: put its learner at a keyframe, and learn on from there.
-
-A run is resumed, forked, inspected at an iteration and checked in this way.
-"""
+"""Computation of a run again from a keyframe, to resume, fork, inspect or verify it."""
 
 from __future__ import annotations
 
@@ -36,19 +33,22 @@ from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.provenance import changed_files, stated_source
 from replay.stored_source import StoredSource
 
-# Facts that a source must have in common with the one that a run learned from.
-SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
+# Properties of a source that must equal those of the source that the run learned from.
+SPEC_FIELDS = ("streams", "frame_shape", "dtype", "fps", "start_ns")
 
-# Keys that a fork must not change: the meaning of the learner's memory depends on them.
+# Keys that a fork must not change, because the meaning of the learner's arrays depends on them.
 FIXED = ("learner.algorithm", "learner.expansion", "learner.tau")
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigSpan:
-    """The configuration and seed of a run's learner from an iteration on; each fork adds one.
+    """Configuration and seed of a run's learner from an iteration on; each fork adds one.
 
     Attributes:
-        changed: values before and now, by key, where they differ from the span before.
+        start: the iteration.
+        config: the learner's configuration.
+        seed: the seed.
+        changed: [old, new] values of the keys that differ from the previous span.
     """
 
     start: int
@@ -58,7 +58,7 @@ class ConfigSpan:
 
 
 def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, ...]:
-    """Return the configurations of a run, in order."""
+    """Return the configurations of a run in the order of their iterations."""
     try:
         table, seed, fork = manifest["config"]["learner"], manifest["seed"], manifest.get(FORK)
         config = build(learner_class(table["algorithm"]).configuration, "learner", table)
@@ -67,7 +67,9 @@ def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, 
         span = ConfigSpan(int(fork["at"]), config, seed, dict(fork["changed"]))
         return (*config_history(log, fork["before"]), span)
     except (LookupError, TypeError, ValueError, RecursionError) as error:
-        raise LogDamagedError(f"{log} does not state how its learner was configured") from error
+        raise LogDamagedError(
+            f"{log} does not state the configuration of its learner: learn it again"
+        ) from error
 
 
 def fork_span(
@@ -76,10 +78,10 @@ def fork_span(
     """Return the configuration of a fork.
 
     Args:
-        learner: the parent's learner where the fork leaves it.
-        manifest: what the parent's log states.
-        settings: `learner.key=value` words, but for the keys in `FIXED`.
-        seed: the seed of the random choices from there on; None for the parent's.
+        learner: the parent's learner at the iteration of the fork.
+        manifest: manifest of the parent's log.
+        settings: `learner.key=value` words, except for the keys in `FIXED`.
+        seed: seed of the random choices from there on; None: the parent's.
 
     Raises:
         UsageError: a setting cannot change.
@@ -88,12 +90,13 @@ def fork_span(
     kind = learner_class(table["algorithm"]).configuration
     config = build(kind, "learner", table, words.get("learner", {}))
     before = section_table(build(kind, "learner", table))
-    found = differences(before, section_table(config))
-    changed = {f"learner.{key}": [then, now] for key, then, now in found}
+    changed = {
+        f"learner.{key}": [old, new] for key, old, new in differences(before, section_table(config))
+    }
     fixed = [f"{section}.*" for section in words if section != "learner"]
     if fixed := [*fixed, *(key for key in FIXED if key in changed)]:
         raise UsageError(
-            f"{fixed[0]} stays as in the parent: a fork changes other keys learner.* alone"
+            f"{fixed[0]} cannot change in a fork: set other keys learner.*, or start another run"
         )
     if seed is not None and seed != manifest["seed"]:
         changed["seed"] = [manifest["seed"], seed]
@@ -102,46 +105,48 @@ def fork_span(
 
 
 def restore(learner: Learner, keyframe: Keyframe, spec: SourceSpec) -> None:
-    """Put a learner into the state of a keyframe, for a source of this spec."""
+    """Set a learner to the state of a keyframe, for a source of this spec."""
     try:
         modules = (replace(m, frame_shape=spec.frame_shape) for m in keyframe.state.modules)
         learner.restore(replace(keyframe.state, modules=tuple(modules)))
     except (LookupError, TypeError, ValueError) as error:
-        what = f"the keyframe after {keyframe.iteration} iterations is of another learner"
-        raise LogDamagedError(f"{what} ({one_line(error)})") from error
+        raise LogDamagedError(
+            f"the keyframe after {keyframe.iteration} iterations is of another learner "
+            f"({one_line(error)}): learn again"
+        ) from error
 
 
 def reconfigured(learner: Learner, span: ConfigSpan, spec: SourceSpec) -> Learner:
-    """Return a learner in the state of another one, with another configuration that fits it."""
+    """Return a learner with another configuration, in the state of `learner`."""
     new, state = open_learner(span.config, spec, span.seed), learner.state
     policy_rng = new.state.policy_rng if "seed" in span.changed else state.policy_rng
     try:
         new.restore(LearnerState(state.arrays, state.modules, policy_rng))
     except ValueError as error:
         raise UsageError(
-            f"the settings do not fit what was learned ({error}): fork with keys that keep its "
+            f"the settings do not fit the learned state ({error}): fork with keys that keep its "
             "shape"
         ) from error
     return new
 
 
 class Recomputation:
-    """A run's learner at the newest keyframe at or before an iteration, to learn on from there.
+    """A run's learner at the newest keyframe at or before an iteration, to continue from there.
 
     Args:
         run: the run's folder, or its log.
-        iteration: iterations done.
-        source: words that name its source, where the run does not state it, or the open source.
+        iteration: number of iterations done.
+        source: words that name the source, if the run does not, or the open source.
 
     Attributes:
-        log: the run's log.
+        log: the log of the run.
         header: the header of the log.
         learner: the learner after `learner.iteration` iterations.
-        t: the source's next frame.
+        t: number of the source's next frame.
 
     Raises:
-        UsageError: there is no such run, or it was learned with another arithmetic.
-        LogDamagedError: it cannot be read.
+        UsageError: the run does not exist, or it was learned with another arithmetic.
+        LogDamagedError: the log cannot be read.
     """
 
     def __init__(
@@ -149,7 +154,7 @@ class Recomputation:
     ) -> None:
         self.log = run_log(Path(run))
         self.header: RunHeader = read_header(self.log)
-        self._given = source
+        self._source_words = source
         self._source: SeekableSource | None = None
         spans = config_history(self.log, self.header.manifest)
         keyframe = read_keyframe(self.log, iteration)
@@ -160,8 +165,8 @@ class Recomputation:
         then, now = self.header.arithmetic, arithmetic_of(self.learner)
         if then != now:
             raise UsageError(
-                f"{self.log} was learned with arithmetic {then}, and this cdmisfa computes with "
-                f"{now}: learn it again"
+                f"{self.log} was learned with arithmetic {then}, but this version of cdmisfa has "
+                f"arithmetic {now}: learn it again"
             )
         self.t = 0
         if keyframe is not None:
@@ -170,20 +175,31 @@ class Recomputation:
 
     @classmethod
     def after(cls, run: Path, iterations: int, source: Sequence[str] | SeekableSource = ()) -> Self:
-        """Play a run again up to an iteration; the learner is the same bit for bit.
+        """Compute a run again up to an iteration; the learner is the same bit for bit.
 
-        The signals that are computed on the way are compared with the log. The caller closes it.
+        The computed signals are compared with the log. The caller closes the result.
 
         Args:
-            run: its folder, or its log.
-            iterations: iterations done; 0 is the beginning.
+            run: the run's folder, or its log.
+            iterations: number of iterations; 0 is the beginning.
             source: see the class.
 
         Raises:
-            UsageError: there is no such run or iteration, or a source is needed and missing.
+            UsageError: the run or the iteration does not exist, or a source is needed and missing.
             LogDamagedError: the log cannot be read.
             NotReproducedError: the signals differ from the log.
         """
+        recomputation = cls(Path(run), iterations, source)
+        with contextlib.ExitStack() as on_error:
+            on_error.enter_context(recomputation)
+            _, difference = recomputation.compare(iterations)
+            if difference is not None:
+                raise NotReproducedError(
+                    f"{recomputation.log}: learned again, {difference}: name the run's own source "
+                    "with --source"
+                )
+            on_error.pop_all()
+        return recomputation
         again = cls(Path(run), iterations, source)
         with contextlib.ExitStack() as failing:
             failing.enter_context(again)
@@ -197,24 +213,24 @@ class Recomputation:
 
     @property
     def source(self) -> SeekableSource:
-        """Source that the run learned from, at frame `t`; opened when it is first needed."""
+        """The source that the run learned from, at frame `t`; opened at the first access."""
         if self._source is not None:
             return self._source
-        source = self._given
+        source = self._source_words
         if not isinstance(source, SeekableSource):
             try:
                 source = open_source_of(self.log.parent, source)
             except UsageError as error:
                 raise UsageError(
-                    f"{error} (after {self.learner.iteration} iterations, which the log holds, the "
-                    "source is needed: name it with --source)"
+                    f"{error} (the log has a keyframe after {self.learner.iteration} iterations; "
+                    "to continue from it, name the source with --source)"
                 ) from error
-        now, then = source.spec, self.header.spec
-        if any(getattr(now, name) != getattr(then, name) for name in SAME):
+        actual, expected = source.spec, self.header.spec
+        if any(getattr(actual, name) != getattr(expected, name) for name in SPEC_FIELDS):
             source.close()
             raise UsageError(
-                f"the source shows other streams than {self.log} was learned from: name its own "
-                "with --source"
+                f"the source has other streams than {self.log} was learned from: name the run's "
+                "own source with --source"
             )
         held_out = self.header.manifest["source"].get("held_out", 0)
         if held_out and isinstance(source, StoredSource):
@@ -224,7 +240,7 @@ class Recomputation:
         return source
 
     def steps(self, count: int) -> Iterator[BlockSignals]:
-        """Learn this many blocks again."""
+        """Learn from the next blocks again, and yield their signals."""
         for _ in range(count):
             block = self.source.take(self.learner.stream, self.learner.tau)
             signals = self.learner.step(block)
@@ -237,36 +253,36 @@ class Recomputation:
     def compare(
         self, stop: int | None, keyframes: Iterable[Keyframe] = ()
     ) -> tuple[int, Difference | None]:
-        """Learn up to an iteration, or to the log's end, and compare with the log.
+        """Learn up to an iteration, and compare with the log.
 
         Args:
-            stop: the iteration; None for the end of the log.
-            keyframes: keyframes of the log that are compared, too.
+            stop: the iteration; None: the end of the log.
+            keyframes: keyframes of the log to compare too.
 
         Returns:
             The iteration that was reached, and the first difference.
         """
-        left = iter(keyframes)
-        at, keyframe = self.learner.iteration, next(left, None)
+        remaining = iter(keyframes)
+        at, keyframe = self.learner.iteration, next(remaining, None)
         for logged in self._logged(stop):
             records: list[BlockSignals] = []
-            other: Difference | None = None
+            in_keyframe: Difference | None = None
             with contextlib.suppress(LogExhaustedError):
                 for signals in self.steps(len(logged)):
                     records.append(signals)
                     if keyframe is not None and keyframe.iteration == self.learner.iteration:
-                        other = other or self._difference_from(keyframe)
-                        keyframe = next(left, None)
-            found = first_differing(iter([logged]), columns_of_records(records), at)
+                        in_keyframe = in_keyframe or self._difference_from(keyframe)
+                        keyframe = next(remaining, None)
+            in_signals = first_differing(iter([logged]), columns_of_records(records), at)
             at += len(logged)
-            if both := [difference for difference in (found, other) if difference is not None]:
+            if both := [d for d in (in_signals, in_keyframe) if d is not None]:
                 return at, min(both, key=lambda difference: difference.iteration)
         if stop is not None and at != stop:
-            raise UsageError(f"{self.log} holds {at} iterations: choose of these")
+            raise UsageError(f"{self.log} has {at} iterations: choose one of these")
         return at, None
 
     def _logged(self, stop: int | None) -> Iterator[SignalColumns]:
-        """Yield the records of the log from the learner's iteration on, up to another one."""
+        """Yield the records of the log from the learner's iteration up to `stop`."""
         at = self.learner.iteration
         if at == stop:
             return
@@ -275,23 +291,25 @@ class Recomputation:
             if count <= 0:
                 return
             if int(columns.iterations[0]) != at:
-                raise LogDamagedError(f"{self.log}: iteration {at} is missing, see cdmisfa verify")
+                raise LogDamagedError(
+                    f"{self.log}: iteration {at} is missing: look at it with cdmisfa verify"
+                )
             yield columns.rows(0, count)
             at += count
 
     def _difference_from(self, keyframe: Keyframe) -> Difference | None:
-        """Return where a keyframe differs from the learner after as many iterations."""
+        """Return the first difference of a keyframe from the learner after as many iterations."""
         stored = _memory(keyframe.state, keyframe.t)
         computed = _memory(self.learner.state, self.t)
         for name in sorted({*stored, *computed}):
-            found = _first_element(stored.get(name, _NOTHING), computed.get(name, _NOTHING))
-            if found is not None:
-                return Difference(keyframe.iteration - 1, f"keyframe {name}", *found)
+            element = _first_element(stored.get(name, _NO_ARRAY), computed.get(name, _NO_ARRAY))
+            if element is not None:
+                return Difference(keyframe.iteration - 1, f"keyframe {name}", *element)
         return None
 
     def other_files(self) -> list[str]:
         """Return the names of files of the run's own source that changed since it learned."""
-        if self._source is None or self._given:
+        if self._source is None or self._source_words:
             return []
         return changed_files(stated_source(self.log), description(self._source, at_once=True))
 
@@ -307,24 +325,24 @@ class Recomputation:
         self.close()
 
 
-_NOTHING = np.zeros(0, np.uint8)
+_NO_ARRAY = np.zeros(0, np.uint8)
 
 
 def _memory(state: LearnerState, t: int) -> dict[str, NDArray[Any]]:
-    """Return everything that a keyframe stores as arrays by name."""
+    """Return the content of a keyframe as arrays, by name."""
     rng = json.dumps(dict(state.policy_rng), sort_keys=True).encode()
     return {**arrays_of(state), "t": np.array([t]), "policy_rng": np.frombuffer(rng, np.uint8)}
 
 
 def _first_element(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], str, str] | None:
-    """Return place and values of the first element in which two arrays differ."""
+    """Return index and both values of the first element in which two arrays differ."""
     if (a.dtype, a.shape) != (b.dtype, b.shape):
         return (), f"{a.dtype} of shape {a.shape}", f"{b.dtype} of shape {b.shape}"
     if a.tobytes() == b.tobytes():
         return None
     if a.dtype.names:
         fields = (_first_element(a[name], b[name]) for name in a.dtype.names)
-        return next((found for found in fields if found is not None), None)
+        return next((element for element in fields if element is not None), None)
     differ = np.argwhere(differing(a, b))
     if not len(differ):
         return None
@@ -336,7 +354,11 @@ def _first_element(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], s
 class Checked:
     """Result of computing the iterations [start, stop) of a run again.
 
-    `other_files` changed since the run learned from them.
+    Attributes:
+        start: the first iteration.
+        stop: the iteration after the last.
+        difference: the first difference from the log; None if there is none.
+        other_files: files of the source that changed since the run learned from them.
     """
 
     start: int
@@ -346,7 +368,7 @@ class Checked:
 
     @property
     def holds(self) -> bool:
-        """Whether the signals and the files are the same."""
+        """Whether the signals are identical and the files unchanged."""
         return self.difference is None and not self.other_files
 
     def as_json(self) -> dict[str, Any]:
@@ -364,9 +386,9 @@ class Checked:
         files = ", ".join(self.other_files)
         other = f"{files}: no longer what the run learned from" if files else ""
         if self.difference is None:
-            what = f"iterations {self.start} to {self.stop - 1}"
-            same = f"{what}: learned again, they are identical, bit for bit"
-            return f"{same}; but {other}" if other else same
+            span = f"iterations {self.start} to {self.stop - 1}"
+            identical = f"{span}: learned again, they are identical, bit for bit"
+            return f"{identical}; but {other}" if other else identical
         return f"{self.difference} when learned again{other and f': {other}'}"
 
 
@@ -376,19 +398,20 @@ def check_run(
     """Compute the iterations [start, stop) of a run again, and compare signals and keyframes.
 
     Args:
-        run: its folder, or its log.
+        run: the run's folder, or its log.
         source: see `Recomputation`.
         start: learning begins at the newest keyframe at or before this iteration.
-        stop: by default where the log ends.
+        stop: the iteration after the last; None: the end of the log.
 
     Raises:
-        UsageError: there is no such run, source or part.
+        UsageError: the run, its source or an iteration does not exist.
         LogDamagedError: the log cannot be read.
     """
-    with Recomputation(run, start, source) as again:
-        first = again.learner.iteration
-        at, difference = again.compare(stop, read_keyframes(again.log, first))
-        changed = tuple(again.other_files())
+    with Recomputation(run, start, source) as recomputation:
+        first = recomputation.learner.iteration
+        keyframes = read_keyframes(recomputation.log, first)
+        at, difference = recomputation.compare(stop, keyframes)
+        changed = tuple(recomputation.other_files())
         if difference is None and 0 < at <= start:
-            again.compare(start + 1)  # refuses, as the log or the part ends before
+            recomputation.compare(start + 1)  # raises the error of a log that ends before
     return Checked(first, at, difference, changed)

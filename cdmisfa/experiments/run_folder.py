@@ -1,4 +1,4 @@
-"""The folder of a run: the command that started it, its log, and the files written at its end."""
+"""Folder of a run: the command that started it, its log, and the files written at its end."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ from replay.runs.provenance import final_record
 from replay.runs.writer import RunWriter
 from replay.stored_source import StoredSource
 
-# Key of a manifest: the command that started the run, which may differ when it is resumed.
+# Key of a manifest: the command that started the run. It may differ when the run is resumed.
 COMMAND = "command"
 
-# Key of a manifest: the run and iteration that a fork continues, and its settings before.
+# Key of a manifest: the run and iteration that a fork continues, and the settings before it.
 FORK = "fork"
 
-# Options of a command that decide how logs are opened.
+# Options of a command that determine how logs are opened.
 OPENING = ("loop", "skip_damaged", "episodes")
 
 # Options of a command that are stored with its run.
@@ -58,14 +58,17 @@ OPTIONS = (
     *("max_iterations", "max_modules"),
 )
 
-# The earlier log of a run that is being resumed, until the new one holds its iterations.
+# Name of the earlier log while a run is being resumed, until the new log has its iterations.
 SET_ASIDE = "run.before.mcap.partial"
 
 
 def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
     """Return the command that starts a run as JSON values, with paths relative to its folder.
 
-    Of the options of the command, those in `OPTIONS` are stored.
+    Args:
+        source: the words of the source.
+        options: options of the command; those in `OPTIONS` are stored.
+        run: folder of the run.
     """
     stored = {name: options[name] for name in OPTIONS if name in options}
     if str(stored.get("preset")).endswith(".toml"):
@@ -76,15 +79,15 @@ def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> 
 
 
 def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return the command that started a run: the words of its source, and its options.
+    """Return the words of the source, and the options, of the command that started a run.
 
     Raises:
-        UsageError: there is no run, or it does not state its command.
-        LogDamagedError: its log cannot be read.
+        UsageError: the run does not exist, or does not state its command.
+        LogDamagedError: the log cannot be read.
     """
     command = read_header(log_to_resume(run)).manifest.get(COMMAND)
     if not isinstance(command, Mapping) or not isinstance(command.get("source"), list):
-        raise UsageError(f"{run} does not state its source: name it")
+        raise UsageError(f"{run} does not state its source: name it with --source")
     options = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in command.items()
@@ -96,7 +99,7 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
 
 
 def command_again(run: Path) -> str:
-    """Return the shell command that starts a run again; "" where the run does not state it."""
+    """Return the shell command that starts a run again; "" if the run does not state it."""
     try:
         source, options = read_command(run)
     except CdmisfaError:
@@ -117,29 +120,29 @@ def log_to_resume(run: Path) -> Path:
     """Return the log of a run, finished or not.
 
     Raises:
-        UsageError: there is none.
+        UsageError: the folder has no log.
     """
     finished = run / RUN_FILE
     for log in (run / SET_ASIDE, partial_path(finished), finished):
         if log.is_file():
             return log
-    raise UsageError(f"{run} holds no {RUN_FILE}: there is no run to resume, start it with --force")
+    raise UsageError(f"{run} has no {RUN_FILE} to resume: start the run with --force")
 
 
 def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
-    """Open the source of a run, as its command states, or the source that other words name.
+    """Open the source that the command of a run states, or the source that words name.
 
     Raises:
-        UsageError: the run does not state its source, or there is no such source.
+        UsageError: the run does not state its source, or the source does not exist.
     """
-    named, options = tuple[str, ...](), dict[str, Any]()
+    stated, options = tuple[str, ...](), dict[str, Any]()
     try:
-        named, options = read_command(run)
+        stated, options = read_command(run)
     except UsageError:
         if not words:
             raise
     config = read_header(log_to_resume(run)).manifest.get("config", {})
-    first, *_ = words = tuple(words) or named
+    first, *_ = words = tuple(words) or stated
     if first in SCENES:
         scene = config.get("scene", {})
         if scene.get("kind") != first:
@@ -148,11 +151,12 @@ def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
         return open_scene(first, build(SCENES[first].config, "scene", scene), record)
     keys = config.get("input", {})
     chosen = {name: options[name] for name in INPUTS if name in options}
-    if words != named and not options.get("episodes"):
-        from replay.corpus.listing import may_be_corpus  # loads pyarrow, which no scene needs
+    if words != stated and not options.get("episodes"):
+        from replay.corpus.listing import may_be_corpus  # imports pyarrow, which is slow
         from replay.open_sources import is_recording
 
-        if not may_be_corpus(words) and is_recording(words):  # its frames were made before
+        # The frames of a recording are made already, so that most input options do not apply.
+        if not may_be_corpus(words) and is_recording(words):
             chosen, keys = {}, {name: keys[name] for name in OF_EVERY_SOURCE if name in keys}
     inputs = InputOptions(**chosen).configured(keys)
     opening: Any = {name: bool(options.get(name)) for name in OPENING}
@@ -161,16 +165,20 @@ def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """The result of a run; `as_json` is the command line's contract.
+    """Result of a run; `as_json` is the document that `learn --json` prints.
 
     Attributes:
-        run: the run's folder, if it has one.
-        source: the description of its source.
-        modules: the learned modules, in order.
+        run: folder of the run; None if nothing is stored.
+        source: identity of the source, see `FrameSource.describe`.
+        seed: seed of the run.
+        iterations: number of iterations.
+        frames: number of frames learned from.
+        signals_sha256: hash of all signals, see `SignalsHash`.
+        modules: the saved modules.
         summary: further results of the learner.
-        held_out: the slowness of the modules on frames that were held out; see `judged`.
-        ended: why the run ended, a key of `ENDINGS`.
-        undecided: streams that were still being learned when the run ended.
+        held_out: slowness of the modules on frames that were held out, see `evaluate`.
+        ended: reason for the end, a key of `END_REASONS`.
+        undecided: streams that were still being learned at the end.
     """
 
     run: str | None
@@ -196,7 +204,7 @@ class RunResult:
 
 
 def module_table(module: Module) -> dict[str, Any]:
-    """Return the facts of a module that results state, as JSON values."""
+    """Return the facts of a module that results contain, as JSON values."""
     return {
         "index": module.index,
         "stream": module.stream,
@@ -212,24 +220,25 @@ def module_table(module: Module) -> dict[str, Any]:
 def with_recipes(
     modules: Iterable[Module], source: FrameSource, described: Mapping[str, Any]
 ) -> tuple[Module, ...]:
-    """Return modules with the recipe by which raw images of their streams become frames.
+    """Return modules with their recipes, which tell how raw images become frames.
 
     Args:
-        modules: the learned modules.
-        source: what they were learned from; of a recording, the recipe is that of its source.
-        described: the description of the source.
+        modules: the saved modules.
+        source: the source that they were learned from; for a recording, the recipe is that of the
+            source that was recorded.
+        described: identity of the source.
     """
     if isinstance(source, StoredSource) and source.recorded:
         described = source.origin()
 
     def recipe(stream: int) -> Recipe:
-        made = Recipe.of(described, source.spec.frame_shape, stream)
-        frames = () if "size" in described else made.size  # else the raw images are frames
+        result = Recipe.of(described, source.spec.frame_shape, stream)
+        frames = () if "size" in described else result.size  # else the raw images are frames
         framings = getattr(source, "framings", [None] * len(source.spec.streams))
-        made = replace(made, raw=getattr(framings[stream], "first", frames) or ())
-        made = replace(made, centre=getattr(source, "centre", "run"))
-        stated = source.pixels(stream) if isinstance(source, StoredSource) else ""
-        return replace(made, pixels=stated) if stated.startswith("bayer_") else made
+        result = replace(result, raw=getattr(framings[stream], "first", frames) or ())
+        result = replace(result, centre=getattr(source, "centre", "run"))
+        pixels = source.pixels(stream) if isinstance(source, StoredSource) else ""
+        return replace(result, pixels=pixels) if pixels.startswith("bayer_") else result
 
     return tuple(replace(module, recipe=recipe(module.stream_index)) for module in modules)
 
@@ -238,20 +247,20 @@ def with_recipes(
 def opened_log(
     folder: Path, source: FrameSource, manifest: Mapping[str, Any], *, force: bool, resumed: bool
 ) -> Iterator[RunWriter]:
-    """Open the log of a run, which is to be finished in the context, and lock its folder.
+    """Create the log of a run, and lock its folder until the context ends.
 
-    On failure the log is left as a readable prefix; the message of an interrupt then names the
-    missing part.
+    After an error the log is a readable beginning of the run; the message of an interrupt then
+    says how to continue.
 
     Args:
-        folder: the run's folder.
-        source: the source of the run.
-        manifest: see `RunWriter`.
-        force: replace the contents of the folder.
-        resumed: whether the run is resumed; its earlier log is moved to `SET_ASIDE`.
+        folder: folder of the run.
+        source: source of the run.
+        manifest: manifest of the log, see `RunWriter`.
+        force: True to replace the contents of the folder.
+        resumed: True if the run is resumed; its earlier log is moved to `SET_ASIDE`.
 
     Raises:
-        UsageError: the folder is not empty, in use or holds a recording.
+        UsageError: the folder is not empty, in use, or has other logs.
         LogWriteError: the log cannot be written.
     """
     if not resumed:
@@ -262,13 +271,13 @@ def opened_log(
     with held(folder):
         finished = folder / RUN_FILE
         logs = [folder / SET_ASIDE, finished, partial_path(finished)]
-        if others := [path for path in logs_in(folder) if path not in logs]:
-            raise UsageError(f"{others[0]} is of no run: choose another folder")
+        if foreign := [path for path in logs_in(folder) if path not in logs]:
+            raise UsageError(f"{foreign[0]} does not belong to a run: choose another folder")
         stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE, REPORT_FILE)]
         with writing(folder):
             if resumed:
                 os.replace(log_to_resume(folder), logs[0])
-            else:  # the logs first, so that a kill leaves nothing that looks like a run
+            else:  # delete the logs first, so that a kill leaves nothing that looks like a run
                 stale = [*logs, *stale]
             refuse_special(*stale)
             for path in stale:
@@ -280,8 +289,8 @@ def opened_log(
             log.abandon()
             if isinstance(error, KeyboardInterrupt):
                 seekable = isinstance(source, SeekableSource)
-                how = "go on with --resume" if seekable else "cameras cannot go back: start another"
-                raise KeyboardInterrupt(f"{folder} is not finished: {how}") from None
+                hint = "continue with --resume" if seekable else "start another (live source)"
+                raise KeyboardInterrupt(f"{folder} is not finished: {hint}") from None
             raise
 
 
@@ -291,10 +300,10 @@ def write_results(
     """Write modules and run.json, close the log with its final record, and build the view.
 
     Args:
-        log: the run's log, with all its blocks and events.
-        result: the run's result.
-        manifest: what the log states at its beginning, and `versions`.
-        view: whether to build one.
+        log: log of the run, with all its blocks and events.
+        result: result of the run.
+        manifest: manifest of the log, and `versions`.
+        view: True to build the view.
     """
     folder = log.path.parent
     save_modules(folder / MODULES_FILE, result.modules)

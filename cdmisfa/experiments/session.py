@@ -1,7 +1,7 @@
-"""A run: a source, a learner, and the folder that stores what happened.
+"""A run in progress: start it, resume it or fork it, learn, and write its folder.
 
-RUN/run.mcap signals, RUN/modules.npz frozen modules, RUN/run.json manifest and result,
-RUN/run.rrd the view. The loop itself is in `loop`, the folder in `run_folder`.
+Files: RUN/run.mcap with the signals, RUN/modules.npz with the modules, RUN/run.json with manifest
+and result, RUN/run.rrd with the view. `loop` has the loop, `run_folder` the folder.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.experiments.documents import versions
-from cdmisfa.experiments.holdout import judged
+from cdmisfa.experiments.holdout import evaluate
 from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn_blocks
 from cdmisfa.experiments.resume import Recomputation, fork_span, reconfigured, restore
 from cdmisfa.experiments.run_folder import (
@@ -45,19 +45,19 @@ from replay.runs.log import read_header
 from replay.runs.provenance import comparable, has_whole_hashes, stated_source
 from replay.runs.writer import RunWriter
 
-# Called with the bytes of the source that were hashed and with all, while a run waits for that.
+# Called with the number of bytes of the source that were hashed, and the total.
 Hashing = Callable[[int, int], None]
 
 
 class Session:
-    """A run that is started, resumed or forked; `learn` then learns to its end.
+    """A run that is started, resumed or forked; `learn` then runs it to its end.
 
     Attributes:
-        source: the source of the run; left open.
+        source: the source of the run; it stays open.
         learner: the learner.
-        folder: the run's folder, or None where nothing is stored.
-        manifest: what its log states at its beginning.
-        before: the log whose first iterations it copies: its own earlier one, or its parent's.
+        folder: folder of the run, or None if nothing is stored.
+        manifest: the manifest at the beginning of the log.
+        before: the log whose first iterations are copied: the run's earlier log, or the parent's.
         keyframe: the state after these iterations; None at the beginning.
         hashing: see `Hashing`.
     """
@@ -80,23 +80,23 @@ class Session:
         """Prepare to start or resume a run; nothing is written before `learn`.
 
         Args:
-            source: live or recorded.
-            config: the learner's configuration, of the class that its entry names.
-            folder: the run's folder, or None to store nothing.
-            seed: the seed of the policy and of the abstractions' first weights.
-            max_iterations: end after this many.
-            max_modules: end after this many modules; by default as the learner says.
+            source: a live or recorded source.
+            config: configuration of the learner, of the class that the learner names.
+            folder: folder of the run, or None to store nothing.
+            seed: seed of the policy and of the initial weights.
+            max_iterations: largest number of iterations.
+            max_modules: largest number of modules; None: the learner's default.
             sections: further configuration tables (`scene`, `record`) for the manifest.
-            command: how the run is started, stored with it; see `command_of`.
-            force: replace an existing run.
-            resume: put learner and source to the newest keyframe of the run in the folder; the
-                signals equal those of an uninterrupted run.
+            command: the command that started the run, stored with it; see `command_of`.
+            force: True to replace an existing run.
+            resume: True to continue the run in the folder from its newest keyframe; the signals
+                equal those of an uninterrupted run.
             hashing: see `Hashing`.
 
         Raises:
-            UsageError: to resume: the source cannot go back; there is no run, or one of another
-                configuration or source.
-            LogDamagedError: to resume: the log cannot be read.
+            UsageError: for `resume`: the source cannot go back, or the run does not exist or has
+                another configuration or source.
+            LogDamagedError: for `resume`: the log cannot be read.
         """
         self.source = source
         self.learner: Learner = open_learner(config, source.spec, seed)
@@ -121,8 +121,8 @@ class Session:
         source = self.source
         if not isinstance(source, SeekableSource):
             raise UsageError(
-                f"{self.manifest['source']['kind']} cannot go back to where the run was stopped: "
-                "resume from its recording, or start another run"
+                f"{self.manifest['source']['kind']} cannot go back to where the run stopped: "
+                "resume from a recording of it, or start another run"
             )
         self.before = log = log_to_resume(folder)
         try:
@@ -130,22 +130,22 @@ class Session:
         except (LogDamagedError, UsageError):
             if log != partial_path(folder / RUN_FILE):
                 raise
-            return  # killed before the log stated anything: start again
+            return  # the run was killed before its log had a header: start again
         if has_whole_hashes(stated_source(log)):
             self.manifest["source"] = description(source, progress=self.hashing)
         if header.forked_at is not None:
             self.manifest[FORK] = header.manifest[FORK]
-        as_json = json.loads(json.dumps(self.manifest))  # lists for tuples, as the log has them
+        as_json = json.loads(json.dumps(self.manifest))  # lists instead of tuples, as in the log
         source_then, source_now = comparable(stated_source(log), as_json["source"])
         spec_then, spec_now = map(dataclasses.asdict, (header.spec, self.source.spec))
         then = {**header.manifest, "source": source_then, "spec": spec_then, COMMAND: None}
         now = {**as_json, "source": source_now, "spec": spec_now, COMMAND: None}
-        found = {key.removeprefix("config."): values for key, *values in differences(then, now)}
-        if found:
-            # another learner has other keys, so its name explains all of them
-            key = "learner.algorithm" if "learner.algorithm" in found else next(iter(found))
+        changed = {key.removeprefix("config."): values for key, *values in differences(then, now)}
+        if changed:
+            # Another learner has other keys, so its name is the reason for all differences.
+            key = "learner.algorithm" if "learner.algorithm" in changed else next(iter(changed))
             raise UsageError(
-                f"{folder} was made with {key} = {found[key][0]}, not {found[key][1]}: resume "
+                f"{folder} was made with {key} = {changed[key][0]}, not {changed[key][1]}: resume "
                 "with the same settings, or choose another folder"
             )
         keyframe = read_keyframe(log)
@@ -172,41 +172,42 @@ class Session:
     ) -> Iterator[Self]:
         """Prepare to continue a run from an iteration with other settings, in another folder.
 
-        Its log begins with the parent's first iterations as they are.
+        The log of the fork begins with the parent's first iterations, unchanged.
 
         Args:
             parent: the run, its folder or its log.
-            at: iterations that are copied of it.
-            folder: the fork's folder.
-            settings: `learner.key=value` words, but for the keys in `resume.FIXED`.
-            seed: the seed of the random choices from there on; the world stays the parent's.
-            source: words that name its source, where the run does not state it.
-            limits: `max_iterations` and `max_modules`, by default the parent's.
-            force: replace an existing run.
+            at: number of iterations that are copied from it.
+            folder: folder of the fork.
+            settings: `learner.key=value` words, except for the keys in `resume.FIXED`.
+            seed: seed of the random choices from there on; the world stays that of the parent.
+            source: words that name the source, if the run does not.
+            limits: `max_iterations` and `max_modules`; None: those of the parent.
+            force: True to replace an existing run.
 
         Yields:
-            The session; its source is open meanwhile.
+            The session; its source is open until the context ends.
 
         Raises:
-            UsageError: there is no such run, iteration or source, or a setting that cannot change.
+            UsageError: the run, the iteration or the source does not exist, or a setting cannot
+                change.
         """
         log, folder = run_log(Path(parent)), folder_here(folder)
         if os.path.realpath(log.parent) == os.path.realpath(folder):
-            raise UsageError(f"{folder} is the run itself: choose another folder")
-        with Recomputation.after(log, at, source) as stopped:
-            manifest, spec = stopped.header.manifest, stopped.source.spec
-            span = fork_span(stopped.learner, manifest, settings, seed)
+            raise UsageError(f"{folder} is the folder of the run itself: choose another one")
+        with Recomputation.after(log, at, source) as parent_run:
+            manifest, spec = parent_run.header.manifest, parent_run.source.spec
+            span = fork_span(parent_run.learner, manifest, settings, seed)
             sections = {k: part for k, part in manifest["config"].items() if k != "learner"}
             words, options = tuple(source), dict[str, Any]()
             with contextlib.suppress(UsageError):  # the run does not state its command
-                named, options = read_command(log.parent)
-                words = words or named
+                stated, options = read_command(log.parent)
+                words = words or stated
             world = sections.get("scene", {}).get("seed")
-            kept = () if world is None else (f"scene.seed={world}",)
-            settings = (*options.get("settings", ()), *kept, *settings)
+            scene = () if world is None else (f"scene.seed={world}",)
+            settings = (*options.get("settings", ()), *scene, *settings)
             options |= {"settings": settings, "seed": span.seed, **(limits or {})}
             session = cls(
-                stopped.source,
+                parent_run.source,
                 span.config,
                 folder,
                 seed=span.seed,
@@ -216,7 +217,7 @@ class Session:
                 command=command_of(words, options, folder) if words else None,
                 force=force,
             )
-            session.learner = reconfigured(stopped.learner, span, spec)
+            session.learner = reconfigured(parent_run.learner, span, spec)
             session.manifest[FORK] = {
                 "parent": os.path.relpath(log.parent, folder),
                 "at": at,
@@ -225,7 +226,7 @@ class Session:
             }
             session.before = log
             state = session.learner.state
-            session.keyframe = Keyframe(at, stopped.t, state, session._versions)
+            session.keyframe = Keyframe(at, parent_run.t, state, session._versions)
             yield session
 
     def learn(
@@ -237,35 +238,36 @@ class Session:
         rerun: bool = True,
         live: Callable[[str], AbstractContextManager[None]] | None = None,
     ) -> RunResult:
-        """Learn until nothing is left to learn, and log every signal.
+        """Learn until the run ends, and log every signal.
 
         Args:
-            sinks: called with everything, after the log; one that raises ends the run.
-            stop: called before every iteration; true ends the run cleanly, without a view, and
-                without reading all of a long source for its hash.
+            sinks: receive every iteration and event, after the log; an exception of one ends the
+                run.
+            stop: called before every iteration; True ends the run without a view, and without
+                reading all of a long source for its hash.
             keyframes: iterations between keyframes, see `Keyframes`.
-            rerun: also build the Rerun view.
-            live: also serve the run to Rerun's viewers while it learns; called with the address,
-                and entered while the run is served.
+            rerun: True to build the Rerun view too.
+            live: serves the run to Rerun viewers while it learns: a context manager that is called
+                with the address.
 
         Raises:
-            UsageError: the folder is not empty and is not to be replaced, or is in use.
-            LogExhaustedError: the source has not enough frames for a single block.
+            UsageError: the folder is in use, or it is not empty and not to be replaced.
+            LogExhaustedError: the source is shorter than one block.
         """
         digest, log = Digest(), None
         all_sinks: list[Sink] = [digest]
         if self._resumed and self.before is not None and self.keyframe is not None:
-            # Damage must be found before anything of the earlier run is replaced.
+            # Read the old log first: damage must be found before anything of the run is replaced.
             end = self.source.spec.time_ns(self.keyframe.t)
             with LogReader(self.before) as earlier:
                 for _, table in earlier.tables():
                     if len(table.log_time) and table.log_time[0] >= end:
                         break
-        with contextlib.ExitStack() as opened:
+        with contextlib.ExitStack() as stack:
             if self.folder is not None:
-                how = {"force": self._force, "resumed": self._resumed}
-                log = opened.enter_context(
-                    opened_log(self.folder, self.source, self.manifest, **how)
+                options = {"force": self._force, "resumed": self._resumed}
+                log = stack.enter_context(
+                    opened_log(self.folder, self.source, self.manifest, **options)
                 )
                 state = Keyframes(log, self.source, self.learner, self._versions, keyframes)
                 all_sinks += [log, state]
@@ -274,8 +276,8 @@ class Session:
 
                 tau, outputs = self.learner.tau, len(self.learner.phi)
                 view = LiveView(self.source.spec, self.manifest, tau, outputs, run=self.folder)
-                all_sinks.append(opened.enter_context(view))
-                opened.enter_context(live(view.address))
+                all_sinks.append(stack.enter_context(view))
+                stack.enter_context(live(view.address))
             if log is not None and self.before is not None:
                 self._copy_log(log, self.before, digest)
                 if live is not None:
@@ -293,16 +295,16 @@ class Session:
         learner, summary, held_out = self.learner, self.learner.summary(), dict[str, Any]()
         if ended != INTERRUPTED:
             components = self.manifest["config"]["learner"].get("components", 1)
-            judgement = judged(self.source, learner.modules, components, stop)
-            ended, held_out = (INTERRUPTED, {}) if judgement is None else (ended, judgement)
-        # After an interrupt nothing is read that is as long as the source.
+            evaluation = evaluate(self.source, learner.modules, components, stop)
+            ended, held_out = (INTERRUPTED, {}) if evaluation is None else (ended, evaluation)
+        # After an interrupt, do not spend time that grows with the length of the source.
         described = description(self.source, at_once=ended == INTERRUPTED, progress=self.hashing)
         streams, undecided = self.source.spec.streams, tuple[str, ...]()
         if not learner.over:
             learned = {streams[module.stream_index] for module in learner.modules}
             undecided = tuple(name for name in streams if name not in learned)
             if "streams" in summary:
-                states = {one["stream"]: one["state"] for one in summary["streams"]}
+                states = {row["stream"]: row["state"] for row in summary["streams"]}
                 undecided = tuple(name for name, state in states.items() if state == "learning")
         return RunResult(
             run=str(self.folder) if self.folder is not None else None,
@@ -319,10 +321,10 @@ class Session:
         )
 
     def _copy_log(self, log: RunWriter, before: Path, digest: Digest) -> None:
-        """Copy the iterations up to the keyframe from the earlier log; hash their signals."""
+        """Copy the iterations before the keyframe from the earlier log, and hash their signals."""
         if self._resumed:
             before = log.path.parent / SET_ASIDE
-        keyframe, self.keyframe = self.keyframe, None  # as large as the learner's memory
+        keyframe, self.keyframe = self.keyframe, None  # frees as much memory as the learner has
         if keyframe is not None:
             at, fork = keyframe.iteration, self.manifest.get(FORK, {})
             for signals in log.copy_log(before, at):
@@ -341,12 +343,16 @@ class Session:
 
 
 def run(
-    source: FrameSource, config: Any, folder: str | Path | None = None, **how: Any
+    source: FrameSource, config: Any, folder: str | Path | None = None, **options: Any
 ) -> RunResult:
     """Start a run, or resume the one in `folder`, and learn to its end.
 
-    For the arguments see `Session` and `Session.learn`.
+    Args:
+        source: see `Session`.
+        config: see `Session`.
+        folder: see `Session`.
+        options: further arguments of `Session` and of `Session.learn`.
     """
     names = Session.learn.__kwdefaults__ or {}
-    learning = {name: how.pop(name) for name in names if name in how}
-    return Session(source, config, folder, **how).learn(**learning)
+    learning = {name: options.pop(name) for name in names if name in options}
+    return Session(source, config, folder, **options).learn(**learning)

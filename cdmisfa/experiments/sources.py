@@ -1,4 +1,4 @@
-"""Sources that the command line names, and the configuration that goes with each."""
+"""Sources that a command names, and the configuration for each."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from replay.corpus.episode_source import Progress
     from replay.stored_source import StoredSource
 
-# The learner of streams that are no scene of ours, nor recorded from one.
-OF_CAMERAS = "progress"
+# Learner of all streams that are not of a scene, nor recorded from one.
+CAMERA_LEARNER = "progress"
 
-# Configuration tables of a run.
+# Sections of the configuration of a run.
 SECTIONS = ("learner", "scene", "record", "input")
 
 # Keys of `record` that logs and cameras state themselves.
@@ -33,16 +33,16 @@ CLOCK = ("fps", "start_ns")
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """The configuration of a run or a recording.
+    """Configuration of a run or a recording.
 
     Attributes:
-        learner: keys `learner.*`, of the learner's own dataclass.
+        learner: keys `learner.*`, in the learner's own dataclass.
         scene: keys `scene.*`.
         record: keys `record.*`.
-        streams: kind of streams that are no scene's: "cameras", "gym", "foreign"; "" of a scene.
-        clock: frames a second, and log time of frame 0 in nanoseconds, where the source states
-            them; None where `record` does.
-        inputs: how an external log or a live stream is read; None of a live scene.
+        streams: kind of streams that are not of a scene: "cameras", "gym", "foreign"; else "".
+        clock: frames a second, and log time of frame 0 (ns), if the source states them; None if
+            `record` does.
+        inputs: how an external log or a live stream is read; None for a live scene.
     """
 
     learner: Any
@@ -53,7 +53,7 @@ class Configuration:
     inputs: InputOptions | None = None
 
     def seeded(self, seed: int | None) -> Configuration:
-        """Return the same with a seed of the scene, where it has none yet."""
+        """Return the configuration with a seed for the scene, if it has none yet."""
         if self.scene.seed is not None or seed is None:
             return self
         return replace(self, scene=replace(self.scene, seed=seed))
@@ -63,7 +63,7 @@ class Configuration:
         return open_scene(self.scene.kind, self.scene, self.record)
 
     def tables(self) -> dict[str, Any]:
-        """Return all but the learner's part as plain tables, for a manifest."""
+        """Return all sections but the learner's as plain tables, for a manifest."""
         scene = {"kind": self.streams} if self.streams else section_table(self.scene)
         clock = {} if self.clock is None else dict(zip(CLOCK, self.clock, strict=True))
         tables = {"scene": scene, "record": section_table(self.record) | clock}
@@ -77,8 +77,8 @@ class Layers:
     """Values of a preset and of `--set` words, by section and key.
 
     Attributes:
-        preset: sections of the preset; None if none was named.
-        words: sections of the words, which win over the preset.
+        preset: sections of the preset; None if no preset was named.
+        words: sections of the words, which override the preset.
     """
 
     preset: Mapping[str, Mapping[str, Any]] | None = None
@@ -86,7 +86,7 @@ class Layers:
 
     @classmethod
     def read(cls, preset: str | None = None, words: Sequence[str] = ()) -> Layers:
-        """Read a preset, by its name or as a .toml file, and `section.key=value` words.
+        """Read a preset, by name or from a .toml file, and `section.key=value` words.
 
         Raises:
             UsageError: see `load_preset` and `parse_settings`.
@@ -94,7 +94,7 @@ class Layers:
         return cls(None if preset is None else load_preset(preset), parse_settings(words))
 
     def section(self, name: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-        """Return the values of a section, for `build`: those of the preset, then the words."""
+        """Return the values of a section for `build`: those of the preset, then the words."""
         return (self.preset or {}).get(name, {}), self.words.get(name, {})
 
 
@@ -115,13 +115,13 @@ def configure(
     """Fill the configuration for a live scene.
 
     Args:
-        kind: the scene, whose preset is used where none is given and the learner has none.
+        kind: name of the scene. Its preset is used if none is named and the learner has none.
         settings: preset and words.
-        seed: becomes `scene.seed` where that is not set; None leaves it to `seeded`.
-        inputs: options of the command line, of which a scene takes `--color` alone.
+        seed: value of `scene.seed` if that is not set; None leaves it to `seeded`.
+        inputs: options of the command line; a scene takes only `--color`.
 
     Raises:
-        UsageError: an unknown scene, preset, learner, section or key, or a value that misfits.
+        UsageError: a scene, preset, learner, section or key is unknown, or a value does not fit.
     """
     misplaced = [f"input.{key}" for key in settings.words.get("input", {})]
     if inputs is not None:
@@ -130,7 +130,7 @@ def configure(
             scene = {**settings.words.get("scene", {}), "color": "true"}
             settings = replace(settings, words={**settings.words, "scene": scene})
     if misplaced:
-        clock = "; its rate is --set record.fps=HZ" if "--rate" in misplaced else ""
+        clock = "; set its rate with --set record.fps=HZ" if "--rate" in misplaced else ""
         raise UsageError(f"{kind} is a scene: {are_for(misplaced, 'logs and cameras')}{clock}")
     return _filled(kind, settings, None).seeded(seed)
 
@@ -144,48 +144,48 @@ def configure_for(
     *,
     resumed: bool = False,
 ) -> Configuration:
-    """Fill the configuration for a source that is no live scene.
+    """Fill the configuration for a source that is not a live scene.
 
-    Its streams and its clock are its own. The preset is that of the scene it was recorded from,
-    else of the kind of its frames; the learner of other streams is `OF_CAMERAS` where neither
-    preset nor settings choose one.
+    The source states its own streams and clock. The preset is that of the scene from which the
+    source was recorded, or else of the kind of its frames. If neither preset nor settings choose a
+    learner, streams of no scene get `CAMERA_LEARNER`.
 
     Args:
-        spec: of the source.
-        described: the description that the source gives.
+        spec: properties of the source.
+        described: identity of the source, see `FrameSource.describe`.
         settings: see `configure`.
         seed: see `configure`.
         inputs: how the source is read.
-        resumed: accept keys of live scenes: the command of a run that is resumed states them.
+        resumed: True to accept keys of live scenes, which the command of a resumed run can have.
 
     Raises:
-        UsageError: as for `configure`, or a key of live scenes.
+        UsageError: as for `configure`, or a key of live scenes is set.
     """
     misplaced = [f"scene.{key}" for key in settings.words.get("scene", {})]
     misplaced += [f"record.{key}" for key in settings.words.get("record", {}) if key in CLOCK]
     if misplaced and not resumed:
-        raise UsageError(f"{are_for(misplaced, 'live scenes')}, and this source is none")
+        raise UsageError(f"{are_for(misplaced, 'live scenes')}, and this source is not one")
     scene = str(described.get("scene", ""))
     kind = scene if scene in SCENES else str(settings.section("scene")[0].get("kind"))
     if kind not in SCENES:
         kind = "icub" if len(spec.frame_shape) == 2 else "oscillatory"
     streams = "" if scene in SCENES else scene or str(described["kind"])
-    filled = _filled(kind, settings, OF_CAMERAS if streams else None)
+    filled = _filled(kind, settings, CAMERA_LEARNER if streams else None)
     clock = spec.fps, spec.start_ns
     filled = replace(filled, streams=streams, clock=clock, inputs=inputs or InputOptions())
     return filled.seeded(seed)
 
 
 def _filled(kind: str, settings: Layers, default: str | None) -> Configuration:
-    """Fill all sections from the preset, which the learner or the scene may name, and the words."""
+    """Fill all sections from the preset (named, or of the learner or the scene) and the words."""
     algorithm = settings.words.get("learner", {}).get("algorithm")
     tables = settings.preset
     if tables is None:
         algorithm = algorithm or default
-        named = getattr(learner_class(algorithm), "preset", None) if algorithm else None
-        tables = load_preset(named or kind)
+        own = getattr(learner_class(algorithm), "preset", None) if algorithm else None
+        tables = load_preset(own or kind)
         if algorithm and algorithm not in LEARNERS:
-            tables["learner"] = {}  # the preset's keys are not those of a user's learner
+            tables["learner"] = {}  # a user's learner has other keys than the preset
         settings = replace(settings, preset=tables)
     for section in (*tables, *settings.words):
         if section not in SECTIONS:
@@ -200,10 +200,10 @@ def _filled(kind: str, settings: Layers, default: str | None) -> Configuration:
 
 
 def read_inputs(inputs: InputOptions | None, settings: Layers) -> InputOptions:
-    """Add the keys `input.*` of settings to options.
+    """Return input options with the keys `input.*` of settings.
 
     Raises:
-        UsageError: there is no such key, or a value does not fit.
+        UsageError: a key does not exist, or a value does not fit.
     """
     return (inputs or InputOptions()).configured(*settings.section("input"))
 
@@ -217,40 +217,40 @@ def open_source(
     inputs: InputOptions | None = None,
     resumed: bool = False,
     say: Callable[[str], None] = lambda line: None,
-    **how: Any,
+    **log_options: Any,
 ) -> tuple[Any, Configuration]:
     """Open a live scene by its name, live streams, a recording, or external logs.
 
     Args:
-        words: the name of a scene, live streams as `is_live` finds them, or those of `open_logs`.
-        preset: instead of the source's own.
+        words: name of a scene, live streams as `is_live` recognises them, or those of `open_logs`.
+        preset: preset to use instead of the source's own.
         settings: `section.key=value` words.
-        seed: of the scene, where `scene.seed` is not set, and of simulated tasks.
-        inputs: see `open_logs`; keys `input.*` of the preset and of settings are added.
-        resumed: the settings are those of a run that is resumed; see `configure_for`.
+        seed: seed of the scene, if `scene.seed` is not set, and of simulated tasks.
+        inputs: see `open_logs`; the keys `input.*` of preset and settings are added.
+        resumed: True if the settings are those of a resumed run; see `configure_for`.
         say: called with a line when the state of a camera changes.
-        how: further arguments of `open_logs`.
+        log_options: further arguments of `open_logs`.
 
     Returns:
-        The source, a `FrameSource`, and one that can go back unless it is live; the configuration.
+        The source, which can go back unless it is live, and the configuration.
 
     Raises:
-        CdmisfaError: there is no such source or setting, or a log is damaged.
+        CdmisfaError: the source or a setting does not exist, or a log is damaged.
     """
-    given = Layers.read(preset, settings)
+    layers = Layers.read(preset, settings)
     live = all(is_live(str(word)) for word in words)
     if is_scene(words):
-        scene = configure(str(words[0]), given, seed, inputs)
+        scene = configure(str(words[0]), layers, seed, inputs)
         return scene.open_scene(), scene
-    inputs = read_inputs(inputs, given)
+    inputs = read_inputs(inputs, layers)
     source: FrameSource
     if live:
         source = open_live(list(map(str, words)), inputs, seed=seed, say=say)
     else:
-        source = open_logs(words, inputs=inputs, **how)
+        source = open_logs(words, inputs=inputs, **log_options)
     try:
         described = description(source, at_once=True)
-        chosen = given, seed, inputs
+        chosen = layers, seed, inputs
         return source, configure_for(source.spec, described, *chosen, resumed=resumed)
     except BaseException:
         source.close()
@@ -269,16 +269,16 @@ def open_logs(
     """Open a recording, external logs, or many of both as episodes.
 
     Args:
-        words: paths, URLs or patterns: of a recording, external logs, or an index of many.
-        loop: start again at the end.
-        skip_damaged: pass over damaged parts.
-        inputs: how images become frames; given, paths are taken as external logs.
-        episodes: each path is an episode of its own; those of an index always are.
+        words: paths, URLs or patterns of a recording, of external logs, or of an index of logs.
+        loop: True to start again at the end.
+        skip_damaged: True to skip damaged parts.
+        inputs: how images become frames; if set, the paths are read as external logs.
+        episodes: True if each path is an episode; logs of an index always are.
         progress: called with the number of opened episodes and the total.
 
     Raises:
-        UsageError: no path that exists.
-        LogDamagedError: the log is damaged.
+        UsageError: a path does not exist.
+        LogDamagedError: a log is damaged.
     """
     from replay.corpus.listing import may_be_corpus
     from replay.open_sources import locations, open_log
@@ -287,7 +287,7 @@ def open_logs(
     inputs = inputs or InputOptions()
     if live := [str(word) for word in words if is_live(str(word))]:
         raise UsageError(
-            f"{live[0]} is a live stream, which cannot go back: record it first, with cdmisfa "
+            f"{live[0]} is a live stream, which cannot go back: record it first with cdmisfa "
             f"record {shlex.join(live)} -o REC"
         )
     for path in (paths := locations(words)):
@@ -295,16 +295,16 @@ def open_logs(
             _, colon, address = str(path).partition(":")
             known = [*SCENES, *(f"{kind}:{address}" for kind in CAMERAS if colon)]
             if str(path) in SCENES:
-                raise no_such(path, [], "a scene is named alone")
+                raise no_such(path, [], "a scene must be the only source")
             raise no_such(path, known, f"the scenes are {', '.join(SCENES)}")
-    how: Any = {"loop": loop, "skip_damaged": skip_damaged}
+    options: Any = {"loop": loop, "skip_damaged": skip_damaged}
     source: StoredSource | None = None
     if episodes or may_be_corpus(words):
         from replay.corpus.episode_source import EpisodeSource
         from replay.corpus.index import logs_of_corpus
 
         if logs := logs_of_corpus(words) or ([[path] for path in paths] if episodes else None):
-            source = EpisodeSource(logs, inputs, progress=progress, **how)
-    source = source or open_log(paths, inputs, **how)
+            source = EpisodeSource(logs, inputs, progress=progress, **options)
+    source = source or open_log(paths, inputs, **options)
     source.centre = inputs.centre
     return source

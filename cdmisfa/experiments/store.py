@@ -1,7 +1,8 @@
-"""Trials, and a row for each when it ends: no trial is computed twice.
+"""Store of trials: a row for each trial that has ended, so that none is computed twice.
 
-A trial is identified by a hash of everything it depends on, the code included. The file rows.jsonl
-of a folder has a line of JSON for each trial; the last line of a trial counts.
+A hash of everything that the result depends on, including the code, identifies a trial. The file
+rows.jsonl of a folder has one line of JSON for each ended trial; a later line replaces an earlier
+one of the same trial.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, par
 from cdmisfa.experiments.documents import writing
 from recorder.log.files import held, make_folder, refuse_named_as_file, refuse_special, to_disk
 
-# The file of the rows in a folder.
+# Name of the file with the rows.
 ROWS = "rows.jsonl"
 
 DONE, FAILED = "done", "failed"
 
-# A finished trial: its `id`, `status`, `point`, `seed`, `code`, and `result` or `error`.
+# Row of an ended trial: its `id`, `status`, `point`, `seed`, `code`, and `result` or `error`.
 Row = dict[str, Any]
 
 
 @cache
 def code(*more: str) -> str:
-    """Return the version of the code that computes trials: the package's, and a hash of sources.
+    """Return the version of the code that computes trials: of the package, and of source files.
 
     Args:
-        more: further modules that decide the result, as "cdmisfa/modules".
+        more: further modules on which the result depends, such as "cdmisfa/modules".
     """
     root = Path(__file__).parents[2]
     folders = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")
@@ -51,17 +52,17 @@ def code(*more: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
-    """A trial: what identifies it, and the call that computes it in any process.
+class PlannedTrial:
+    """A trial that can be computed in any process, and its identity.
 
     Attributes:
-        id: hash of everything the result depends on.
-        call: computes the result, a mapping of JSON values; pickled for workers.
-        point: the settings that differ from trial to trial.
-        seed: the seed.
-        code: the version of the code; a worker must have the same.
+        id: hash of everything that the result depends on.
+        call: computes the result, a mapping of JSON values; it is pickled for workers.
+        point: the settings that differ between trials.
+        seed: seed of the trial.
+        code: version of the code; a worker must have the same.
         modules: see `code`.
-        log: a file that the trial writes, or None.
+        log: file that the trial writes, or None.
     """
 
     id: str
@@ -80,19 +81,19 @@ def make_trial(
     seed: int = 0,
     modules: tuple[str, ...] = (),
     log: Path | None = None,
-) -> Trial:
-    """Return a trial, identified by the JSON values that its result depends on, and by the code."""
+) -> PlannedTrial:
+    """Return a trial; the JSON values `depends` and the version of the code identify it."""
     version = code(*modules)
     text = json.dumps([*depends, version], sort_keys=True, separators=(",", ":"))
     number = hashlib.sha256(text.encode()).hexdigest()[:32]
-    return Trial(number, call, point, seed, version, modules, log)
+    return PlannedTrial(number, call, point, seed, version, modules, log)
 
 
-def compute(trial: Trial) -> Mapping[str, Any]:
-    """Return the result of a trial, or under "error" why there is none.
+def compute(trial: PlannedTrial) -> Mapping[str, Any]:
+    """Return the result of a trial; {"error": message} if it failed.
 
     Raises:
-        LogWriteError: the disk refuses a file, and would refuse the files of other trials too.
+        LogWriteError: a file cannot be written; then other trials would fail too.
     """
     version = code(*trial.modules)
     if trial.code != version:
@@ -112,10 +113,11 @@ class SweepReport:
     """Outcome of computing trials.
 
     Attributes:
-        trials: the number of trials that were asked for.
-        skipped: the number that were finished before.
-        computed: the number that finished now.
-        failed: rows of failed trials, now or before.
+        folder: folder of the rows.
+        trials: number of requested trials.
+        skipped: number of trials that had finished before.
+        computed: number of trials that finished now.
+        failed: rows of the failed trials, now or before.
     """
 
     folder: Path
@@ -126,29 +128,29 @@ class SweepReport:
 
 
 def run_trials(
-    trials: Sequence[Trial],
+    trials: Sequence[PlannedTrial],
     folder: Path,
     *,
     jobs: int = 1,
     scheduler: str | None = None,
     retry_failed: bool = False,
-    begin: Callable[[Sequence[Trial]], None] = lambda missing: None,
+    begin: Callable[[Sequence[PlannedTrial]], None] = lambda missing: None,
     progress: Callable[[int, int, int], None] = lambda finished, failed, total: None,
 ) -> SweepReport:
     """Compute the trials that have no row in a folder yet.
 
     Args:
-        trials: all trials that are asked for.
-        folder: the folder of the rows; made where it does not exist.
-        jobs: local processes.
-        scheduler: address of a dask scheduler, whose workers compute instead.
-        retry_failed: compute trials again that failed before.
-        begin: called with the missing trials, once the folder is locked and before the first.
-        progress: called with the trials finished, failed, and asked for.
+        trials: all requested trials.
+        folder: folder of the rows; it is created if missing.
+        jobs: number of local processes.
+        scheduler: address of a dask scheduler whose workers compute instead.
+        retry_failed: True to compute failed trials again.
+        begin: called with the missing trials after the folder is locked.
+        progress: called with the numbers of finished, failed and requested trials.
 
     Raises:
-        UsageError: another process works in the folder.
-        LogDamagedError: a line of the rows is none.
+        UsageError: another process uses the folder.
+        LogDamagedError: a line of the rows is damaged.
         LogWriteError: a row cannot be written.
         WorkersError: a worker died, or no scheduler answers.
     """
@@ -156,27 +158,27 @@ def run_trials(
     refuse_named_as_file(folder)
     refuse_special(folder, path)
 
-    def is_missing(trial: Trial) -> bool:
+    def is_missing(trial: PlannedTrial) -> bool:
         row = rows.get(trial.id)
         if row is None or (retry_failed and row["status"] == FAILED):
             return True
         return row["status"] == DONE and trial.log is not None and not trial.log.exists()
 
-    with contextlib.ExitStack() as opened:
+    with contextlib.ExitStack() as stack:
         with writing(path):
             make_folder(folder)
-        opened.enter_context(held(folder))
+        stack.enter_context(held(folder))
         rows, size = _read(path)
         with writing(path):
-            # Unbuffered, so that closing does not repeat a write that the disk refused.
-            file = opened.enter_context(open(path, "ab", buffering=0))
-            file.truncate(size)  # a kill cut the rest short
+            # Unbuffered: closing a buffered file would repeat a write that the disk refused.
+            file = stack.enter_context(open(path, "ab", buffering=0))
+            file.truncate(size)  # drop the partial line of a killed process
             to_disk(folder)
         missing = [trial for trial in trials if is_missing(trial)]
         begin(missing)
         skipped, done = len(trials) - len(missing), 0
-        left = {trial.id for trial in missing}
-        failed = sum(rows[t.id]["status"] == FAILED for t in trials if t.id not in left)
+        pending = {trial.id for trial in missing}
+        failed = sum(rows[t.id]["status"] == FAILED for t in trials if t.id not in pending)
         computed = run_all(compute, missing, jobs=jobs, scheduler=scheduler)
         for finished, (index, result) in enumerate(computed, start=skipped + 1):
             trial, broke = missing[index], "error" in result
@@ -202,20 +204,18 @@ def run_trials(
     return SweepReport(folder, len(trials), skipped, done, failures)
 
 
-def read_rows(folder: Path) -> Iterator[Row]:
-    """Yield the last row of every trial in a folder.
-
-    A last line that a kill cut short does not count.
+def read_trial_rows(folder: Path) -> Iterator[Row]:
+    """Yield the last row of every trial in a folder, without a partial last line.
 
     Raises:
-        UsageError: the file is no regular file.
-        LogDamagedError: a line is no row, or together they take more memory than `budget`.
+        UsageError: rows.jsonl is not a regular file.
+        LogDamagedError: a line is damaged, or the rows take more memory than `budget`.
     """
     yield from _read(folder / ROWS)[0].values()
 
 
 def _read(path: Path) -> tuple[dict[str, Row], int]:
-    """Return the last row of every trial by its identity, and the bytes of whole lines."""
+    """Return the last row of every trial by its id, and the number of bytes of complete lines."""
     rows: dict[str, Row] = {}
     size = 0
     if not path.exists():
@@ -229,11 +229,11 @@ def _read(path: Path) -> tuple[dict[str, Row], int]:
                 try:
                     row = parse_json(line, MAX_LIST)
                     row = {**row, "status": row["status"], "point": dict(row["point"])}
-                    rows.pop(row["id"], None)  # the order is that of the last rows
+                    rows.pop(row["id"], None)  # so that the order is that of the last rows
                     rows[row["id"]] = row
                 except (ValueError, KeyError, TypeError) as error:
                     raise LogDamagedError(
-                        f"{path} line {number} is no trial's row: remove the line"
+                        f"{path} line {number} is not the row of a trial: remove the line"
                     ) from error
                 size += len(line)
     except MemoryError:
@@ -242,7 +242,7 @@ def _read(path: Path) -> tuple[dict[str, Row], int]:
             f"{path}: its rows take more than {BUDGET >> 20} MiB of memory, the limit: "
             "split the grid over several folders"
         ) from None
-    # A trial whose file another trial has written since is no longer finished.
+    # A trial whose file was written again by another trial is no longer finished.
     writers = {Path(row["run"]).name: row["id"] for row in rows.values() if row.get("run")}
     current = {
         row["id"]: row

@@ -1,7 +1,7 @@
 """Sweeps: many trials over a grid of settings and seeds, each computed once.
 
-A sweep that was stopped, or that is asked for again with more seeds or a larger grid, computes the
-missing trials in its folder; see `store`.
+A sweep that was stopped, or is requested again with more seeds or a larger grid, computes only the
+missing trials; see `store`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from cdmisfa.experiments.sources import (
     open_logs,
     read_inputs,
 )
-from cdmisfa.experiments.store import SweepReport, Trial, make_trial, run_trials
-from cdmisfa.experiments.trial import has_whole_trials, run_trial
+from cdmisfa.experiments.store import PlannedTrial, SweepReport, make_trial, run_trials
+from cdmisfa.experiments.trial import has_whole_trials, run_oscillatory_trial
 from recorder.images.options import InputOptions
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.runs.folders import REQUEST
 
-# Keys of a run's result that a trial's row has elsewhere, or not at all.
-UNKEPT = ("schema", "run", "source", "seed", "signals_sha256", "undecided")
+# Keys of a run's result that a trial's row stores elsewhere or not at all.
+DROPPED_KEYS = ("schema", "run", "source", "seed", "signals_sha256", "undecided")
 
 
 def sweep(
@@ -46,26 +46,26 @@ def sweep(
     folder: str | Path,
     *,
     grid: Mapping[str, Sequence[Any]] | None = None,
-    **how: Any,
+    **options: Any,
 ) -> SweepReport:
     """Run every trial of a grid that is not finished yet.
 
     Args:
-        source: see `plan`, as for `grid` and the further arguments.
-        folder: the folder of the rows; made where it does not exist.
+        source: see `plan`.
+        folder: folder of the rows; it is created if missing.
         grid: values to try, by configuration key.
-        how: further arguments of `plan`, and `jobs`, `scheduler`, `retry_failed` and `progress`
-            of `run_trials`.
+        options: further arguments of `plan`, and `jobs`, `scheduler`, `retry_failed` and
+            `progress` of `run_trials`.
 
     Raises:
-        UsageError: a wrong key, value or source, found before any trial starts.
+        UsageError: a key, a value or the source is wrong; no trial has started then.
         WorkersError: a worker died, or no scheduler answers.
     """
     folder, grid = Path(folder).resolve(), grid or {}
     words = (source,) if isinstance(source, str | Path) else tuple(source)
     names = ("jobs", "scheduler", "retry_failed", "progress")
-    where = {name: how.pop(name) for name in names if name in how}
-    trials = plan(source, grid=grid, **how)
+    execution = {name: options.pop(name) for name in names if name in options}
+    trials = plan(source, grid=grid, **options)
     request = {
         "schema": 1,
         "source": [str(word) for word in words],
@@ -74,10 +74,10 @@ def sweep(
         "trials": [{"id": trial.id, "point": dict(trial.point)} for trial in trials],
     }
 
-    def begin(missing: Sequence[Trial]) -> None:
+    def begin(missing: Sequence[PlannedTrial]) -> None:
         write_json(folder / REQUEST, request)
 
-    return run_trials(trials, folder, begin=begin, **where)
+    return run_trials(trials, folder, begin=begin, **execution)
 
 
 def plan(
@@ -90,24 +90,24 @@ def plan(
     loop: bool = False,
     inputs: InputOptions | None = None,
     **limits: int | None,
-) -> list[Trial]:
-    """Return every trial of a sweep, in the grid's order, seeds innermost; check all settings.
+) -> list[PlannedTrial]:
+    """Check all settings, and return every trial of a sweep in the order of the grid.
 
     Args:
-        source: a scene's name or the paths of logs, as for `learn`.
+        source: name of a scene or paths of logs, as for `learn`.
         grid: values to try, by configuration key; every combination is a point.
-        seeds: every point is tried with each of them.
-        preset: instead of the source's own.
+        seeds: seeds with which every point is tried.
+        preset: preset to use instead of that of the source.
         settings: `section.key=value` words for all trials.
-        loop: start a log again at its end.
+        loop: True to start a log again at its end.
         inputs: how images of logs become frames; see `open_source`.
         limits: `max_iterations` and `max_modules`, at which each trial ends.
 
     Raises:
-        UsageError: an unknown key, a value that does not fit, or no such source.
+        UsageError: a key is unknown, a value does not fit, or the source does not exist.
     """
     if keys := [key for key in grid if key.startswith("input.")]:
-        raise UsageError(f"grid: {keys[0]} is the same for all trials: give it with --set")
+        raise UsageError(f"grid: {keys[0]} must be equal for all trials: set it with --set")
     words = (source,) if isinstance(source, str | Path) else tuple(source)
     scene, recorded = is_scene(words), None
     # Workers may have another working directory.
@@ -119,38 +119,38 @@ def plan(
     inputs = inputs or InputOptions()
     opening = {"loop": loop, "inputs": inputs}
     seeds, ends = tuple(seeds), [limits.get("max_iterations"), limits.get("max_modules")]
-    trials: dict[str, Trial] = {}
+    trials: dict[str, PlannedTrial] = {}
     for values in itertools.product(*grid.values()):
         point = dict(zip(grid, values, strict=True))
         points = (f"{key}={value}" for key, value in point.items())
-        given = Layers.read(preset, (*settings, *points))
+        layers = Layers.read(preset, (*settings, *points))
         if recorded is None:
-            configured = configure(str(words[0]), given, None, inputs)
+            configured = configure(str(words[0]), layers, None, inputs)
         else:
-            configured = configure_for(spec, recorded, given, None, inputs)
+            configured = configure_for(spec, recorded, layers, None, inputs)
         learner = configured.learner
         for seed in seeds:
             configuration = configured.seeded(seed)
             depends: list[Any] = [section_table(learner), _user_code(learner.algorithm)]
-            if scene:  # of a recording, the world's part does not count
+            if scene:  # the world of a recording does not change the trial
                 depends.append(configuration.tables())
             if inputs != InputOptions():
                 depends.append(dataclasses.asdict(inputs))
-            call = partial(run_one, paths, configuration, opening, seed=seed, **limits)
+            call = partial(compute_trial, paths, configuration, opening, seed=seed, **limits)
             trial = make_trial(call, depends, seed, recorded, ends, point=point, seed=seed)
             trials.setdefault(trial.id, trial)
     return list(trials.values())
 
 
 def _user_code(algorithm: str) -> str:
-    """Return a hash of the module of a user's learner, as `code` is of ours; "" for ours."""
+    """Return a hash of the file that defines a user's learner; "" for the package's learners."""
     if algorithm in LEARNERS:
         return ""
     module = inspect.getfile(learner_class(algorithm))
     return hashlib.sha256(Path(module).read_bytes()).hexdigest()
 
 
-def run_one(
+def compute_trial(
     source: Sequence[str],
     configuration: Configuration,
     opening: Mapping[str, Any],
@@ -158,21 +158,24 @@ def run_one(
     seed: int,
     **limits: Any,
 ) -> dict[str, Any]:
-    """Run one trial: an oscillatory one as a whole in C where the learner can, others as `learn`.
+    """Run one trial: on oscillatory streams entirely in C if possible, else like `learn`.
 
     Args:
-        source: a scene's name, or the paths of logs.
-        configuration: preset, settings, the grid's point and the seed together.
+        source: name of a scene, or paths of logs.
+        configuration: the configuration with the point of the grid and the seed.
         opening: `loop` and `inputs` of `open_logs`.
-        seed: the seed.
+        seed: seed of the trial.
         limits: `max_iterations` and `max_modules`.
+
+    Returns:
+        The result as JSON values.
     """
     live = is_scene(source)
     opened = configuration.open_scene() if live else open_logs(source, **opening)
     with contextlib.closing(opened):
         if source == ("oscillatory",) and has_whole_trials(configuration.learner):
             streams = cast(OscillatoryConfig, configuration.scene).streams
-            result = run_trial(configuration.learner, streams, seed=seed, **limits)
+            result = run_oscillatory_trial(configuration.learner, streams, seed=seed, **limits)
             modules = with_recipes(result.modules, opened, opened.describe())
             return {
                 "iterations": result.iterations,
@@ -182,6 +185,6 @@ def run_one(
                 "epsilon": result.epsilon,
                 "ended": result.ended,
             }
-        how: dict[str, Any] = {"seed": seed, "sections": configuration.tables(), "rerun": False}
-        learned = run(opened, configuration.learner, **how, **limits)
-    return {key: value for key, value in learned.as_json().items() if key not in UNKEPT}
+        options: dict[str, Any] = {"seed": seed, "sections": configuration.tables()}
+        learned = run(opened, configuration.learner, rerun=False, **options, **limits)
+    return {key: value for key, value in learned.as_json().items() if key not in DROPPED_KEYS}

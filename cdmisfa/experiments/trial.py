@@ -1,7 +1,7 @@
-"""Whole trials in C: what `CuriousLearner.step` calls, no Python per block.
+"""Trials on oscillatory streams entirely in C, without Python code for each block.
 
-A trial gives bit for bit what `CuriousLearner.step` gives on the same source. It is for
-sources that repeat, as the oscillatory streams do, so that one period in memory is all of it.
+A trial gives bit for bit what `CuriousLearner.step` gives on the same source. It needs streams that
+repeat, as the oscillatory streams do, so that one period of frames in memory is the whole source.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from cdmisfa.experiments.loop import ending
 from cdmisfa.modules import Module
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
 
-# Iterations between two returns to Python.
+# Iterations in one call of C. It changes the speed only.
 CHUNK = 512
 
 
 @dataclass(frozen=True, slots=True)
 class Swap:
-    """An abrupt change of the world: another signal on a stream from the next block on.
+    """Abrupt change of the world: a stream gets another signal from the next block on.
 
     Attributes:
-        below: it happens once, when epsilon first falls below this.
+        below: the swap happens once, when epsilon first falls below this value.
         stream: index of the stream.
-        name: the signal it shows from then on.
+        name: name of the new signal.
     """
 
     below: float
@@ -48,16 +48,16 @@ class TrialResult:
     """Result of a trial.
 
     Attributes:
-        modules: the learned modules, in order.
-        iterations: the number of iterations.
-        frames: the number of frames.
-        final_policy: policy of the abstraction being learned at the end.
-        epsilon: its probability of a random action.
-        ended: why, as for a run: "max_modules", "max_iterations" or "nothing_left".
-        swapped: the iteration from which on the swapped signal was shown; -1 never.
-        curves: if asked for, the signals of all iterations as arrays, named as in `BlockSignals`
-            and equal to it: the fields of `OUTCOME` (N,), eta_dot (N, J), R (N, S)
-            of the stay entries, Q (N, S, 2) and policy (N, S).
+        modules: the saved modules.
+        iterations: number of iterations.
+        frames: number of frames.
+        final_policy: policy at the end.
+        epsilon: probability of a random action at the end.
+        ended: reason for the end: "max_modules", "max_iterations" or "nothing_left".
+        swapped: first iteration with the swapped signal; -1 if there was none.
+        curves: None, or the signals of all iterations as arrays with the names and values of
+            `BlockSignals`: the fields of `OUTCOME` (N,), eta_dot (N, J), R (N, S) of the stay
+            entries, Q (N, S, 2) and policy (N, S).
     """
 
     modules: tuple[Module, ...]
@@ -75,7 +75,7 @@ def has_whole_trials(config: Any) -> bool:
     return isinstance(open_learner(config, OscillatorySource().spec, 0), CuriousLearner)
 
 
-def run_trial(
+def run_oscillatory_trial(
     config: LearnerConfig,
     streams: Sequence[str] = ("x1", "x2", "x3"),
     *,
@@ -85,19 +85,19 @@ def run_trial(
     swap: Swap | None = None,
     curves: bool = False,
 ) -> TrialResult:
-    """Learn from oscillatory streams until nothing is left to learn.
+    """Learn from oscillatory streams until the learner ends.
 
     Args:
-        config: the learner's configuration.
-        streams: signals the streams show.
-        seed: seed of the policy and of the abstractions' first weights.
-        max_iterations: end after this many.
-        max_modules: end after this many modules; by default as many as there are streams.
-        swap: an abrupt change.
-        curves: keep the signals of all iterations.
+        config: configuration of the learner.
+        streams: names of the signals.
+        seed: seed of the policy and of the initial weights.
+        max_iterations: largest number of iterations.
+        max_modules: largest number of modules; None: one for each stream.
+        swap: an abrupt change, or None.
+        curves: True to record the signals of all iterations.
 
     Raises:
-        ValueError: the learner is in Python.
+        ValueError: the learner cannot run in C.
     """
     learner = open_learner(config, OscillatorySource(streams).spec, seed)
     if not isinstance(learner, CuriousLearner):
@@ -111,16 +111,16 @@ def run_trial(
     while not (ended := ending(learner, limit, max_iterations)):
         if not len(uniforms):
             uniforms = learner.policy_rng.random((CHUNK, 3))
-        left = CHUNK if max_iterations is None else max_iterations - learner.iteration
-        drawn = uniforms[:left]
+        remaining = CHUNK if max_iterations is None else max_iterations - learner.iteration
+        drawn = uniforms[:remaining]
         record = _records(len(drawn), config.outputs, len(streams)) if curves else {}
         below = swap.below if swap is not None and swapped < 0 else -1.0
         done = learner.repeat(frames, x, drawn, below, _as_struct(record))
         uniforms = uniforms[done:]
         if curves:
-            kept = {name: array[:done] for name, array in record.items()}
-            outcome = kept.pop("outcome")
-            parts.append({name: outcome[name] for name in OUTCOME.names or ()} | kept)
+            signals = {name: array[:done] for name, array in record.items()}
+            outcome = signals.pop("outcome")
+            parts.append({name: outcome[name] for name in OUTCOME.names or ()} | signals)
         if learner.out["saved"][0]:
             learner.save_abstraction()
         elif swap is not None and learner.epsilon < below:
@@ -142,7 +142,7 @@ def run_trial(
 def _expand(
     config: LearnerConfig, tables: Sequence[FloatArray]
 ) -> tuple[kernels.Struct, kernels.Struct]:
-    """One period of every stream and the tau frames after it, as shown and as learned from."""
+    """Return one period of every stream and the tau frames after it, raw and expanded."""
     index = np.arange(PERIOD + config.tau) % PERIOD
     frames = np.concatenate([table[index] for table in tables])
     return kernels.frames_of(frames), kernels.frames_of(expand(config.expansion, frames))

@@ -1,6 +1,6 @@
-"""How slow outputs are on frames that follow what was learned from, beside batch SFA's own.
+"""Slowness of outputs on frames after those learned from, and batch SFA for comparison.
 
-Frames are taken block by block, so that memory holds few of them, however many there are.
+Frames are read piece by piece, so that the memory does not depend on their number.
 """
 
 from __future__ import annotations
@@ -16,23 +16,24 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.features.outputs import slowness_by_moments
 from cdmisfa.features.recursive import RecursiveFeature
 
-# Frames (n, I) in their order, and whether some are missing before them.
+# Frames (n, I) in their order, and whether frames are missing before them.
 Pieces = Iterable[tuple[NDArray[Any], bool]]
 
-# Directions that are kept while frames are taken in, for each that is wanted of all of them.
-KEPT = 8
+# Directions that are stored while frames are read, as a multiple of the components. Set by hand: a
+# larger factor approaches exact batch SFA, and takes more time and memory.
+STORED_PER_COMPONENT = 8
 
-# Share of the largest variance below which a direction holds rounding noise.
-NOTHING = 1e-10
+# Share of the largest variance below which a direction holds rounding noise; as in `batch_sfa`.
+TOLERANCE = 1e-10
 
 
 class BatchOutputs(NamedTuple):
-    """Outputs of batch SFA, fewer where the frames vary in fewer directions.
+    """Outputs of batch SFA, fewer if the frames vary in fewer directions.
 
     Attributes:
         phi: (J, I) the slowest outputs as weights of the centred frame.
-        mean: (I,) of the frames.
-        directions: (K, I) the leading principal components, orthonormal, in which they are.
+        mean: (I,) mean of the frames.
+        directions: (K, I) the leading principal components, orthonormal, which span phi.
     """
 
     phi: FloatArray
@@ -41,25 +42,27 @@ class BatchOutputs(NamedTuple):
 
 
 def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) -> BatchOutputs:
-    """Return the slowest outputs of frames that all count the same, in their leading components.
+    """Return the slowest outputs within the leading principal components of frames.
 
-    That is what `batch_sfa` finds of frames in memory within their leading principal components, up
-    to how far the directions that are kept meanwhile, `KEPT` times as many, hold these.
+    All frames have equal weights. The result approaches that of `batch_sfa` on the components; the
+    difference is what `STORED_PER_COMPONENT` times as many directions do not hold.
 
     Args:
-        pieces: at least one, uint8 pixels, which count 1/255 each, or float64 values.
-        frames: how many there are in all.
-        components: K.
-        outputs: J.
+        pieces: at least one piece of uint8 pixels, which count 1/255 each, or float64 values.
+        frames: total number of frames.
+        components: number of components K.
+        outputs: number of outputs J.
     """
     sfa: RecursiveFeature | None = None
     for x, gap in pieces:
-        sfa = sfa or RecursiveFeature(x.shape[1], KEPT * components // 2, window=frames)
+        sfa = sfa or RecursiveFeature(
+            x.shape[1], STORED_PER_COMPONENT * components // 2, window=frames
+        )
         sfa.update(x, gap)
     assert sfa is not None
     state = sfa.state
     variance = state.variance[: min(components, int(state.counts[0]))]
-    variance = variance[variance > NOTHING * variance.max(initial=0.0)]
+    variance = variance[variance > TOLERANCE * variance.max(initial=0.0)]
     size, scale = len(variance), 1 / np.sqrt(variance)
     _, rotation = np.linalg.eigh(state.differences[:size, :size] * scale * scale[:, None])
     directions = state.basis[:size]
@@ -67,20 +70,21 @@ def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) ->
 
 
 def following_slowness(
-    pieces: Pieces, abstractions: Sequence[tuple[FloatArray, FloatArray]]
+    pieces: Pieces, features: Sequence[tuple[FloatArray, FloatArray]]
 ) -> list[FloatArray]:
-    """`slowness` of the outputs of several abstractions, in one pass over frames.
+    """Return the slowness of the outputs of several features, in one pass over the frames.
 
     Args:
         pieces: see `batch_outputs`.
-        abstractions: of each phi (J, I) and mean (I,), y = phi (x - mean).
+        features: weights phi (J, I) and mean (I,) of each, y = phi (x - mean).
 
     Returns:
-        For each (J,) in 1/frame; infinite where an output stands still, and NaN where no frame
+        (J,) cycles a frame for each of them; infinite for a constant output, NaN if no frame
         follows another.
     """
-    phi = np.concatenate([phi for phi, _ in abstractions])
-    offset = np.concatenate([kernels.mean_output(*each) for each in abstractions])
+    phi = np.concatenate([phi for phi, _ in features])
+    phi = np.concatenate([phi for phi, _ in features])
+    offset = np.concatenate([kernels.mean_output(phi, mean) for phi, mean in features])
     count, steps = 0, 0
     total, squares, moved = (np.zeros(len(phi)) for _ in range(3))
     last: FloatArray | None = None
@@ -93,7 +97,7 @@ def following_slowness(
         squares += (y * y).sum(axis=0)
         moved += (change * change).sum(axis=0)
     if not steps:
-        return [np.full(len(phi), np.nan) for phi, _ in abstractions]
+        return [np.full(len(phi), np.nan) for phi, _ in features]
     variance = squares / count - (total / count) ** 2
-    slow = [slowness_by_moments(*one) for one in zip(moved / steps, variance, strict=True)]
-    return np.split(np.array(slow), np.cumsum([len(phi) for phi, _ in abstractions[:-1]]))
+    slow = [slowness_by_moments(d, v) for d, v in zip(moved / steps, variance, strict=True)]
+    return np.split(np.array(slow), np.cumsum([len(phi) for phi, _ in features[:-1]]))

@@ -85,7 +85,7 @@ def refuse_existing(folder: Path, *, force: bool, goes_on: bool = True) -> None:
     refuse_file(folder)
     refuse_named_as_file(folder)
     if folder.exists() and not force and any(folder.iterdir()):
-        other = ", go on with --resume" if goes_on else ""
+        other = ", continue with --resume" if goes_on else ""
         raise UsageError(f"{folder} exists: choose another folder{other} or overwrite with --force")
 
 

@@ -61,7 +61,7 @@ class Work:
 
 def not_begun(ran: Ran) -> bool:
     """Return whether a command refused to resume because nothing of use is there yet."""
-    return ran.code == 2 and ("no run to resume" in ran.err or "fork again with --f" in ran.err)
+    return ran.code == 2 and ("to resume: start" in ran.err or "fork again with --f" in ran.err)
 
 
 def _files(place: Path) -> dict[str, str]:

@@ -80,7 +80,7 @@ def _print_info(info: LogReport) -> None:
 
 def _print_run(info: LogReport, run: Mapping[str, Any]) -> None:
     """Print what a run learned, with which learner, and why it ended."""
-    from cdmisfa.experiments.loop import ENDINGS
+    from cdmisfa.experiments.loop import END_REASONS
 
     streams = run["streams"]
     more = len(streams) - MOST_STREAMS
@@ -98,7 +98,7 @@ def _print_run(info: LogReport, run: Mapping[str, Any]) -> None:
             f"not ended: {done} so far; it learns, or was stopped before its modules were kept"
         )
     else:
-        printing.line(f"ended after {done}: {ENDINGS.get(info.ended, info.ended)}")
+        printing.line(f"ended after {done}: {END_REASONS.get(info.ended, info.ended)}")
 
 
 def _length(info: LogReport, start: int, end: int) -> str:

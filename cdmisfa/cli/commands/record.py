@@ -245,7 +245,9 @@ def _writing(output: Path, title: str, **notice: str) -> Iterator[tuple[Bar, Sto
         try:
             yield shown, stop
         except (RecordingStoppedError, KeyboardInterrupt):
-            printing.status(f"cdmisfa: interrupted: {output} is not finished: go on with --resume")
+            printing.status(
+                f"cdmisfa: interrupted: {output} is not finished: continue with --resume"
+            )
             raise SystemExit(stop.exit_code) from None
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.experiments.results import logistic_midpoint, mean_interval
-from cdmisfa.experiments.trial import Swap, run_trial
+from cdmisfa.experiments.trial import Swap, run_oscillatory_trial
 from cdmisfa.studies.paper import figures
 from cdmisfa.studies.paper.experiment import (
     Experiment,
@@ -114,7 +114,7 @@ class NonStationary(Experiment):
         """Show zero, x2, x3; the first becomes x1 when epsilon falls below epsilon^c."""
         keys = {settings["key"]: settings["value"]}
         decays = dict.fromkeys(("epsilon_decay", "epsilon_tail_decay"), DECAY)
-        result = run_trial(
+        result = run_oscillatory_trial(
             paper_config("oscillatory", **keys, **decays, patience=1),
             ("zero", "x2", "x3"),
             seed=settings["seed"],

@@ -11,7 +11,7 @@ import numpy as np
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.experiments.results import summary
-from cdmisfa.experiments.trial import run_trial
+from cdmisfa.experiments.trial import run_oscillatory_trial
 from cdmisfa.kernels import instantaneous_slowness
 from cdmisfa.modules import Module
 from cdmisfa.studies.paper import figures
@@ -81,7 +81,7 @@ class Oscillatory(Experiment):
     def run(self, settings: Settings) -> Output:
         """Learn until three modules are saved."""
         config = paper_config("oscillatory")
-        result = run_trial(
+        result = run_oscillatory_trial(
             config, seed=settings["seed"], max_iterations=MAX_ITERATIONS, curves=True
         )
         curves: Any = result.curves
@@ -148,7 +148,9 @@ class FiveStreams(Experiment):
     def run(self, settings: Settings) -> Output:
         """Learn until nothing is left."""
         config, seed = paper_config("oscillatory"), settings["seed"]
-        result = run_trial(config, self.streams, seed=seed, max_iterations=MAX_ITERATIONS)
+        result = run_oscillatory_trial(
+            config, self.streams, seed=seed, max_iterations=MAX_ITERATIONS
+        )
         return module_row(result.modules), {}
 
     def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
@@ -180,7 +182,7 @@ class Stability(Experiment):
         """Let epsilon fall to 0.8 and then be 0; count the changes of the policy from there on."""
         keys = {"algorithm": settings["algorithm"], "epsilon_decay": 0.998}
         config = paper_config("oscillatory", **keys, epsilon_tail_decay=0.0, **NEVER)
-        result = run_trial(
+        result = run_oscillatory_trial(
             config, seed=settings["seed"], max_iterations=ITERATIONS, max_modules=1, curves=True
         )
         curves: Any = result.curves

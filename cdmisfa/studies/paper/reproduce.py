@@ -25,7 +25,7 @@ from cdmisfa.core.errors import (
     did_you_mean,
 )
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
-from cdmisfa.experiments.store import code, make_trial, read_rows, run_trials
+from cdmisfa.experiments.store import code, make_trial, read_trial_rows, run_trials
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Settings, Trial
 from cdmisfa.studies.paper.icub import Icub, make_recording
 from cdmisfa.studies.paper.nonstationary import NonStationary
@@ -105,7 +105,7 @@ def reproduce(
     )
     for row in report.failed:
         raise CdmisfaError(f"{name} trial {row['point']}: {row['error']}; the others are kept")
-    rows = {row["id"]: row for row in read_rows(folder)}
+    rows = {row["id"]: row for row in read_trial_rows(folder)}
     finished = [_finished(folder, rows[task.id]) for task in tasks]
     findings = Findings()
     experiment.evaluate(finished, findings)
