@@ -23,7 +23,7 @@ from cdmisfa.experiments.session import run
 from recorder.cameras.live import LiveSource
 from recorder.cameras.words import open_live
 from recorder.images.options import InputOptions
-from recorder.live import RecordedWhileWatched
+from recorder.live import LiveRecorder
 
 STREAMS = 4
 FPS = 30.0
@@ -81,7 +81,7 @@ def watch(folder: Path, seconds: float, streams: int = STREAMS) -> list[object]:
         assert isinstance(source, LiveSource)
         cpu, wall = time.process_time(), time.perf_counter()
         end = wall + seconds
-        with RecordedWhileWatched(source, folder) as live:
+        with LiveRecorder(source, folder) as live:
             run(live, ProgressConfig(), stop=lambda: time.perf_counter() > end)
             counts = source.alignment
         wall = time.perf_counter() - wall

@@ -1,6 +1,6 @@
-"""Configuration of every scene and every recording (keys `scene.*` and `record.*`), and --split.
+"""Configuration that all scenes and recordings share (`scene.*`, `record.*`), and `--split`.
 
-`world` and `log` import it. Keys of one scene alone are in the module of that scene.
+Keys of one scene only are in the module of that scene.
 """
 
 from __future__ import annotations
@@ -51,24 +51,24 @@ class RecordConfig(Section):
 
 
 def parse_split(text: str) -> float:
-    """Return the seconds of a part of a recording, from a duration as "10min".
+    """Return the length of a part of a recording in seconds, from a duration such as "10min".
 
     Raises:
-        UsageError: it is no duration.
+        UsageError: the text is not a duration.
     """
     duration = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?) ?(s|min|h)", text.strip())
     if duration is None or not float(duration[1]):
-        raise UsageError(f"--split is {text!r}: give a duration as 90s, 10min or 1h")
+        raise UsageError(f"--split is {text!r}: give a duration such as 90s, 10min or 1h")
     return float(duration[1]) * {"s": 1, "min": 60, "h": 3600}[duration[2]]
 
 
 def check_view_names(names: tuple[str, ...], key: str) -> None:
-    """Refuse names of views that are equal, or cannot be names of files.
+    """Check that names of views are distinct and can be file names.
 
     Raises:
-        UsageError: at the first such name.
+        UsageError: they are not.
     """
     plain = all(name.isidentifier() and name.isascii() and len(name) <= 64 for name in names)
     if not names or not plain or len(set(names)) != len(names):
-        given = ", ".join(map(repr, names))
-        raise UsageError(f"{key} is {given}: name each view once, by letters, digits and _")
+        actual = ", ".join(map(repr, names))
+        raise UsageError(f"{key} is {actual}: name each view once, in letters, digits and _")

@@ -1,4 +1,4 @@
-"""Record a source while it is learned from."""
+"""Record a source while a learner learns from it."""
 
 from __future__ import annotations
 
@@ -11,36 +11,37 @@ from typing import Any, Final, Self
 from cdmisfa.core.blocks import Block, ForwardSource, FrameSource, check_request
 from cdmisfa.core.errors import LogExhaustedError
 from recorder.config import RecordConfig
-from recorder.log.files import folder_here, prepared_folder, refuse_existing
+from recorder.log.files import local_folder, prepared_folder, refuse_existing
 from recorder.log.resume import begin_view, other_recordings
 from recorder.recording import ViewLogs, ViewRecording, recording_spec
 from recorder.world.scenes import BLOCK
 
-# Name of the metadata record that counts used and dropped images of a live stream.
+# Name of the metadata record with the numbers of used and dropped images of a live stream.
 COUNTS: Final = "cdmisfa.live"
 
 
-class RecordedWhileWatched(ForwardSource):
-    """Record every stream of a source, whichever is watched.
+class LiveRecorder(ForwardSource):
+    """Source that records every stream of another source, whichever the learner attends to.
 
-    The recording gives the blocks of `take` again, to the bit: `learn` from both gives the same
-    signals. Used as a context: leaving it finishes the files, also when the source has ended or
-    learning was stopped; an error leaves readable `.partial` files.
+    The recording gives the blocks of `take` again, bit for bit: `learn` from both gives the same
+    signals. Use it as a context manager: leaving the context finishes the files, also if the source
+    has ended or learning was stopped; an error leaves readable `.partial` files.
 
     Args:
-        source: at its first frame, such as cameras that cannot go back; closed with this.
-        folder: of the recording; made if it does not exist.
-        settings: how the files are written; the clock is the source's.
-        split: seconds of the parts that every view is written as.
-        force: overwrite an earlier recording in the folder.
+        source: a source at its first frame, such as cameras that cannot go back; it is closed
+            together with this object.
+        folder: folder of the recording; it is created if missing.
+        settings: settings of the files; the clock is that of the source.
+        split: length of the parts of every view (s); None: one file.
+        force: True to overwrite an earlier recording in the folder.
 
     Attributes:
-        files: of the recording, once it is finished.
-        ended: why the source ended, where it did.
+        files: files of the recording after it is finished.
+        ended: the message with which the source ended, or "".
 
     Raises:
-        UsageError: the folder exists, or no recording can hold what the source shows.
-        LogWriteError: the disk does not take it.
+        UsageError: the folder exists, or a recording cannot hold the source.
+        LogWriteError: a file cannot be written.
     """
 
     def __init__(
@@ -55,9 +56,9 @@ class RecordedWhileWatched(ForwardSource):
         self.files: list[ViewRecording] = []
         self.ended = ""
         self._source, self._spec, self._t = source, source.spec, source.t
-        self.folder = folder_here(folder)
+        self.folder = local_folder(folder)
         self.gaps = bool(getattr(source, "gaps", False))
-        refuse_existing(self.folder, force=force, goes_on=False)
+        refuse_existing(self.folder, force=force, resumable=False)
         settings = settings or RecordConfig()
         recording = recording_spec(source, settings, None)
         views = recording.spec.streams
@@ -71,12 +72,12 @@ class RecordedWhileWatched(ForwardSource):
 
     @property
     def alignment(self) -> Mapping[str, Mapping[str, int]]:
-        """See `LiveSource`; empty of sources that count nothing."""
+        """See `LiveSource`; empty for sources that do not count images."""
         return getattr(self._source, "alignment", {})
 
     @property
     def stop(self) -> Callable[[], bool]:
-        """Function that the source calls while it waits; true ends the wait."""
+        """Function that the source calls while it waits; True ends the wait."""
         return getattr(self._source, "stop", lambda: False)
 
     @stop.setter
@@ -85,7 +86,7 @@ class RecordedWhileWatched(ForwardSource):
             self._source.stop = stop
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """See `FrameSource`; recorded before it is given."""
+        """Record the next frames, and return them; see `FrameSource`."""
         check_request(self.spec, 0, n)
         try:
             blocks = self._source.take_all(n)
@@ -124,27 +125,27 @@ class RecordedWhileWatched(ForwardSource):
             self.close()
 
 
-def record_watched(
-    recorded: RecordedWhileWatched,
+def record_live(
+    recorder: LiveRecorder,
     *,
     frames: int | None = None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float], None] = lambda done: None,
 ) -> None:
-    """Record until the source ends, or is stopped; then finish the recording.
+    """Record until the source ends or is stopped; then finish the recording.
 
     Args:
-        recorded: entered, and finished, here.
-        frames: number of frames; by default all that the source shows.
-        stop: called often; true ends the recording.
+        recorder: the recorder, whose context is entered and left here.
+        frames: number of frames; None: up to the end of the source.
+        stop: called often; True ends the recording.
         progress: called with the number of frames.
 
     Raises:
-        LogWriteError: the disk does not take it.
+        LogWriteError: a file cannot be written.
     """
-    recorded.stop = stop
-    step = 1 if recorded.gaps else BLOCK
-    with recorded, contextlib.suppress(LogExhaustedError):
-        while not stop() and (frames is None or recorded.t < frames):
-            recorded.take_all(step if frames is None else min(step, frames - recorded.t))
-            progress(recorded.t)
+    recorder.stop = stop
+    step = 1 if recorder.gaps else BLOCK
+    with recorder, contextlib.suppress(LogExhaustedError):
+        while not stop() and (frames is None or recorder.t < frames):
+            recorder.take_all(step if frames is None else min(step, frames - recorder.t))
+            progress(recorder.t)

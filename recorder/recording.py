@@ -1,4 +1,4 @@
-"""Record a source: every view at every frame, one MCAP file for each view."""
+"""Record a source: every frame of every view, in one MCAP file for each view."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.log.files import folder_here, holds_recording, prepared_folder, refuse_existing
+from recorder.log.files import holds_recording, local_folder, prepared_folder, refuse_existing
 from recorder.log.manifest import RecordingSpec, RecordingStart, store_start
 from recorder.log.resume import (
     ViewResume,
@@ -39,20 +39,20 @@ from recorder.world.scenes import (
 
 _FILE_NAME = re.compile(r"[\w-][\w.-]*")
 
-# Frames of each view if the source does not end and no number is given.
+# Number of frames of each view if the source is endless and no number is given.
 DEFAULT_FRAMES: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class ViewRecording:
-    """One finished file of a recording.
+    """A finished file of a recording.
 
     Attributes:
-        name: of the view.
-        file: the file's path.
-        frames: how many it holds.
-        bytes: its size.
-        sha256: its checksum.
+        name: name of the view.
+        file: path of the file.
+        frames: number of frames.
+        bytes: size of the file.
+        sha256: SHA-256 of the file.
     """
 
     name: str
@@ -62,12 +62,12 @@ class ViewRecording:
     sha256: str
 
     def as_json(self) -> dict[str, Any]:
-        """Return the file as plain JSON values."""
+        """Return the attributes as JSON values."""
         return {**dataclasses.asdict(self), "file": str(self.file)}
 
 
 class RecordingStoppedError(CdmisfaError):
-    """A recording was asked to stop; its `.partial` files are readable and can be resumed."""
+    """Request to stop a recording; its `.partial` files are readable and can be resumed."""
 
     exit_code = 130
 
@@ -88,44 +88,44 @@ def record(
 ) -> list[ViewRecording]:
     """Record the first frames of a source into a folder.
 
-    The files depend on what the source shows and states of itself only: not on `jobs`, not on
-    which views are recorded, not on having been interrupted and resumed. Errors, and exceptions
+    The bytes of the files depend only on the frames and the description of the source: not on
+    `jobs`, on the selection of views, or on interruptions that were resumed. Errors, and exceptions
     that signal handlers raise, leave readable `.partial` files.
 
     Args:
-        source: anything with frames, also one that cannot go back; left open.
-        folder: made if it does not exist.
-        frames: how many, of each view; by default all of the source, or `DEFAULT_FRAMES` where it
-            does not end, and where a recording is resumed as many as it was begun with.
-        views: which views; by default all.
-        settings: how the files are written; the clock is the source's.
-        split: seconds of the parts that every view is written as; by default one file, or where
-            a recording is resumed as it was started.
-        jobs: processes that render; only a scene can be opened in more than one.
-        force: overwrite an earlier recording in the folder.
-        resume: continue where an earlier attempt with the same arguments ended.
-        stop: asked after every block; true ends the recording with an error.
+        source: a source of frames, also one that cannot go back; it stays open.
+        folder: folder of the recording; it is created if missing.
+        frames: number of frames of each view; None: all of the source, or `DEFAULT_FRAMES` if it is
+            endless, or for `resume` as many as at the start.
+        views: names of the views; None: all.
+        settings: settings of the files; the clock is that of the source.
+        split: length of the parts of each view (s); None: one file, or for `resume` as at the
+            start.
+        jobs: number of processes that render; only a scene can use more than one.
+        force: True to overwrite an earlier recording in the folder.
+        resume: True to continue an earlier attempt with the same arguments.
+        stop: called after every block; True ends the recording with an error.
         progress: called after every block with the number of frames written of every view.
 
     Raises:
-        UsageError: the folder exists, or an argument is wrong.
-        LogWriteError: the disk does not take it.
+        UsageError: the folder exists, or an argument is not valid.
+        LogWriteError: a file cannot be written.
         LogExhaustedError: the source has fewer frames.
         LogDamagedError: the source was replaced while it was read.
-        RecordingStoppedError: it was stopped.
+        RecordingStoppedError: `stop` returned True.
     """
     scene = scene_of(source)
     settings = settings or (RecordConfig() if scene is None else scene.record)
-    folder = folder_here(folder)
+    folder = local_folder(folder)
     length = source.spec.length
     if frames is not None and not 1 <= frames <= (length or frames):
-        most = "" if length is None else f", and no more than the {length} that there are"
-        raise UsageError(f"--frames is {frames}: record at least one{most}")
+        limit = "" if length is None else f", and at most the {length} of the source"
+        raise UsageError(f"--frames is {frames}: record at least one{limit}")
     if not resume:
         refuse_existing(folder, force=force)
     elif force or not holds_recording(folder):
         raise UsageError(
-            f"{folder} holds no recording to go on with, or --force is given: choose another "
+            f"{folder} has no recording to resume, or --force is given: choose another "
             "folder, or leave out --force or --resume"
         )
     recording = recording_spec(source, settings, scene)
@@ -157,21 +157,21 @@ def record(
                 if stop() and done < frames:
                     raise RecordingStoppedError(f"{folder} is not finished: continue with --resume")
         if starts:
-            source.describe()  # an error where it was replaced while it was read
+            source.describe()  # raises an error if the source was replaced while it was read
         return logs.finish()
 
 
 class ViewLogs:
-    """Write the logs of a recording.
+    """The logs of a recording while they are written.
 
     Args:
-        folder: of the recording, made and held.
-        recording: what is recorded.
-        settings: how the files are written.
-        places: where each view is begun or resumed.
-        frames: number of frames that each view shall have.
-        split: seconds of a part.
-        poses: of the head in each of the recording's views, where there is a head.
+        folder: folder of the recording, created and locked.
+        recording: specification of the recording.
+        settings: settings of the files.
+        places: file and frame at which each view begins or is resumed.
+        frames: number of frames that each view will have.
+        split: length of a part (s); None: one file.
+        poses: pose of the head in each view of the source; empty without a head.
     """
 
     def __init__(
@@ -209,16 +209,16 @@ class ViewLogs:
             raise
 
     def starts(self) -> dict[int, int]:
-        """Return the next frame of each stream that is written."""
+        """Return the next frame of each stream that is being written."""
         return {stream: log.t for stream, log in self._logs.items()}
 
     def write(self, block: Block) -> None:
-        """Write a block; one that contradicts its source would spoil the file and is refused."""
+        """Write a block; raise an error if it contradicts the specification of its source."""
         shape, dtype, spec = block.frames.shape[1:], block.frames.dtype, self._recording.spec
         if shape != spec.frame_shape or dtype != spec.dtype:
             raise CdmisfaError(
-                f"{spec.streams[block.stream]} shows {shape} {dtype} at frame {block.t}, not the "
-                f"{spec.frame_shape} {spec.dtype} that its source states: mend the source"
+                f"frame {block.t} of {spec.streams[block.stream]} is {shape} {dtype}, but its "
+                f"source states {spec.frame_shape} {spec.dtype}: correct the source"
             )
         self._logs[block.stream].write(block)
 
@@ -227,7 +227,7 @@ class ViewLogs:
         self._logs[stream].add_metadata(name, values)
 
     def finish(self) -> list[ViewRecording]:
-        """Finish the files, and return those of all views."""
+        """Finish the files, and return the files of all views."""
         for log in self._logs.values():
             log.finish()
         store_start(self._folder, list(self._parts))
@@ -236,7 +236,7 @@ class ViewLogs:
         ]
 
     def abandon(self) -> None:
-        """Leave the files as they are, readable; nothing where they are finished."""
+        """Close unfinished files as readable partial files."""
         for log in self._logs.values():
             log.abandon()
 
@@ -248,14 +248,14 @@ def record_scene(
     settings: RecordConfig | None = None,
     **options: Any,
 ) -> list[ViewRecording]:
-    """Open a scene by its name, `record` it and close it.
+    """Open a scene by name, record it, and close it.
 
     Args:
-        name: one of `SCENES`.
-        folder: of the recording.
-        config: of the scene; by default the preset's, with seed 0.
-        settings: the clock and the files.
-        options: those of `record`.
+        name: name of the scene, one of `SCENES`.
+        folder: folder of the recording.
+        config: configuration of the scene; None: the preset's, with seed 0.
+        settings: settings of the clock and the files.
+        options: further arguments of `record`.
 
     Raises:
         CdmisfaError: the scene cannot be opened, or as for `record`.
@@ -268,13 +268,13 @@ def recorded(folder: Path) -> list[ViewRecording]:
     """Return the files of a complete recording; nothing for an incomplete one.
 
     Raises:
-        LogDamagedError: the disk does not give a file.
+        LogDamagedError: the disk cannot read a file.
     """
     return [view_recording(*log) for log in finished_logs(folder)]
 
 
 def view_recording(view: str, path: Path, frames: int) -> ViewRecording:
-    """Return a finished file of a view with its size and checksum, which reads all of it."""
+    """Return a finished file with its size and checksum; this reads all of it."""
     with path.open("rb") as file:
         checksum = hashlib.file_digest(file, "sha256").hexdigest()
     return ViewRecording(view, path, frames, path.stat().st_size, checksum)
@@ -283,25 +283,25 @@ def view_recording(view: str, path: Path, frames: int) -> ViewRecording:
 def recording_spec(
     source: FrameSource, settings: RecordConfig, scene: OpenScene | None
 ) -> RecordingSpec:
-    """Return what is recorded of a source.
+    """Return the specification of the recording of a source.
 
     Raises:
-        UsageError: no recording can hold it.
+        UsageError: a recording cannot hold the source.
     """
     spec = source.spec
     for name in spec.streams:
         if not _FILE_NAME.fullmatch(name) or spec.streams.count(name) > 1:
-            raise UsageError(f"a view cannot be called {name!r}: give different names of files")
+            raise UsageError(f"a view cannot be called {name!r}: use distinct file names")
     if not spec.images and (spec.dtype, len(spec.frame_shape)) != ("float64", 1):
         raise UsageError(
-            f"a recording holds gray images, (height, width) uint8, or vectors, (n,) float64, not "
-            f"{spec.frame_shape} {spec.dtype}"
+            f"frames of the source are {spec.frame_shape} {spec.dtype}: a recording holds gray "
+            "images, (height, width) uint8, or vectors, (n,) float64"
         )
     slowest, fastest = RECORDED_FPS
     if not slowest <= spec.fps <= fastest:
         raise UsageError(
-            f"a recording has {slowest:g} to {fastest:.0f} frames a second, not {spec.fps:g}: give "
-            "its source such an fps; logs are read at another rate with --align time --rate"
+            f"the source has {spec.fps:g} frames a second: a recording has {slowest:g} to "
+            f"{fastest:.0f}; set another fps, or read a log with --align time --rate"
         )
     if scene is None:
         stated = description(source)

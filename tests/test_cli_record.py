@@ -77,7 +77,7 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
     for wrong, what in (
         (("--seed", 8), "its seed is '7', now it is '8'"),
         (("--split", "4s"), "begun with --split 5s, not --split 4s"),
-        (("icub",), "is of another recording"),
+        (("icub",), "belongs to another recording"),
     ):
         if wrong == ("icub",):
             pytest.importorskip("pybullet")

@@ -43,8 +43,8 @@ CASES: dict[str, tuple[str, ...]] = {
         "was made with learner.algorithm = 2.0, not progress",
     ),
     # what is written has the name of its kind
-    "view RUN --save x.mp4": ("x.mp4: the view is a file of Rerun, name it x.rrd",),
-    "export REC --to images -o z.csv": ("z.csv: a folder is written, name it without .csv",),
+    "view RUN --save x.mp4": ("x.mp4: the view is a file of Rerun: name it x.rrd",),
+    "export REC --to images -o z.csv": ("z.csv: the output is a folder: name it without .csv",),
     # a file of another kind is a wrong word and no damage
     **{f"{command} numbers.h5": (NO_MCAP,) for command in ("info", "verify", "check")},
     "view --save out.rrd numbers.h5": (NO_MCAP,),

@@ -122,5 +122,5 @@ def test_a_camera_that_is_unplugged_leaves_readable_partials(tmp_path: Path) -> 
 def test_a_source_that_ends_is_recorded_to_its_end(tmp_path: Path) -> None:
     files = record(Webcams(length=70), tmp_path / "rec")
     assert [file.frames for file in files] == [70, 70]
-    with pytest.raises(UsageError, match=r"--frames is 71: .*no more than the 70"):
+    with pytest.raises(UsageError, match=r"--frames is 71: .*at most the 70"):
         record(Webcams(length=70), tmp_path / "other", frames=71)

@@ -23,7 +23,7 @@ from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from recorder.cameras.live import LiveSource, Steady
 from recorder.cameras.readers import Readers
-from recorder.live import COUNTS, RecordedWhileWatched, record_watched
+from recorder.live import COUNTS, LiveRecorder, record_live
 from replay.integrity.info import describe
 from replay.integrity.verify import check_log
 from replay.open_sources import open_recording
@@ -180,7 +180,7 @@ def learned(source: FrameSource, config: Any) -> RunResult:
 def test_what_is_learned_live_is_learned_again_from_the_recording(
     tmp_path: Path, config: Any, split: float | None
 ) -> None:
-    with RecordedWhileWatched(opened(rough(), 3), tmp_path / "rec", split=split) as live:
+    with LiveRecorder(opened(rough(), 3), tmp_path / "rec", split=split) as live:
         first = learned(live, config)
     counts = live.alignment
     for name in ("repeated", "dropped", "missing", "late", "disordered"):
@@ -206,7 +206,7 @@ def test_a_live_run_that_ends_within_a_block_is_checked_by_its_recording(
     tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
     script = [*steady(0, 0, 100), *steady(0, 5, 30)]  # a gap, and less than a block behind it
-    with RecordedWhileWatched(opened(script), tmp_path / "rec") as live:
+    with LiveRecorder(opened(script), tmp_path / "rec") as live:
         run(live, ProgressConfig(tau=40, components=3, outputs=1), tmp_path / "run", rerun=False)
     assert live.t > 100
     checked = cdmisfa("check", tmp_path / "run", "--source", tmp_path / "rec")
@@ -298,7 +298,7 @@ def test_a_full_queue_is_emptied_and_says_so() -> None:
 
 def test_a_recording_with_gaps_is_shown_with_its_gaps(tmp_path: Path) -> None:
     source = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
-    record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
+    record_live(LiveRecorder(source, tmp_path / "rec"), frames=90)
     assert check_log(tmp_path / "rec").ok
     with open_recording(tmp_path / "rec", loop=True) as looped:
         looped.seek(85)

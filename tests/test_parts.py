@@ -84,6 +84,6 @@ def test_a_lost_part_is_not_written_over(parts: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(parts, tmp_path / "rec"))
     (folder / "x2-001.mcap").unlink()
     before = contents(folder)
-    with pytest.raises(UsageError, match=r"x2-002\.mcap is there, but not frame 150 of x2"):
+    with pytest.raises(UsageError, match=r"x2-002\.mcap exists, but frame 150 of x2"):
         record_scene("oscillatory", folder, frames=FRAMES, split=SPLIT, resume=True)
     assert contents(folder) == before

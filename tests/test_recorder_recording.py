@@ -18,7 +18,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.config import RecordConfig
 from recorder.log.files import RECORDING, partial_path
 from recorder.log.manifest import RecordingStart, read_start, store_start
-from recorder.log.resume import frames_held
+from recorder.log.resume import stored_frames
 from recorder.recording import RecordingStoppedError, record_scene
 from recorder.world.icub.config import IcubConfig
 from recorder.world.scenes import SCENES, open_scene
@@ -32,7 +32,7 @@ def sha256(path: Path) -> str:
 
 
 def whole_frames(path: Path, view: str) -> int:
-    return frames_held(path, view).stop_from(0)
+    return stored_frames(path, view).stop_from(0)
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +231,7 @@ def test_an_error_of_the_disk_while_resuming_costs_no_frame(tmp_path, monkeypatc
 def test_a_finished_recording_is_made_longer_and_never_shorter(oscillatory, tmp_path):
     record_scene("oscillatory", tmp_path / "a", frames=130)
     before = contents(tmp_path / "a")
-    with pytest.raises(UsageError, match="holds 130 frames, more than --frames 20"):
+    with pytest.raises(UsageError, match="has 130 frames, more than --frames 20"):
         record_scene("oscillatory", tmp_path / "a", frames=20, resume=True)
     assert contents(tmp_path / "a") == before
     record_scene("oscillatory", tmp_path / "a", frames=3000, resume=True)
@@ -243,8 +243,8 @@ def test_a_finished_recording_is_made_longer_and_never_shorter(oscillatory, tmp_
     [
         ({"views": ["left"]}, "no view 'left': name one of x1, x2, x3"),
         ({"force": True, "resume": True}, "leave out --force"),
-        ({"settings": RecordConfig(fps=25)}, r"x3\.mcap cannot be continued: its fps is '50\.0'"),
-        ({}, r"x2\.mcap is there, but not frame 0 of x2"),
+        ({"settings": RecordConfig(fps=25)}, r"x3\.mcap cannot be resumed: its fps is '50\.0'"),
+        ({}, r"x2\.mcap exists, but frame 0 of x2"),
     ],
 )
 def test_what_cannot_be_resumed_is_named_and_nothing_changes(tmp_path, options, words):

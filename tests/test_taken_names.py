@@ -58,7 +58,7 @@ def test_force_replaces_files_only(
     places = {"RUN": str(made["run"]), "REC": str(made["rec"]), "OUT": str(tmp_path / "OUT")}
     for name, place in places.items():
         words = words.replace(name, place)
-    assert_one_line(cdmisfa(*words.split(), "--force"), 2, "is no file but a device")
+    assert_one_line(cdmisfa(*words.split(), "--force"), 2, "is a device, pipe or socket")
     assert looks(tmp_path / out) == before
     assert os.listdir(tmp_path) == [out]
 
@@ -86,8 +86,8 @@ def test_a_run_and_a_recording_do_not_share_a_folder(
     assert_one_line(cdmisfa(*learn, "--force"), 2, "x1.mcap does not belong to a run")
     record = ("record", "oscillatory", "--frames", 20, "-o")
     for word in ("--force", "--resume"):
-        assert_one_line(cdmisfa(*record, made["run"], word), 2, "run.mcap is of no recording")
+        assert_one_line(cdmisfa(*record, made["run"], word), 2, "run.mcap does not belong to a recording")
     assert (names(made["rec"]), names(made["run"])) == before
     (tmp_path / "letter.txt").write_text("mine")
-    assert_one_line(cdmisfa(*record, tmp_path, "--resume"), 2, "holds no recording to go on with")
+    assert_one_line(cdmisfa(*record, tmp_path, "--resume"), 2, "has no recording to resume")
     assert names(tmp_path) == {"letter.txt"}

@@ -31,11 +31,11 @@ from cdmisfa.experiments.store import (
 from cdmisfa.modules import Module
 from recorder.images.options import InputOptions
 from recorder.log.files import (
-    found_path,
-    held,
+    locked_folder,
     make_folder,
     refuse_existing,
     relative_path,
+    resolved_path,
     to_disk,
 )
 from replay.corpus.index import IndexedLog, index_logs, indexed_logs, is_index
@@ -126,11 +126,11 @@ def apply_to_logs(
     request = {"schema": 1, "modules": application.identity, "options": chosen}
     folder, parts = out / STORE, out / STORE / "parts"
     if not folder.exists():
-        refuse_existing(out, force=force, goes_on=False)
+        refuse_existing(out, force=force, resumable=False)
     with contextlib.ExitStack() as stack:
         with writing(out):
             make_folder(folder)
-        stack.enter_context(held(out))
+        stack.enter_context(locked_folder(out))
         stack.callback(shutil.rmtree, parts, ignore_errors=True)
         shutil.rmtree(parts, ignore_errors=True)  # partial files of a killed process
         make_folder(parts)
@@ -234,7 +234,7 @@ def _earlier_root(folder: Path, request: Mapping[str, Any], *, force: bool) -> s
             f"{folder.parent} holds outputs of other {different[0]}: choose another folder, or "
             f"{remedy}"
         )
-    return found_path(earlier["root"], folder)
+    return resolved_path(earlier["root"], folder)
 
 
 def _common_root(words: Sequence[str], out: Path) -> str:

@@ -24,14 +24,14 @@ from recorder.images.framing import Recipe
 from recorder.images.options import OF_EVERY_SOURCE, InputOptions
 from recorder.images.options import OPTIONS as INPUTS
 from recorder.log.files import (
-    found_path,
-    held,
+    locked_folder,
     logs_in,
     make_folder,
     partial_path,
     refuse_existing,
     refuse_special,
     relative_path,
+    resolved_path,
 )
 from recorder.world.scenes import SCENES, open_scene
 from replay.runs.folders import MODULES_FILE, REPORT_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
@@ -94,8 +94,8 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
         if name in OPTIONS
     }
     if str(options.get("preset")).endswith(".toml"):
-        options["preset"] = found_path(str(options["preset"]), run)
-    return tuple(found_path(str(word), run) for word in command["source"]), options
+        options["preset"] = resolved_path(str(options["preset"]), run)
+    return tuple(resolved_path(str(word), run) for word in command["source"]), options
 
 
 def command_again(run: Path) -> str:
@@ -265,10 +265,10 @@ def opened_log(
     """
     if not resumed:
         resumable = FORK not in manifest and isinstance(source, SeekableSource)
-        refuse_existing(folder, force=force, goes_on=resumable)
+        refuse_existing(folder, force=force, resumable=resumable)
         with writing(folder):
             make_folder(folder)
-    with held(folder):
+    with locked_folder(folder):
         finished = folder / RUN_FILE
         logs = [folder / SET_ASIDE, finished, partial_path(finished)]
         if foreign := [path for path in logs_in(folder) if path not in logs]:

@@ -36,7 +36,7 @@ from cdmisfa.experiments.run_folder import (
     with_recipes,
     write_results,
 )
-from recorder.log.files import folder_here, partial_path
+from recorder.log.files import local_folder, partial_path
 from recorder.mcap.reader import LogReader
 from replay.runs.compare import differences
 from replay.runs.folders import RUN_FILE, run_log
@@ -100,7 +100,7 @@ class Session:
         """
         self.source = source
         self.learner: Learner = open_learner(config, source.spec, seed)
-        self.folder = None if folder is None else folder_here(folder)
+        self.folder = None if folder is None else local_folder(folder)
         self.before: Path | None = None
         self.keyframe: Keyframe | None = None
         self._limits = {"max_iterations": max_iterations, "max_modules": max_modules}
@@ -191,7 +191,7 @@ class Session:
             UsageError: the run, the iteration or the source does not exist, or a setting cannot
                 change.
         """
-        log, folder = run_log(Path(parent)), folder_here(folder)
+        log, folder = run_log(Path(parent)), local_folder(folder)
         if os.path.realpath(log.parent) == os.path.realpath(folder):
             raise UsageError(f"{folder} is the folder of the run itself: choose another one")
         with Recomputation.after(log, at, source) as parent_run:

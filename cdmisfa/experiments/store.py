@@ -22,7 +22,13 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import run_all
 from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, parse_json
 from cdmisfa.experiments.documents import writing
-from recorder.log.files import held, make_folder, refuse_named_as_file, refuse_special, to_disk
+from recorder.log.files import (
+    locked_folder,
+    make_folder,
+    refuse_named_as_file,
+    refuse_special,
+    to_disk,
+)
 
 # Name of the file with the rows.
 ROWS = "rows.jsonl"
@@ -167,7 +173,7 @@ def run_trials(
     with contextlib.ExitStack() as stack:
         with writing(path):
             make_folder(folder)
-        stack.enter_context(held(folder))
+        stack.enter_context(locked_folder(folder))
         rows, size = _read(path)
         with writing(path):
             # Unbuffered: closing a buffered file would repeat a write that the disk refused.

@@ -1,8 +1,8 @@
-"""Write files that exist as a whole or not at all, and find the files of a recording.
+"""Files that are written completely or not at all, checks of output names, and files of recordings.
 
-A file that is being written has another name until it is complete, so a NAME is always whole. A log
-is called NAME.partial, for it is readable; anything else NAME.<process>.partial, so that two
-processes never write one file. One process at a time holds a folder.
+A file has another name while it is being written, so that a file with its final name is complete.
+A partial log is called NAME.partial, because it can be read; other files NAME.<process>.partial, so
+that two processes never write the same file. Only one process can lock a folder.
 """
 
 from __future__ import annotations
@@ -20,109 +20,111 @@ from typing import Final
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 
-# File that says how a recording was started; gone when every view is finished.
+# File with the arguments of a recording; it is deleted when every view is finished.
 #
-# It is beside the logs, because these hold the same bytes whatever length was wanted first.
+# It is not part of the logs, because their bytes must not depend on the requested length.
 RECORDING: Final = "recording.json"
 
-# Endings of names that are always taken for files, never for folders.
-_OF_FILES = frozenset({".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"})
+# File name endings that are never used for folders.
+_FILE_ENDINGS = frozenset({".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"})
 _LOG = re.compile(r"(?P<name>.+)\.mcap(\.partial(\.kept)?)?")
 _PART = re.compile(r"-\d{3,}$")
 
 
-# Checks of the name of an output; each raises a UsageError
+# Checks of output names; each raises a UsageError
 
 
 def refuse_special(*paths: Path) -> None:
-    """Refuse to replace a device, a pipe, a socket, or a link to one."""
+    """Check that no path is a device, a pipe, a socket, or a link to one."""
     for path in paths:
         if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
-            raise UsageError(f"{path} is no file but a device, pipe or socket: choose another name")
+            raise UsageError(f"{path} is a device, pipe or socket: choose another name")
 
 
 def refuse_file(folder: Path) -> None:
-    """Refuse to make a folder where a file, a device or a pipe is."""
+    """Check that a folder can be created at a path."""
     refuse_special(folder)
     if folder.is_file():
-        raise UsageError(f"{folder} is a file: name a folder, which is made if it is not there")
+        raise UsageError(f"{folder} is a file: name a folder")
 
 
 def refuse_taken(path: Path, *, force: bool) -> None:
-    """Refuse to write a file where something is; with `force`, where that is no file."""
+    """Check that a file can be written: nothing is there or, with `force`, a file."""
     refuse_special(path)
     if path.is_dir() or (path.exists() and not force):
-        what = "is a folder" if path.is_dir() else "exists"
-        raise UsageError(f"{path} {what}: choose another name, or overwrite a file with --force")
+        problem = "is a folder" if path.is_dir() else "exists"
+        raise UsageError(f"{path} {problem}: choose another name, or overwrite it with --force")
 
 
-def refuse_unless(path: Path, what: str, *endings: str) -> None:
-    """Refuse to write a file under the name of another kind.
+def refuse_unless(path: Path, fact: str, *endings: str) -> None:
+    """Check the ending of a file name.
 
     Args:
         path: the file.
-        what: a clause about the file, as "the image is a PNG".
-        endings: allowed endings; the first is recommended.
+        fact: a clause about the file for the error, such as "the image is a PNG".
+        endings: the allowed endings; the first is recommended.
     """
     if path.suffix.lower() not in endings:
-        raise UsageError(f"{path}: {what}, name it {path.stem}{endings[0]}")
+        raise UsageError(f"{path}: {fact}: name it {path.stem}{endings[0]}")
 
 
 def refuse_named_as_file(folder: Path) -> None:
-    """Refuse to make a folder under the name of a file."""
-    if (ending := folder.suffix.lower()) in _OF_FILES:
-        raise UsageError(f"{folder}: a folder is written, name it without {ending}")
+    """Check that a folder is not named like a file."""
+    if (ending := folder.suffix.lower()) in _FILE_ENDINGS:
+        raise UsageError(f"{folder}: the output is a folder: name it without {ending}")
 
 
-def refuse_existing(folder: Path, *, force: bool, goes_on: bool = True) -> None:
-    """Refuse to write a recording or a run where there is something, unless with `force`.
+def refuse_existing(folder: Path, *, force: bool, resumable: bool = True) -> None:
+    """Check that a folder for a recording or a run is empty or, with `force`, is a folder.
 
     Args:
-        folder: of the recording or the run.
-        force: overwrite its content.
-        goes_on: whether --resume could continue its content.
+        folder: folder of the recording or the run.
+        force: True to overwrite its contents.
+        resumable: True if --resume could continue its contents.
     """
     refuse_file(folder)
     refuse_named_as_file(folder)
     if folder.exists() and not force and any(folder.iterdir()):
-        other = ", continue with --resume" if goes_on else ""
-        raise UsageError(f"{folder} exists: choose another folder{other} or overwrite with --force")
+        resume = ", continue with --resume," if resumable else ""
+        raise UsageError(
+            f"{folder} exists: choose another folder{resume} or overwrite with --force"
+        )
 
 
-def folder_here(place: str | Path) -> Path:
-    """Return a folder of this machine by its path; refuse a URL, which would become a folder."""
+def local_folder(place: str | Path) -> Path:
+    """Return the path of a folder on this machine; raise a UsageError for a URL."""
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(place)):
         raise UsageError(f"{place} is a URL: name a path on this machine")
     return Path(place)
 
 
-# Paths within a document
+# Paths in a document
 
 
 def relative_path(word: str, folder: Path) -> str:
-    """Return a path relative to a folder, so that both can move; a URL as it is."""
+    """Return a path relative to a folder, so that both can be moved; a URL unchanged."""
     return word if "://" in word else os.path.join(os.curdir, os.path.relpath(word, folder))
 
 
-def found_path(word: str, folder: Path) -> str:
-    """Resolve a path of `relative_path`; return another word as it is."""
+def resolved_path(word: str, folder: Path) -> str:
+    """Resolve a path from `relative_path`; return another word unchanged."""
     return os.path.normpath(folder / word) if word.startswith(os.curdir) else word
 
 
-# Files that replace others as a whole
+# Files that replace others completely
 
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a path to write a file or a folder at, which takes its own name once it is complete.
+    """Yield a temporary path to write a file or folder at; at the end it gets its final name.
 
-    Its folder is made; a file or folder of that name is replaced. After an error nothing is left.
-    The disk has all of a file before it takes its name, and then the name, so that a power cut
-    leaves this file or the one before.
+    The parent folder is created; a file or folder with that name is replaced. An error leaves
+    nothing behind. All of a file is on the disk before it gets its name, so that a power cut leaves
+    either this file or the previous one.
 
     Raises:
-        UsageError: a device or a pipe has that name, or a file that of its folder.
-        LogWriteError: it cannot be written.
+        UsageError: a device or a pipe has that name, or a file has the name of the parent folder.
+        LogWriteError: the file cannot be written.
     """
     refuse_special(path)
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
@@ -145,32 +147,32 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Remove what processes that were killed have left of a file."""
+    """Remove partial files of processes that were killed."""
     name = re.compile(rf"{re.escape(path.name)}\.(\d+)\.partial")
     for other in path.parent.iterdir():
         if match := name.fullmatch(other.name):
             try:
-                os.kill(int(match[1]), 0)  # signal 0 only asks whether the process lives
+                os.kill(int(match[1]), 0)  # signal 0 only tests whether the process exists
             except (ProcessLookupError, OverflowError):
                 _remove(other)
             except PermissionError:
-                pass  # it lives, and is another user's
+                pass  # the process exists and belongs to another user
 
 
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
-        with contextlib.suppress(FileNotFoundError):  # another process removes it, too
+        with contextlib.suppress(FileNotFoundError):  # another process removes it at the same time
             shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
 
 
 def to_disk(path: Path) -> None:
-    """Sync a file, or the names in a folder, before anything else is done."""
+    """Sync a file, or the names in a folder, to the disk."""
     try:
         handle = os.open(path, os.O_RDONLY)
     except PermissionError:
-        return  # a folder that may be written, but not read
+        return  # a folder that can be written but not read
     try:
         os.fsync(handle)
     except OSError as error:
@@ -181,10 +183,10 @@ def to_disk(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, with its parents, that a power cut cannot take away again.
+    """Create a folder and its parents, and sync them, so that a power cut cannot remove them.
 
     Raises:
-        UsageError: there is a file of that name.
+        UsageError: there is a file with that name.
     """
     paths = (folder, *folder.parents)
     for path in paths:
@@ -196,11 +198,11 @@ def make_folder(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Keep every other process that holds folders out of this one; a kill releases it, too.
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Lock a folder against other processes that use this function; a kill releases the lock.
 
     Raises:
-        UsageError: another process holds it, or there is no such folder.
+        UsageError: another process has locked it, or the folder does not exist.
     """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -211,7 +213,7 @@ def held(folder: Path) -> Iterator[None]:
             f"{folder} is in use by another process: wait for it, or choose another folder"
         ) from error
     except OSError:
-        pass  # a file system without locks: nothing can be held there
+        pass  # this file system has no locks
     try:
         yield
     finally:
@@ -222,7 +224,7 @@ def held(folder: Path) -> Iterator[None]:
 
 
 def partial_path(path: Path) -> Path:
-    """Return the name of a log until it is complete."""
+    """Return the name of a log while it is incomplete."""
     return path.with_name(path.name + ".partial")
 
 
@@ -232,26 +234,26 @@ def aside_path(path: Path) -> Path:
 
 
 def part_name(view: str, number: int | None) -> str:
-    """Return the name of a view's file, or of one of its parts."""
+    """Return the file name of a view, or of one of its parts."""
     return f"{view}.mcap" if number is None else f"{view}-{number:03d}.mcap"
 
 
 def part_number(path: Path, view: str) -> int | None:
-    """Return the number of a view's part by its file's name; None if the view is not split."""
+    """Return the number of a view's part from its file name; None if the view is not split."""
     number = path.name.removeprefix(view).partition(".")[0]
     return int(number[1:]) if number else None
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """List the logs in a folder, finished or not."""
+    """Return the logs in a folder, finished or not."""
     return sorted(p for p in folder.glob("*.mcap*") if _LOG.fullmatch(p.name) and p.is_file())
 
 
 def view_logs(folder: Path, views: Collection[str]) -> dict[str, list[Path]]:
-    """List the files of some views in a folder, finished or not.
+    """Return the files of views in a folder, finished or not.
 
     Raises:
-        UsageError: one is no file but a device or a pipe.
+        UsageError: one of them is a device or a pipe.
     """
     logs: dict[str, list[Path]] = {view: [] for view in views}
     for path in sorted(folder.iterdir()):
@@ -264,7 +266,7 @@ def view_logs(folder: Path, views: Collection[str]) -> dict[str, list[Path]]:
 
 
 def holds_recording(folder: Path) -> bool:
-    """Return whether a folder may hold a recording, or holds nothing yet."""
+    """Return whether a folder has parts of a recording, or is empty."""
     paths = list(folder.iterdir()) if folder.is_dir() else []
     return not paths or any(
         _LOG.fullmatch(path.name) or path.name.startswith(RECORDING) for path in paths
@@ -275,25 +277,27 @@ def holds_recording(folder: Path) -> bool:
 def prepared_folder(
     folder: Path, views: Sequence[str], stale: Sequence[Path] = ()
 ) -> Iterator[None]:
-    """Make and hold a recording's folder, and remove its files of some views.
+    """Create and lock a recording's folder, and remove files of earlier recordings.
 
     Args:
-        folder: of the recording.
-        views: whose files are removed.
-        stale: files of other recordings to be removed, with how they were started.
+        folder: folder of the recording.
+        views: views whose files are removed.
+        stale: files of other recordings that are removed, together with their arguments.
 
     Raises:
-        UsageError: another process holds it, or one of these is no file.
-        LogWriteError: it cannot be made, or they cannot be removed.
+        UsageError: another process has locked the folder, or one of the files is a device.
+        LogWriteError: the folder cannot be created, or a file cannot be removed.
     """
     with contextlib.ExitStack() as stack:
         try:
             make_folder(folder)
-            stack.enter_context(held(folder))
+            stack.enter_context(locked_folder(folder))
             old = {*stale, *itertools.chain(*view_logs(folder, views).values())}
             old |= {folder / RECORDING} if stale else set()
-            for path in sorted(old, reverse=True):  # last parts first: a kill leaves the first ones
+            for path in sorted(old, reverse=True):  # last parts first: a kill leaves a beginning
                 path.unlink(missing_ok=True)
         except OSError as error:
-            raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
+            raise LogWriteError(
+                f"{folder} cannot be written: {error.strerror}: check its rights and free space"
+            ) from error
         yield

@@ -1,8 +1,8 @@
-"""Write an MCAP file that survives what happens to it.
+"""MCAP files that stay readable after a crash.
 
-A `LogFile` is `NAME.partial` until it is finished, so a file called NAME is always
-whole. What was written is readable up to the last flush after any end: an error, a
-signal, kill -9, a full disk; after a power cut up to the last `sync`.
+A `LogFile` is called NAME.partial until it is finished, so that a file called NAME is complete. It
+is readable up to the last flush after an error, a signal, kill -9 or a full disk, and up to the
+last `sync` after a power cut.
 """
 
 from __future__ import annotations
@@ -20,27 +20,29 @@ from recorder.log.files import partial_path, refuse_taken, to_disk
 from recorder.mcap.store import OPEN_FILES
 from recorder.mcap.writer import McapWriter
 
-# Log time after which the chunk in progress is handed to the operating system, by default.
+# Default log time after which the present chunk is passed to the operating system. A shorter time
+# loses less after a kill, and makes more and smaller chunks.
 #
-# A run's log flushes by wall time (`replay/runs/writer.py`).
+# A run's log flushes by wall time instead (`replay/runs/writer.py`).
 FLUSH_NS: Final = 1_000_000_000
 
 
 class AppendOnlyFile:
-    """A binary file that is only appended to and, once a write failed, refuses every later one.
+    """Binary file that only grows, and refuses all writes after one has failed.
 
-    The MCAP writer would continue after a failed write, and the log would have a hole in it.
+    The MCAP writer would continue after a failed write, and leave a hole in the log.
 
-    The first `OPEN_FILES` that are written at the same time stay open, which locks them for other
-    processes; further ones are opened for each write. A recorder of many files holds their folder.
+    The first `OPEN_FILES` files that are written at the same time stay open, which locks them
+    against other processes; further files are opened for each write. A recorder of many files locks
+    their folder instead.
     """
 
     def __init__(self, path: Path) -> None:
-        """Begin an empty file.
+        """Create an empty file.
 
         Raises:
-            UsageError: another process writes it.
-            LogWriteError: it cannot be opened.
+            UsageError: another process is writing the file.
+            LogWriteError: the file cannot be opened.
         """
         self._path, self._size = path, 0
         self._error: LogWriteError | None = None
@@ -51,7 +53,7 @@ class AppendOnlyFile:
             try:
                 self._lock(file)
                 file.seek(0)
-                if os.fstat(file.fileno()).st_size:  # a device, as /dev/full, cannot be truncated
+                if os.fstat(file.fileno()).st_size:  # a device such as /dev/full has no size
                     file.truncate()
             except BaseException:
                 file.close()
@@ -70,28 +72,28 @@ class AppendOnlyFile:
             raise LogWriteError(f"{self._path}: this log is closed, nothing more can be written")
 
     def write(self, data: bytes | memoryview) -> int:
-        """Append all of the bytes."""
+        """Append the bytes, and return their number."""
         with self._opened() as file:
             self._size += file.write(data)
         return len(data)
 
     def tell(self) -> int:
-        """Return the number of bytes that were appended."""
+        """Return the number of appended bytes."""
         return self._size
 
     def flush(self) -> None:
-        """Hand everything to the operating system."""
+        """Pass all written bytes to the operating system."""
         with self._opened() as file:
             file.flush()
 
     def sync(self) -> None:
-        """Let the disk have everything."""
+        """Write all bytes to the disk."""
         with self._opened() as file:
             file.flush()
             os.fsync(file.fileno())
 
     def close(self) -> None:
-        """Close the file; the error of an earlier write is kept, as closing repeats that write."""
+        """Close the file; ignore an error of it, which repeats that of an earlier write."""
         self.closed = True
         _STAY_OPEN.discard(self)
         file, self._file = self._file, None
@@ -101,7 +103,7 @@ class AppendOnlyFile:
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[BinaryIO]:
-        """Yield the file, open; after an error nothing more is written."""
+        """Yield the open file; raise the error of an earlier write."""
         self.check()
         with self._errors():
             if self._file is not None:
@@ -112,7 +114,7 @@ class AppendOnlyFile:
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
-        """Turn an error of the disk into one of the log, keep the first, and close the file."""
+        """Convert the first OSError to a LogWriteError, remember it, and close the file."""
         try:
             yield
         except OSError as error:
@@ -122,15 +124,15 @@ class AppendOnlyFile:
             raise self._error from error
 
     def _lock(self, file: BinaryIO) -> None:
-        """Keep other processes from writing the file while it is open."""
+        """Lock the file against other processes while it is open."""
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Another process may have given it its final name since it was opened here.
+            # Another process may have renamed the file after it was opened here.
             mine = os.path.samestat(os.stat(self._path), os.fstat(file.fileno()))
         except (BlockingIOError, FileNotFoundError):
             mine = False
         except OSError:
-            mine = True  # a file system without locks: nothing can be held there
+            mine = True  # this file system has no locks
         if not mine:
             raise UsageError(
                 f"{self._path} is being written by another process: wait for it, or choose another "
@@ -142,7 +144,7 @@ _STAY_OPEN: Final[WeakSet[AppendOnlyFile]] = WeakSet()
 
 
 def write_error(path: Path, error: OSError) -> LogWriteError:
-    """Return the error for a disk that does not take a file."""
+    """Return the error for a file that cannot be written."""
     return LogWriteError(
         f"{path} cannot be written: {error.strerror or error}; "
         "check the free space and rights there, what was flushed is readable"
@@ -150,31 +152,31 @@ def write_error(path: Path, error: OSError) -> LogWriteError:
 
 
 class LogFile(McapWriter):
-    """One MCAP file: chunked, indexed, with CRCs and repeated schemas and channels.
+    """MCAP file: chunked, indexed, with CRCs and repeated schemas and channels.
 
-    As a context manager it finishes the file on success and leaves the flushed
-    `.partial` on an exception. The same calls give the same bytes. Every method that writes raises
-    a `LogWriteError` if the disk does not take it, or did not take something before.
+    As a context manager it finishes the file on success, and leaves the readable `.partial` after
+    an exception. The same calls give the same bytes. Every method that writes raises a
+    `LogWriteError` if this write or an earlier one fails.
 
     Attributes:
-        path: the file's name once it is finished.
-        partial: its name until then.
+        path: name of the finished file.
+        partial: name until then.
     """
 
     def __init__(
         self, path: Path, *, force: bool = False, flush_ns: int = FLUSH_NS, **options: Any
     ) -> None:
-        """Open NAME.partial for writing.
+        """Create NAME.partial.
 
         Args:
-            path: the file's name once it is finished.
-            force: overwrite an earlier file.
-            flush_ns: log time after which it is flushed.
-            options: of `McapWriter`.
+            path: name of the finished file.
+            force: True to overwrite an earlier file.
+            flush_ns: log time after which the file is flushed (ns).
+            options: arguments of `McapWriter`.
 
         Raises:
-            UsageError: the file or its partial exists and `force` is not set, another process
-                writes it, or it is no file.
+            UsageError: the file or its partial exists and `force` is not set, another process is
+                writing it, or it is a device.
             LogWriteError: the file cannot be opened.
         """
         self.path = Path(path)
@@ -198,15 +200,15 @@ class LogFile(McapWriter):
         return self._stream.closed
 
     def write(self, channel: int, log_time: int, data: bytes, sequence: int = 0) -> None:
-        """Write a message that was published at its log time.
+        """Write a message whose publish time is its log time.
 
-        Once `flush_ns` of log time have passed since the chunk began, it is flushed first.
+        The present chunk is flushed first if `flush_ns` of log time have passed since it began.
 
         Args:
             channel: id from `add_channel`.
-            log_time: nanoseconds.
+            log_time: log time (ns).
             data: the encoded message.
-            sequence: the publisher's counter.
+            sequence: sequence number.
         """
         self.write_all(((channel, log_time, data, log_time, sequence),))
 
@@ -214,7 +216,7 @@ class LogFile(McapWriter):
         """Write messages that are flushed together, at least one.
 
         Args:
-            messages: channel, log time, data, publish time and sequence of each, as `write` says.
+            messages: channel, log time, data, publish time and sequence number of each.
         """
         self._stream.check()
         log_time = messages[0][1]
@@ -226,7 +228,7 @@ class LogFile(McapWriter):
         self.add_messages(messages)
 
     def flush(self) -> None:
-        """Close the chunk in progress and hand everything to the operating system."""
+        """End the present chunk, and pass all bytes to the operating system."""
         self._stream.check()
         self._chunk_start = None
         self.end_chunk()
@@ -234,7 +236,7 @@ class LogFile(McapWriter):
         self._stream.flush()
 
     def sync(self) -> None:
-        """Flush, and let the disk have everything: a power cut takes nothing of it."""
+        """Flush, and write all bytes to the disk, so that a power cut does not lose them."""
         self.flush()
         self._stream.sync()
         if not self._named_on_disk:
@@ -242,10 +244,10 @@ class LogFile(McapWriter):
             self._named_on_disk = True
 
     def finish(self) -> None:
-        """Write the index, make the file durable and give it its name.
+        """Write the index, sync the file, and give it its final name.
 
         Raises:
-            UsageError: a file of that name appeared meanwhile; the `.partial` stays.
+            UsageError: a file with that name was created meanwhile; the `.partial` stays.
         """
         try:
             self._stream.check()
@@ -255,20 +257,20 @@ class LogFile(McapWriter):
             self._stream.close()
         if not self._force and self.path.exists():
             raise UsageError(
-                f"{self.path} appeared while it was being written: "
-                f"the new log is whole in {self.partial.name}, rename it"
+                f"{self.path} was created by another program meanwhile: "
+                f"the new log is complete in {self.partial.name}: rename it"
             )
         self._rename(self.path)
 
     def abandon(self) -> None:
-        """Flush what can be flushed and close, leaving a readable `.partial`."""
+        """Flush if possible, and close; the `.partial` stays readable."""
         if not self.closed:
             with contextlib.suppress(LogWriteError):
                 self.sync()
             self._stream.close()
 
     def _rename(self, name: Path) -> None:
-        """Give the file a name, also on the disk."""
+        """Rename the file, and sync the name to the disk."""
         try:
             os.replace(self.partial, name)
             to_disk(name.parent)

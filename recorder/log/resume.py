@@ -1,8 +1,8 @@
-"""Resume a recording: find what an earlier attempt left of each view, and where to continue.
+"""Resume a recording: find the frames that an earlier attempt left, and continue after them.
 
-The logs of an attempt are read in the order of the file, up to where they are damaged or torn. A
-log that is resumed is kept aside while its frames are copied into a new one, which so has the
-bytes of a log that was never interrupted.
+The logs of an attempt are read in file order up to the first damage. A log that is resumed is
+renamed while its frames are copied into a new log, which therefore has the same bytes as a log that
+was never interrupted.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MAGIC
 
 
-class FramesHeld(NamedTuple):
+class StoredFrames(NamedTuple):
     """The frames in an earlier log of a view.
 
     Attributes:
-        first: its first frame.
-        stop: its frames [first, stop) are all there, except those of gaps.
-        end: one more than its last frame; 0 without any.
-        gaps: whether the source may lack frames, the first of a log, too.
+        first: number of the first frame.
+        stop: the frames [first, stop) are complete, except for gaps of the source.
+        end: number after the last frame; 0 without frames.
+        gaps: True if frames of the source can be missing, also the first frame of a log.
         frames: number of frames in [first, stop).
     """
 
@@ -49,15 +49,18 @@ class FramesHeld(NamedTuple):
     frames: int = 0
 
     def stop_from(self, first: int) -> int:
-        """Return the stop of the frames [first, stop) that are all there."""
+        """Return the number after the last frame that follows `first` without a missing frame."""
         follows = self.first == first or (self.gaps and self.first > first)
         return self.stop if self.end and follows else first
 
 
-def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
-    """Read once through a log, damaged or not, for the frames of a view that it holds.
+def stored_frames(path: Path, view: str, *, gaps: bool = False) -> StoredFrames:
+    """Return the frames of a view in a log, which may be damaged.
 
-    With `gaps` the source may lack frames.
+    Args:
+        path: the log.
+        view: name of the view.
+        gaps: True if frames of the source can be missing.
     """
     first = stop = end = count = 0
     for topic, frame, _, _ in messages(path):
@@ -66,24 +69,24 @@ def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
             if frame == stop or (gaps and frame > stop):
                 stop, count = frame + 1, count + 1
             end = max(end, frame + 1)
-    return FramesHeld(first, stop, end, gaps, count)
+    return StoredFrames(first, stop, end, gaps, count)
 
 
 def messages(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
-    """Yield messages in the order of the file, up to where it is damaged or torn.
+    """Yield the messages of a log in file order, up to the first damage.
 
     Yields:
-        The topic of each, its sequence number, log time in nanoseconds, and data.
+        Topic, sequence number, log time (ns) and data of each message.
 
     Raises:
-        LogDamagedError: the disk does not give the file, which says nothing of the log.
+        LogDamagedError: the disk cannot read the file.
     """
     log = _opened(path)
     if log is None:
         return
     with log:
         for segment in log.segments:
-            # A gap in the frames would shift all that follow: nothing behind damage is taken.
+            # Stop at damage: a missing frame would shift all later frames.
             damage = log.first_damage
             unproven = segment.cut or (damage is not None and segment.offset >= damage)
             table = None if unproven else log.table(segment)
@@ -96,16 +99,16 @@ def messages(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
 
 @dataclass(frozen=True, slots=True)
 class ViewResume:
-    """Frame and file at which a view is begun or resumed.
+    """File and frame at which a view begins or is resumed.
 
     Attributes:
         path: file of the part to write.
-        parts: file and number of frames of each part that is finished.
+        parts: file and number of frames of each finished part.
         first: first frame of the part to write.
-        log: the earlier log that holds the most frames of that part, if any does.
-        stop: it holds [first, stop).
+        log: the earlier log with the most frames of that part; None if there is none.
+        stop: the earlier log has the frames [first, stop).
         stale: logs that are not needed.
-        complete: whether the parts are the whole view, and nothing is to be written.
+        complete: True if the finished parts are the whole view.
     """
 
     path: Path
@@ -118,7 +121,7 @@ class ViewResume:
 
 
 def begin_view(folder: Path, view: str, split: float | None, first: int = 0) -> ViewResume:
-    """Return where a view without files begins."""
+    """Return the beginning of a view that has no files yet."""
     return ViewResume(folder / part_name(view, None if split is None else 0), first=first)
 
 
@@ -130,33 +133,33 @@ def resume_views(
     frames: int | None,
     default: int,
 ) -> tuple[dict[str, ViewResume], float | None, int]:
-    """Find where each view of a recording is resumed. Changes nothing.
+    """Find where each view of a recording is resumed; change no file.
 
     Args:
-        folder: of the recording.
-        recording: what is recorded.
+        folder: folder of the recording.
+        recording: specification of the recording.
         views: names of the views.
-        split: seconds of a part; None for those of the start.
-        frames: frames of each view; None for those of the start.
-        default: frames of each view if the recording does not say how it was started.
+        split: length of a part (s); None: as at the start of the recording.
+        frames: number of frames of each view; None: as at the start of the recording.
+        default: number of frames of each view if the recording does not state it.
 
     Returns:
-        The place of each view, the seconds of a part, and the frames of each view.
+        File and frame of each view, length of a part (s), and number of frames of each view.
 
     Raises:
-        UsageError: it was started with another source, seed or split, has more frames, or there
-            are files of another recording.
+        UsageError: the recording was started with another source, seed or split, has more frames,
+            or there are files of another recording.
     """
     start = read_start(folder)
     limit = min((start.split[view] for view in views if view in start.split), default=None)
     split = limit if split is None else split
     if limit not in (None, split):
         raise UsageError(
-            f"{folder} was begun with --split {limit:g}s, not --split {split:g}s: go on with the "
-            "same, or overwrite with --force"
+            f"{folder} was started with --split {limit:g}s, not --split {split:g}s: use the same, "
+            "or overwrite with --force"
         )
     earlier = {
-        view: {path: frames_held(path, view, gaps=recording.gaps) for path in logs}
+        view: {path: stored_frames(path, view, gaps=recording.gaps) for path in logs}
         for view, logs in view_logs(folder, views).items()
     }
     lengths = [start.frames[view] for view in views if view in start.frames]
@@ -165,24 +168,24 @@ def resume_views(
     )
     if not finished and not lengths:
         lengths = [default]
-    for path, held in itertools.chain(*(files.items() for files in earlier.values())):
-        if frames is not None and held.end > frames:
+    for path, stored in itertools.chain(*(files.items() for files in earlier.values())):
+        if frames is not None and stored.end > frames:
             raise UsageError(
-                f"{path} holds {held.end} frames, more than --frames {frames}: --resume shortens "
-                f"nothing, give --frames {held.end} or more, or overwrite with --force"
+                f"{path} has {stored.end} frames, more than --frames {frames}, and --resume cannot "
+                f"shorten it: give --frames {stored.end} or more, or overwrite with --force"
             )
-        lengths.append(held.end)
+        lengths.append(stored.end)
     frames = frames or max(lengths)
     places = {}
-    others: list[Path] = []
+    misfits: list[Path] = []
     for view, files in earlier.items():
-        others += [p for p in files if (part_number(p, view) is None) != (split is None)]
-        if not others:
+        misfits += [p for p in files if (part_number(p, view) is None) != (split is None)]
+        if not misfits:
             ended = recording.gaps and view not in start.frames
             places[view] = _resume_view(folder, view, recording, split, files, frames, ended=ended)
-    if others := others or other_recordings(folder, recording):
+    if misfits := misfits or other_recordings(folder, recording):
         raise UsageError(
-            f"{others[0]} is of another recording, or was recorded with another --split: use the "
+            f"{misfits[0]} belongs to another recording or has another --split: use the "
             "same, or overwrite with --force"
         )
     return places, split, frames
@@ -193,24 +196,24 @@ def _resume_view(
     view: str,
     recording: RecordingSpec,
     split: float | None,
-    files: Mapping[Path, FramesHeld],
+    files: Mapping[Path, StoredFrames],
     frames: int,
     *,
     ended: bool,
 ) -> ViewResume:
-    """Skip the parts of a view that are finished, and find where to resume.
+    """Skip the finished parts of a view, and find where to resume it.
 
     Args:
-        folder: of the recording.
+        folder: folder of the recording.
         view: name of the view.
-        recording: what is recorded.
-        split: seconds of a part.
-        files: all of the view's files, and the frames in each.
-        frames: of the view; no file has more.
-        ended: whether its recording has ended, so that frames missing in its files are a gap.
+        recording: specification of the recording.
+        split: length of a part (s).
+        files: all files of the view, and the frames in each.
+        frames: number of frames of the view; no file has more.
+        ended: True if the recording has ended, so that missing frames are gaps of the source.
 
     Raises:
-        UsageError: the files are of something else, or split in another way.
+        UsageError: the files are of another recording, or split in another way.
     """
     numbers = {path: part_number(path, view) for path in files}
     parts: list[tuple[Path, int]] = []
@@ -218,33 +221,33 @@ def _resume_view(
     first = 0
     while True:
         path = folder / part_name(view, None if split is None else len(parts))
-        kept = aside_path(path)
-        attempts = [p for p in (path, partial_path(path), kept) if p in files]
+        aside = aside_path(path)
+        attempts = [p for p in (path, partial_path(path), aside) if p in files]
         later = [p for p, number in numbers.items() if number is not None and number > len(parts)]
         log = max(attempts, key=lambda p: files[p].stop_from(first), default=path)
         stop = files[log].stop_from(first) if attempts else first
         if stop > first:
-            found = _recording_metadata(log) or {}
+            stated = _recording_metadata(log) or {}
             for key, value in recording.metadata(view, first).record().items():
-                if found.get(key) != value:
+                if stated.get(key) != value:
                     raise UsageError(
-                        f"{log} cannot be continued: its {key} is {found.get(key)!r}, now it is "
-                        f"{value!r}; use the same command and versions, or overwrite with --force"
+                        f"{log} cannot be resumed: its {key} is {stated.get(key)!r}, not "
+                        f"{value!r}: use the same command and versions, or overwrite with --force"
                     )
         follows = any(files[p].end or p.suffix == ".mcap" for p in later)
         if stop > first and log == path and (follows or stop == frames or ended):
             parts.append((path, files[path].frames))
-            stale += [kept] if kept in attempts else []
+            stale += [aside] if aside in attempts else []
             first = stop
             if follows:
                 continue
             return ViewResume(path, tuple(parts), first, stale=(*stale, *later), complete=True)
-        # A file with its final name was finished once: it is not written over without --force.
+        # A file with its final name was complete once: only --force may overwrite it.
         replaced = later if stop > first else [*attempts, *later]
         if finished := [p for p in replaced if p.suffix == ".mcap"]:
             raise UsageError(
-                f"{finished[0]} is there, but not frame {stop} of {view} before it: recover that "
-                "part, or overwrite with --force"
+                f"{finished[0]} exists, but frame {stop} of {view} before it is missing: recover "
+                "that part, or overwrite with --force"
             )
         if stop > first:
             return ViewResume(path, tuple(parts), first, log, stop, (*stale, *later))
@@ -252,10 +255,10 @@ def _resume_view(
 
 
 def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
-    """List view, file and frames of each log of a complete recording; nothing of another.
+    """Return view, file and number of frames of each log of a complete recording; else nothing.
 
     Raises:
-        LogDamagedError: the disk does not give a log.
+        LogDamagedError: the disk cannot read a log.
     """
     if not folder.is_dir() or (folder / RECORDING).exists():
         return []
@@ -267,64 +270,66 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
         if path.suffix != ".mcap" or record is None:
             return []
         stated = ViewMetadata.parse(path, record)
-        held = frames_held(path, stated.view, gaps=stated.gaps)
-        if held.stop_from(stops.get(stated.view, 0)) != held.end or not held.end:
+        stored = stored_frames(path, stated.view, gaps=stated.gaps)
+        if stored.stop_from(stops.get(stated.view, 0)) != stored.end or not stored.end:
             return []
-        stops[stated.view] = held.stop
-        logs.append((stated.view, path, held.frames))
+        stops[stated.view] = stored.stop
+        logs.append((stated.view, path, stored.frames))
     if stated is None or len(stops) != (len(stated.streams) or stated.stream_count):
         return []
     return logs if stated.gaps or len(set(stops.values())) == 1 else []
 
 
 def other_recordings(folder: Path, recording: RecordingSpec) -> list[Path]:
-    """List the logs in a folder that are of another recording.
+    """Return the logs in a folder that belong to another recording.
 
     Raises:
-        UsageError: one is readably of something else.
+        UsageError: a log is not of a recording.
     """
-    others = []
+    foreign = []
     for path in logs_in(folder):
         record = _recording_metadata(path)
         if record is None:
             continue
         view = record.get("view", "")
         stated = recording.metadata(view).record() if view in recording.spec.streams else {}
-        mine = {k: v for k, v in stated.items() if k != "first_frame" and "version_" not in k}
-        if not mine or any(record.get(key) != value for key, value in mine.items()):
-            others.append(path)
-    return others
+        expected = {k: v for k, v in stated.items() if k != "first_frame" and "version_" not in k}
+        if not expected or any(record.get(key) != value for key, value in expected.items()):
+            foreign.append(path)
+    return foreign
 
 
 def set_log_aside(place: ViewResume) -> Path | None:
-    """Remove stale logs, and move the log to be resumed aside.
+    """Remove stale logs, and rename the log to be resumed.
 
     Returns:
-        Where that log is now, if there is one.
+        The new name of that log; None if there is none.
 
     Raises:
-        LogWriteError: the disk does not allow it.
+        LogWriteError: a file cannot be removed or renamed.
     """
-    path, kept = place.path, aside_path(place.path)
+    path, aside = place.path, aside_path(place.path)
     try:
         for old in place.stale:
             old.unlink()
         if place.log is None:
             return None
-        if place.log != kept:
-            os.replace(place.log, kept)
-        for poorer in (path, partial_path(path)):
-            poorer.unlink(missing_ok=True)
+        if place.log != aside:
+            os.replace(place.log, aside)
+        for shorter in (path, partial_path(path)):
+            shorter.unlink(missing_ok=True)
     except OSError as error:
-        raise LogWriteError(f"{path} cannot be continued: {error.strerror}") from error
-    return kept
+        raise LogWriteError(
+            f"{path} cannot be resumed: {error.strerror}: check the rights of its folder"
+        ) from error
+    return aside
 
 
 def _opened(path: Path) -> LogReader | None:
-    """Open a log, damaged or not; return None for a file that does not begin as one.
+    """Open a log, which may be damaged; return None if the file does not begin as a log.
 
     Raises:
-        LogDamagedError: the disk does not give it.
+        LogDamagedError: the disk cannot read the file.
     """
     with opened_regular(path) as file:
         start = file.read(len(MAGIC))
@@ -332,10 +337,10 @@ def _opened(path: Path) -> LogReader | None:
 
 
 def _recording_metadata(path: Path) -> Mapping[str, str] | None:
-    """Return the metadata of a recording's log; None if the log ends before it.
+    """Return the metadata of a recording's log; None if the log ends before them.
 
     Raises:
-        UsageError: it is a log of something else.
+        UsageError: the log is not of a recording.
     """
     log = _opened(path)
     if log is None:
@@ -344,5 +349,5 @@ def _recording_metadata(path: Path) -> Mapping[str, str] | None:
         if not log.metadata:
             return None
         if log.metadata[0].name != RECORDING_METADATA:
-            raise UsageError(f"{path} is of no recording: choose another folder")
+            raise UsageError(f"{path} does not belong to a recording: choose another folder")
         return log.metadata[0].metadata

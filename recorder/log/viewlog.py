@@ -1,4 +1,4 @@
-"""Write the log of one view: its channels and metadata, as one file or as parts of a duration."""
+"""Log of one view: its channels, metadata and messages, in one file or in parts."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from recorder.log.messages import (
 from recorder.log.resume import messages
 from recorder.log.scenery import scenery_of
 
-# Name of the attachment with the configuration of what was recorded.
+# Name of the attachment with the configuration of the recorded source.
 CONFIG_NAME: Final = "config.json"
 
 # Name of the coordinate frame of the robot's root.
@@ -42,27 +42,27 @@ ROOT_FRAME: Final = "root"
 
 
 class ViewLog:
-    """Writes one view: VIEW.mcap, or VIEW-000.mcap, VIEW-001.mcap, ... where it is split.
+    """Writer of one view: VIEW.mcap, or VIEW-000.mcap, VIEW-001.mcap, ... if it is split.
 
-    It holds frames, ground truth, the head's pose, and the world: cameras and frames are written
-    with the pose, the objects at every frame. The frame is the last message of its time, so that
-    a frame that can be read has its truth, too.
+    It writes frames, ground truth, head pose and scene: cameras and coordinate frames together with
+    the pose, objects at every frame. The frame is the last message of its time, so that a frame
+    that can be read has its truth too.
 
-    Where a part ends depends on its frames only, not on the blocks they came in.
+    The end of a part depends on its frames only, not on the lengths of the blocks.
 
     Args:
-        folder: of the recording.
+        folder: folder of the recording.
         view: name of the view.
-        recording: what is recorded.
-        settings: how it is written.
-        pose: of the head in this view, where there is a head; written once a second.
-        split: seconds of a part; None for a single file.
-        parts: file and number of frames of each part that is finished.
-        first: first frame of the part that is next.
+        recording: specification of the recording.
+        settings: settings of the files.
+        pose: pose of the head in this view, written once a second; None without a head.
+        split: length of a part (s); None: one file.
+        parts: file and number of frames of each finished part.
+        first: first frame of the next part.
 
     Attributes:
-        parts: as given; those that are finished since are added.
-        t: the next frame to be written.
+        parts: the finished parts, to which further ones are added.
+        t: number of the next frame.
     """
 
     def __init__(
@@ -93,15 +93,15 @@ class ViewLog:
         self._file = self._begin_part()
 
     def write(self, block: Block) -> None:
-        """Write the frames of a block, which must start at `t`, or later where there are gaps.
+        """Write the frames of a block, which must start at `t` or, with gaps, later.
 
         Raises:
-            ValueError: the block is of another stream or time.
-            LogWriteError: the disk does not take it.
+            ValueError: the block has another stream or time.
+            LogWriteError: the file cannot be written.
         """
         follows = block.t >= self.t if self._recording.gaps else block.t == self.t
         if block.stream != self._stream or not follows:
-            raise ValueError(f"{self._file.path}: frame {self.t} is next, not {block.t}")
+            raise ValueError(f"{self._file.path}: the next frame is {self.t}, not {block.t}")
         for t, (frame, truth) in enumerate(zip(block.frames, block.truth, strict=True), block.t):
             if self._length is not None and self.t - self._first >= self._length:
                 self._begin_next_part()
@@ -113,10 +113,10 @@ class ViewLog:
             self._frames += 1
 
     def copy(self, path: Path, stop: int) -> None:
-        """Copy the frames before `stop` that an earlier log has of the part to be written.
+        """Copy the frames before `stop` from an earlier log of the part.
 
         Raises:
-            LogDamagedError: they are not there any more.
+            LogDamagedError: the frames are no longer there.
         """
         last = self._first
         for topic, sequence, log_time, data in messages(path):
@@ -135,17 +135,17 @@ class ViewLog:
         self._file.add_metadata(name, values)
 
     def finish(self) -> None:
-        """Give the last part its index and its name, and remove the log it was copied from."""
+        """Finish the last part, and remove the log from which it was copied."""
         self._file.finish()
         aside_path(self._file.path).unlink(missing_ok=True)
         self.parts.append((self._file.path, self._frames))
 
     def abandon(self) -> None:
-        """Leave a readable partial."""
+        """Close the present part as a readable partial file."""
         self._file.abandon()
 
     def _begin_part(self) -> LogFile:
-        """Begin the part that follows the finished ones, with the next frame."""
+        """Create the part that begins with the next frame."""
         self._first, self._frames = self.t, 0
         number = None if self._length is None else len(self.parts)
         log = LogFile(
@@ -156,7 +156,7 @@ class ViewLog:
         )
         stated = self._recording.metadata(self._view, self.t)
         log.add_metadata(RECORDING_METADATA, stated.record())
-        if not stated.stream_count or stated.stream_index == 0:  # it may name all of many views
+        if not stated.stream_count or stated.stream_index == 0:  # for many views: once is enough
             config, start = self._recording.config_json(), self._spec.start_ns
             log.add_attachment(CONFIG_NAME, "application/json", config, log_time=start)
         self._channels = {
@@ -166,9 +166,9 @@ class ViewLog:
         return log
 
     def _begin_next_part(self) -> None:
-        """Begin a part before the one before is finished.
+        """Begin the next part before the present one is finished.
 
-        So a recording that was killed always has an unfinished file, by which it is known.
+        A recording that is killed then always has an unfinished file, which shows its state.
         """
         full = self._file
         full.flush()
@@ -181,7 +181,7 @@ class ViewLog:
 
 
 def _encoders(view: str, recording: RecordingSpec, pose: HeadPose | None) -> dict[str, Encoder]:
-    """Return encoders by topic: of a view's frames and truth, and of its scene's world if any."""
+    """Return the encoders of a view by topic: frames, truth, and the world of its scene if any."""
     spec = recording.spec
     encoders: dict[str, Encoder] = {view_topic(view): VectorEncoder()}
     if spec.images:

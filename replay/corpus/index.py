@@ -18,7 +18,7 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError, one_line
 from cdmisfa.core.processes import run_all
 from cdmisfa.core.untrusted import check_regular, parse_json
-from recorder.log.files import atomic_write, held, make_folder, refuse_unless
+from recorder.log.files import atomic_write, locked_folder, make_folder, refuse_unless
 from replay.corpus.index_rows import MARK, SCHEMA, VERSION, read_rows
 from replay.corpus.listing import INDEX, ListedLog, find_logs, may_be_corpus
 from replay.storage.location import is_url, location
@@ -111,7 +111,7 @@ def index_logs(
     """
     index = _index_of(words, out)
     make_folder(index.parent)
-    with held(index.parent):
+    with locked_folder(index.parent):
         indexed = Indexed(index)
         logs = _logs_by_path(words, index.parent)
         table = SCHEMA.empty_table()

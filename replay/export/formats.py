@@ -72,7 +72,7 @@ def export(
     if single:
         refuse_taken(out, force=force)
     else:
-        refuse_existing(out, force=force, goes_on=False)
+        refuse_existing(out, force=force, resumable=False)
         for file in out.rglob("*"):
             if not file.is_dir() and file.suffix not in WRITTEN:
                 other = f"{out} has files that no export wrote, as {file.relative_to(out)}"

@@ -183,7 +183,7 @@ def _opened(
     if unused and (live or is_scene(words)):
         raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
     for folder in filter(None, (output, record_to) if live else ()):
-        refuse_existing(folder, force=force, goes_on=False)
+        refuse_existing(folder, force=force, resumable=False)
     with bar("opening", "logs") as shown:
         frames, configuration = open_source(
             words, progress=shown.update, say=printing.status, **how
@@ -195,12 +195,10 @@ def _opened(
             printing.source(frames)
         stack.callback(printing.source_changes, frames)
         if record_to is not None:
-            from recorder.live import RecordedWhileWatched
+            from recorder.live import LiveRecorder
 
             stack.callback(printing.status, f"recording {record_to}")
-            recorded = RecordedWhileWatched(
-                frames, record_to, settings=configuration.record, force=force
-            )
+            recorded = LiveRecorder(frames, record_to, settings=configuration.record, force=force)
             frames = stack.enter_context(recorded)
         yield frames, configuration
 

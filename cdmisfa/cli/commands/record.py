@@ -151,20 +151,20 @@ def _record_live(
     Further arguments are those of `open_source`.
     """
     from cdmisfa.experiments.sources import open_source
-    from recorder.live import RecordedWhileWatched, record_watched
+    from recorder.live import LiveRecorder, record_live
     from recorder.log.files import refuse_existing
     from recorder.recording import DEFAULT_FRAMES
 
-    refuse_existing(output, force=force, goes_on=False)
+    refuse_existing(output, force=force, resumable=False)
     source, configuration = open_source(words, say=printing.status, **how)
     notice = "finishing the recording; again to stop at once\n"
     with contextlib.closing(source), stoppable(notice) as stop:
         frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)
-        recorded = RecordedWhileWatched(
+        recorded = LiveRecorder(
             source, output, settings=configuration.record, split=split, force=force
         )
         with bar("recording", "frames") as shown:
-            record_watched(
+            record_live(
                 recorded, frames=frames, stop=stop, progress=lambda done: shown.update(done, frames)
             )
     if recorded.ended and not stop():
