@@ -156,8 +156,8 @@ def test_a_chunk_that_holds_more_or_less_than_it_states_is_refused(
     stored = np.frombuffer(raw, np.uint8)
     assert decompressed(stored, name, size).tobytes() == data
     for wrong in (size - 1, size + 1):
-        with pytest.raises(MalformedRecord, match=f"it states {wrong} bytes decompressed"):
+        with pytest.raises(MalformedRecord, match=f"it states {wrong} decompressed bytes"):
             decompressed(stored, name, wrong)
-    with pytest.raises(MalformedRecord, match=r"cut short|decompressed and holds"):
+    with pytest.raises(MalformedRecord, match=r"cut short|decompressed bytes and has"):
         decompressed(stored[:-1], name, size)
     assert data.startswith(decompressed(stored[: size // 2 + 20], name, size, cut=True).tobytes())

@@ -13,7 +13,7 @@ from test_cli import assert_one_line
 LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
 
 A_RUN = "is a run, not a recording: open it with cdmisfa view"
-NO_MCAP = "numbers.h5 is no log that is read: logs are .mcap, .bag and .db3 files"
+NO_MCAP = "numbers.h5 is not a supported log: logs are .mcap, .bag and .db3 files"
 VAIN = "is for live scenes, and this source is not one"
 TAKEN = "taken exists: choose another folder"
 

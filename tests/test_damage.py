@@ -70,16 +70,16 @@ DAMAGES: dict[str, Damage] = {
 }
 """Given the bytes, and of an MCAP file its last chunk but one and the place of its summary."""
 
-EMPTY, NO_MCAP = "empty, nothing was written", "not an MCAP file"
+EMPTY, NO_MCAP = "it is empty: record or copy it again", "not an MCAP file"
 WITHIN = "cut short: the file ends within a record"
 NO_END = "cut short: the end of the file and its index are missing"
-ALL_THERE = "cut short: its summary is not all there, every message is"
+ALL_THERE = "cut short: part of its summary is missing, but no message is"
 BAD = "its CRC does not match"
 FEW = "cut short: the file ends within a record|no message can be recovered"
-BARE = "it has no checksums, nothing vouches for its bytes"
-HEAD = "it is not the chunk that the summary names|a chunk's length is not that of its data"
+BARE = "it has no checksums, so that changed bytes cannot be noticed"
+HEAD = "it is not the chunk in the summary|the length of a chunk contradicts its data"
 NO_PNG = "its JPEG or PNG is broken|it does not begin as a PNG|its PNG is cut short"
-INDEX = "message index is not of its messages|other messages than the summary|data section: " + BAD
+INDEX = "index contradicts its messages|other messages than the summary|data section: " + BAD
 
 TABLE: dict[str, dict[str, tuple[str, str, str]]] = {
     # Damage: exit codes of COMMANDS, "-" where one does not apply; the state, with that of the
@@ -95,12 +95,12 @@ TABLE: dict[str, dict[str, tuple[str, str, str]]] = {
         "cut in a chunk": ("3 3 0 - 3 0", "cut short unchecked", WITHIN),
         "no summary": ("3 3 0 - 0 0", "cut short unchecked", ALL_THERE),
         "no footer": ("3 3 0 - 0 0", "cut short unchecked", ALL_THERE),
-        "chunk": ("3 3 3 - 3 3", "damaged bad", "its zstd data is broken"),
+        "chunk": ("3 3 3 - 3 3", "damaged bad", "its zstd data is damaged"),
         "head of a chunk": ("3 3 3 - 0 3", "damaged bad", HEAD),
         "message index": ("3 3 3 - 0 3", "damaged bad", INDEX),
         "data end": ("3 3 3 - 3 3", "damaged bad", f"data section: {BAD}"),
         "summary": ("3 3 3 - 0 3", "damaged bad", f"summary: {BAD}"),
-        "footer": ("3 3 3 - 0 3", "damaged bad", "footer: it points outside the file"),
+        "footer": ("3 3 3 - 0 3", "damaged bad", "footer: it points outside of the file"),
     },
     "ROS 2": {
         "none": ("0 0 0 0 0 0", "whole ok", ""),
@@ -110,12 +110,12 @@ TABLE: dict[str, dict[str, tuple[str, str, str]]] = {
         "cut between chunks": ("3 3 0 0 3 0", "cut short unchecked", NO_END),
         "cut in a chunk": ("3 3 0 0 3 0", "cut short unchecked", WITHIN),
         "no summary": ("3 3 0 0 0 0", "cut short unchecked", ALL_THERE),
-        "chunk": ("3 3 3 3 3 3", "damaged bad", "its zstd data is broken"),
+        "chunk": ("3 3 3 3 3 3", "damaged bad", "its zstd data is damaged"),
         "head of a chunk": ("3 3 3 3 0 3", "damaged bad", HEAD),
         "message index": ("3 3 3 3 0 3", "damaged bad", INDEX),
         "data end": ("3 3 3 3 3 3", "damaged bad", f"data section: {BAD}"),
         "summary": ("3 3 3 3 0 3", "damaged bad", f"summary: {BAD}"),
-        "footer": ("3 3 3 3 0 3", "damaged bad", "footer: it points outside the file"),
+        "footer": ("3 3 3 3 0 3", "damaged bad", "footer: it points outside of the file"),
     },
     "ROS 2, no checksums": {
         "none": ("0 0 0 0 0 0", "whole absent", BARE),

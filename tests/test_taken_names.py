@@ -86,7 +86,7 @@ def test_a_run_and_a_recording_do_not_share_a_folder(
     assert_one_line(cdmisfa(*learn, "--force"), 2, "x1.mcap does not belong to a run")
     record = ("record", "oscillatory", "--frames", 20, "-o")
     for word in ("--force", "--resume"):
-        assert_one_line(cdmisfa(*record, made["run"], word), 2, "run.mcap does not belong to a recording")
+        assert_one_line(cdmisfa(*record, made["run"], word), 2, "does not belong to a recording")
     assert (names(made["rec"]), names(made["run"])) == before
     (tmp_path / "letter.txt").write_text("mine")
     assert_one_line(cdmisfa(*record, tmp_path, "--resume"), 2, "has no recording to resume")

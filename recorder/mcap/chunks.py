@@ -1,6 +1,6 @@
-"""Decode the chunks of a log to tables of messages, and check all that they state.
+"""Decode the chunks of a log to tables of messages, and check everything that they state.
 
-A chunk may lie about its size and hold anything: no more memory is asked for than `MAX_CHUNK`.
+A chunk can state a wrong size and have any content: at most `MAX_CHUNK` bytes are allocated.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from recorder.mcap.records import (
 )
 from recorder.mcap.store import Store
 
-# The message indexes of a chunk: channel, and (n, 2) log time and place of each message.
+# Message indexes of a chunk: channel, and (n, 2) log time (ns) and offset of each message.
 Pairs = list[tuple[int, NDArray[np.uint64]]]
 
 
 @dataclass(frozen=True, slots=True)
 class MessageTable:
-    """Messages of one chunk in file order, one row each.
+    """Messages of one chunk in file order, one row for each.
 
     Attributes:
-        data: (B,) uint8, the chunk's decompressed records.
+        data: (B,) uint8, the decompressed records of the chunk.
         records: (n,) of `cdmisfa.kernels.frames.MESSAGE`.
     """
 
@@ -58,27 +58,27 @@ class MessageTable:
 
     @property
     def channel(self) -> NDArray[np.uint16]:
-        """Channel of each message, (n,)."""
+        """(n,) channel of each message."""
         return self.records["channel"]
 
     @property
     def log_time(self) -> NDArray[np.uint64]:
-        """Log time of each message, (n,) nanoseconds."""
+        """(n,) log time of each message (ns)."""
         return self.records["log_time"]
 
     @property
     def at(self) -> IntArray:
-        """Place of each payload in `data`, (n,)."""
+        """(n,) offset of each payload in `data`."""
         return self.records["at"]
 
     @property
     def size(self) -> IntArray:
-        """Bytes of each payload, (n,)."""
+        """(n,) size of each payload (bytes)."""
         return self.records["size"]
 
     def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
-        """Return the messages of rows, given by number, (k,), or by a truth value each, (n,)."""
-        # The result of indexing, in a third of its time.
+        """Return the messages at indices (k,), or where a mask (n,) is True."""
+        # compress and take give the result of indexing in a third of its time.
         pick = self.records.compress if rows.dtype == np.bool_ else self.records.take
         return MessageTable(self.data, pick(rows))
 
@@ -89,16 +89,16 @@ class MessageTable:
             yield channel, sequence, log_time, published, bytes(data[at : at + size])
 
     def payload(self, row: int) -> bytes:
-        """Return a copy of a payload."""
+        """Return a copy of a message's payload."""
         return self.view(row).tobytes()
 
     def view(self, row: int) -> memoryview:
-        """Return a payload, still in the memory of the chunk."""
+        """Return a message's payload as a view of the chunk's memory."""
         at = int(self.at[row])
         return self.data[at : at + int(self.size[row])].data
 
     def index(self, channel: int) -> bytes:
-        """Return the message index of a channel: time and place of each message, in file order."""
+        """Return the message index record of a channel, in file order."""
         rows = self.channel == channel
         columns = self.log_time[rows], self.at[rows] - MESSAGE_HEADER.size
         pairs = np.stack(columns, 1, dtype="<u8", casting="unsafe")
@@ -106,7 +106,7 @@ class MessageTable:
         return head + pairs.tobytes()
 
     def agrees(self, indexes: Pairs) -> bool:
-        """Return whether message indexes name exactly these messages."""
+        """Return whether message indexes state exactly these messages."""
         channels = np.repeat([n for n, _ in indexes], [len(pairs) for _, pairs in indexes])
         if len(channels) != len(self):
             return False
@@ -123,11 +123,11 @@ def walked_table(
     """Return a chunk's messages, definitions as (opcode, content), and range of log times.
 
     Args:
-        data: (B,) its decompressed records.
-        cut: leave out its end where that is broken.
+        data: (B,) the decompressed records.
+        cut: True to ignore an invalid end.
 
     Raises:
-        MalformedRecord: it holds bytes that are no record, or a record that may not be there.
+        MalformedRecord: the chunk has bytes that are not a record, or a record of another section.
     """
     try:
         messages, others, place, times = walk_records(data)
@@ -139,30 +139,31 @@ def walked_table(
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             definitions.append((opcode, data[at + RECORD_HEADER.size : end].tobytes()))
         elif opcode <= max(Opcode) and not cut:
-            raise MalformedRecord(f"it holds a {Opcode(opcode).name} record")
+            raise MalformedRecord(f"it has a {Opcode(opcode).name} record, which is not allowed")
     if place < len(data) and not cut:
-        raise MalformedRecord(f"its byte {place} begins no record that ends within it")
+        raise MalformedRecord(f"no complete record begins at its byte {place}")
     return MessageTable(data, messages), definitions, times
 
 
-# The end of a problem with an index that contradicts its chunk, which costs no message.
+# End of a warning about an index that contradicts its chunk, which does not lose messages.
 UNUSED: Final = "(the index is not used)"
 
-# Decoded chunks that are kept, one at least: few, because reading moves forward, and memory that is
-# used again is still in the CPU's cache.
+# Size of the decoded chunks in the cache, at least one chunk. It is small because reading moves
+# forward, and because memory that is used again is still in the processor's cache.
 CACHE_BYTES: Final = 1024 * 1024
-# Most memory that zstd may take for its window, because a frame may ask for any.
+# Largest window of zstd, which a hostile frame could otherwise set to any size.
 _WINDOW: Final = MAX_CHUNK // 2
 _PIECE: Final = 1 << 17
-# A chunk is decoded ahead if it has this many stored bytes, as handing fewer over takes as long, at
-# most this many decompressed, because of their memory, and is not hardly compressed.
-_LONG: Final = 256 * 1024
-_LARGE: Final = 8 * 1024 * 1024
-_PACKED: Final = 0.9
+# A chunk is decoded ahead of time in another thread if it has at least this stored size (for less,
+# the transfer takes longer than the decoding), at most this decompressed size (because of the
+# memory), and at most this ratio of both (else there is little to decode).
+_MIN_AHEAD: Final = 256 * 1024
+_MAX_AHEAD: Final = 8 * 1024 * 1024
+_MAX_RATIO: Final = 0.9
 
 
 class _Zstd(threading.local):
-    """A decompressor for each thread."""
+    """One decompressor for each thread, because zstd's are not thread-safe."""
 
     def __init__(self) -> None:
         self.decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
@@ -173,14 +174,14 @@ _BROKEN: Final = (zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EO
 
 
 class Chunks:
-    """Decode the chunks of a file, and keep the last few.
+    """Decoder of the chunks of a file, with a cache of the last ones.
 
     Args:
         file: the log.
-        definitions: those of the chunks are added.
-        note: called with (where, what) for a message index that is not of its chunk's messages,
-            which costs none of them; None if indexes are not compared.
-        without_crc: called for a chunk that has no CRC of its own.
+        definitions: receives the definitions in the chunks.
+        note: called with (place, problem) for a message index that contradicts its chunk, which
+            loses no message; None: do not compare indexes.
+        without_crc: called for a chunk without a CRC.
     """
 
     def __init__(
@@ -202,14 +203,14 @@ class Chunks:
         self._thread: ThreadPoolExecutor | None = None
 
     def expect(self, segments: Sequence[Segment]) -> None:
-        """Announce the chunks that are read one after the other, to decode one ahead."""
-        self._following = {one.offset: two for one, two in itertools.pairwise(segments)}
+        """Announce the chunks that will be read one after the other, to decode one ahead."""
+        self._following = {first.offset: second for first, second in itertools.pairwise(segments)}
 
     def table(self, segment: Segment) -> MessageTable:
         """Return the messages of a chunk in file order.
 
         Raises:
-            MalformedRecord: it is damaged.
+            MalformedRecord: the chunk is damaged.
         """
         key = segment.offset
         if key in self._cache:
@@ -226,7 +227,7 @@ class Chunks:
         """Read a chunk's message indexes, or those of some channels.
 
         Raises:
-            MalformedRecord: they are larger than any chunk.
+            MalformedRecord: the indexes are larger than any chunk.
         """
         if not segment.indexes:
             return []
@@ -241,7 +242,7 @@ class Chunks:
         return indexes
 
     def close(self) -> None:
-        """Drop the decoded chunks, and end the thread; harmless when called twice."""
+        """Drop the decoded chunks, and end the thread; a second call does nothing."""
         self._cache.clear()
         self._cached, self._ahead = 0, None
         if self._thread is not None:
@@ -259,36 +260,36 @@ class Chunks:
         table, definitions, (earliest, latest) = walked_table(raw, cut=segment.cut)
         if len(table) and not segment.cut:
             if earliest < segment.start or latest > segment.end:
-                raise MalformedRecord("it holds messages outside the time range it states")
+                raise MalformedRecord("it has messages outside its time range")
             if self._note and segment.indexes and not table.agrees(self.index(segment)):
-                self._note(segment.name, f"its message index is not of its messages {UNUSED}")
+                self._note(segment.name, f"its message index contradicts its messages {UNUSED}")
         for opcode, content in definitions:
             self._definitions.add(opcode, content, segment.name)
         return table
 
     def _look_ahead(self, segment: Segment) -> None:
-        """Start to decode the next chunk while this one is used, if it takes long."""
+        """Start to decode the next chunk in a thread, if decoding it takes long."""
         in_order = self._following.get(self._last) is segment
         self._last = segment.offset
         following = self._following.get(segment.offset)
         if following is None or not in_order or type(self._file) is not Store:
             return
-        slow = following.compression and _LONG <= following.stored < _PACKED * following.size
-        if slow and following.size <= _LARGE and not following.cut:
+        slow = _MIN_AHEAD <= following.stored < _MAX_RATIO * following.size
+        if following.compression and slow and following.size <= _MAX_AHEAD and not following.cut:
             self._thread = self._thread or ThreadPoolExecutor(1)
             future = self._thread.submit(chunk_records, self._file, following)
             self._ahead = following.offset, future
 
 
 def chunk_records(file: Store, segment: Segment) -> ByteArray:
-    """Read the records of a chunk, whose CRC must match; any thread may call it.
+    """Read the records of a chunk, and check its CRC; any thread may call this function.
 
     Args:
         file: the log.
-        segment: the chunk; its CRC is set where only the summary stated it.
+        segment: the chunk; its CRC is set if only the summary stated the chunk.
 
     Raises:
-        MalformedRecord: the chunk is damaged, or is not as the summary states it.
+        MalformedRecord: the chunk is damaged, or contradicts the summary.
     """
     compression, size, begin = segment.compression, segment.size, segment.offset
     check_size(compression, 0 if segment.cut else size)
@@ -297,37 +298,37 @@ def chunk_records(file: Store, segment: Segment) -> ByteArray:
     if segment.stated:
         crc = int.from_bytes(head[CHUNK_HEADER.size - 4 : CHUNK_HEADER.size], "little")
         if head != segment.head(crc):
-            raise MalformedRecord("it is not the chunk that the summary names")
+            raise MalformedRecord("it is not the chunk in the summary")
         segment.crc, segment.stated = crc, False
     records = decompressed(stored, compression, min(size, MAX_CHUNK), cut=segment.cut)
     if segment.cut:
         return records
     if segment.crc and crc32(records.data) != segment.crc:
-        raise MalformedRecord("its CRC does not match: damaged")
+        raise MalformedRecord("its CRC does not match")
     return freeze(records)
 
 
 def check_size(compression: str, size: int) -> None:
-    """Refuse an unknown compression, and more than `MAX_CHUNK` bytes decompressed."""
+    """Check that a compression is known, and a decompressed size is at most `MAX_CHUNK`."""
     if compression not in ("", "zstd", "lz4"):
         raise MalformedRecord(f"its compression {compression[:40]!r} is unknown")
     if size > MAX_CHUNK:
         raise MalformedRecord(
-            f"it states {size} bytes decompressed, above the limit of {MAX_CHUNK} bytes"
+            f"it states a decompressed size of {size} bytes, above the limit of {MAX_CHUNK}"
         )
 
 
 def decompressed(stored: ByteArray, compression: str, size: int, *, cut: bool = False) -> ByteArray:
-    """Return the records of a chunk.
+    """Return the decompressed records of a chunk.
 
     Args:
-        stored: its bytes.
+        stored: the stored bytes.
         compression: "zstd", "lz4" or "".
-        size: bytes that it states, at most `MAX_CHUNK`.
-        cut: return the records before the end of a chunk that was cut, `size` bytes at most.
+        size: size that the chunk states, at most `MAX_CHUNK`.
+        cut: True to return the records before the end of a cut chunk, at most `size` bytes.
 
     Raises:
-        MalformedRecord: broken data, or another number of bytes than stated.
+        MalformedRecord: the data is damaged, or its size is not the stated one.
     """
     try:
         if compression == "zstd":
@@ -337,18 +338,18 @@ def decompressed(stored: ByteArray, compression: str, size: int, *, cut: bool = 
         else:
             records = stored[:size] if cut else stored
     except _BROKEN as error:
-        raise MalformedRecord(f"its {compression} data is broken ({error})") from None
+        raise MalformedRecord(f"its {compression} data is damaged ({error})") from None
     if len(records) != size and not cut:
         actual = f"more than {size}" if len(records) > size else len(records)
-        raise MalformedRecord(f"it states {size} bytes decompressed and holds {actual}")
+        raise MalformedRecord(f"it states {size} decompressed bytes and has {actual}")
     return records
 
 
 def _from_zstd(stored: ByteArray, size: int, cut: bool) -> ByteArray:
-    """Decompress zstd, one byte more than `size` if there are more."""
+    """Decompress zstd data, one byte more than `size` if there is more."""
     reader = _ZSTD.decompressor.stream_reader(stored.data, read_across_frames=True)
     out, done = np.empty(size + 1, np.uint8), 0
-    step = _PIECE if cut else size  # where all of it fits, zstd writes straight into it
+    step = _PIECE if cut else size  # in one step, zstd writes directly into `out`
     with contextlib.suppress(zstandard.ZstdError) if cut else contextlib.nullcontext():
         while done < size and (n := reader.readinto(out[done : min(done + step, size)].data)):
             done += n
@@ -358,7 +359,7 @@ def _from_zstd(stored: ByteArray, size: int, cut: bool) -> ByteArray:
 
 
 def _from_lz4(stored: ByteArray, size: int, cut: bool) -> ByteArray:
-    """Decompress LZ4, one byte more than `size` if there are more."""
+    """Decompress LZ4 data, one byte more than `size` if there is more."""
     lz4_frame = lz4.frame.LZ4FrameDecompressor()
     data = lz4_frame.decompress(stored.data, max_length=size + (not cut))
     if len(data) <= size and not (cut or lz4_frame.eof):

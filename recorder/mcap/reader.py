@@ -1,7 +1,7 @@
-"""Read any MCAP file, strictly: whole or cut, with or without an index.
+"""`LogReader`: strict reader of any MCAP file, complete or cut, with or without an index.
 
-A reader gives every message that is there, in file order, and never one whose checksum does not
-match. Memory holds a few chunks.
+It returns every message in file order, and none whose checksum does not match. Memory holds a few
+chunks.
 """
 
 from __future__ import annotations
@@ -31,18 +31,19 @@ from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]
 
-NO_CHECKSUMS: Final = "it has no checksums, nothing vouches for its bytes"
+NO_CHECKSUMS: Final = "it has no checksums, so that changed bytes cannot be noticed"
 
 
 class LogReader(LogStructure):
-    """An MCAP file, read by its content and not by what its index claims.
+    """An MCAP file, read by its content and not by the claims of its index.
 
-    Damage is an error that names the file, the chunk and its time range. With
-    `skip_damaged` the damaged chunk is left out and noted in `problems` instead, and the
-    unverifiable part of a chunk in which the file ends is read too. Where its summary accounts
-    for every message, only what is asked for is read: each chunk is checked when it is, and the
-    checksum over all data where all of it is read (`check`, `sha256`) or a chunk has none of its
-    own.
+    Damage raises an error with the file, the chunk and its time range. With `skip_damaged` the
+    damaged chunk is skipped and noted in `problems`, and the part of a cut last chunk that can be
+    decoded is read too, unverified.
+
+    If the summary accounts for every message, only the requested chunks are read and checked. The
+    checksum over all data is checked if all of it is read (`check`, `sha256`), or a chunk has no
+    checksum of its own.
     """
 
     def __init__(
@@ -51,16 +52,16 @@ class LogReader(LogStructure):
         """Open a log.
 
         Args:
-            log: path of a file, or its bytes, which are closed with the reader.
-            skip_damaged: leave out what is damaged.
-            check: "chunks" believes a summary that accounts for every message; "data" looks at
-                every record of a file and at the checksum over its data; "pass" leaves to
-                `one_pass` the latter, and without `skip_damaged` also the former. By default
-                "chunks", with `skip_damaged` "data".
+            log: path of a file, or its store, which is closed with the reader.
+            skip_damaged: True to skip damaged parts.
+            check: "chunks" trusts a summary that accounts for every message; "data" reads every
+                record, and the checksum over the data; "pass" leaves the checksum, and without
+                `skip_damaged` also the records, to `one_pass`. None: "chunks", or "data" with
+                `skip_damaged`.
 
         Raises:
-            UsageError: it cannot be opened.
-            LogDamagedError: not an MCAP file, or its structure is damaged.
+            UsageError: the file cannot be opened.
+            LogDamagedError: it is not an MCAP file, or its structure is damaged.
         """
         self._failed: set[int] = set()
         self._defined = self._searched = self._checked = False
@@ -73,7 +74,7 @@ class LogReader(LogStructure):
             note = None if check == "chunks" else self.note
             self._chunks = Chunks(log, self.definitions, note, self._check_unproven)
             if self.torn is not None and self.torn in self.segments:
-                # The header of a chunk that was still open states no times yet.
+                # The header of a chunk that was still being written states no times yet.
                 table = self.table(self.torn)
                 if table is not None and len(table):
                     times = table.log_time
@@ -86,50 +87,50 @@ class LogReader(LogStructure):
                 raise LogDamagedError(f"{log.path}: {error}") from None
             raise
 
-    # What the file holds
+    # Content of the file
 
     @property
     def statistics(self) -> Statistics | None:
-        """The statistics in the summary, or None."""
+        """Statistics in the summary, or None."""
         return self.summary.statistics if self.summary else None
 
     @property
     def warnings(self) -> list[str]:
-        """Missing, left out and unproven parts of the file, a line each that names it."""
+        """Missing, skipped and unprotected parts, one line for each with the path of the file."""
         problems = [f"{p.where}: {p.what}" for p in self.problems]
         lines = (f"{self.path}: {text}" for text in (self.missing, *problems) if text)
         return [*lines, *self.unproven()]
 
     def unproven(self) -> list[str]:
-        """Return a line that names the file if nothing vouches for its bytes."""
+        """Return a line with the path if the file has no checksums."""
         return [f"{self.path}: {NO_CHECKSUMS}"] if self.crc_absent() else []
 
     @property
     def channels(self) -> Mapping[int, Channel]:
-        """Every channel of the file; reads the chunks where nothing else names them."""
+        """All channels of the file; reads chunks if nothing else defines the channels."""
         self._define()
         return self.definitions.channels
 
     @property
     def schemas(self) -> Mapping[int, Schema]:
-        """Every schema of the file; reads the chunks where nothing else names them."""
+        """All schemas of the file; reads chunks if nothing else defines the schemas."""
         self._define()
         return self.definitions.schemas
 
     def attachment_data(self, attachment: Attachment) -> bytes:
-        """Read an attachment's bytes; a LogDamagedError where that is too much at once."""
+        """Return an attachment's bytes; raise a LogDamagedError if they are too large."""
         if attachment.size > MAX_CHUNK:
             raise LogDamagedError(
                 f"{self.path}: attachment {attachment.name[:80]!r} has {attachment.size} bytes, "
-                f"above the limit of {MAX_CHUNK}"
+                f"above the limit of {MAX_CHUNK}: read it with another tool"
             )
         return self.file.read(attachment.offset, attachment.size)
 
     def crc_absent(self) -> int:
-        """Count the segments that no checksum protects.
+        """Return the number of segments without a checksum.
 
-        Of a file opened by its index without a checksum over all data, the first chunk stands for
-        all: reading the head of each would take as long as reading the file.
+        For a file that was opened by its index and has no checksum over all data, only the first
+        chunk is tested: reading the header of each would take as long as reading the file.
         """
         if self.data_crc:
             return 0
@@ -140,10 +141,10 @@ class LogReader(LogStructure):
         return sum(1 for s in segments if s.crc == 0 and s.size)
 
     def sha256(self, counted: Callable[[int], None] = lambda count: None) -> str:
-        """Return the SHA-256 of the file, and check the checksum over all data on the way.
+        """Return the SHA-256 of the file, and check the checksum over all data at the same time.
 
         Args:
-            counted: called with the number of each further bytes that were hashed.
+            counted: called with the size of each hashed block (bytes).
         """
         sha256, crc, at = hashlib.sha256(), 0, 0
         end = self.data_end if self.data_crc else 0
@@ -156,7 +157,7 @@ class LogReader(LogStructure):
         return sha256.hexdigest()
 
     def tail(self) -> Iterator[bytes]:
-        """Yield the bytes from the data end record on, where the file was opened by its index."""
+        """Yield the bytes from the data end record on, if the file was opened by its index."""
         if self.by_index:
             yield from self.file.blocks(self.data_end, self.file.size)
 
@@ -166,29 +167,31 @@ class LogReader(LogStructure):
         """Yield the messages in file order.
 
         Args:
-            topics: only these; None for all.
+            topics: topics to select; None: all.
 
         Raises:
-            LogDamagedError: at the first damage, without `skip_damaged`.
+            LogDamagedError: without `skip_damaged`, at the first damage.
         """
         for segment, table in self.tables(topics=topics):
             known = {c: self._channel(c, segment) for c in np.unique(table.channel).tolist()}
-            own = {c: k for c, k in known.items() if k and (topics is None or k.topic in topics)}
-            if len(own) < len(known):
-                table = table.select(np.isin(table.channel, list(own)))
+            selected = {
+                c: k for c, k in known.items() if k and (topics is None or k.topic in topics)
+            }
+            if len(selected) < len(known):
+                table = table.select(np.isin(table.channel, list(selected)))
             for number, sequence, log_time, published, data in table.rows():
-                yield Message(own[number], sequence, log_time, published, data)
+                yield Message(selected[number], sequence, log_time, published, data)
 
     def tables(
         self, *, start: int = 0, topics: Collection[str] | None = None
     ) -> Iterator[tuple[Segment, MessageTable]]:
-        """Yield the messages chunk by chunk as columns, in file order.
+        """Yield the messages as one table for each chunk, in file order.
 
-        Chunks that end before log time `start` are left out, and of a log that was opened by its
-        index those without any of `topics`.
+        Chunks that end before log time `start` (ns) are skipped, and for a log that was opened by
+        its index those without any of `topics`.
 
         Raises:
-            LogDamagedError: at the first damage, without `skip_damaged`.
+            LogDamagedError: without `skip_damaged`, at the first damage.
         """
         chosen = [s for s in self.segments if s.end >= start]
         if self.by_index:
@@ -201,13 +204,13 @@ class LogReader(LogStructure):
                 yield segment, table.select(table.log_time >= np.uint64(start)) if start else table
 
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
-        """Yield every chunk in file order, None for one that is damaged and left out.
+        """Yield every chunk in file order, with None for a damaged one that is skipped.
 
-        Without `skip_damaged` each byte is read once, and every record is looked at on the way. The
-        checksum over all of the data is checked at the end. The log was opened with check "pass".
+        Open the log with check "pass" for this. Without `skip_damaged` each byte is read once, and
+        every record and the checksum over all data are checked.
 
         Raises:
-            LogDamagedError: at the first damage, without `skip_damaged`.
+            LogDamagedError: without `skip_damaged`, at the first damage.
         """
         file = self.file
         assert isinstance(file, OnePass)
@@ -222,19 +225,19 @@ class LogReader(LogStructure):
         self._check_data(file.crc_to(self.data_end))
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
-        """Announce the chunks, or only `indexes` of them, that will be read one after the other."""
+        """Announce the chunks, or only their indexes, that will be read one after the other."""
         self._chunks.expect(() if indexes else segments)
         spans = ((s.data_end if indexes else s.offset, s.stop) for s in segments)
         self.file.expect(list(spans))
 
     def table(self, segment: Segment) -> MessageTable | None:
-        """Decode a chunk and check it; the last few are kept.
+        """Decode and check a chunk; the last few stay in a cache.
 
         Returns:
-            Its messages in file order, or None where it is damaged and `skip_damaged` is on.
+            The messages in file order; None if the chunk is damaged and `skip_damaged` is set.
 
         Raises:
-            LogDamagedError: it is damaged, without `skip_damaged`.
+            LogDamagedError: without `skip_damaged`, the chunk is damaged.
         """
         if self.skip_damaged and segment.offset in self._failed:
             return None
@@ -242,7 +245,7 @@ class LogReader(LogStructure):
             return self._chunks.table(segment)
         except MalformedRecord as error:
             self._failed.add(segment.offset)
-            if not (segment.cut and self.skip_damaged):  # that the file ends in it is said anyway
+            if not (segment.cut and self.skip_damaged):  # `missing` describes a cut chunk
                 self.refuse(segment.name, str(error))
             return None
 
@@ -250,7 +253,7 @@ class LogReader(LogStructure):
         """Read a chunk's message indexes, or those of some channels.
 
         Raises:
-            LogDamagedError: they are larger than any chunk.
+            LogDamagedError: the indexes are larger than any chunk.
         """
         try:
             return self._chunks.index(segment, channels)
@@ -258,7 +261,7 @@ class LogReader(LogStructure):
             raise LogDamagedError(f"{self.path}: {segment.name}: {error}") from None
 
     def close(self) -> None:
-        """Close the file; harmless when called twice."""
+        """Close the file; a second call does nothing."""
         self._chunks.close()
         self.file.close()
 
@@ -268,24 +271,24 @@ class LogReader(LogStructure):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # Inside
+    # Internals
 
     def _check_data(self, crc: int | None = None) -> None:
-        """Compare the checksum over all data that the log states with theirs, once.
+        """Compare the checksum over all data with the data, once.
 
         Args:
-            crc: of the data, where they were read; by default they are read now.
+            crc: CRC of the data if they were read already; None: read them now.
         """
         if not self.data_crc or self._checked:
             return
         self._checked = True
         if (self.file.crc(0, self.data_end) if crc is None else crc) != self.data_crc:
             if not self.skip_damaged:
-                self._search()  # an error that names the chunk says more
+                self._search()  # raises an error that names the damaged chunk, if it has a CRC
             self.refuse("data section", "its CRC does not match: damaged")
 
     def _check_unproven(self) -> None:
-        """Check the data for a chunk that has no checksum of its own."""
+        """Check all data if a chunk has no checksum of its own."""
         if self.by_index:
             self._check_data()
 
@@ -298,18 +301,18 @@ class LogReader(LogStructure):
             schemas = {0, *self.definitions.schemas}
             if channel and channel.schema_id in schemas:
                 return channel
-        what = f"it holds messages of channel {number}, never defined"
+        problem = f"it has messages of channel {number}, which is not defined"
         if channel is not None:
-            what = f"schema {channel.schema_id} of {channel.topic!r} is never defined"
-        self.refuse(segment.name, what)
+            problem = f"schema {channel.schema_id} of {channel.topic!r} is not defined"
+        self.refuse(segment.name, problem)
         return channel
 
     def _define(self) -> None:
-        """Decode chunks until every channel that has messages is known."""
+        """Decode chunks until every channel with messages is defined."""
         if self._defined:
             return
         known, counted = self.definitions.channels, set[int]()
-        # A summary that is believed defines every channel of which it counts messages.
+        # A trusted summary defines every channel whose messages it counts.
         for segment in () if self.by_index else self.segments:
             counts = segment.channel_counts()
             if counts is None or not counts.keys() <= known.keys():
@@ -321,7 +324,7 @@ class LogReader(LogStructure):
             self._search()
 
     def _search(self) -> None:
-        """Decode every chunk: a definition may be in one that holds no message of it."""
+        """Decode every chunk: a definition can be in a chunk without messages of its channel."""
         if not self._searched:
             self._searched = True
             for segment in self.segments:

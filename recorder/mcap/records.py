@@ -1,7 +1,7 @@
-"""Parse the records of MCAP, with every length checked.
+"""Records of MCAP, parsed with a check of every length.
 
-Nothing here trusts a length, count or text of the file. Callers turn a `MalformedRecord` into an
-error that names the file.
+No length, count or text in a file is trusted. Callers turn a `MalformedRecord` into an error that
+names the file.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ try:  # the same checksum, several times faster
 except ImportError:
     from zlib import crc32 as _crc32
 
-MAGIC: Final = b"\x89MCAP0\r\n"  # the first and the last bytes of a file
+MAGIC: Final = b"\x89MCAP0\r\n"  # first and last bytes of a file
 RECORD_HEADER: Final = struct.Struct("<BQ")
 
-# Larger chunks and definitions are refused before memory is asked for. Writers make chunks of 1 to
-# 4 MiB by default; 144 MiB hold an image of 8192x6144 in RGB.
+# Largest chunk and definition (bytes); larger ones are refused before memory is allocated. Writers
+# make chunks of 1 to 4 MiB by default; 144 MiB hold an RGB image of 8192x6144.
 MAX_CHUNK: Final = 144 * 1024 * 1024
 MAX_DEFINITION: Final = 64 * 1024 * 1024
 
 # Opcode, length, channel, sequence, log time, publish time; the payload follows.
 MESSAGE_HEADER: Final = struct.Struct("<BQHIQQ")
-# Opcode, length, channel, bytes of the pairs of log time and place in the chunk, which follow.
+# Opcode, length, channel, size of the pairs (log time, offset in the chunk) that follow.
 INDEX_HEADER: Final = struct.Struct("<BQHI")
 # Opcode, length, first and last log time, size and CRC; compression and records follow.
 CHUNK_HEADER: Final = struct.Struct("<BQQQQI")
-# Bytes that hold all of a chunk before its records: the name of its compression is short.
+# Bytes that hold all of a chunk before its records, because names of compressions are short.
 CHUNK_PEEK: Final = 256
 
 
-class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with a record, not where
-    """A record contradicts the format; the reader adds file and place."""
+class MalformedRecord(LogDamagedError):  # noqa: N818 - it names the problem, not yet the file
+    """Record that contradicts the format; the reader adds file and offset."""
 
 
-# The formats that are read, for errors; docs/how-to/open-data.md describes each.
+# Supported formats, for errors.
 KINDS: Final = (
     "logs are .mcap, .bag and .db3 files, videos (.mp4, .m4v, .mov, .mkv, .webm, .avi, .wmv, .mpg, "
     ".mpeg), tables (.csv, .parquet), folders of .png or .jpg files, LeRobot datasets, and arrays "
@@ -55,51 +55,51 @@ KINDS: Final = (
 
 
 def no_log(path: Path) -> CdmisfaError:
-    """Return the error for a file that does not begin as MCAP; damage if it is named as MCAP."""
+    """Return the error for a file that does not begin as MCAP: damage if its name is .mcap."""
     if ".mcap" in path.name:
         return LogDamagedError(f"{path}: not an MCAP file (its first bytes are not MCAP's)")
     if path.suffix in (".npy", ".npz"):
         return UsageError(
             f"{path} holds arrays: make a recording of them with cdmisfa convert {path} -o REC"
         )
-    return UsageError(f"{path} is no log that is read: {KINDS}")
+    return UsageError(f"{path} is not a supported log: {KINDS}")
 
 
 class Fields(ReadDataStream):
-    """Read the fields of one record, one after the other, within its bounds."""
+    """Reader of the fields of one record, which does not read beyond its end."""
 
-    def __init__(self, data: bytes | memoryview, what: str) -> None:
+    def __init__(self, data: bytes | memoryview, record: str) -> None:
         super().__init__(io.BytesIO(data))
-        self._size, self._what = len(data), what
+        self._size, self._record = len(data), record
 
     def read(self, length: int) -> bytes:
         """Return the next bytes.
 
         Raises:
-            MalformedRecord: there are fewer left.
+            MalformedRecord: fewer bytes are left.
         """
         left = self._size - self.count
         if length > left:
             raise MalformedRecord(
-                f"{self._what} is cut short or lies about a length ({length} bytes wanted, "
-                f"{left} there)"
+                f"{self._record} is cut short or states a wrong length (it needs {length} bytes, "
+                f"and {left} are left)"
             )
         return bytes(super().read(length))
 
     def read_prefixed_string(self) -> str:
-        """Return a text with its length in front.
+        """Return a text that follows its length.
 
         Raises:
-            MalformedRecord: it is not UTF-8.
+            MalformedRecord: the text is not UTF-8.
         """
         try:
             return str(super().read_prefixed_string())
         except UnicodeDecodeError:
-            raise MalformedRecord(f"{self._what} holds a text that is not UTF-8") from None
+            raise MalformedRecord(f"{self._record} has a text that is not UTF-8") from None
 
 
 def crc32(data: bytes | memoryview, value: int = 0) -> int:
-    """Return the CRC-32 of bytes, continued from the `value` of the bytes before."""
+    """Return the CRC-32 of bytes, continued from the CRC `value` of earlier bytes."""
     return int(_crc32(data, value))
 
 
@@ -111,13 +111,13 @@ def chunk_head(start: int, end: int, size: int, crc: int, compression: str, stor
     return head + struct.pack(f"<I{len(name)}sQ", len(name), name, stored)
 
 
-# Takes (where, what) of a damage: raises, or notes it where damage is left out.
+# Called with (place, problem) for damage; it raises an error, or notes the damage if it is skipped.
 Refuse = Callable[[str, str], None]
 
 
 @dataclass(slots=True)
 class IndexPart:
-    """The message index of one channel in one chunk: `count` pairs at `offset` in the file."""
+    """Message index of one channel in one chunk: `count` pairs at `offset` in the file."""
 
     channel: int
     offset: int
@@ -126,20 +126,22 @@ class IndexPart:
 
 @dataclass(slots=True)
 class Segment:
-    """A chunk, or messages outside chunks that follow one another.
+    """A chunk, or a stretch of messages outside chunks.
 
     Attributes:
-        offset: place in the file of its first record.
-        data_offset: place in the file of its (compressed) records.
-        stored: bytes there.
-        size: bytes once decompressed.
-        crc: CRC-32 of the decompressed bytes, 0 where the writer gave none.
-        start: log time of its earliest message.
-        end: log time of its latest message.
+        offset: offset in the file of the first record.
+        data_offset: offset in the file of the (compressed) records.
+        stored: stored size of the records (bytes).
+        size: decompressed size of the records (bytes).
+        compression: "zstd", "lz4" or "".
+        crc: CRC-32 of the decompressed records; 0: none.
+        start: log time of the earliest message (ns).
+        end: log time of the latest message (ns).
+        chunked: True for a chunk.
         indexes: the chunk's message indexes, in file order.
-        counts: messages of each channel where a walk counted them.
-        cut: the file ends within it.
-        stated: it is known from the summary, its own header was not read.
+        counts: number of messages of each channel, if a walk counted them.
+        cut: True if the file ends within it.
+        stated: True if only the summary states it, and its own header was not read.
     """
 
     offset: int
@@ -158,7 +160,7 @@ class Segment:
 
     @classmethod
     def of_chunk(cls, offset: int, content: bytes | memoryview) -> Segment:
-        """Parse the header of a chunk at a place in the file."""
+        """Parse the header of a chunk at an offset in the file."""
         fields = Fields(content, "a chunk")
         start, end, size = fields.read8(), fields.read8(), fields.read8()
         crc, compression, stored = fields.read4(), fields.read_prefixed_string(), fields.read8()
@@ -166,23 +168,23 @@ class Segment:
         return cls(offset, data, stored, size, compression, crc, start, end, chunked=True)
 
     def within(self, end: int) -> Segment:
-        """Return a chunk whose data must not run over the end of its record."""
+        """Return the chunk, after a check that its data end within its record."""
         if self.data_end > end:
-            raise MalformedRecord("a chunk's length is not that of its data")
+            raise MalformedRecord("the length of a chunk contradicts its data")
         return self
 
     def head(self, crc: int) -> bytes:
-        """Return the bytes of a chunk before its records, given their CRC."""
+        """Return the bytes of a chunk before its records, for a CRC of the records."""
         return chunk_head(self.start, self.end, self.size, crc, self.compression, self.stored)
 
     @property
     def data_end(self) -> int:
-        """Place in the file after its records."""
+        """Offset in the file after the records."""
         return self.data_offset + self.stored
 
     @property
     def stop(self) -> int:
-        """Place in the file after its message indexes."""
+        """Offset in the file after the message indexes."""
         if not self.indexes:
             return self.data_end
         last = self.indexes[-1]
@@ -190,12 +192,12 @@ class Segment:
 
     @property
     def name(self) -> str:
-        """Name in errors."""
+        """Name of the segment in errors."""
         kind = "chunk" if self.chunked else "messages"
         return f"{kind} at byte {self.offset} (log time {self.start} to {self.end} ns)"
 
     def channel_counts(self) -> dict[int, int] | None:
-        """Return the messages of each channel, or None if only decoding can tell."""
+        """Return the number of messages of each channel; None if only decoding can tell."""
         if self.counts is not None:
             return self.counts
         if not self.indexes:
@@ -208,7 +210,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A file within the log, whose bytes are at `offset`."""
+    """A file in the log, whose bytes are at `offset`."""
 
     name: str
     media_type: str
@@ -220,7 +222,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Damage of a log, or a loss."""
+    """Damage or loss in a log: the place, and a description."""
 
     where: str
     what: str
@@ -228,7 +230,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message of a log; times in nanoseconds."""
+    """A message of a log; times in ns."""
 
     channel: Channel
     sequence: int
@@ -238,7 +240,7 @@ class Message:
 
 
 class Definitions:
-    """The schemas and channels of a log; an id has one meaning."""
+    """The schemas and channels of a log, each with one meaning for an id."""
 
     def __init__(self, refuse: Refuse) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -247,11 +249,11 @@ class Definitions:
         self._seen: set[tuple[int, bytes]] = set()
         self._bytes = 0
 
-    def add(self, opcode: int, content: bytes, where: str) -> None:
+    def add(self, opcode: int, content: bytes, place: str) -> None:
         """Add a Schema or Channel record; refuse one whose id has another meaning.
 
         Raises:
-            MalformedRecord: it is no such record, or all of them take too much memory.
+            MalformedRecord: the record is not valid, or all of them take too much memory.
         """
         key = (opcode, content)
         if key in self._seen:
@@ -265,5 +267,5 @@ class Definitions:
         known: dict[int, Any] = self.schemas if is_schema else self.channels
         if known.setdefault(new.id, new) != new:
             kind = "schema" if is_schema else "channel"
-            self._refuse(where, f"{kind} {new.id} is defined twice with different content")
+            self._refuse(place, f"{kind} {new.id} is defined twice with different content")
         self._seen.add(key)

@@ -1,4 +1,4 @@
-"""Find the next sound record of a damaged log."""
+"""Search for the next sound record of a damaged log."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from recorder.mcap.records import (
 )
 from recorder.mcap.store import Store
 
-# Opcode, length, times and the low half of the size, its high half, CRC, compression, stored bytes:
-# lengths below 4 GiB have four zero bytes, which random data hardly has at all of these places.
+# A chunk: opcode, length, times, size, CRC, compression, stored size. Sizes below 4 GiB have four
+# zero bytes each; random data hardly has zeros at all of these offsets.
 _CHUNK: Final = re.compile(
     rb"(?=\x06[\s\S]{4}\0{4}[\s\S]{20}\0{4}[\s\S]{4}(\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)[\s\S]{4}\0{4})"
 )
-# The length that some writers state in a chunk until they have finished it.
+# Length that some writers state in a chunk until it is finished.
 _OPEN_LENGTH: Final = 2**64 - 1
 _BLOCK: Final = 1 << 20
 
-# Bytes that blocks share, more than the pattern and the stored bytes' length take.
+# Bytes that neighbouring blocks share, more than the pattern with the stored size takes.
 _OVERLAP: Final = 64
 
 
@@ -42,7 +42,7 @@ def is_record(file: Store, at: int, stop: int) -> bool:
 
 
 def inner_end(file: Store, opcode: int, content: int) -> int | None:
-    """Return where a chunk or a message index ends by the lengths within it; None for others."""
+    """Return the end of a chunk or message index by its inner lengths; None for other records."""
     if opcode == Opcode.MESSAGE_INDEX:
         return content + 6 + int.from_bytes(file.peek(content + 2, 4), "little")
     if opcode == Opcode.CHUNK:
@@ -53,12 +53,12 @@ def inner_end(file: Store, opcode: int, content: int) -> int | None:
 
 
 def cut_chunk(file: Store, content: int, length: int, limit: int) -> Segment | None:
-    """Return the part of a chunk before the end of the file, if its head is there.
+    """Return the part of a chunk before the end of the file; None if its header is incomplete.
 
     Args:
         file: the log.
-        content: place of the record's content.
-        length: of the content, as the record states it.
+        content: offset of the record's content.
+        length: length of the content that the record states.
         limit: end of the file.
     """
     try:
@@ -76,7 +76,7 @@ def cut_chunk(file: Store, content: int, length: int, limit: int) -> Segment | N
 
 
 def next_chunk(file: Store, at: int, stop: int) -> int | None:
-    """Return the first place in [at, stop) where a chunk with consistent lengths begins."""
+    """Return the first offset in [at, stop) at which a chunk with consistent lengths begins."""
     while at < stop:
         block = file.read(at, min(_BLOCK + _OVERLAP, stop - at))
         for match in _CHUNK.finditer(block):

@@ -1,8 +1,8 @@
-"""Read the structure of a log: by a walk over its outer records, or from its summary.
+"""Structure of an MCAP log: read from its summary, or by a walk over its outer records.
 
-The walk needs no index: it finds chunks, loose messages, metadata and attachments in
-whole files, in files without a summary, and in files that were cut anywhere. The
-summary is compared with them.
+The walk needs no index. It finds chunks, messages outside chunks, metadata and attachments in
+complete files, in files without a summary, and in files that are cut anywhere, and compares the
+summary with them.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ from recorder.mcap.resync import cut_chunk, inner_end, is_record, next_chunk
 from recorder.mcap.store import OnePass, Store
 from recorder.mcap.summary import Summary, read_summary
 
-# Messages outside chunks are decoded about this many bytes at once, as many as a chunk has.
+# Approximate size of the pieces in which messages outside chunks are decoded, that of a usual
+# chunk.
 LOOSE_BYTES: Final = 1024 * 1024
-_LOOSE: Final = struct.Struct("<HIQ")
-_INDEX: Final = struct.Struct("<HI")
+_LOOSE: Final = struct.Struct("<HIQ")  # channel, sequence and log time of a message
+_INDEX: Final = struct.Struct("<HI")  # channel and size of a message index
 _DATA_END_BYTES: Final = RECORD_HEADER.size + 4
-# Most bytes of an attachment's names.
+# Largest size of an attachment's fields before its data (name and media type).
 _BEFORE_DATA: Final = 1024 * 1024
-# The first opcode of records that writers may define themselves.
+# First opcode that the format reserves for records of other programs.
 _PRIVATE: Final = 0x80
 
 
@@ -51,19 +52,20 @@ class LogStructure:
 
     Args:
         file: the log.
-        skip_damaged: note damage in `problems`, and continue at the next sound chunk; else raise.
-        by_index: believe a summary that accounts for every message, and read no chunk.
+        skip_damaged: True to note damage in `problems`, and continue at the next sound chunk; False
+            to raise an error.
+        by_index: True to trust a summary that accounts for every message, and read no chunk.
 
     Attributes:
         problems: the damage.
-        by_index: the summary was believed.
-        segments: chunks and messages outside them, in file order.
-        torn: the chunk within which the file ends, or None.
-        complete: the file has its end, and nothing is missing.
-        missing: the end that a cut file lacks, in words; "" for a whole one.
-        data_crc: CRC of the data section, 0 for none, None where the file ends before it.
-        data_end: place where the data section ends.
-        first_damage: place of the first record that is damaged, None where none is.
+        by_index: True if the summary was trusted.
+        segments: chunks and stretches of messages outside chunks, in file order.
+        torn: the chunk in which the file ends, or None.
+        complete: True if the file has its end, and nothing is missing.
+        missing: description of the missing end of a cut file; "" if nothing is missing.
+        data_crc: CRC of the data section; 0: none; None: the file ends before it.
+        data_end: offset at which the data section ends.
+        first_damage: offset of the first damaged record; None if there is none.
     """
 
     def __init__(self, file: Store, *, skip_damaged: bool, by_index: bool) -> None:
@@ -83,15 +85,16 @@ class LogStructure:
         self._metadata_bytes = 0
         self._loose: Segment | None = None
         self._last_chunk: Segment | None = None
-        # The place of the record, the place up to which records are sound, the end of an inner one.
+        # Offset of the present record; offset up to which records are sound; end of an inner
+        # record.
         self._at = self._sure = len(MAGIC)
         self._inside = 0
         if not (start := file.read(0, len(MAGIC))):
-            raise LogDamagedError(f"{file.path}: empty, nothing was written")
+            raise LogDamagedError(f"{file.path}: it is empty: record or copy it again")
         if start != MAGIC:
             raise no_log(file.path)
         self.summary: Summary | None = read_summary(file, self.definitions, self.refuse)
-        # The damage in a footer may be in the place where it says that the data ends.
+        # In a damaged footer the offset at which the data section ends can be wrong.
         lies = skip_damaged and self.summary is not None and self.summary.broken
         self._limit = self.summary.begin if self.summary and not lies else None
         if not by_index or not self._take_index():
@@ -99,7 +102,7 @@ class LogStructure:
 
     @property
     def attachments(self) -> list[Attachment]:
-        """The attachments; their CRCs were checked."""
+        """The attachments; reading them checks their CRCs."""
         spans, self._attachment_ranges = self._attachment_ranges, []
         try:
             for start, stop in spans:
@@ -108,25 +111,25 @@ class LogStructure:
             self.refuse("attachments", str(error))
         return self._attachments
 
-    def refuse(self, where: str, what: str) -> None:
-        """Raise an error for damage at a place, or note it with `skip_damaged`."""
+    def refuse(self, place: str, problem: str) -> None:
+        """Raise an error for damage or, with `skip_damaged`, note it."""
         if not self.skip_damaged:
             raise LogDamagedError(
-                f"{self.path}: {where}: {what}; save the rest with cdmisfa recover (from a "
+                f"{self.path}: {place}: {problem}; save the rest with cdmisfa recover (from a "
                 "recording, cdmisfa learn --skip-damaged leaves it out)"
             )
-        self.note(where, what)
+        self.note(place, problem)
 
-    def note(self, where: str, what: str) -> None:
-        """Note a problem at a place once."""
-        problem = Problem(where, what)
-        self.problems += [problem] if problem not in self.problems else []
+    def note(self, place: str, problem: str) -> None:
+        """Add a problem to `problems`, unless it is there."""
+        new = Problem(place, problem)
+        self.problems += [new] if new not in self.problems else []
 
     def walk(self) -> Iterator[Segment]:
         """Walk over every record of a log that was opened by its index, in one pass.
 
         Yields:
-            Each chunk that the index names, before the walk continues to the record behind it.
+            Each chunk in the index, before the walk continues after it.
         """
         assert self._limit is not None
         assert isinstance(self.file, OnePass)
@@ -141,13 +144,13 @@ class LogStructure:
             yield segment
         self._walk_data()
 
-    def _damaged(self, where: str, what: str) -> None:
+    def _damaged(self, place: str, problem: str) -> None:
         if self.first_damage is None:
             self.first_damage = self._at
-        self.refuse(where, what)
+        self.refuse(place, problem)
 
     def _take_index(self) -> bool:
-        """Take the chunks from the summary; return whether it accounts for every message."""
+        """Take chunks from the summary; return False if it does not account for each message."""
         summary = self.summary
         if summary is None:
             return False
@@ -161,7 +164,7 @@ class LogStructure:
             for start, stop in summary.ranges(Opcode.METADATA_INDEX):
                 self._record_at(start, stop, Opcode.METADATA)
         except MalformedRecord:
-            # A summary that lies is not used: the walk finds what is in the file.
+            # The summary is wrong: do not use it. The walk finds the content of the file.
             self._at, self.data_crc = len(MAGIC), None
             self.metadata, self._metadata_bytes = [], 0
             return False
@@ -174,12 +177,12 @@ class LogStructure:
         head = self.file.peek(start, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
         present, length = RECORD_HEADER.unpack(head)
         if present != opcode or stop not in (None, start + RECORD_HEADER.size + length):
-            raise MalformedRecord(f"at byte {start} is no {opcode.name} record")
+            raise MalformedRecord(f"there is no {opcode.name} record at byte {start}")
         self._at = start
         self._take(present, start + RECORD_HEADER.size, length)
 
     def _walk_data(self, stop: int | None = None) -> None:
-        """Walk over the records up to a place, or to the end of the data."""
+        """Walk over the records up to an offset, or to the end of the data section."""
         while self.data_crc is None and (stop is None or self._at < stop):
             limit = self.file.size if self._limit is None else self._limit
             where = f"byte {self._at}"
@@ -195,19 +198,19 @@ class LogStructure:
             return
         self._close_loose()
         if self.data_crc is not None and self._limit is None and not self.missing:
-            self.missing = "cut short: its summary is not all there, every message is"
+            self.missing = "cut short: part of its summary is missing, but no message is"
         self.complete = self._limit is not None and self.data_crc is not None
         if self.complete and self.summary:
-            for what in self.summary.contradictions(self.segments):
-                self._damaged("summary", what)
-        # The CRC of a cut chunk is that of records that are not there.
+            for contradiction in self.summary.contradictions(self.segments):
+                self._damaged("summary", contradiction)
+        # The CRC of a cut chunk is that of its complete records.
         if self.torn is not None and (self.skip_damaged or not self.torn.crc):
             self.segments.append(self.torn)
 
     # The outer records
 
     def _step(self, limit: int) -> bool:
-        """Read the next record; return whether the file does not end there."""
+        """Read the next record; return False if the file ends here."""
         head = self.file.peek(self._at, RECORD_HEADER.size) if self._at < limit else b""
         if len(head) < RECORD_HEADER.size or self._at + RECORD_HEADER.size > limit:
             return self._cut("the end of the file and its index are missing")
@@ -215,27 +218,27 @@ class LogStructure:
         content = self._at + RECORD_HEADER.size
         end = content + length
         if opcode == 0:
-            # Some file systems leave zeros where data did not reach the disk before a power cut.
+            # After a power cut some file systems leave zeros where data did not reach the disk.
             rest = self.file.blocks(self._at, self.file.size)
             if self._limit is None and not any(map(any, rest)):
                 return self._cut(f"from byte {self._at} on there are only zeros")
             raise MalformedRecord("no record (opcode 0)")
         inner = inner_end(self.file, opcode, content) if self.skip_damaged else None
         if inner is not None and inner < end and is_record(self.file, inner, limit):
-            # Only the record's own length is damaged: what it holds ends where a record begins.
+            # Only the length of the record is damaged: its content ends where a record begins.
             self._damaged(f"byte {self._at}", "a record's length is not that of what it holds")
             end, length = inner, inner - content
         if end > limit:
             if opcode == Opcode.CHUNK and self._limit is None:
                 self.torn = cut_chunk(self.file, content, length, limit)
             return self._cut(
-                f"the file ends within a record at byte {self._at}, {limit - self._at} bytes of it "
-                "are there"
+                f"the file ends within a record at byte {self._at}, of which it has "
+                f"{limit - self._at} bytes"
             )
         if self._at == len(MAGIC) and opcode != Opcode.HEADER:
             raise MalformedRecord("the file does not begin with a header record")
         if self.skip_damaged and self.summary and opcode != Opcode.CHUNK:
-            # A damaged length would jump over sound chunks: the summary says where these begin.
+            # A damaged length would skip sound chunks: the summary has their offsets.
             named = self.summary.named
             place = bisect_left(named, self._at)
             if place < len(named) and named[place] == self._at:
@@ -258,7 +261,7 @@ class LogStructure:
             head = self.file.peek(content, min(length, _INDEX.size)).ljust(_INDEX.size, b"\0")
             channel, size = _INDEX.unpack(head)
             if size + _INDEX.size > length or size % 16:
-                raise MalformedRecord("a message index lies about its length")
+                raise MalformedRecord("the length of a message index contradicts its content")
             part = IndexPart(channel, content + _INDEX.size, size // 16)
             self._last_chunk.indexes.append(part)
             return
@@ -283,30 +286,30 @@ class LogStructure:
             self._attachment(content, length)
         elif opcode == Opcode.HEADER:
             if self._at != len(MAGIC):
-                raise MalformedRecord("a second header, as of two files in one")
+                raise MalformedRecord("there is a second header, as in two joined files")
             header = Header.read(Fields(self._definition(content, length), "the header"))
             self.profile, self.library = header.profile, header.library
         elif opcode == Opcode.DATA_END:
             self.data_end = self._at
             crc = Fields(self.file.peek(content, min(length, 4)), "the data end").read4()
             if self.skip_damaged and self._limit is None and length != 4:
-                raise MalformedRecord("a data end of another length than its own")
+                raise MalformedRecord("a data end record has a wrong length")
             if self._limit is not None and content + length != self._limit:
                 raise MalformedRecord("the data section does not end where the summary starts")
             self.data_crc = crc
         elif opcode <= max(Opcode) or (self.skip_damaged and opcode < _PRIVATE):
-            raise MalformedRecord(f"a record of opcode {opcode} among the data")
+            raise MalformedRecord(f"the data section has a record of opcode {opcode}")
 
     def _definition(self, content: int, length: int) -> bytes:
-        """Read a record that is kept in memory."""
+        """Read a record that is stored in memory."""
         if length > MAX_DEFINITION:
             raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
         return self.file.read(content, length)
 
     def _loose_message(self, content: int, length: int) -> None:
-        """Add a message outside chunks to the messages before it."""
+        """Add a message outside chunks to the present stretch of such messages."""
         if not _LOOSE.size + 8 <= length <= MAX_CHUNK:
-            raise MalformedRecord(f"a message of {length} bytes: it has 22 to {MAX_CHUNK}")
+            raise MalformedRecord(f"a message has {length} bytes, not 22 to {MAX_CHUNK}")
         number, _, time = _LOOSE.unpack(self.file.peek(content, _LOOSE.size))
         end = content + length
         if self._loose is not None and end - self._loose.offset > LOOSE_BYTES:
@@ -332,7 +335,7 @@ class LogStructure:
         name, media_type = fields.read_prefixed_string(), fields.read_prefixed_string()
         size = fields.read8()
         if fields.count + size + 4 > length:
-            raise MalformedRecord("an attachment lies about its length")
+            raise MalformedRecord("the length of an attachment contradicts its content")
         data = content + fields.count
         self._inside = data + size + 4
         crc = int.from_bytes(self.file.read(data + size, 4), "little")
@@ -344,16 +347,16 @@ class LogStructure:
 
     # The end of the file
 
-    def _cut(self, what: str) -> bool:
+    def _cut(self, fact: str) -> bool:
         if self._limit is not None:
             raise MalformedRecord("the data section has no end record before the summary")
-        self.missing = f"cut short: {what}"
+        self.missing = f"cut short: {fact}"
         if self.torn is not None and self.torn.crc and not self.skip_damaged:
             self.missing += "; recover can save part of the last chunk, unverified"
         return False
 
     def _resume_after(self) -> bool:
-        """Continue at the next chunk that the summary names, else at the next that looks sound."""
+        """Continue at the next chunk in the summary, or else at the next that looks sound."""
         self._close_loose()
         self._last_chunk = None
         place = None
@@ -364,18 +367,18 @@ class LogStructure:
             place = next_chunk(self.file, self._sure + (self._sure == self._at), stop)
         if place is None:
             return False
-        # Records behind the last sound one may have been read at wrong places.
+        # Records after the last sound one may have been read at wrong offsets: drop them.
         self.segments = [s for s in self.segments if s.offset < place]
         self._attachments = [a for a in self._attachments if a.offset < place]
         self._at = place
         return True
 
     def _resume_after_cut(self) -> bool:
-        """Continue where it was a damaged length that made the file look cut."""
-        what = self.missing.removeprefix("cut short: ")
+        """Continue if the file looked cut only because of a damaged length."""
+        fact = self.missing.removeprefix("cut short: ")
         more = self.torn is None and self._at < self.file.size
         if not (self.skip_damaged and more and self._resume_after()):
             return False
         self.missing = ""
-        self._damaged(f"byte {self._sure}", what)
+        self._damaged(f"byte {self._sure}", fact)
         return True

@@ -1,7 +1,8 @@
-"""Write MCAP: chunked, compressed, indexed, with every checksum.
+"""`McapWriter`: write MCAP files, chunked, compressed, indexed, with every checksum.
 
-The bytes are those that the mcap package writes, except for the blocks of lz4, in a quarter of its
-time a message: a message is only appended to its chunk, and everything else is done for the chunk.
+The bytes equal those of the mcap package, except for LZ4 blocks, and take a quarter of its time for
+each message: a message is only appended to its chunk, and all other work is done once for the
+    chunk.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from mcap.opcode import Opcode
 from recorder.config import Compression
 from recorder.mcap.records import INDEX_HEADER, MAGIC, MESSAGE_HEADER, chunk_head, crc32
 
-_OF_MESSAGE: Final = int(Opcode.MESSAGE)
+_MESSAGE: Final = int(Opcode.MESSAGE)
 _MESSAGE_SIZE: Final = MESSAGE_HEADER.size
 _MESSAGE_FIELDS: Final = _MESSAGE_SIZE - 9
 # The part of the footer that the summary's checksum covers.
@@ -29,22 +30,22 @@ _FOOTER: Final = struct.Struct("<BQQQ")
 
 _COMPRESS: Final[Mapping[Compression, tuple[str, Callable[[memoryview], bytes]]]] = {
     "zstd": ("zstd", zstandard.compress),
-    # Blocks that do not refer to earlier ones take a third less time, and 3 % more room.
+    # Blocks that do not refer to earlier ones take a third less time and 3 % more space.
     "lz4": ("lz4", partial(lz4.frame.compress, block_linked=False)),
     "none": ("", bytes),
 }
 
 
 class McapWriter:
-    """Write one file, from its first byte to its last.
+    """Writer of one file, from its first byte to its last.
 
     Args:
-        out: the open file, which is only appended to.
-        library: writer of the file, as its header states.
-        profile: of the messages, as the header states.
-        compression: of the chunks.
-        chunk_size: bytes of records at which a chunk ends.
-        aside: compress and append chunks in a thread of their own; the bytes are the same.
+        out: the open file, to which bytes are appended.
+        library: name of the writing program, for the header.
+        profile: profile of the messages, for the header.
+        compression: compression of the chunks.
+        chunk_size: size of the records at which a chunk ends (bytes).
+        aside: True to compress and append chunks in another thread; the bytes are the same.
     """
 
     def __init__(
@@ -66,10 +67,10 @@ class McapWriter:
         self._attachments: list[mcap.AttachmentIndex] = []
         self._metadata: list[mcap.MetadataIndex] = []
         self._counts: dict[int, int] = {}
-        # Only grow: memory that is used again is in the cache. One takes the next chunk while the
-        # other is compressed.
+        # Two buffers that only grow, because memory that is used again is in the processor's cache.
+        # One receives the next chunk while the other is compressed.
         self._records = memoryview(bytearray())
-        self._spare = memoryview(bytearray()) if aside else self._records
+        self._other_buffer = memoryview(bytearray()) if aside else self._records
         self._aside = ThreadPoolExecutor(1) if aside else None
         self._pending: Future[None] | None = None
         self._size = 0
@@ -80,12 +81,12 @@ class McapWriter:
 
     @property
     def size(self) -> int:
-        """Bytes written so far, without the chunk in progress."""
+        """Number of bytes written, without the present chunk."""
         self.settle()
         return int(self._out.tell())
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Define how messages are decoded, and return its id; the same schema gets the same."""
+        """Define a schema, and return its id; an equal schema gets the same id."""
         for known in self._schemas:
             if (known.name, known.encoding, known.data) == (name, encoding, data):
                 return known.id
@@ -102,7 +103,7 @@ class McapWriter:
         encoding: str = "protobuf",
         metadata: Mapping[str, str] | None = None,
     ) -> int:
-        """Define a channel of messages on a topic, and return its id; schema 0 is none."""
+        """Define a channel, and return its id; schema 0 means none."""
         number, facts = len(self._channels) + 1, dict(metadata or {})
         channel = mcap.Channel(number, topic, encoding, facts, schema)
         self._channels.append(channel)
@@ -119,7 +120,7 @@ class McapWriter:
                 self._grow(stop)
             records, fields = self._records, _MESSAGE_FIELDS + length
             MESSAGE_HEADER.pack_into(
-                records, at, _OF_MESSAGE, fields, channel, sequence, log_time, publish_time
+                records, at, _MESSAGE, fields, channel, sequence, log_time, publish_time
             )
             records[start:stop] = data
             self._size = stop
@@ -131,7 +132,7 @@ class McapWriter:
                 self.end_chunk()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a named map of texts at once, outside the chunks."""
+        """Write a metadata record immediately, outside of the chunks."""
         self.settle()
         data = _encoded(mcap.Metadata(name=name, metadata=dict(values)))
         self._metadata.append(mcap.MetadataIndex(self._out.tell(), len(data), name))
@@ -141,7 +142,7 @@ class McapWriter:
     def add_attachment(
         self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
     ) -> None:
-        """Write a named file at once, outside the chunks; times in nanoseconds."""
+        """Write an attachment immediately, outside of the chunks; times in ns."""
         self.settle()
         stored = _encoded(mcap.Attachment(create_time, log_time, name, media_type, data))
         place, times = (self._out.tell(), len(stored)), (log_time, create_time)
@@ -150,12 +151,12 @@ class McapWriter:
         self._out.flush()
 
     def end_chunk(self) -> None:
-        """End the chunk in progress if it holds a message; it is appended now or later."""
+        """End the present chunk if it has a message; another thread may append it later."""
         if not self._index:
             return
         self.settle()
         work = partial(self._append_chunk, self._records, self._size, self._index)
-        self._records, self._spare = self._spare, self._records
+        self._records, self._other_buffer = self._other_buffer, self._records
         self._size, self._index = 0, {}
         if self._aside is None:
             work()
@@ -163,13 +164,13 @@ class McapWriter:
             self._pending = self._aside.submit(work)
 
     def settle(self) -> None:
-        """Wait until all chunks that ended are appended, and raise the error of one."""
+        """Wait until all ended chunks are appended; raise the error of one that failed."""
         if self._pending is not None:
             self._pending.result()
             self._pending = None
 
     def end(self) -> None:
-        """End the chunk in progress and append the summary."""
+        """End the present chunk, and append the summary."""
         self.end_chunk()
         self.settle()
         self._append(_encoded(mcap.DataEnd(self._crc)))
@@ -207,9 +208,9 @@ class McapWriter:
         """Append a chunk with its message indexes.
 
         Args:
-            buffer: its records first.
-            size: of the records.
-            index: by channel the times of its messages, each with its place.
+            buffer: the buffer, which begins with the records.
+            size: size of the records (bytes).
+            index: for each channel, log time and offset of each message, alternating.
         """
         times = [pairs[::2] for pairs in index.values()]
         first, last = min(map(min, times)), max(map(max, times))
@@ -254,12 +255,12 @@ class McapWriter:
             self.end_chunk()
 
     def _grow(self, size: int) -> None:
-        """Make room for `size` bytes of records."""
+        """Enlarge the buffer to at least `size` bytes."""
         grown = memoryview(bytearray(max(size, 2 * self._size)))
         grown[: self._size] = self._records[: self._size]
         self._records = grown
         if self._aside is None:
-            self._spare = grown
+            self._other_buffer = grown
 
     def _append(self, data: bytes | memoryview) -> None:
         self._crc = crc32(data, self._crc)
