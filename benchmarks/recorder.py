@@ -10,7 +10,7 @@ from pathlib import Path
 
 from benchmarks.report import interleaved, middle, ratio, save
 from recorder.recording import record_scene
-from recorder.world.scenes import open_scene, take_here
+from recorder.world.scenes import blocks_in_process, open_scene
 
 
 def rendering(scene: str, frames: int) -> Callable[[], int]:
@@ -19,7 +19,7 @@ def rendering(scene: str, frames: int) -> Callable[[], int]:
     def call() -> int:
         with contextlib.closing(open_scene(scene)) as source:
             starts = dict.fromkeys(range(len(source.spec.streams)), 0)
-            return sum(len(block.frames) for block in take_here(source, starts, frames))
+            return sum(len(block.frames) for block in blocks_in_process(source, starts, frames))
 
     return call
 

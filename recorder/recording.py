@@ -31,10 +31,10 @@ from recorder.log.viewlog import ViewLog
 from recorder.world.scenes import (
     SCENES,
     OpenScene,
+    blocks_in_process,
     open_scene,
     render_in_processes,
     scene_of,
-    take_here,
 )
 
 _FILE_NAME = re.compile(r"[\w-][\w.-]*")
@@ -146,7 +146,7 @@ def record(
         logs = ViewLogs(folder, recording, settings, places, frames, split, poses)
         open_logs.callback(logs.abandon)
         starts = logs.starts()
-        blocks = take_here(source, starts, frames)
+        blocks = blocks_in_process(source, starts, frames)
         if scene and jobs > 1 and starts:
             blocks = render_in_processes(scene, starts, frames, jobs)
         with contextlib.closing(blocks):

@@ -75,8 +75,8 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
         )
     again = ("record", "--resume", "-o", folder)
     for wrong, what in (
-        (("--seed", 8), "its seed is '7', now it is '8'"),
-        (("--split", "4s"), "begun with --split 5s, not --split 4s"),
+        (("--seed", 8), "its seed is '7', not '8'"),
+        (("--split", "4s"), "started with --split 5s, not --split 4s"),
         (("icub",), "belongs to another recording"),
     ):
         if wrong == ("icub",):

@@ -56,7 +56,7 @@ CASES: dict[str, tuple[str, ...]] = {
     # a grid is checked before anything runs, and live streams are recorded first
     "sweep oscillatory --seeds 0 -o s --grid learner.tau=40,many": ("learner.tau",),
     "sweep gym:Pendulum-v1 --seeds 0 -o s": (
-        "record it first, with cdmisfa record gym:Pendulum-v1 -o REC",
+        "record it first with cdmisfa record gym:Pendulum-v1 -o REC",
     ),
     # --summary prints the results of a sweep, and computes nothing
     "sweep oscillatory": ("name the folder of the sweep with -o",),
@@ -69,7 +69,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "doctor left.mcap": ("check files with cdmisfa verify left.mcap",),
     # a fork that cannot be
     "fork RUN --iteration 3 -o x --set learner.tau=20": ("learner.tau cannot change in a fork",),
-    "fork RUN --iteration 16 -o x": ("holds 15 iterations",),
+    "fork RUN --iteration 16 -o x": ("has 15 iterations",),
     # neither a file nor the folder one is in is replaced
     "fork RUN --iteration 3 --force -o file": ("file is a file: name a folder",),
     "learn oscillatory -o EMPTY": ("is empty: name a",),

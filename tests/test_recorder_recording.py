@@ -279,7 +279,7 @@ def test_a_killed_rendering_process_ends_the_recording_with_one_line(recorder, t
     _, complaint = process.communicate(timeout=10)
     assert process.returncode == 1
     (line,) = complaint.strip().splitlines()
-    assert line.startswith("cdmisfa: a rendering process ended: continue with --resume")
+    assert line.startswith("cdmisfa: a rendering process died: continue with --resume")
     assert not any(alive(pid) for pid in workers)
     for view in STREAMS:
         assert whole_frames(tmp_path / "a" / f"{view}.mcap.partial", view) > 0

@@ -17,7 +17,7 @@ from recorder.config import RecordConfig
 from recorder.log.scenery import scenery_of, turned
 from recorder.recording import record_scene
 from recorder.world.icub.config import EyesConfig, IcubConfig
-from recorder.world.icub.head import FRAMES_OF_A_LOOK, Roaming
+from recorder.world.icub.head import LOOK_FRAMES, Roaming
 from replay.open_sources import open_recording
 from replay.runs.run import read_outline
 
@@ -33,7 +33,7 @@ def test_a_roaming_head_dwells_on_views_and_turns_between_them_the_same_at_every
     assert np.abs(np.diff(angles)).max() < 15
     runs = [(yaw, len(list(same))) for yaw, same in itertools.groupby(angles)]
     dwells = [n for yaw, n in runs if yaw in YAW]
-    assert min(dwells[:-1]) >= FRAMES_OF_A_LOOK - 12
+    assert min(dwells[:-1]) >= LOOK_FRAMES - 12
     assert len({yaw for yaw, _ in runs}) < 40  # of few angles, each drawn once
 
 

@@ -235,9 +235,7 @@ def test_a_source_that_cannot_go_back_is_refused_and_the_run_left_alone(tmp_path
     out = tmp_path / "run"
     go(OscillatorySource(), out, 30)
     before = contents(out)
-    with pytest.raises(
-        UsageError, match=r"oscillatory cannot go back .* resume from its recording"
-    ):
+    with pytest.raises(UsageError, match=r"oscillatory cannot go back .* resume from a recording"):
         go(ForwardOnly(), out, 40, resume=True)
     assert contents(out) == before
 

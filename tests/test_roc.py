@@ -107,5 +107,5 @@ def test_1_0_can_learn_the_paper_s_modules_too() -> None:
 
 def test_1_0_refuses_more_streams_than_its_table_has() -> None:
     spec = SourceSpec(tuple(f"s{i}" for i in range(65)), (2,), "float64")
-    with pytest.raises(UsageError, match="at most 64 streams"):
+    with pytest.raises(UsageError, match="give at most 64"):
         CuriousLearner(LearnerConfig(algorithm="1.0"), spec, 0)

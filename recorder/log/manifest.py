@@ -1,6 +1,6 @@
-"""Store the manifest of a recording: the metadata of each view's file, and RECORDING.
+"""Manifest of a recording: the metadata of each view's file, and the arguments of its start.
 
-RECORDING holds the command that started a recording, stored for --resume.
+The file RECORDING has the arguments until every view is finished, for --resume.
 """
 
 from __future__ import annotations
@@ -26,33 +26,34 @@ from cdmisfa.core.untrusted import MAX_JSON, parse_json, read_regular
 from recorder.log.files import RECORDING, atomic_write, to_disk
 from recorder.log.messages import SCHEMA_VERSION
 
-# Limits of what a file may state, far above any recording: a broken file must not take all memory.
+# Limits of the values in a file, far above those of any recording, so that a damaged file cannot
+# take all memory.
 MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
 MAX_FRAMES: Final = 2**33
 
-# Streams that every file of a recording names; of more each names its own, so that all together do
-# not grow with their square.
-MOST_NAMED: Final = 100
+# Largest number of streams that every file of a recording names. With more, each file names only
+# its own stream, because the total size of the names grows with the square of their number.
+MAX_NAMED: Final = 100
 
 # Packages whose versions every file states.
 PACKAGES: Final = ("cdmisfa", "numpy", "zstandard")
 
 _VERSION = "version_"
 
-# Keys that a file has only if they are not their default, which most recordings have.
-_AT_NEED = ("gaps", "stream_count")
+# Keys that a file has only if they are not the default.
+_OPTIONAL = ("gaps", "stream_count")
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingStart:
-    """How a recording was started.
+    """The arguments with which a recording was started.
 
     Attributes:
-        scene: name of what is recorded; "" if it is not known.
-        seed: of the scene's motions.
-        frames: number of frames that each unfinished view shall have.
-        split: seconds of a part of each unfinished view that is split.
+        scene: name of the recorded source; "" if unknown.
+        seed: seed of the scene's motions.
+        frames: number of frames that each unfinished view will have.
+        split: length of a part of each unfinished view that is split (s).
     """
 
     scene: str = ""
@@ -62,11 +63,11 @@ class RecordingStart:
 
 
 def read_start(folder: Path) -> RecordingStart:
-    """Read how an unfinished recording was started; a broken RECORDING says nothing.
+    """Return the arguments of an unfinished recording; empty ones if RECORDING is damaged.
 
     Raises:
         UsageError: the file is too large.
-        LogDamagedError: the disk does not give it.
+        LogDamagedError: the disk cannot read it.
     """
     path = folder / RECORDING
     data = read_regular(path, MAX_JSON) if path.is_file() else b""
@@ -79,15 +80,20 @@ def read_start(folder: Path) -> RecordingStart:
         return RecordingStart()
     if not frames:
         return RecordingStart()
-    known = type(seed) is int and 0 <= seed < 2**63
-    return RecordingStart(scene, seed if known else None, frames, split)
+    valid = type(seed) is int and 0 <= seed < 2**63
+    return RecordingStart(scene, seed if valid else None, frames, split)
 
 
 def store_start(folder: Path, views: Sequence[str], start: RecordingStart | None = None) -> None:
-    """Store how some views are started, or that they are finished, beside the others.
+    """Store the arguments of views that are started; remove those of finished views.
+
+    Args:
+        folder: folder of the recording.
+        views: names of the views.
+        start: the arguments; None: the views are finished.
 
     Raises:
-        LogWriteError: the disk does not take it.
+        LogWriteError: the file cannot be written.
     """
     before = read_start(folder)
     start = start or dataclasses.replace(before, frames={}, split={})
@@ -108,22 +114,22 @@ class ViewMetadata:
     """Metadata record of a view's file; each attribute is a key.
 
     Attributes:
-        scene: name of what was recorded.
+        scene: name of the recorded source.
         view: name of the stream.
-        stream_index: its place among the streams of the recording, from 0.
-        streams: all of them; none if they are more than `MOST_NAMED`.
+        stream_index: index of the stream in the recording, from 0.
+        streams: names of all streams; empty for more than `MAX_NAMED`.
         frame_shape: (height, width) or (I,).
         dtype: "uint8" or "float64".
-        truth: a name for each column of ground truth.
+        truth: name of each column of ground truth.
         fps: frames a second.
-        start_ns: log time of frame 0.
+        start_ns: log time of frame 0 (ns).
         first_frame: number of the file's first frame.
-        seed: of the scene's motions.
-        config_sha256: checksum of the configuration that is attached.
-        gaps: whether frames may be missing, because live streams had none to show.
+        seed: seed of the scene's motions.
+        config_sha256: SHA-256 of the attached configuration.
+        gaps: True if frames can be missing, because a live stream did not deliver them.
         stream_count: number of streams if they are not named, else 0.
-        versions: of packages that the bytes may depend on, each a key, too.
-        values: the record as it is in the file that it was read from.
+        versions: versions of packages on which the bytes can depend; each is a key too.
+        values: the record as it was read from the file.
     """
 
     scene: str
@@ -145,32 +151,32 @@ class ViewMetadata:
 
     @property
     def spec(self) -> SourceSpec:
-        """Specification of the file's view as a source, without a length."""
+        """Properties of the file's view as a source, without a length."""
         return SourceSpec(
             (self.view,), self.frame_shape, self.dtype, self.truth, self.fps, self.start_ns
         )
 
     def times(self, frames: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """Return the log times of frames, (n,) nanoseconds, as `SourceSpec.time_ns` gives them."""
+        """Return the log times of frames, (n,) ns, as `SourceSpec.time_ns` does."""
         return times_of(frames, self.fps, self.start_ns).astype(np.uint64)
 
     def frames_at(self, times: NDArray[np.uint64]) -> NDArray[np.int64]:
-        """Return the frames nearest to log times, (n,) nanoseconds."""
+        """Return the numbers of the frames nearest to log times (n,) (ns)."""
         return np.clip(nearest_frames(times, self.fps, self.start_ns), -1, MAX_FRAMES)
 
     def record(self) -> dict[str, str]:
-        """Return the file's metadata record."""
-        others = ["versions", "values", *(n for n in _AT_NEED if not getattr(self, n))]
-        names = [f.name for f in dataclasses.fields(self) if f.name not in others]
+        """Return the metadata record as texts."""
+        omitted = ["versions", "values", *(n for n in _OPTIONAL if not getattr(self, n))]
+        names = [f.name for f in dataclasses.fields(self) if f.name not in omitted]
         stated = {name: _text(getattr(self, name)) for name in names}
         return {"schema": str(SCHEMA_VERSION), **stated, **self.versions}
 
     @classmethod
     def parse(cls, path: object, values: Mapping[str, str]) -> ViewMetadata:
-        """Check a file's metadata record.
+        """Parse and check a file's metadata record.
 
         Raises:
-            LogDamagedError: a key that reading depends on is missing or makes no sense.
+            LogDamagedError: a key that is needed to read the file is missing or not valid.
         """
         try:
             shape = tuple(map(int, values["frame_shape"].split("x")))
@@ -209,13 +215,13 @@ class ViewMetadata:
                 raise ValueError(f"{wrong[0]} is {values[wrong[0]][:60]!r}")
         except (KeyError, ValueError) as error:
             raise LogDamagedError(
-                f"{path}: its recording metadata is broken ({error}): record it again"
+                f"{path}: its recording metadata is damaged ({error}): record it again"
             ) from None
         return stated
 
 
 def _text(value: Any) -> str:
-    """Return a value as a metadata record has it."""
+    """Return a value as a text of a metadata record."""
     if isinstance(value, tuple):
         between = "," if not value or isinstance(value[0], str) else "x"
         return between.join(map(str, value))
@@ -228,15 +234,15 @@ def _names(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpec:
-    """Specification of a recording; attempts at one recording agree in it.
+    """Specification of a recording; all attempts at one recording have the same.
 
     Attributes:
-        kind: name of what is recorded: a scene's, or the kind of a source.
-        seed: of the scene's motions.
-        spec: of its source, with the names of the views as its streams.
-        config: its configuration, as JSON values.
-        packages: whose versions the frames depend on, beside `PACKAGES`.
-        gaps: whether streams may lack frames.
+        kind: name of the scene, or kind of the source.
+        seed: seed of the scene's motions.
+        spec: properties of the source; its streams are the views.
+        config: configuration of the recording, as JSON values.
+        packages: packages on whose versions the frames depend, in addition to `PACKAGES`.
+        gaps: True if frames of streams can be missing.
     """
 
     kind: str
@@ -247,12 +253,12 @@ class RecordingSpec:
     gaps: bool = False
 
     def config_json(self) -> bytes:
-        """Return the configuration as the attachment holds it."""
+        """Return the configuration as the bytes of the attachment."""
         return (json.dumps(self.config, indent=2, sort_keys=True) + "\n").encode()
 
     def metadata(self, view: str, first_frame: int = 0) -> ViewMetadata:
-        """Return the metadata of the file of a view that begins with a frame."""
-        spec, named = self.spec, len(self.spec.streams) <= MOST_NAMED
+        """Return the metadata of a view's file that begins with a frame."""
+        spec, named = self.spec, len(self.spec.streams) <= MAX_NAMED
         return ViewMetadata(
             scene=self.kind,
             view=view,

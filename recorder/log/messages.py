@@ -1,9 +1,9 @@
-"""Encode the messages of a recording as protobuf: encoders, schemas and their byte layout.
+"""Protobuf messages of a recording: encoders, schemas and byte layout.
 
-Images are `foxglove.RawImage`, and a scene's cameras, frames and objects Foxglove's messages, too,
-so that Foxglove and Rerun show them without us. The values that a vectorised reader takes out of a
-message are at a fixed distance from its end, because only the timestamp before them varies in
-length.
+Images are `foxglove.RawImage`; the cameras, frames and objects of a scene are Foxglove's messages
+too, so that Foxglove and Rerun show them without this package. The values of a message have a fixed
+distance from its end, because only the timestamp before them varies in length; a vectorised reader
+relies on that.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from recorder.log.scenery import (
     turned,
 )
 
-# Name of the metadata record that says what a recording is.
+# Name of the metadata record that describes a recording.
 RECORDING_METADATA = "cdmisfa.recording"
 
-# Rises whenever a channel, a message or a metadata key changes its meaning.
+# Version of the messages. Raise it if a channel, a message or a metadata key changes its meaning.
 SCHEMA_VERSION = 1
 
 TRUTH_TOPIC = "/truth"
@@ -55,13 +55,13 @@ SIDES = ("left_eye", "right_eye")
 # Message and schema encoding of every channel.
 ENCODING = "protobuf"
 
-# Pixel format of image views: one byte of grey.
+# Pixel format of image views: one byte of gray.
 IMAGE_ENCODING = "mono8"
 IMAGE_SCHEMA = "foxglove.RawImage"
 VECTOR_SCHEMA = "cdmisfa.Vector"
 TRUTH_SCHEMA = "cdmisfa.GroundTruth"
 
-# Most columns of ground truth: their tags then take at most two bytes.
+# Largest number of columns of ground truth; the tags of their fields then take at most two bytes.
 MAX_TRUTH = 1000
 
 _FIRST_TRUTH_FIELD = 2
@@ -81,12 +81,12 @@ def calibration_topic(view: str, side: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Payload:
-    """Place of a message's values, counted from its end.
+    """Position of a message's values, counted from its end.
 
     Attributes:
-        tail: bytes between the values' end and the message's end.
-        size: bytes of the values.
-        before: bytes that must stand right before the values (tag and length).
+        tail: number of bytes from the end of the values to the end of the message.
+        size: number of bytes of the values.
+        before: bytes directly before the values (tag and length).
     """
 
     tail: int
@@ -95,7 +95,7 @@ class Payload:
 
 
 def image_payload(height: int, width: int, frame_id: str) -> Payload:
-    """Return the place of the pixels of a grey `foxglove.RawImage`."""
+    """Return the position of the pixels in a gray `foxglove.RawImage`."""
     name = frame_id.encode()
     size = height * width
     tail = 1 + len(varint(len(name))) + len(name) if name else 0
@@ -103,22 +103,22 @@ def image_payload(height: int, width: int, frame_id: str) -> Payload:
 
 
 def vector_payload(length: int) -> Payload:
-    """Return the place of the little-endian float64 values of a `cdmisfa.Vector`."""
+    """Return the position of the little-endian float64 values in a `cdmisfa.Vector`."""
     size = 8 * length
     return Payload(0, size, b"\x12" + varint(size) if size else b"")
 
 
 def truth_tags(names: Sequence[str]) -> list[bytes]:
-    """Return the tags before each of the float64 values that end a `cdmisfa.GroundTruth`."""
+    """Return the tags before the float64 values at the end of a `cdmisfa.GroundTruth`."""
     return [varint((_FIRST_TRUTH_FIELD + i) << 3 | 1) for i in range(len(names))]
 
 
 class Encoder:
-    """Encode messages of one kind, which have a timestamp; `schema` is its name.
+    """Encoder of messages of one type; `schema` is the name of the type.
 
     Args:
-        message: filled in, but for its time.
-        stamped: its parts that have the timestamp, if it has none itself.
+        message: the message, complete except for its time.
+        stamped: the parts of it that have a timestamp, if it has none itself.
     """
 
     def __init__(self, message: Any, stamped: Sequence[Any] = ()) -> None:
@@ -131,19 +131,19 @@ class Encoder:
         return descriptor_set(self._message.DESCRIPTOR)
 
     def __call__(self, time_ns: int, values: Any) -> bytes:
-        """Encode the message at a time; subclasses fill in the values of this time."""
+        """Encode the message at a time; derived classes set the values of this time."""
         for part in self._stamped:
             part.timestamp.FromNanoseconds(time_ns)
         return bytes(self._message.SerializeToString())
 
 
 class ImageEncoder(Encoder):
-    """Encode frames of a view as `foxglove.RawImage`, mono8.
+    """Encoder of frames as `foxglove.RawImage`, mono8.
 
     Args:
-        height: rows of pixels.
-        width: pixels of a row.
-        frame_id: the coordinate frame the image belongs to.
+        height: height of the image (pixels).
+        width: width of the image (pixels).
+        frame_id: coordinate frame of the image.
     """
 
     def __init__(self, height: int, width: int, frame_id: str) -> None:
@@ -154,25 +154,25 @@ class ImageEncoder(Encoder):
         super().__init__(image)
         blank = self._message.SerializeToString()
         end = len(blank) - payload.tail
-        # All but its time and its pixels is the same in every message of the view, and protobuf
-        # would copy the pixels twice.
+        # Only time and pixels vary between the messages of a view. Joining the constant parts with
+        # them avoids a second copy of the pixels, which protobuf would make.
         self._around = blank[: end - payload.size], blank[end:]
 
     def __call__(self, time_ns: int, values: ByteArray) -> bytes:
         """Encode one frame, (height, width) uint8.
 
         Raises:
-            ValueError: it is of another size.
+            ValueError: the frame has another size.
         """
         before, after = self._around
         if values.nbytes != self._size:
-            raise ValueError(f"a frame of {values.nbytes} bytes given, not of {self._size}")
+            raise ValueError(f"the frame has {values.nbytes} bytes, not {self._size}")
         pixels: Any = np.ascontiguousarray(values)
         return b"".join((_timestamp(time_ns), before, pixels, after))
 
 
 class VectorEncoder(Encoder):
-    """Encode values of a stream as `cdmisfa.Vector`, exact to the bit."""
+    """Encoder of vectors as `cdmisfa.Vector`, exact to the bit."""
 
     def __init__(self) -> None:
         repeated = _FIELD.LABEL_REPEATED
@@ -186,13 +186,13 @@ class VectorEncoder(Encoder):
 
 
 class TruthEncoder(Encoder):
-    """Encode ground truth as `cdmisfa.GroundTruth`: one double a name.
+    """Encoder of ground truth as `cdmisfa.GroundTruth`, with a double for each name.
 
     Args:
-        names: the columns of `Block.truth`.
+        names: names of the columns of `Block.truth`.
 
     Raises:
-        UsageError: a name that protobuf does not allow, or too many of them.
+        UsageError: protobuf does not allow a name, or there are too many names.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -200,10 +200,10 @@ class TruthEncoder(Encoder):
         allowed = all(_NAME.fullmatch(name) and name != "timestamp" for name in names)
         if not allowed or len(names) > MAX_TRUTH or len(set(names)) != len(names):
             raise UsageError(
-                f"ground truth needs at most {MAX_TRUTH} different names of letters, digits and _, "
-                f"not {', '.join(map(repr, names))[:200]}"
+                f"names of ground truth are {', '.join(map(repr, names))[:200]}: give at most "
+                f"{MAX_TRUTH} distinct names of letters, digits and _"
             )
-        # Explicit presence: a zero is written too, so that every message has the same layout.
+        # Explicit presence: protobuf then also writes zeros, so that all messages have one layout.
         double: Any = {"type": _FIELD.TYPE_DOUBLE, "label": _FIELD.LABEL_OPTIONAL}
         fields = [
             _FIELD(name=name, number=i + _FIRST_TRUTH_FIELD, oneof_index=i, **double)
@@ -221,12 +221,12 @@ class TruthEncoder(Encoder):
 
 
 class ObjectsEncoder(Encoder):
-    """Encode where the objects and the table are, as `foxglove.SceneUpdate`.
+    """Encoder of the positions of objects and table, as `foxglove.SceneUpdate`.
 
     Args:
         scenery: the objects.
-        names: of the columns of truth.
-        root: name of the root's frame.
+        names: names of the columns of truth.
+        root: name of the root's coordinate frame.
     """
 
     def __init__(self, scenery: Scenery, names: Sequence[str], root: str) -> None:
@@ -239,7 +239,7 @@ class ObjectsEncoder(Encoder):
         super().__init__(update, update.entities)
 
     def __call__(self, time_ns: int, values: FloatArray) -> bytes:
-        """Encode where everything is at a time with this (D,) truth."""
+        """Encode the positions for a row of truth, (D,)."""
         truth = values.tolist()
         for place, x, y in self._moved:
             place.x, place.y = truth[x], -truth[y]
@@ -247,7 +247,7 @@ class ObjectsEncoder(Encoder):
 
 
 def _add_thing(update: Any, thing: Thing, root: str) -> Any:
-    """Add a thing to a `foxglove.SceneUpdate`, and return its place there."""
+    """Add an object to a `foxglove.SceneUpdate`, and return its position in the message."""
     entity = update.entities.add(id=thing.name, frame_id=root)
     shapes = {"box": entity.cubes, "cylinder": entity.cylinders, "sphere": entity.spheres}
     shape = shapes[thing.shape].add()
@@ -262,7 +262,7 @@ def _add_thing(update: Any, thing: Thing, root: str) -> Any:
 
 
 def pose_encoder(frame_id: str, pose: HeadPose) -> Encoder:
-    """Return the encoder of a pose in a frame, as `foxglove.PoseInFrame`."""
+    """Return the encoder of a head pose, as `foxglove.PoseInFrame`."""
     message = PoseInFrame_pb2.PoseInFrame(frame_id=frame_id)
     _set(message.pose.position, pose.position)
     _set(message.pose.orientation, pose.quaternion)
@@ -270,7 +270,7 @@ def pose_encoder(frame_id: str, pose: HeadPose) -> Encoder:
 
 
 def calibration_encoder(eye: Eye, frame_id: str) -> Encoder:
-    """Return the encoder of how an eye maps the world, as `foxglove.CameraCalibration`."""
+    """Return the encoder of an eye's camera matrix, as `foxglove.CameraCalibration`."""
     f, x, y = eye.focal, eye.width / 2, eye.height / 2
     return Encoder(
         CameraCalibration_pb2.CameraCalibration(
@@ -285,10 +285,11 @@ def calibration_encoder(eye: Eye, frame_id: str) -> Encoder:
 
 
 def transforms_encoder(gaze: Gaze, root: str) -> Encoder:
-    """Return the encoder of where a view's head and eyes are, as `foxglove.FrameTransforms`.
+    """Return the encoder of the coordinate frames of a view, as `foxglove.FrameTransforms`.
 
-    From the root's frame to `VIEW/head`, turned by the yaw; from there to VIEW, between the eyes,
-    tilted, along whose z they look; and from there to each eye.
+    The frames are a chain: from the root to `VIEW/head`, turned by the yaw; to VIEW, tilted,
+        between
+    the eyes, with z along their gaze; and to each eye.
     """
     message = FrameTransforms_pb2.FrameTransforms()
     view, head, middle = gaze.name, f"{gaze.name}/head", gaze.middle
@@ -304,20 +305,20 @@ def transforms_encoder(gaze: Gaze, root: str) -> Encoder:
 
 
 def _set(message: Any, values: Sequence[float]) -> None:
-    """Fill in a vector, or a quaternion, (x, y, z, w)."""
+    """Set a vector, or a quaternion (x, y, z, w)."""
     for name, value in zip("xyzw", values, strict=False):
         setattr(message, name, value)
 
 
 def _seen_from(place: Place, turn: Quaternion, eye: Eye) -> tuple[Place, Quaternion]:
-    """Return the place and the turn of an eye, seen from a frame."""
+    """Return position and rotation of an eye relative to a coordinate frame."""
     back = inverse(turn)
     x, y, z = turned(back, np.subtract(eye.place, place).tolist()).tolist()
     return (x, y, z), times(back, eye.turn)
 
 
 def descriptor_set(descriptor: Any) -> bytes:
-    """Return a message's file and every file it imports, imports first, as MCAP wants it."""
+    """Return a FileDescriptorSet of a message and its imports, imports first, as MCAP requires."""
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
     def collect(file: Any) -> None:
@@ -333,7 +334,7 @@ def descriptor_set(descriptor: Any) -> bytes:
 
 
 def _message(name: str, fields: Sequence[Any]) -> Any:
-    """Make an empty message of package cdmisfa: a timestamp as field 1, then the fields."""
+    """Return an empty message of package cdmisfa: a timestamp as field 1, then the fields."""
     imports = [timestamp_pb2.DESCRIPTOR.name]
     file = descriptor_pb2.FileDescriptorProto(
         name=f"cdmisfa/{name}.proto", package="cdmisfa", syntax="proto3", dependency=imports
@@ -361,7 +362,7 @@ def _timestamp(time_ns: int) -> bytes:
 
 @lru_cache(1024)
 def varint(number: int) -> bytes:
-    """Encode a whole number as protobuf's variable-length integer."""
+    """Return a number as protobuf's variable-length integer."""
     out = bytearray()
     while number > 127:
         out.append(number & 127 | 128)

@@ -1,7 +1,8 @@
-"""Return where everything is in the iCub scene, from the configuration that recordings state.
+"""Geometry of the iCub scene: poses of head, eyes and objects, from a recording's configuration.
 
-The robot's root frame is x to the back, y to the right, z up, in metres; the paper's y, which the
-ground truth has, goes to the left. A camera's frame is x to the right, y down, z along its gaze.
+The robot's root frame has x to the back, y to the right, z up, in metres. The paper's y, which the
+ground truth uses, points to the left. A camera's frame has x to the right, y down, z along its
+gaze.
 """
 
 from __future__ import annotations
@@ -22,27 +23,27 @@ from recorder.world.icub.room import painted
 
 KIND = "icub"  # name of the scene
 
-# The view of a head that roams, and the column of truth with its yaw to the left.
+# Name of the view of a roaming head, and of the column of truth with its yaw (degrees to the left).
 ROAMING = ROAM, YAW
 
 Quaternion = tuple[float, float, float, float]  # (x, y, z, w)
 Place = tuple[float, float, float]
 
-# From a camera's frame to that of a head that looks straight on: its z goes to -x.
+# Rotation from a camera's frame to that of a head that looks straight ahead: its z becomes -x.
 _GAZE: Quaternion = (-0.5, -0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """An object on the table, or the table.
+    """An object on the table, or the table itself.
 
     Attributes:
-        name: of the object.
+        name: name of the object.
         shape: "box", "cylinder" or "sphere".
-        size: its extent along x, y and z.
+        size: extent along x, y and z (m).
         colour: red, green and blue, 0 to 1.
-        place: its centre; x and y of an object that moves are in the truth.
-        truth: columns of truth with x and y; none if it does not move.
+        place: centre (m); for a moving object the truth has x and y.
+        truth: names of the columns of truth with x and y; empty if the object does not move.
     """
 
     name: str
@@ -53,20 +54,21 @@ class Thing:
     truth: tuple[str, ...] = ()
 
     def places(self, names: Sequence[str], truth: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return its centre, (n, 3), at frames with this (n, D) truth, whose columns have names."""
+        """Return the centre (n, 3) in m for rows (n, D) of truth, whose columns have `names`."""
         x, y = (truth[:, list(names).index(name)] for name in self.truth)
         return np.stack([x, -y, np.full(len(truth), self.place[2])], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
 class Eye:
-    """A camera: its pose, and how it maps the world.
+    """A camera: its pose and its focal length.
 
     Attributes:
-        place: of its centre.
-        turn: from its frame to the root's.
-        width: pixels of its image, as height.
-        focal: length in pixels, in both directions.
+        place: centre of the camera (m).
+        turn: rotation from its frame to the root frame.
+        width: width of the image (pixels).
+        height: height of the image (pixels).
+        focal: focal length in both directions (pixels).
     """
 
     place: Place
@@ -78,16 +80,16 @@ class Eye:
 
 @dataclass(frozen=True, slots=True)
 class Gaze:
-    """A view: the turn of the head, and its eyes.
+    """A view: the rotation of the head, and its eyes.
 
     Attributes:
-        name: of the view.
-        yaw: of the neck, degrees to the left.
-        pitch: of the neck, degrees upwards.
-        tilt: of the eyes, degrees upwards.
-        head: the head's pose.
-        middle: an eye between the two.
-        eyes: the left one and the right one.
+        name: name of the view.
+        yaw: angle of the neck (degrees to the left).
+        pitch: angle of the neck (degrees upwards).
+        tilt: angle of the eyes (degrees upwards).
+        head: pose of the head.
+        middle: a camera in the middle between both eyes.
+        eyes: the left and the right eye.
     """
 
     name: str
@@ -101,16 +103,16 @@ class Gaze:
 
 @dataclass(frozen=True, slots=True)
 class Scenery:
-    """The robot and the objects in front of it.
+    """The robot, the table and the objects on it.
 
     Attributes:
-        robot: a model of the icub-models package.
-        gazes: one for each view.
-        table: does not move.
-        objects: move.
-        eyes: their measures, keys `scene.eyes.*`.
-        transit: degrees that the head turns in a frame; 0 where it jumps.
-        arms: angles of the arms' joints, degrees, where they do not hang.
+        robot: name of a model in the icub-models package.
+        gazes: one gaze for each view.
+        table: the table.
+        objects: the moving objects.
+        eyes: dimensions of the eyes, the keys `scene.eyes.*`.
+        transit: mean angle that the head turns in a frame (degrees); 0 if it jumps.
+        arms: angles of the arms' joints (degrees); empty if the arms hang.
     """
 
     robot: str
@@ -122,11 +124,11 @@ class Scenery:
     arms: Mapping[str, float] = field(default_factory=dict)
 
     def gaze(self, view: str) -> Gaze | None:
-        """Return the gaze of a view, None if there is no such view."""
+        """Return the gaze of a view, or None."""
         return next((gaze for gaze in self.gazes if gaze.name == view), None)
 
     def turned(self, gaze: Gaze, yaw: float) -> Gaze:
-        """Return a gaze with another yaw of the head, degrees to the left."""
+        """Return a gaze with another yaw of the head (degrees to the left)."""
         return _gaze(gaze.name, yaw, self.eyes, gaze.head.position)
 
     def way(self, before: Gaze, after: Gaze) -> list[Gaze]:
@@ -136,14 +138,14 @@ class Scenery:
 
 
 def scenery_of(config: Mapping[str, Any], neck: Place | None = None) -> Scenery | None:
-    """Return the scenery of a scene's configuration (`scene.*`), None for another scene.
+    """Return the scenery of a scene's configuration; None if it is not the iCub scene.
 
     Args:
-        config: the table, as `as_table` gives it.
-        neck: origin of the neck yaw joint; by default that of iCub v2.5.
+        config: the table `scene` of a recording.
+        neck: origin of the neck yaw joint (m); None: that of iCub v2.5.
 
     Raises:
-        LogDamagedError: it is one of the iCub scene, and keys are missing or make no sense.
+        LogDamagedError: keys are missing or not valid.
     """
     if config.get("kind") != KIND:
         return None
@@ -169,15 +171,17 @@ def scenery_of(config: Mapping[str, Any], neck: Place | None = None) -> Scenery 
             arms=arms if config.get("arms") else {},
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise LogDamagedError(f"the configuration of the scene is broken ({error})") from error
+        raise LogDamagedError(
+            f"the configuration of the scene is damaged ({error}): record it again"
+        ) from error
 
 
 def turns_of(config: Mapping[str, Any], streams: Sequence[int]) -> tuple[tuple[int, ...], ...]:
-    """Return the frames that are lost between each two streams as the head turns, [from][to].
+    """Return the number of frames lost between each two streams while the head turns, [from][to].
 
     Args:
-        config: of the scene, as a recording states it; its head may jump, or it may have none.
-        streams: their places among the scene's.
+        config: the table `scene` of a recording; without turns the result is empty.
+        streams: indices of the streams in the scene.
     """
     try:
         if not config.get("transit"):
@@ -190,7 +194,7 @@ def turns_of(config: Mapping[str, Any], streams: Sequence[int]) -> tuple[tuple[i
 
 
 def _paint(config: Mapping[str, Any], name: str) -> tuple[float, float, float] | None:
-    """Return the colour of a thing if it is painted."""
+    """Return the colour of an object that has a texture, else None."""
     return painted(name) if config.get("texture") else None
 
 
@@ -230,7 +234,7 @@ def _gaze(name: str, yaw: float, eyes: Mapping[str, Any], neck: Place) -> Gaze:
 
 
 def times(first: Quaternion, second: Quaternion) -> Quaternion:
-    """Return the product of two quaternions: turn by the second, then by the first."""
+    """Return the product of two quaternions: rotate by the second, then by the first."""
     (a, b, c, w), (x, y, z, v) = first, second
     return (
         w * x + a * v + b * z - c * y,

@@ -1,4 +1,4 @@
-"""The paper's oscillatory streams as a `FrameSource`."""
+"""`OscillatorySource`: the paper's oscillatory streams."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cdmisfa.core.errors import LogExhaustedError, Registry
 from cdmisfa.kernels import cos, sin
 from recorder.config import SceneConfig, check_view_names
 
-# Frames after which every oscillatory stream repeats: theta_t = 2 pi t / 500.
+# Frames after which every stream repeats, from the paper: theta_t = 2 pi t / 500.
 PERIOD = 500
 
 
@@ -60,10 +60,10 @@ STREAMS: Registry[_Signal] = Registry(
 def one_period(name: str) -> FloatArray:
     """Return all PERIOD frames of a stream, (500, 2).
 
-    Taking frames from this table makes a block's bits independent of how it is cut.
+    Blocks are taken from this table, so that their bits do not depend on how they are cut.
 
     Raises:
-        UsageError: no such stream.
+        UsageError: the stream does not exist.
     """
     theta = 2 * np.pi * np.arange(PERIOD) / PERIOD
     return freeze(np.ascontiguousarray(STREAMS[name](theta)))
@@ -89,10 +89,10 @@ class OscillatorySource(ClockedSource):
     """Deterministic two-dimensional streams on the common clock.
 
     Args:
-        streams: names from `STREAMS`.
+        streams: names of streams in `STREAMS`.
         fps: frames per second.
-        start_ns: log time of frame 0 in nanoseconds.
-        length: frames after which the streams end; by default they do not.
+        start_ns: log time of frame 0 (ns).
+        length: number of frames of the streams; None: endless.
 
     Raises:
         UsageError: a stream does not exist.
@@ -111,14 +111,14 @@ class OscillatorySource(ClockedSource):
         start_ns: int = START_NS,
         length: int | None = None,
     ) -> None:
-        self._shown = list(streams)
+        self._names = list(streams)
         self._tables = [one_period(name) for name in streams]
         self._spec = SourceSpec(tuple(streams), (2,), "float64", ("theta",), fps, start_ns, length)
 
     def replace(self, stream: int, name: str) -> None:
-        """Show another signal on a stream, from the next block on (the abrupt swap)."""
+        """Replace the signal of a stream from the next block on (an abrupt change)."""
         self._tables[stream] = one_period(name)
-        self._shown[stream] = name
+        self._names[stream] = name
 
     def take(self, stream: int, n: int) -> Block:
         """Return the next n frames of a stream; see `FrameSource.take`."""
@@ -126,7 +126,7 @@ class OscillatorySource(ClockedSource):
         length = self._spec.length
         if length is not None and self._t + n > length:
             raise LogExhaustedError(
-                f"the streams end after {length} frames: {n} more at frame {self._t} do not exist"
+                f"the streams have {length} frames: {n} more at frame {self._t} do not exist"
             )
         index = (self._t + np.arange(n)) % PERIOD
         frames = self._tables[stream][index]
@@ -135,5 +135,5 @@ class OscillatorySource(ClockedSource):
         return block
 
     def describe(self) -> Mapping[str, Any]:
-        """Return the streams shown now."""
-        return {"kind": "oscillatory", "streams": list(self._shown)}
+        """Return the kind and the present signals of the streams."""
+        return {"kind": "oscillatory", "streams": list(self._names)}

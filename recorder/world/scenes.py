@@ -1,4 +1,4 @@
-"""Open scenes by name, and render the blocks of their frames in order of time."""
+"""Scenes: open one by name, and render blocks of it, also in several processes."""
 
 from __future__ import annotations
 
@@ -20,25 +20,24 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
 
-# Opens a scene's source by its configuration and the clock of the frames.
-#
-# Worker processes import the function: it must not be local.
+# Opens a scene's source for its configuration and the clock of the frames. Worker processes import
+# the function, so that it must not be local.
 Opener = Callable[[Any, RecordConfig], ClockedSource]
 
 
-# Stream, first frame and number of frames of a block.
+# Index of the stream, first frame and number of frames of a block.
 Request = tuple[int, int, int]
 
-# Frames rendered at a time; divides `motions.CHUNK`, so no block needs two chunks.
+# Frames rendered at a time. It divides `motions.CHUNK`, so that no block needs two chunks.
 BLOCK = 64
 
-# Blocks that each process may render ahead of the writer.
+# Blocks that each process may render before the writer takes them; more use more memory.
 _AHEAD = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A simulated world; its default preset has its name.
+    """A simulated world; its default preset has the same name.
 
     Attributes:
         config: class of its configuration (keys `scene.*`).
@@ -70,9 +69,9 @@ class OpenScene:
     """The arguments with which a scene's source was opened.
 
     Attributes:
-        name: of the scene.
-        config: its configuration, with a seed.
-        record: the clock of the frames.
+        name: name of the scene.
+        config: configuration of the scene, with a seed.
+        record: clock of the frames.
     """
 
     name: str
@@ -80,9 +79,9 @@ class OpenScene:
     record: RecordConfig
 
     def table(self) -> dict[str, Any]:
-        """Return the scene's configuration as recordings state it.
+        """Return the scene's configuration as a table for recordings.
 
-        Recordings state the keys of both scenes, to keep their bytes.
+        It has the keys of all scenes, because recordings always had them and keep their bytes.
         """
         configs = IcubConfig(), OscillatoryConfig(), self.config
         return {key: value for config in configs for key, value in section_table(config).items()}
@@ -94,13 +93,13 @@ def open_scene(
     """Open a live source of a scene's streams.
 
     Args:
-        name: one of `SCENES`.
-        config: of the scene; by default the preset's, with seed 0.
-        record: the clock of the frames.
+        name: name of the scene, one of `SCENES`.
+        config: configuration of the scene; None: the preset's, with seed 0.
+        record: clock of the frames.
 
     Raises:
-        UsageError: no such scene, or one that cannot be built.
-        CdmisfaError: the scene needs a simulator that is not installed.
+        UsageError: the scene does not exist or cannot be built.
+        CdmisfaError: the simulator of the scene is not installed.
     """
     config = config or SCENES[name].config()
     scene = OpenScene(name, replace(config, seed=config.seed or 0), record or RecordConfig())
@@ -110,16 +109,16 @@ def open_scene(
 
 
 def scene_of(source: FrameSource) -> OpenScene | None:
-    """Return what `open_scene` opened a source from; None for any other source."""
+    """Return the arguments of `open_scene` for a source; None for any other source."""
     return getattr(source, "_scene_opened", None)
 
 
 def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
-    """Yield all missing blocks, by time and then by stream, so that no view gets far ahead.
+    """Yield requests for all missing blocks, by time and then by stream.
 
     Args:
-        starts: the first missing frame of each stream.
-        frames: where all streams end.
+        starts: number of the first missing frame of each stream.
+        frames: number of frames of each stream.
     """
     for low in range(0, frames, BLOCK):
         high = min(low + BLOCK, frames)
@@ -129,19 +128,19 @@ def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
                 yield stream, first, high - first
 
 
-def take_here(
+def blocks_in_process(
     source: FrameSource, starts: dict[int, int], frames: int
 ) -> Generator[Block, None, None]:
-    """Yield the missing blocks of streams, one after the other, from one source.
+    """Yield the missing blocks of streams from one source.
 
     Args:
-        source: can go back, or has not yet come to any of the missing frames.
-        starts: the first missing frame of each stream.
-        frames: where all streams end.
+        source: a source that can go back, or is before the first missing frame.
+        starts: number of the first missing frame of each stream.
+        frames: number of frames of each stream.
 
     Raises:
         UsageError: the source cannot go back to the first missing frame.
-        LogExhaustedError: it ends before.
+        LogExhaustedError: the source ends first.
     """
     if isinstance(source, SeekableSource):
         for request in requests(starts, frames):
@@ -154,7 +153,7 @@ def take_here(
         raise UsageError(
             f"the source is at frame {source.t} and cannot go back to {first}: open it again"
         )
-    step = max(1, min(BLOCK, int(source.spec.fps / 2)))  # so that files grow every second
+    step = max(1, min(BLOCK, int(source.spec.fps / 2)))  # so that files grow at least every second
     while source.t < frames:
         for block in source.take_all(min(step, frames - source.t)):
             done = starts.get(block.stream, frames) - block.t
@@ -167,7 +166,13 @@ def take_here(
 def render_in_processes(
     scene: OpenScene, starts: dict[int, int], frames: int, jobs: int
 ) -> Generator[Block, None, None]:
-    """Yield the blocks of `take_here` in the same order, by `jobs` processes with a world each.
+    """Yield the blocks of `blocks_in_process` in the same order, rendered by several processes.
+
+    Args:
+        scene: the scene, which each process opens.
+        starts: number of the first missing frame of each stream.
+        frames: number of frames of each stream.
+        jobs: number of processes.
 
     Raises:
         CdmisfaError: a process died, or could not open the scene.
@@ -186,14 +191,14 @@ def render_in_processes(
                 yield from pending.popleft().result()
     except WorkersError as error:
         raise CdmisfaError(
-            "a rendering process ended: continue with --resume; if it ends again, use --jobs 1 to "
-            "see why, or more memory"
+            "a rendering process died: continue with --resume; if it dies again, use --jobs 1 to "
+            "see the reason, or more memory"
         ) from error
 
 
 @cache
 def _source(opener: Opener, config: SceneConfig, record: RecordConfig) -> SeekableSource:
-    """Open the world of a rendering process, once."""
+    """Open the scene in a rendering process, once."""
     return opener(config, record)
 
 
@@ -203,7 +208,7 @@ def _render(opened: tuple[Opener, SceneConfig, RecordConfig], request: Request) 
 
 
 def _take(source: SeekableSource, request: Request) -> Iterator[Block]:
-    """Yield a block's frames: all of them, or each stretch between gaps."""
+    """Yield the frames of a block: all of them, or each stretch between gaps."""
     stream, first, n = request
     for low, high in source.spans(stream, first, first + n):
         source.seek(low)

@@ -1,7 +1,7 @@
-"""Cameras as matrices, column by column as OpenGL has them, and the eyes in the plain scene.
+"""Cameras as OpenGL matrices (column by column), and the images of the eyes in the plain scene.
 
-Only the attended view is rendered. The table never changes, so each eye draws it once; a frame
-draws only the objects and puts them in front of that image by depth: six times as fast.
+Only the attended view is rendered. The table never changes: each eye draws it once, and a frame
+draws only the objects and merges them with that image by depth, which is six times as fast.
 """
 
 from __future__ import annotations
@@ -18,21 +18,22 @@ from recorder.world.icub.config import EyesConfig
 from recorder.world.icub.head import bent
 from recorder.world.icub.world import World
 
-# Thousandths of red, green and blue in grey (ITU-R BT.601); whole numbers round exactly.
+# Weights of red, green and blue in gray, in thousandths (ITU-R BT.601). Whole numbers round the
+# same on every machine.
 LUMA = (299, 587, 114)
 
 Matrix = tuple[float, ...]
 
 
 def eye_matrix(eyes: EyesConfig, neck: FloatArray, yaw: float, side: int) -> Matrix:
-    """Return the view matrix of an eye, column by column as OpenGL has it.
+    """Return the view matrix of an eye.
 
     Args:
-        eyes: the head's measures.
-        neck: (3,) origin of the neck yaw joint, root frame (x back, y right, z up), where it is
-            with the neck bent.
-        yaw: of the head, degrees to the left.
-        side: +1 the left eye, -1 the right one.
+        eyes: dimensions of the head.
+        neck: (3,) origin of the neck yaw joint at the head's pitch, in the root frame (x back,
+            y right, z up; m).
+        yaw: angle of the head (degrees to the left).
+        side: +1 for the left eye, -1 for the right one.
     """
     turn, tilt = math.radians(yaw), math.radians(eyes.tilt)
     forward = bent((-math.cos(turn), -math.sin(turn), 0.0), eyes.pitch)
@@ -56,7 +57,7 @@ def view_matrix(place: FloatArray, target: FloatArray) -> Matrix:
 
 
 def perspective(vertical_fov: float, aspect: float, near: float, far: float) -> Matrix:
-    """Return the projection matrix of a camera, column by column; degrees and metres."""
+    """Return the projection matrix of a camera; `vertical_fov` in degrees, distances in m."""
     scale = 1.0 / math.tan(math.radians(vertical_fov) / 2)
     return _projection(scale / aspect, scale, near, far)
 
@@ -72,28 +73,28 @@ def _projection(across: float, up: float, near: float, far: float) -> Matrix:
 
 
 def grey(colours: ByteArray) -> ByteArray:
-    """Convert colours, (..., 3 or 4), to grey, (...): BT.601, rounded."""
+    """Convert colours (..., 3 or 4) to gray (...) by BT.601, rounded."""
     red, green, blue = (colours[..., i].astype(np.uint32) for i in range(3))
     mixed = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
     return ((mixed + 500) // 1000).astype(np.uint8)
 
 
-def from_afar(half: float) -> Matrix:
-    """Return the projection matrix of a camera `AFAR` metres away that sees `half` to each side.
+def far_projection(half: float) -> Matrix:
+    """Return the projection of a camera `FAR` metres away with a field of `half` m to each side.
 
-    The renderer knows no camera without perspective.
+    It replaces a parallel projection, which the renderer does not have.
     """
-    return _projection(AFAR / half, AFAR / half, AFAR - 5.0, AFAR + 5.0)
+    return _projection(FAR / half, FAR / half, FAR - 5.0, FAR + 5.0)
 
 
-# Metres from which light is as good as parallel.
-AFAR = 100.0
+# Distance from which rays are practically parallel (m).
+FAR = 100.0
 
 
-def seen_from(view: Matrix, places: FloatArray) -> FloatArray:
-    """Transform (3, ...) places, root frame, to a camera's frame: to its right, up, behind it.
+def to_camera(view: Matrix, places: FloatArray) -> FloatArray:
+    """Transform points (3, ...) from the root frame to a camera's: right, up, and backwards.
 
-    Element by element, so that the sums are the same on every processor.
+    It computes element by element, so that sums are the same on every processor.
     """
     x, y, z = places
     return np.stack(
@@ -104,9 +105,9 @@ def seen_from(view: Matrix, places: FloatArray) -> FloatArray:
 def rays(
     view: Matrix, projection: Matrix, height: int, width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the place of a camera, (3, 1, 1), and the rays of its pixels, root frame.
+    """Return the position of a camera, (3, 1, 1), and the rays of its pixels, in the root frame.
 
-    A ray, of (3, height, width), is the step for a metre of depth.
+    A ray, (3, height, width), is the step for one metre of depth.
     """
     across = ((np.arange(width) + 0.5) / width * 2 - 1) / projection[0]
     up = (1 - (np.arange(height) + 0.5) / height * 2) / projection[5]
@@ -118,18 +119,18 @@ def rays(
 
 
 def metres(depth: NDArray[Any], projection: Matrix) -> FloatArray:
-    """Convert the depth of an image, 0 to 1, to metres in front of a camera."""
+    """Convert a depth image, 0 to 1, to distances in front of a camera (m)."""
     return projection[14] / (2 * np.asarray(depth, np.float64) - 1 + projection[10])
 
 
 class Eyes:
-    """Renders the images of both eyes in each view, side by side.
+    """Renderer of the images of both eyes in each view, side by side.
 
-    Hides the world's table, since it is already in every eye's background.
+    It hides the world's table, which is in the background of every eye already.
 
     Args:
-        eyes: the head's measures.
-        world: before any object was placed, so that it shows the table alone.
+        eyes: dimensions of the head.
+        world: the world before any object was placed, so that only the table is visible.
 
     Attributes:
         shape: (height, width) of the joined image.
@@ -149,13 +150,16 @@ class Eyes:
         world.hide_table()
 
     def look(self, view: int, t: int, positions: FloatArray, yaw: Sequence[float]) -> ByteArray:
-        """Render a view from frame t on, (n, height, width of both eyes).
+        """Render a view from frame t on.
 
         Args:
-            view: number of the view.
-            t: not used: a plain scene depends on the places of objects only.
-            positions: (n, objects, ...) of the objects, see `World.place`.
-            yaw: not used: in a plain scene the head never turns within a view.
+            view: index of the view.
+            t: ignored: a plain scene depends only on the positions of the objects.
+            positions: (n, objects, ...) positions of the objects, see `World.place`.
+            yaw: ignored: in a plain scene the head does not turn within a view.
+
+        Returns:
+            (n, height, width of both eyes) gray levels.
         """
         del t, yaw
         frames = np.empty((len(positions), *self.shape), np.uint8)

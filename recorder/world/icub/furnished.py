@@ -1,7 +1,7 @@
-"""Render the images of the robot's eyes in a furnished room.
+"""`FurnishedEyes`: images of the robot's eyes in a furnished room.
 
-All that never moves (room, table, arms, their shadows) is a plate, drawn finely once for each eye
-of a view. A frame draws only the objects and their shadows on the table into it.
+Everything that never moves (room, table, arms, their shadows) is a plate, an image that is drawn
+once for each eye of a view. A frame draws only the objects and their shadows on the table into it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.eyes import Matrix, eye_matrix, grey, metres, perspective, rays, seen_from
+from recorder.world.icub.eyes import Matrix, eye_matrix, grey, metres, perspective, rays, to_camera
 from recorder.world.icub.lens import SAMPLES, Lens
 from recorder.world.icub.room import room_of
 from recorder.world.icub.shadows import LAMP, TEXEL, ObjectShadow, RoomShadows
@@ -25,30 +25,33 @@ from recorder.world.icub.world import World
 # Rays of a plate for each ray of a frame, along each side.
 FINE = 2
 
-# Shares of the ambient light, of the lamp's light, and of mirrored light.
+# Shares of ambient, diffuse and mirrored light. These and the next constants are set by hand
+# (decision 0037), for a room that looks like a lit one.
 LIGHTING = {"lightAmbientCoeff": 0.62, "lightDiffuseCoeff": 0.68, "lightSpecularCoeff": 0.1}
 
-# The share of light lost far from the lamp, that distance, and the brightest place, metres.
+# Share of light that is lost far from the lamp, distance at which half of it is, and position of
+# the brightest point (m).
 _POOL, _WIDE, _UNDER = 0.25, 0.8, (-0.55, -0.1)
 
-# Rows and columns of a picture.
-Part = tuple[slice, slice]
+# Rows and columns of a part of an image.
+ImagePart = tuple[slice, slice]
 
-# Metres from the table's height within which a pixel counts as the table.
+# Distance from the table's height within which a pixel belongs to the table (m).
 _FLAT = 0.003
 
 
 @dataclass(frozen=True, slots=True)
 class Plate:
-    """The image of an eye without objects.
+    """Image of an eye without objects.
 
     Attributes:
-        view: matrix of the eye.
+        view: view matrix of the eye.
         light: (height, width, channels) the image.
-        depth: (height, width) of the image.
-        rows: (height, width) y of the point where the ray of each pixel meets the table, root
-            frame, in `TEXEL`; `columns` is x.
-        lamp: share of the light that a shadow takes at each pixel: 0 beside the table.
+        depth: (height, width) depth of the image.
+        rows: (height, width) y of the point where each pixel's ray meets the table, in the root
+            frame, in units of `TEXEL`; `columns` is x.
+        columns: see `rows`.
+        lamp: (height, width) share of the light that a shadow removes; 0 beside the table.
     """
 
     view: Matrix
@@ -60,17 +63,17 @@ class Plate:
 
 
 class FurnishedEyes:
-    """Renders the images of both eyes in a room, side by side.
+    """Renderer of the images of both eyes in a furnished room, side by side.
 
-    Hides all bodies that never move, since they are in the plates.
+    It hides all bodies that never move, which are in the plates.
 
     Args:
-        scene: one that is not plain.
-        world: its plain bodies are replaced.
+        scene: configuration of a scene that is not plain.
+        world: the world, whose plain bodies are replaced.
 
     Attributes:
-        shape: (height, width) of the joined image; for colours, red, green and blue of both eyes
-            are beside one another.
+        shape: (height, width) of the joined image; in colour, the red, green and blue images of
+            both eyes are side by side.
     """
 
     def __init__(self, scene: IcubConfig, world: World) -> None:
@@ -109,7 +112,7 @@ class FurnishedEyes:
         return np.moveaxis(images, -1, 2).reshape(len(frames), *self.shape)
 
     def _see(self, plate: Plate, places: FloatArray, out: ByteArray) -> None:
-        """Write an eye's image, (height, width, channels), with the objects at their places."""
+        """Write an eye's image, (height, width, channels), with the objects at their positions."""
         out[...] = plate.light
         parts = {}
         for number, ((x, y, z), radius) in enumerate(self._balls):
@@ -122,28 +125,30 @@ class FurnishedEyes:
             if self._shadows:
                 image = image * self._shade(plate, places, part, tuple(parts))[..., None]
             colours, depth = self._draw_part(plate.view, part)
-            seen = depth < plate.depth[part]
-            out[part] = np.where(seen[..., None], self._toned(colours), image)
+            nearer = depth < plate.depth[part]
+            out[part] = np.where(nearer[..., None], self._toned(colours), image)
 
     def _shade(
-        self, plate: Plate, places: FloatArray, part: Part, objects: Sequence[int]
+        self, plate: Plate, places: FloatArray, part: ImagePart, objects: Sequence[int]
     ) -> NDArray[np.float32]:
         """Return the share of light that the objects' shadows leave to a part of an image."""
-        rows, columns, left = plate.rows[part], plate.columns[part], np.ones(1, np.float32)
+        rows, columns, rest = plate.rows[part], plate.columns[part], np.ones(1, np.float32)
         for number in objects:
             x, y = places[number, :2] / TEXEL
             hidden = self._shadows[number].hidden(rows + np.float32(y), columns - np.float32(x))
-            left = left * (1 - hidden)
-        return np.asarray(1 - (1 - left) * plate.lamp[part])
+            rest = rest * (1 - hidden)
+        return np.asarray(1 - (1 - rest) * plate.lamp[part])
 
-    def _part(self, view: Matrix, middle: tuple[float, float, float], radius: float) -> Part | None:
-        """Return the rows and columns of the pixels that a ball may cover, or None."""
-        x, y, z = seen_from(view, np.array(middle)).tolist()
+    def _part(
+        self, view: Matrix, middle: tuple[float, float, float], radius: float
+    ) -> ImagePart | None:
+        """Return the part of an image that a ball can cover, or None."""
+        x, y, z = to_camera(view, np.array(middle)).tolist()
         if -z <= radius + self._scene.eyes.near:
             return None
         part = []
         for at, size in ((y / z, self._size[0]), (-x / z, self._size[1])):
-            # Far from the middle of an image a ball looks longer.
+            # Perspective lengthens a ball far from the middle of the image.
             reach = radius * self._focal / -z * math.sqrt(1 + at * at) * 1.1 + 1
             centre = size / 2 + self._focal * at
             low, high = max(0, int(centre - reach)), min(size, int(centre + reach) + 1)
@@ -152,23 +157,23 @@ class FurnishedEyes:
             part.append(slice(low, high))
         return part[0], part[1]
 
-    def _draw_part(self, view: Matrix, part: Part) -> tuple[ByteArray, NDArray[np.float32]]:
+    def _draw_part(self, view: Matrix, part: ImagePart) -> tuple[ByteArray, NDArray[np.float32]]:
         """Render the colours and the depth of a part of an image."""
         (height, width), (rows, columns) = self._size, part
         down, across = rows.stop - rows.start, columns.stop - columns.start
-        whole = list(self._projection)
-        whole[0] *= width / across
-        whole[5] *= height / down
-        whole[8] = (columns.start + columns.stop - width) / across
-        whole[9] = (height - rows.start - rows.stop) / down
-        return self._world.render(view, tuple(whole), across, down, LAMP, **LIGHTING)
+        projection = list(self._projection)
+        projection[0] *= width / across
+        projection[5] *= height / down
+        projection[8] = (columns.start + columns.stop - width) / across
+        projection[9] = (height - rows.start - rows.stop) / down
+        return self._world.render(view, tuple(projection), across, down, LAMP, **LIGHTING)
 
     def _toned(self, colours: ByteArray) -> ByteArray:
-        """Convert colours, (..., 3 or 4), to the channels of the eyes."""
+        """Convert colours (..., 3 or 4) to the channels of the eyes."""
         return colours[..., :3] if self._channels == 3 else grey(colours)[..., None]
 
     def _plates_at(self, yaw: float) -> list[Plate]:
-        """Return the plates of both eyes, drawn when the head first turns there."""
+        """Return the plates of both eyes at an angle of the head, drawn when it is first used."""
         if yaw not in self._plates:
             world, arms = self._world, self._scene.arms
             world.show_objects(())
@@ -202,7 +207,7 @@ class FurnishedEyes:
 
 
 def sizes_of(scene: IcubConfig) -> list[tuple[float, float]]:
-    """Return each object's radius on the table, and its height."""
+    """Return the radius of each object on the table, and its height (m)."""
     return [
         (scene.object1.half_size * math.sqrt(2), 2 * scene.object1.half_size),
         (scene.object2.radius, scene.object2.height),
@@ -211,20 +216,20 @@ def sizes_of(scene: IcubConfig) -> list[tuple[float, float]]:
 
 
 def _fall(scene: IcubConfig, height: float) -> tuple[float, float]:
-    """Return the offset, x and y, of the shadow of a point at a height over the table."""
+    """Return the offset (x, y) of the shadow of a point at a height above the table (m)."""
     share = height / LAMP[2] if scene.shadow else 0.0
     return -share * LAMP[0], -share * LAMP[1]
 
 
 def _ball(scene: IcubConfig, across: float, height: float) -> tuple[tuple[float, ...], float]:
-    """Return a ball around an object and its shadow: middle, from the object, and radius."""
+    """Return a ball around an object and its shadow: centre relative to the object, and radius."""
     x, y = _fall(scene, height)
     middle = x / 2, y / 2, scene.table.top + height / 2
     return middle, math.hypot(across + math.hypot(x, y) / 2, height / 2)
 
 
 def light_at(scene: IcubConfig, places: FloatArray, hidden: FloatArray) -> FloatArray:
-    """Return the factor of the colours at (3, ...) places: shadows, and distance from the lamp."""
+    """Return the factor of the colours at points (3, ...): shadows, and distance from the lamp."""
     if not scene.shadow:
         return np.ones(hidden.shape)
     x, y, _ = places
@@ -233,7 +238,7 @@ def light_at(scene: IcubConfig, places: FloatArray, hidden: FloatArray) -> Float
 
 
 def averaged(image: NDArray[Any], n: int) -> FloatArray:
-    """Average (n h, n w, ...) to (h, w, ...), the mean of each n x n pixels."""
+    """Return the means of each n x n pixels of an image, (n h, n w, ...) to (h, w, ...)."""
     total = np.zeros((image.shape[0] // n, image.shape[1] // n, *image.shape[2:]))
     for i in range(n * n):
         total += image[i // n :: n, i % n :: n]

@@ -1,7 +1,7 @@
-"""Where the objects are: as the paper moves them, or as physics drags them behind that.
+"""Positions of the objects: as the paper moves them, or as physics drags them after that.
 
-Physics has a server of its own, stepped frame after frame from the first on. Positions are stored,
-so that going back costs nothing.
+The physics has a simulator of its own, which is stepped frame after frame. Its poses are stored, so
+that going back is immediate.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from cdmisfa.core.arrays import FloatArray
 from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
 from recorder.world.icub.world import silenced, start_simulator
 
-# Frames drawn at a time.
+# Frames drawn at a time. Another value changes the random walk of every seed.
 CHUNK = 4096
 
-# Spawn key of the world: the learner may spawn its own generators from the same seed.
+# Spawn key of the world's generators under the seed; the learner has other keys.
 _WORLD = 0x1C0B
 
 
 def toggling_motion(config: BoxConfig, generator: np.random.Generator) -> Iterator[FloatArray]:
-    """Yield chunks (CHUNK, 2): x uniform and independent; y toggles between two places."""
+    """Yield chunks (CHUNK, 2): x uniform and independent; y toggles between two values."""
     for t in itertools.count(0, CHUNK):
         x = _uniform(generator.random(CHUNK), config.x)
         phase = (t + np.arange(CHUNK)) // config.toggle_every % 2
@@ -33,7 +33,7 @@ def toggling_motion(config: BoxConfig, generator: np.random.Generator) -> Iterat
 
 
 def uniform_motion(config: CylinderConfig, generator: np.random.Generator) -> Iterator[FloatArray]:
-    """Yield chunks (CHUNK, 2): x and y uniform and independent of the frame before."""
+    """Yield chunks (CHUNK, 2): x and y uniform and independent of the previous frame."""
     while True:
         units = generator.random((CHUNK, 2))
         yield np.stack([_uniform(units[:, 0], config.x), _uniform(units[:, 1], config.y)], axis=1)
@@ -55,7 +55,7 @@ def walking_motion(config: SphereConfig, generator: np.random.Generator) -> Iter
 
 
 def reflect(values: FloatArray, limits: Range) -> FloatArray:
-    """Reflect a free walk, (n,), at the limits."""
+    """Reflect a free walk (n,) at the limits."""
     low, high = limits
     width = high - low
     if width == 0:
@@ -71,7 +71,7 @@ class Motions:
         self._restart()
 
     def positions(self, start: int, n: int) -> FloatArray:
-        """Return (n, objects, 2) x and y from frame `start` on, the paper's coordinates, metres."""
+        """Return (n, objects, 2) x and y from frame `start` on, in the paper's coordinates (m)."""
         parts = []
         while n > 0:
             chunk, first = divmod(start, CHUNK)
@@ -103,35 +103,38 @@ def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
     return limits[0] + (limits[1] - limits[0]) * unit
 
 
-# Steps of 1/240 s in a frame: the objects have an eighth of a second to follow.
+# Physics steps of 1/240 s in a frame: the objects have 1/8 s to follow. These and the next
+# constants are set by hand (decision 0037).
 STEPS = 30
 
-# Frames stepped at a time.
+# Frames simulated at a time.
 _AHEAD = 64
 
-# Decimals of a pose: those beyond differ with the processor's sine and cosine.
+# Decimals of a pose; further ones differ with the processor's sine and cosine.
 _DIGITS = 5
 
+# Masses of box, cylinder and ball (kg).
 _MASSES = (0.25, 0.3, 0.15)
 
-# Of a magnet at most, newtons.
+# Largest force of a magnet (N).
 _FORCE = 12.0
 
-# Metres that a magnet is too low: it holds its object on the table, where the ball rolls.
+# Depth of a magnet below its object's centre (m): it presses the object to the table.
 _PRESS = 0.002
 
-_FRICTION, _OF_TABLE = 0.4, 0.5
+# Friction of the objects and of the table.
+_FRICTION, _TABLE_FRICTION = 0.4, 0.5
 
 
 class PhysicalMotions:
-    """Poses of the objects of a scene that follow `Motions`.
+    """Poses of the objects of a scene, which magnets drag after `Motions`.
 
-    Box and cylinder never tip or turn, as if led by a rail: tumbling is chaotic, and differs
-    between kinds of processors. The ball rolls.
+    Box and cylinder cannot tip or turn: tumbling is chaotic, and differs between processors. The
+    ball rolls.
     """
 
     def __init__(self, scene: IcubConfig, seed: int) -> None:
-        self._targets, self._top, self._kept = Motions(scene, seed), scene.table.top, 0
+        self._targets, self._top, self._stored = Motions(scene, seed), scene.table.top, 0
         self._blocks: list[FloatArray] = []
         with silenced():
             self._bullet, _ = start_simulator()
@@ -140,7 +143,7 @@ class PhysicalMotions:
         bullet.setPhysicsEngineParameter(fixedTimeStep=1 / 240, deterministicOverlappingPairs=1)
         table = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=(3.0, 3.0, 0.1))
         body = bullet.createMultiBody(0, table, basePosition=(0, 0, self._top - 0.1))
-        bullet.changeDynamics(body, -1, lateralFriction=_OF_TABLE)
+        bullet.changeDynamics(body, -1, lateralFriction=_TABLE_FRICTION)
         can = {"radius": cylinder.radius, "height": cylinder.height}
         shapes: tuple[tuple[Any, float], ...] = (
             ({"shapeType": bullet.GEOM_BOX, "halfExtents": (box.half_size,) * 3}, box.half_size),
@@ -156,24 +159,24 @@ class PhysicalMotions:
     def positions(self, start: int, n: int) -> FloatArray:
         """Return (n, objects, 7) poses from frame `start` on.
 
-        X and y in the paper's coordinates, z, and the quaternion in the root frame.
+        A pose is x and y in the paper's coordinates, z, and the quaternion in the root frame.
         """
-        while self._kept < start + n:
-            self._blocks.append(self._step(self._kept))
-            self._kept += _AHEAD
+        while self._stored < start + n:
+            self._blocks.append(self._step(self._stored))
+            self._stored += _AHEAD
         first, last = start // _AHEAD, -(-(start + n) // _AHEAD)
-        found = np.concatenate(self._blocks[first:last])
-        return found[start - first * _AHEAD :][:n]
+        poses = np.concatenate(self._blocks[first:last])
+        return poses[start - first * _AHEAD :][:n]
 
     def close(self) -> None:
-        """End the simulator; harmless when called twice."""
+        """End the simulator; a second call does nothing."""
         with contextlib.suppress(self._bullet.error):
             self._bullet.disconnect()
 
     def _body(
         self, shape: dict[str, Any], half: float, mass: float, place: list[float], *, rolls: bool
     ) -> tuple[int, int, float]:
-        """Add an object; return it, the magnet that draws it, and the magnet's height."""
+        """Add an object; return it, the magnet that drags it, and the magnet's height."""
         bullet, (x, y) = self._bullet, place
         body = bullet.createMultiBody(
             mass, bullet.createCollisionShape(**shape), basePosition=(x, -y, self._top + half)
@@ -181,7 +184,7 @@ class PhysicalMotions:
         bullet.changeDynamics(body, -1, lateralFriction=_FRICTION, linearDamping=0.0)
         if not rolls:
             bullet.changeDynamics(body, -1, localInertiaDiagonal=(0.0, 0.0, 0.0))
-        # It draws the ball at its middle; what slides, near the table, so that it stays there.
+        # The magnet acts at the centre of the ball, and low on what slides, so that it stays flat.
         low = 0.0 if rolls else -0.8 * half
         height = self._top + half + low - _PRESS
         magnet = bullet.createConstraint(
@@ -191,7 +194,7 @@ class PhysicalMotions:
         return body, magnet, height
 
     def _step(self, start: int) -> FloatArray:
-        """Step the physics and return the poses from frame `start` on."""
+        """Simulate the next frames, and return the poses from frame `start` on."""
         bullet, poses = self._bullet, np.empty((_AHEAD, len(self._bodies), 7))
         for targets, row in zip(self._targets.positions(start, _AHEAD), poses, strict=True):
             for (_, magnet, height), (x, y) in zip(self._bodies, targets.tolist(), strict=True):
@@ -201,7 +204,7 @@ class PhysicalMotions:
             for (body, _, _), pose in zip(self._bodies, row, strict=True):
                 (x, y, z), turn = bullet.getBasePositionAndOrientation(body)
                 pose[:] = [round(part, _DIGITS) for part in (x, -y, z, *turn)]
-                # The next frame starts from rounded values: differences do not add up.
+                # Continue from rounded values, so that differences between machines do not add up.
                 speeds = bullet.getBaseVelocity(body)
                 x, y, *rest = pose.tolist()
                 bullet.resetBasePositionAndOrientation(body, (x, -y, rest[0]), rest[1:])

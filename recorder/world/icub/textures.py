@@ -1,7 +1,7 @@
-"""Textures of the furnished room and its objects, drawn from whole numbers alone.
+"""Textures of the furnished room and its objects, computed from hashes.
 
-Every value comes from hashing a place in a lattice, so a texture is the same bytes on every
-machine and needs no file. A texture is (SIDE, SIDE, 3) in [0, 1] and repeats seamlessly.
+Every value is a hash of its position, so that a texture has the same bytes on every machine and
+needs no file. A texture is (SIDE, SIDE, 3) in [0, 1] and repeats without a seam.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 
-# Pixels of a texture along each side.
+# Width and height of a texture (pixels).
 SIDE = 512
 
 Pixels = NDArray[np.float32]
@@ -22,7 +22,7 @@ Colour = Sequence[float]
 
 
 def hashed(rows: int, columns: int, seed: int) -> Pixels:
-    """Return (rows, columns) values in [0, 1) that depend on their place only."""
+    """Return (rows, columns) values in [0, 1) that depend on their position only."""
     i, j = np.indices((rows, columns), dtype=np.uint64)
     mixed = i * np.uint64(0x9E3779B97F4A7C15) + j * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(seed)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
@@ -31,17 +31,17 @@ def hashed(rows: int, columns: int, seed: int) -> Pixels:
 
 
 def cloud(rows: int, columns: int, seed: int) -> Pixels:
-    """Return (SIDE, SIDE) smooth noise in [0, 1) with `rows` and `columns` of bumps."""
+    """Return (SIDE, SIDE) smooth noise in [0, 1) with a number of bumps along each side."""
     grid = hashed(rows, columns, seed)
     (i, u), (j, v) = (_steps(n) for n in (rows, columns))
     above, below = grid[i], grid[(i + 1) % rows]
     lines = above + (below - above) * u[:, None]
-    left, right = lines[:, j], lines[:, (j + 1) % columns]
-    return left + (right - left) * v
+    start, stop = lines[:, j], lines[:, (j + 1) % columns]
+    return start + (stop - start) * v
 
 
 def _steps(n: int) -> tuple[NDArray[np.int64], Pixels]:
-    """Return the bump before each pixel, and the share of the way to the next bump."""
+    """Return the bump before each pixel, and the share of the distance to the next bump."""
     at = np.arange(SIDE, dtype=np.float32) * np.float32(n) / np.float32(SIDE)
     low = at.astype(np.int64)
     u = at - low
@@ -49,7 +49,7 @@ def _steps(n: int) -> tuple[NDArray[np.int64], Pixels]:
 
 
 def wood(base: Colour, seed: int, boards: int) -> Pixels:
-    """Draw boards beside one another, their fibres along the rows: tone, grain and joints."""
+    """Draw parallel boards with fibres along the rows: tone, grain and joints."""
     at = np.arange(SIDE) * boards // SIDE
     fibres = 0.5 * cloud(3, 170, seed) + 0.3 * cloud(9, 256, seed + 1)
     fibres += 0.35 * cloud(2, 23, seed + 2)
@@ -60,7 +60,7 @@ def wood(base: Colour, seed: int, boards: int) -> Pixels:
 
 
 def tiles(base: Colour, seed: int, across: int) -> Pixels:
-    """Draw square tiles, each with a tone, with joints."""
+    """Draw square tiles of different tones with joints."""
     at = np.arange(SIDE) * across // SIDE
     value = 0.8 + 0.16 * hashed(across, across, seed)[at][:, at] + 0.1 * cloud(64, 64, seed + 1)
     joint = np.arange(SIDE) * across % SIDE < 5 * across
@@ -69,13 +69,13 @@ def tiles(base: Colour, seed: int, across: int) -> Pixels:
 
 
 def plaster(base: Colour, seed: int, bumps: int) -> Pixels:
-    """Draw a wall, slightly uneven."""
+    """Draw a slightly uneven wall."""
     value = 0.88 + 0.06 * cloud(bumps, bumps, seed) + 0.08 * cloud(120, 120, seed + 1)
     return _painted(base, value)
 
 
 def die(base: Colour, seed: int, spots: int) -> Pixels:
-    """Draw a cube's side: a darker frame, and light spots along the diagonal."""
+    """Draw a side of a cube: a darker frame, and light spots along the diagonal."""
     image = _painted(base, 0.85 + 0.25 * cloud(9, 9, seed))
     i, j = np.indices((SIDE, SIDE))
     image[np.minimum(np.minimum(i, j), SIDE - 1 - np.maximum(i, j)) < SIDE // 12] *= 0.55
@@ -86,7 +86,7 @@ def die(base: Colour, seed: int, spots: int) -> Pixels:
 
 
 def box_label(base: Colour, seed: int, bands: int) -> Pixels:
-    """Draw bands around a can or a ball, every other one light."""
+    """Draw bands around a can or a ball, every second one light."""
     image = _painted(base, 0.85 + 0.25 * cloud(12, 12, seed))
     light = (np.arange(SIDE) * (2 * bands + 1) // SIDE) % 2 == 1
     image[light] = _painted((0.93, 0.91, 0.84), 0.9 + 0.1 * cloud(12, 40, seed + 1))[light]
@@ -97,7 +97,7 @@ def _painted(base: Colour, value: Pixels) -> Pixels:
     return np.clip(value[..., None] * np.array(base, np.float32), 0.0, 1.0)
 
 
-# By name: functions of a colour, a seed, and a count of boards, tiles, spots ...
+# Textures by name: functions of a colour, a seed, and a number of boards, tiles, spots and so on.
 TEXTURES: dict[str, Callable[[Colour, int, int], Pixels]] = {
     "wood": wood,
     "tiles": tiles,
@@ -109,6 +109,6 @@ TEXTURES: dict[str, Callable[[Colour, int, int], Pixels]] = {
 
 @cache
 def texture(name: str, colour: tuple[float, ...], count: int) -> ByteArray:
-    """Return a texture of `TEXTURES`, (SIDE, SIDE, 3) bytes; drawn once in a process."""
+    """Return a texture of `TEXTURES`, (SIDE, SIDE, 3) bytes; it is drawn once in a process."""
     seed = sum(round(1000 * part) for part in colour) + count
     return np.rint(TEXTURES[name](colour, seed, count) * 255).astype(np.uint8)

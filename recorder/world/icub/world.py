@@ -1,7 +1,7 @@
-"""The iCub's world in PyBullet: robot, table and objects, placed and never simulated.
+"""`World`: robot, table and objects of the iCub scene in PyBullet.
 
-Objects are moved by hand each frame, so no physics step is ever made and nothing
-depends on the machine's speed.
+Objects are moved by hand in each frame; no physics step is made, so that nothing depends on the
+speed of the machine.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.head import ARMS
 from recorder.world.icub.room import Piece, Room
 
-# The joints that turn the head to the left, the last of the neck, and bend it upwards.
+# Names of the joints that turn the head to the left, and bend it upwards.
 NECK_YAW, NECK_PITCH = b"neck_yaw", b"neck_pitch"
 
 _AWAY = (0.0, 0.0, -100.0)
@@ -36,24 +36,24 @@ class World:
     """Robot, table and objects in a PyBullet server of their own, without a window.
 
     Args:
-        scene: the robot, the table and the objects.
+        scene: configuration of robot, table and objects.
 
     Raises:
         CdmisfaError: PyBullet or the robot models are not installed.
-        UsageError: no such robot, a robot without a neck, or a view the neck cannot turn to.
+        UsageError: the robot does not exist or has no neck, or its neck cannot turn to a view.
 
     Attributes:
-        neck: (3,) origin of the neck yaw joint in the root frame, metres.
+        neck: (3,) origin of the neck yaw joint in the root frame (m).
     """
 
     def __init__(self, scene: IcubConfig) -> None:
         self._objects: list[int] = []
         self._pieces: list[int] = []
-        self._shown: Sequence[int] = ()
+        self._visible: Sequence[int] = ()
         with silenced():
             self._bullet, models = start_simulator()
             bullet = self._bullet
-            # Looked up once: they are called for every frame.
+            # Looked up once, because they are called for every frame.
             self._move = partial(bullet.resetBasePositionAndOrientation, ornObj=_UPRIGHT)
             self._see = partial(
                 bullet.getCameraImage,
@@ -75,10 +75,10 @@ class World:
                 raise
 
     def place(self, positions: NDArray[np.float64]) -> None:
-        """Put the objects at (objects, 2) positions, x and y in the paper's coordinates.
+        """Move the objects to positions (objects, 2), x and y in the paper's coordinates.
 
-        Its y is to the robot's left, the root frame's to its right. Positions of (objects, 7) go
-        on with z and a quaternion, root frame.
+        The paper's y points to the robot's left, the root frame's to its right. Positions can also
+        be (objects, 7), with z and a quaternion in the root frame.
         """
         for body, height, (x, y, *pose) in zip(
             self._objects, self._heights, positions.tolist(), strict=True
@@ -87,22 +87,22 @@ class World:
             self._move(body, (x, -y, z), ornObj=turn)
 
     def hide_table(self) -> None:
-        """Move the table out of sight for good."""
+        """Move the table out of sight."""
         self._move(self._table, _AWAY)
 
     def furnish(self, room: Room, *, arms: bool) -> None:
-        """Put a furnished room's pieces and objects in place of the plain ones.
+        """Replace the plain bodies by the pieces and objects of a furnished room.
 
         Args:
             room: the pieces and objects.
-            arms: whether the robot rests its arms on the table.
+            arms: True if the robot rests its arms on the table.
         """
         for body in (self._table, *self._objects):
             self._bullet.removeBody(body)
         with silenced(), tempfile.TemporaryDirectory() as folder:
             self._pieces = [self._piece(piece, folder) for piece in room.pieces]
             self._objects = [self._piece(piece, folder) for piece in room.objects]
-        self._shown = range(len(room.objects))
+        self._visible = range(len(room.objects))
         bullet = self._bullet
         for joint in range(bullet.getNumJoints(self._robot)) if arms else ():
             angle = ARMS.get(bullet.getJointInfo(self._robot, joint)[1].decode()[2:])
@@ -110,26 +110,26 @@ class World:
                 bullet.resetJointState(self._robot, joint, math.radians(angle))
 
     def show_room(self, pieces: Collection[int], *, robot: bool) -> None:
-        """Show these pieces of the room, and the robot or not; hidden bodies take no time."""
+        """Make pieces of the room and the robot visible or not; hidden bodies take no time."""
         for number, body in enumerate(self._pieces):
-            self._show(body, -1, shown=number in pieces)
+            self._show(body, -1, visible=number in pieces)
         for body, link in self._colours:
             if body == self._robot:
-                self._show(body, link, shown=robot)
+                self._show(body, link, visible=robot)
 
     def show_objects(self, numbers: Sequence[int]) -> None:
-        """Show these objects of a furnished room, and hide the others."""
+        """Make only these objects of a furnished room visible."""
         for number, body in enumerate(self._objects):
-            if (number in numbers) != (number in self._shown):
-                self._show(body, -1, shown=number in numbers)
-        self._shown = numbers
+            if (number in numbers) != (number in self._visible):
+                self._show(body, -1, visible=number in numbers)
+        self._visible = numbers
 
-    def _show(self, body: int, link: int, *, shown: bool) -> None:
-        colour = self._colours[body, link] if shown else (0.0, 0.0, 0.0, 0.0)
+    def _show(self, body: int, link: int, *, visible: bool) -> None:
+        colour = self._colours[body, link] if visible else (0.0, 0.0, 0.0, 0.0)
         self._bullet.changeVisualShape(body, link, rgbaColor=colour)
 
     def _piece(self, piece: Piece, folder: str) -> int:
-        """Add a body with a mesh and paint of its own."""
+        """Add a body with a mesh and a texture."""
         bullet = self._bullet
         colour = (*(piece.colour if piece.paint is None else (1.0, 1.0, 1.0)), 1.0)
         visual = bullet.createVisualShape(
@@ -158,10 +158,10 @@ class World:
         light: tuple[float, float, float],
         **lighting: float,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Render a camera's image: (height, width, 4) colours and (height, width) depth.
+        """Render a camera's image: colours (height, width, 4) and depth (height, width).
 
         Raises:
-            CdmisfaError: the simulator refuses.
+            CdmisfaError: the simulator reports an error.
         """
         try:
             image = self._see(width, height, view, projection, lightDirection=light, **lighting)
@@ -171,13 +171,14 @@ class World:
         return colours, np.asarray(image[3], dtype=np.float32).reshape(height, width)
 
     def close(self) -> None:
-        """End the simulator; harmless when called twice."""
+        """End the simulator; a second call does nothing."""
         with contextlib.suppress(self._bullet.error):
             self._bullet.disconnect()
 
     def _build(self, scene: IcubConfig, path: str) -> None:
         bullet = self._bullet
-        # Without merging, no link of this robot has a state: it has too many fixed joints.
+        # Without merging, PyBullet gives no state for any link: the robot has too many fixed
+        # joints.
         self._robot = bullet.loadURDF(
             path,
             useFixedBase=True,
@@ -186,22 +187,22 @@ class World:
         joints = range(bullet.getNumJoints(self._robot))
         shapes = bullet.getVisualShapeData(self._robot)
         self._colours = {(shape[0], shape[1]): tuple(shape[7]) for shape in shapes}
-        # Its own eyes see the same bytes without it (its head is around them), 60 times as fast.
+        # The eyes are inside of the head: without the robot they see the same, 60 times as fast.
         for link in (-1, *joints):
             bullet.changeVisualShape(self._robot, link, rgbaColor=(0, 0, 0, 0))
-        found = {info[1]: info for info in (bullet.getJointInfo(self._robot, i) for i in joints)}
-        neck_joint, eyes = found[NECK_YAW][0], scene.eyes
+        by_name = {info[1]: info for info in (bullet.getJointInfo(self._robot, i) for i in joints)}
+        neck_joint, eyes = by_name[NECK_YAW][0], scene.eyes
         for key, angles in ((NECK_YAW, eyes.yaw), (NECK_PITCH, (eyes.pitch,))):
-            low, high = (math.degrees(limit) for limit in found[key][8:10])
+            low, high = (math.degrees(limit) for limit in by_name[key][8:10])
             for angle in angles:
                 if not low <= angle <= high:
                     raise UsageError(
                         f"scene.eyes.{key.decode()[5:]} has {angle:g}: the neck of {scene.robot} "
-                        f"turns from {low:.0f} to {high:.0f} degrees"
+                        f"turns from {low:.0f} to {high:.0f} degrees: give an angle in this range"
                     )
-        bullet.resetJointState(self._robot, found[NECK_PITCH][0], math.radians(eyes.pitch))
+        bullet.resetJointState(self._robot, by_name[NECK_PITCH][0], math.radians(eyes.pitch))
         place = bullet.getLinkState(self._robot, neck_joint, computeForwardKinematics=1)[4]
-        # To the micrometre: the rest is the rounding of the simulator's float32.
+        # Rounded to micrometres: further digits are rounding of the simulator's float32.
         self.neck = np.array([round(part, 6) for part in place])
         self._add_bodies(scene)
 
