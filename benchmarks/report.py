@@ -175,8 +175,8 @@ PARTS = {
     ),
     "long_recordings": Part(
         "Memory for long recordings",
-        "Peak memory of a process, Python and its libraries included, for a recording of 100 MB "
-        "and one of 10 GB, and the part of the large one that is read.",
+        "Peak memory of a process, Python and its libraries included, for a short and a long "
+        "recording, and the part of the long one that is read.",
         (0, 2, 5, 6),
     ),
     "opening": Part(
