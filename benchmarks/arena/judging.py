@@ -68,7 +68,7 @@ def run_learner(learner: Learner, source: ArenaSource, name: str) -> Course:
         course.watched.append((block.t, stream))
         about = stream, shown.name, shown.learnable, len(course.watched)
         course.saved += [Saved(module, *about) for module in learner.modules[len(course.saved) :]]
-        if any(f"{source.spec.streams[stream]} is given up" in text for text in learner.events):
+        if any(f"{source.spec.streams[stream]} is rejected" in text for text in learner.events):
             visits = sum(watched == stream for _, watched in course.watched)
             course.given_up.setdefault(stream, visits)
     return course

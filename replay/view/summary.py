@@ -87,8 +87,7 @@ def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
     for text in events:
         if about := [name for name in names if text.startswith(f"stream {name} ")]:
             name = max(about, key=len)
-            text = text.removeprefix(f"stream {name} ").removeprefix("is ")
-            outcomes[name] = text.replace("given up", "rejected", 1)
+            outcomes[name] = text.removeprefix(f"stream {name} ").removeprefix("is ")
     counts = Counter(outline.states)
     states = [(counts[code], words) for code, words in enumerate(STATE_WORDS)]
     lines = [", ".join(f"{count} {state}" for count, state in states if count), ""]

@@ -267,7 +267,7 @@ class ProgressLearner:
             if reason:
                 code, eta = decisions.REASONS.index(reason), float(candidate.tested[0])
                 decisions.record_decision(row, decisions.REJECTED, -1, eta, code)
-                return self._event(stream, f"is given up after {row['decided']} blocks: {reason}")
+                return self._event(stream, f"is rejected after {row['decided']} blocks: {reason}")
         elif state == decisions.REJECTED:
             final = decisions.REASONS[int(row["why"])] == decisions.NO_PROGRESS
             if not final and decisions.is_promising(candidate, self.config):
@@ -311,7 +311,7 @@ class ProgressLearner:
         decisions.record_decision(row, state, index, eta)
         if index == before:
             return self._event(stream, f"still shows what module {index + 1} gives")
-        by = "learned by" if learned else f"known by {module.stream}'s"
+        by = "learned by" if learned else f"explained by {module.stream}'s"
         what = f"{'has changed and is' if before >= 0 else 'is'} {by} module {index + 1}"
         text = f"{what} after {row['decided']} blocks, slowness {eta:.4f}"
         if new and self._n_outputs > 1:
