@@ -39,8 +39,12 @@ def test_what_others_rely_on_is_what_was_written_down() -> None:
 def test_the_page_states_the_versions_of_files() -> None:
     page = (interface.SNAPSHOT.parents[2] / "docs/reference/stability.md").read_text("utf-8")
     formats = interface.formats()
-    stated = [f"| {name} {formats[name]} |" for name in ("recordings", "signals", "index of logs")]
-    stated.append(f"its `schema` is now {formats['JSON documents']}.")
+    stated = [
+        f"| recording | {formats['recordings']} |",
+        f"| `run.mcap` | {formats['signals']} |",
+        f"| `corpus.parquet` | {formats['index of logs']} |",
+        f"(`schema` is now {formats['JSON documents']})",
+    ]
     assert [line for line in stated if line not in page] == []
 
 
