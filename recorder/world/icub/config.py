@@ -100,7 +100,7 @@ class BoxConfig(Section):
 
     Attributes:
         half_size: half the length of an edge of the box (m).
-        grey: grey level of the box, from 0 (black) to 1 (white).
+        grey: gray level of the box, from 0 (black) to 1 (white).
         x: range of x (m).
         y: the two values of y (m).
         toggle_every: number of frames between two changes of y.
@@ -121,7 +121,7 @@ class CylinderConfig(Section):
     Attributes:
         radius: radius of the cylinder (m).
         height: height of the cylinder (m).
-        grey: grey level of the cylinder, from 0 (black) to 1 (white).
+        grey: gray level of the cylinder, from 0 (black) to 1 (white).
         x: range of x (m).
         y: range of y (m).
     """
@@ -140,7 +140,7 @@ class SphereConfig(Section):
 
     Attributes:
         radius: radius of the sphere (m).
-        grey: grey level of the sphere, from 0 (black) to 1 (white).
+        grey: gray level of the sphere, from 0 (black) to 1 (white).
         x: range of x (m).
         y: range of y (m).
         step_x: standard deviation of the step of x in a frame (m).
@@ -163,12 +163,12 @@ class IcubConfig(SceneConfig):
     Attributes:
         robot: name of a robot model in the package icub-models.
         room: whether the table has edges and legs, in a room with floor, walls and furniture.
-        texture: whether surfaces show wood, tiles, plaster and paint instead of plain greys.
+        texture: whether surfaces show wood, tiles, plaster and paint instead of plain grays.
         shadow: share of the light that is missing in a shadow.
         arms: whether the arms of the robot rest on the table, where the eyes see them.
         blur: whether each pixel is blurred with its neighbours, by (1, 2, 1) / 4 in each direction.
         vignette: share of the light that is lost in the corners of an image.
-        noise: standard deviation of the sensor noise at middle grey (grey levels).
+        noise: standard deviation of the sensor noise at middle gray (gray levels).
         color: whether a frame shows red, green and blue side by side.
         physics: whether objects slide and roll to their next position instead of jumping there.
         transit: speed of the head in degrees a frame: frames are lost while it turns to another
