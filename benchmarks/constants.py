@@ -34,12 +34,13 @@ FRAMES = 100_000
 REFERENCE_COMPONENTS = 16
 
 NOTE = (
-    "Each constant at half and at twice its value, all others as they are: the value, learnable "
-    "streams learned (slowness at most 1.25 times that of batch SFA on the following frames), "
-    "modules saved of streams without a slow feature, modules saved of a stream that has one "
-    "already, and mean blocks until every stream is decided (a run that does not end counts "
-    "2,500). Of a number that is compared with 1, its distance to 1 is halved and doubled; of two "
-    "bounds around 1, their logarithms. No decision used these streams with these seeds."
+    "Each constant at half and at twice its value, all others as they are. A cell has the value, "
+    "the learnable streams that were learned (slowness at most 1.25 times that of batch SFA on the "
+    "following frames), the modules that were saved of streams without a slow feature, the modules "
+    "of a stream that has one already, and the mean number of blocks until every stream is decided "
+    "(a run that does not end counts 2,500). If a number is compared with 1, its distance to 1 is "
+    "halved and doubled; of two bounds around 1, their logarithms. No decision used these streams "
+    "with these seeds."
 )
 
 HEADER = ("constant", "value", "about", "origin", "half", "twice")
@@ -123,14 +124,16 @@ def cell(rows: list[Any]) -> str:
 
 def summarize(rows: list[Any]) -> list[list[str]]:
     """Return the table: a line for each constant, after one for the unchanged learner."""
-    table = [["(unchanged)", "", "", "", cell([row for row in rows if not row[0]]), ""]]
+    unchanged = cell([row for row in rows if not row[0]])
+    table = [["(all unchanged)", "", "", "", unchanged, unchanged]]
     for entry in TABLE["constants"]:
         name = entry["name"]
         tried = [value for constant, value in variants() if constant == name]
         cells = [entry["fixed"], ""] if "fixed" in entry else []
         for value in tried:
             same = [row for row in rows if row[0] == name and json_equal(row[1], value)]
-            cells.append(f"{written(value)}: {cell(same)}")
+            outcome = cell(same)
+            cells.append(f"{written(value)}: {outcome if outcome != unchanged else 'no change'}")
         table.append([name, written(current(name)), entry["about"], entry["origin"], *cells])
     return table
 

@@ -27,7 +27,7 @@ from cdmisfa.experiments.documents import markdown
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 
 # Columns of a help text, so that it fits beside the sidebars.
-WIDTH = 92
+WIDTH = 90
 
 # Commands that have an option with the same help, from which the option is described once.
 SHARED = 4

@@ -80,8 +80,8 @@ SMALL = ("view", "recording")
 REPORTS = {
     "report": ("icub", "1000,1100"),
     "gallery-icub": ("runs/icub", "900,720"),
-    "gallery-photographs": ("runs/photographs", "900,720"),
-    "gallery-rejected": ("runs/rejected", "900,720"),
+    "gallery-photographs": ("runs/photographs", "900,790"),
+    "gallery-rejected": ("runs/rejected", "900,790"),
 }
 
 
