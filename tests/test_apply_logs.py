@@ -89,7 +89,7 @@ def test_a_folder_of_logs_becomes_one_table(
     assert Counter(rows) == {(name, "cam"): 90 for name in NAMES} | recorded
     told = cdmisfa("apply", run, logs, "-o", out)
     assert told.code == 3
-    assert "7 logs: 0 processed now, 7 before; of these 2 failed, or ended early" in told.out
+    assert "7 logs: 0 processed now, 7 processed before, 2 failed or incomplete" in told.out
     assert "failed: broken.mcap: " in told.out
 
 
@@ -177,7 +177,7 @@ def test_other_outputs_are_replaced_only_by_force(
     assert sorted(name.rpartition(".")[2] for name in files(out)) == ["csv"] * 4
     shutil.copytree(run, tmp_path / "moved")
     moved = cdmisfa("apply", tmp_path / "moved", logs, "-o", out, "--frames", 30, "--to", "csv")
-    assert "3 logs: 0 processed now, 3 before" in moved.out
+    assert "3 logs: 0 processed now, 3 processed before" in moved.out
     other = Run(run).modules
     from replay.runs.modules import save_modules
 
@@ -200,7 +200,7 @@ def test_what_is_finished_is_kept_when_it_is_stopped(run: Path, logs: Path, tmp_
         complaint = process.communicate(timeout=30)[1]
     assert process.returncode == 143
     assert complaint.splitlines()[-1] == (
-        f"cdmisfa: interrupted: {out} keeps what is finished: run the same command to continue"
+        f"cdmisfa: interrupted: finished results are in {out}: run the same command again"
     )
     done = len(files(out))
     assert pq.read_table(out).num_rows == 90 * done
@@ -226,7 +226,7 @@ def test_a_full_disk_is_a_line_and_the_files_before_are_kept(
     assert "long.mcap.parquet cannot be written: " in done.err
     assert "File too large" in done.err
     assert list(files(out)) == ["a.mcap.parquet"]
-    assert "1 processed now, 1 before" in cdmisfa("apply", run, logs, "-o", out).out
+    assert "1 processed now, 1 processed before" in cdmisfa("apply", run, logs, "-o", out).out
 
 
 def test_odd_names_are_as_they_were_in_the_table(run: Path, logs: Path, tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ class TestJson:
         done = cdmisfa("info", oscillatory_run)
         assert done.code == 0
         assert "run, whole, checksums ok, seed 0\n" in done.out
-        assert "ended after 15 iterations of 100 frames: the asked number of iter" in done.out
+        assert "ended after 15 iterations of 100 frames: the requested number of iter" in done.out
         assert "learner 2.0, 3 streams: x1, x2, x3" in done.out
         assert "2016-01-01 00:00:00.000Z" in done.out
         killed = tmp_path / "killed"
@@ -61,7 +61,9 @@ class TestJson:
         (killed / "run.mcap.partial").write_bytes(log[: len(log) // 2])
         done = cdmisfa("info", killed)
         assert (done.code, "no module" in done.out) == (3, False)
-        assert re.search(r"^not ended: \d+ iterations of 100 frames so far", done.out, re.MULTILINE)
+        assert re.search(
+            r"^not finished after \d+ iterations of 100 frames:", done.out, re.MULTILINE
+        )
         torn = Path(shutil.copy(oscillatory_recording / "x1.mcap", tmp_path))
         flip(torn)
         done = cdmisfa("info", torn)
@@ -132,7 +134,7 @@ class TestRuns:
         ("algorithm", "blocks", "said"),
         [
             ("2.0", 20, "not decided: x1, x2, x3\n"),
-            ("progress", 50, "x2: not decided, slowness 0.00"),
+            ("progress", 50, "blocks (slowness 0.00"),
         ],
     )
     def test_a_recording_that_ends_is_the_end_of_its_run(
@@ -152,7 +154,7 @@ class TestRuns:
         assert "0 frames are left at frame 2000" in done.err
         assert "--loop" in done.err
         assert said in done.out
-        assert f"ended after {blocks} iterations: there were no more frames" in done.out
+        assert f"ended after {blocks} iterations: the source has no more frames" in done.out
         result = json.loads((run / "run.json").read_text())["result"]
         again = cdmisfa(*words, "--json").json | {"run": str(run)}
         resumed = cdmisfa("learn", "--resume", "-o", run, "--no-rerun", "--json").json
@@ -167,7 +169,7 @@ class TestRuns:
         info = cdmisfa("info", run)
         assert "whole" in info.out
         assert f"ended after {blocks} iterations of " in info.out
-        assert "frames: there were no more frames" in info.out
+        assert "frames: the source has no more frames" in info.out
         looped = cdmisfa(*words, "--loop", "--max-iterations", blocks + 5, "--json").json
         assert looped["iterations"] == blocks + 5
 
@@ -206,7 +208,7 @@ class TestInterrupts:
             process.send_signal(number)
             out, err = process.communicate(timeout=60)
         assert process.returncode == code, err
-        assert err.endswith(f"go on with cdmisfa learn --resume -o {run}\n")
+        assert err.endswith(f"continue with cdmisfa learn --resume -o {run}\n")
         assert "Traceback" not in err
         assert Outcome(code, out, err).json["ended"] == "interrupted"
         assert sorted(f.name for f in run.iterdir() if "partial" in f.name) == []

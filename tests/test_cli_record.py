@@ -88,7 +88,7 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
     assert contents(folder) == contents(tmp_path / "whole")
     complete = cdmisfa(*again, "--json")
     assert (complete.code, complete.json["frames"]) == (0, 400)
-    assert complete.err == f"{folder} is complete: nothing was left to record\n"
+    assert complete.err == f"{folder} is complete: there is nothing to resume\n"
     longer = cdmisfa("record", "oscillatory", *again[1:], *words[2:], "--frames", 450, "--json")
     assert longer.code == 0, longer.err
     assert (longer.json["frames"], longer.err) == (450, "")
@@ -96,4 +96,4 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
     for unknown in (again, (*again, "--frames", 9)):
         assert cdmisfa(*unknown).code == 2
     nothing = cdmisfa("record", "--resume", "-o", tmp_path / "new")
-    assert (nothing.code, "name the SCENE" in nothing.err) == (2, True)
+    assert (nothing.code, "name a scene" in nothing.err) == (2, True)

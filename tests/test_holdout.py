@@ -71,7 +71,7 @@ def test_frames_held_out_are_not_learned_from_and_judged_as_batch_sfa_is(
     assert cdmisfa("info", run, "--json").json["held_out"] == found["held_out"]
     lines = cdmisfa("info", run).out.splitlines()
     own, theirs = (", ".join(f"{v:.4f}" for v in told[k]) for k in ("slowness", "of_batch"))
-    at = lines.index("slowness on the frames 5400 to 5999, which were held out:")
+    at = lines.index("slowness on the held-out frames 5400 to 5999:")
     assert lines[at + 1] == f"module 1 of log: {own}; batch SFA: {theirs}"
 
 

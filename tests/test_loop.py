@@ -13,8 +13,9 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.cli.progress import Bar
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.outcomes import END_REASONS
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.loop import END_REASONS, Digest, Keyframes, learn_blocks
+from cdmisfa.experiments.loop import Digest, Keyframes, learn_blocks
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 
@@ -126,10 +127,10 @@ def test_progress_says_what_is_watched_and_what_was_saved_last(
     *before, (done, total, note) = shown.told
     assert (done, total) == (learner.iteration, None)
     (module,) = learner.modules
-    assert note.startswith(f"watching {module.stream}, saved last: module 1 of {module.stream}, ")
-    assert all("nothing saved yet" in words for *_, words in before)
+    assert note.startswith(f"attending to {module.stream}, last module: 1 of {module.stream}, ")
+    assert all("no module yet" in words for *_, words in before)
     assert {words.split(",")[0] for *_, words in before} == {
-        f"watching {name}" for name in source.spec.streams
+        f"attending to {name}" for name in source.spec.streams
     }
     (line,) = shown.said
     assert line.startswith(f"iteration {learner.iteration - 1}: module 1 saved on stream")

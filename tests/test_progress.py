@@ -67,8 +67,8 @@ def test_it_learns_what_is_there_gives_up_what_is_not_and_ends(seed: int) -> Non
     for place, module in enumerate(learner.modules):
         assert encodes(learner, place, source, module.stream_index) > 0.95
     rows = {row["stream"]: row for row in learner.summary()["streams"]}
-    assert rows["noise"]["why"] == "nothing in it is slow"
-    assert rows["constant"]["why"] == "it is constant"
+    assert rows["noise"]["why"] == "no slow feature"
+    assert rows["constant"]["why"] == "constant input"
     assert (rows["constant"]["slowness"], rows["noise"]["module"]) == (None, None)
     assert rows["swing"]["slowness"] < 0.05 < 0.15 < rows["noise"]["slowness"]
 
@@ -165,14 +165,14 @@ def test_a_candidate_tests_before_it_learns() -> None:
     assert noise.fitted < noise.tested[0]
     assert relative_slowness(noise) > 0.85 > 0.4 > relative_slowness(swing)
     assert relative_fitted_slowness(noise) > 0.75 > 0.4 > relative_fitted_slowness(swing)
-    assert rejection_reason(noise, ProgressConfig()) == "nothing in it is slow"
+    assert rejection_reason(noise, ProgressConfig()) == "no slow feature"
     assert rejection_reason(swing, ProgressConfig()) == ""
     assert is_promising(swing, ProgressConfig())
     assert swing.error == learning_error(swing.change, swing.tested[0], swing.fitted)
     black = Candidate(192, 8, 1, 8000, 20)
     for _ in range(12):
         black.learn(np.zeros((40, 192), np.uint8), gap=False)
-    assert (black.varies, rejection_reason(black, ProgressConfig())) == (False, "it is constant")
+    assert (black.varies, rejection_reason(black, ProgressConfig())) == (False, "constant input")
 
 
 @pytest.mark.parametrize("tau", [3, 40, 100])
@@ -277,7 +277,7 @@ def test_eight_outputs_are_decided_as_one_and_marked(cdmisfa: Cdmisfa, tmp_path:
     np.testing.assert_allclose(stroll.transform(frames, outputs=0), y[:, :1])
     said = cdmisfa("info", tmp_path / "run").out
     assert re.search(rf"{stroll.index} +stroll +\d+ +{stroll.eta[0]:.4f}, \(", said)
-    assert "in brackets: not slow on frames that were not learned from" in said
+    assert "in brackets: not slow on new frames" in said
     found = cdmisfa("info", tmp_path / "run", "--json").json["modules"]
     assert [one["slow"] for one in found] == [m.slow.tolist() for m in opened]
 

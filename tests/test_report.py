@@ -210,7 +210,7 @@ def test_learning_does_not_fail_with_its_report(
     monkeypatch.setattr(reports, "_reproducible", broken)
     done = cdmisfa("learn", "oscillatory", "--max-iterations", 5, "--no-rerun", "-o", tmp_path)
     assert done.code == 0
-    assert "has no report (no page today)" in done.err
+    assert "no report was written (no page today)" in done.err
     assert (tmp_path / "modules.npz").is_file()
 
 

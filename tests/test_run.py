@@ -14,8 +14,8 @@ from run_data import parts_of, read_signals
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.outcomes import END_REASONS
 from cdmisfa.core.signals import SignalsHash
-from cdmisfa.experiments.loop import END_REASONS
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run as run_it
 from recorder.world.oscillatory import OscillatorySource

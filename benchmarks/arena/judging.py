@@ -45,7 +45,7 @@ class Course:
     Attributes:
         saved: the modules, in order.
         watched: of every block its first frame and its stream.
-        given_up: blocks that each stream was watched until it was first given up.
+        given_up: blocks that each stream was watched until it was first rejected.
         ended: whether the learner ended by itself.
     """
 

@@ -140,7 +140,7 @@ def source_changes(frames: FrameSource) -> None:
 def result(run: RunResult, *, as_json: bool) -> None:
     """Print the result of a run that has ended."""
     from cdmisfa.core.names import counted
-    from cdmisfa.experiments.loop import END_REASONS
+    from cdmisfa.core.outcomes import END_REASONS
     from replay.integrity.report import ModuleInfo
 
     if as_json:
@@ -157,7 +157,7 @@ def result(run: RunResult, *, as_json: bool) -> None:
     line(f"ended after {counted(run.iterations, 'iteration')}: {END_REASONS[run.ended]}")
     line(f"signals sha256 {run.signals_sha256}")
     if run.run is not None:
-        line(f"run {run.run}    look at it: cdmisfa view {quoted(run.run)}")
+        line(f"run written to {run.run}; view it with cdmisfa view {quoted(run.run)}")
 
 
 def modules(learned: Sequence[ModuleInfo], *, policies: bool) -> None:
@@ -175,7 +175,7 @@ def modules(learned: Sequence[ModuleInfo], *, policies: bool) -> None:
             row.insert(3, " ".join(ACTIONS[action] for action in module.policy))
     table(head, rows)
     if any(0 in m.slow for m in learned):
-        line("in brackets: not slow on frames that were not learned from")
+        line("in brackets: not slow on new frames")
 
 
 def slownesses(eta: Sequence[float], slow: Sequence[int] = ()) -> str:
@@ -188,15 +188,10 @@ def slownesses(eta: Sequence[float], slow: Sequence[int] = ()) -> str:
 
 def stream_outcome(stream: Mapping[str, Any]) -> None:
     """Print what the progress learner decided about a stream."""
-    from cdmisfa.core.names import counted
+    from cdmisfa.core.outcomes import outcome_text
 
-    text = "not decided" if stream["state"] == "learning" else stream["state"].replace("_", " ")
-    if stream["module"] is not None:
-        text += f" by module {stream['module']}"
-    if stream["slowness"] is not None:
-        text += f", slowness {stream['slowness']:.4f} on frames not learned from"
-    reason = f": {stream['why']}" if stream["why"] else ""
-    line(f"{stream['stream']}: {text}, after {counted(stream['blocks'], 'block')}{reason}")
+    values = (stream[key] for key in ("state", "module", "blocks", "slowness", "why"))
+    line(f"{stream['stream']}: {outcome_text(*values)}")
 
 
 def held_out(judged: Mapping[str, Any]) -> None:
@@ -204,7 +199,7 @@ def held_out(judged: Mapping[str, Any]) -> None:
     if not judged["modules"]:
         return
     start, stop = judged["frames"]
-    line(f"slowness on the frames {start} to {stop - 1}, which were held out:")
+    line(f"slowness on the held-out frames {start} to {stop - 1}:")
     for module in judged["modules"]:
         online, batch = (slownesses(module[key]) for key in ("slowness", "of_batch"))
         line(f"module {module['module']} of {module['stream']}: {online}; batch SFA: {batch}")

@@ -103,7 +103,7 @@ def resumable_bar(out: Path, title: str, unit: str) -> Iterator[Bar]:
             yield shown
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{out} keeps what is finished: run the same command to continue"
+            f"finished results are in {out}: run the same command again"
         ) from None
 
 
@@ -149,14 +149,14 @@ class RunProgress(Sink):
     def _note(self, signals: BlockSignals, learner: Learner) -> str:
         """Return the attended stream, the module saved last, and how much is left to learn."""
         streams, modules = self._spec.streams, learner.modules
-        saved = "nothing saved yet"
+        saved = "no module yet"
         if modules:
-            saved = f"saved last: module {modules[-1].index} of {modules[-1].stream}"
+            saved = f"last module: {modules[-1].index} of {modules[-1].stream}"
         learning = int((signals.state == 0).sum())
         left = f"ε {signals.epsilon:.2f}"
         if learning:
-            left = f"{learning} of {len(streams)} being learned"
-        return f"watching {streams[signals.stream]}, {saved}, {left}"
+            left = f"{learning} of {len(streams)} streams not decided"
+        return f"attending to {streams[signals.stream]}, {saved}, {left}"
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Print a warning."""
@@ -170,7 +170,7 @@ class RunProgress(Sink):
             self._bar.restart("hashing", "MB")
             self._bar.say(
                 f"computing the SHA-256 of the source: {done / GIGABYTE:.1f} of "
-                f"{size / GIGABYTE:.1f} GB are read"
+                f"{size / GIGABYTE:.1f} GB read"
             )
         self._bar.update(done / 1e6, size / 1e6)
 

@@ -81,7 +81,7 @@ class Learner(Protocol):
 
     @property
     def over(self) -> str:
-        """Reason to end, a key of `loop.END_REASONS`; "" while there is something to learn."""
+        """Reason to end, a key of `outcomes.END_REASONS`; "" while there is something to learn."""
 
     @property
     def max_modules(self) -> int | None:

@@ -3,28 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from cdmisfa.core.blocks import Block, FrameSource, turn_to
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Keyframe, Learner, Sink
+from cdmisfa.core.outcomes import END_REASONS, EXHAUSTED, INTERRUPTED
 from cdmisfa.core.signals import BlockSignals, SignalsHash
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
-
-INTERRUPTED: Final = "interrupted"
-EXHAUSTED: Final = "log_exhausted"
-
-# Descriptions of the reasons for which a run ends.
-END_REASONS: Mapping[str, str] = {
-    "max_modules": "the requested number of modules was learned",
-    "max_iterations": "the requested number of iterations was done",
-    "nothing_left": "no module was saved for a long time after exploration ended",
-    "all_decided": "every stream is decided",
-    EXHAUSTED: "there were no more frames",
-    INTERRUPTED: "it was interrupted",
-}
 
 # Default number of iterations between two keyframes. Fewer make resuming faster and logs larger.
 KEYFRAME_INTERVAL = 100

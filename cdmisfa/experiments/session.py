@@ -20,9 +20,10 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
+from cdmisfa.core.outcomes import INTERRUPTED
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.holdout import evaluate
-from cdmisfa.experiments.loop import INTERRUPTED, Digest, Keyframes, learn_blocks
+from cdmisfa.experiments.loop import Digest, Keyframes, learn_blocks
 from cdmisfa.experiments.resume import Recomputation, fork_span, reconfigured, restore
 from cdmisfa.experiments.run_folder import (
     COMMAND,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.agents.progress.candidate import Candidate, log_ratio
 from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.core.outcomes import CONSTANT, NO_PROGRESS, NOTHING_SLOW, REJECTIONS, TOO_SLOW
 from cdmisfa.core.signals import STATES
 from cdmisfa.features.outputs import window_rate
 from cdmisfa.modules import Module
@@ -33,7 +34,7 @@ SETTLING_WINDOWS = 4.5
 # blocks on noise.
 MIN_REJECTION_WINDOWS = 0.24
 
-# Test windows without progress after which a candidate is given up: 16,000 frames with the default
+# Test windows without progress after which a candidate is rejected: 16,000 frames with the default
 # configuration, twice `learner.window`. Set by hand. Smaller values reject streams that pause.
 MAX_STALLED_WINDOWS = 8
 
@@ -105,21 +106,8 @@ CHANGED_SLOWNESS_LOG = 0.8
 
 LEARNING, LEARNED, EXPLAINED, REJECTED = range(len(STATES))
 
-# Reasons for a rejection.
-REJECTIONS = (CONSTANT, NOTHING_SLOW, NO_PROGRESS) = (
-    "it is constant",
-    "nothing in it is slow",
-    "it made no progress",
-)
-
 # Reasons by the code that is stored in the table of streams; 0 is none.
 REASONS = ("", *REJECTIONS)
-
-# Note on a learned stream whose slow feature hardly varied within a test window.
-TOO_SLOW = (
-    "slower than tests can tell, so it may hold for these frames only; for what takes longer to "
-    "come and go raise learner.test_frames and learner.window, both as many times"
-)
 
 # One row of the table of streams. The names are part of stored states and do not change.
 STREAM = np.dtype(

@@ -24,7 +24,8 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.learning import LearnerState, overwrite
-from cdmisfa.core.signals import BlockSignals
+from cdmisfa.core.outcomes import NO_PROGRESS, outcome_text
+from cdmisfa.core.signals import STATES, BlockSignals
 from cdmisfa.modules import Module
 
 # Smallest test window in blocks, also if `learner.test_frames` holds fewer. Set by hand: the change
@@ -259,23 +260,24 @@ class ProgressLearner:
             if not reason and decisions.has_vanished(candidate, self.config):
                 del self._candidates[stream]
                 if row["visits"] - row["decided"] < most_blocks:
-                    return self._event(stream, "starts again: its slow feature came to rest")
-                reason = decisions.NO_PROGRESS
-            if reason == decisions.NO_PROGRESS and module >= 0:
+                    return self._event(stream, "is learned again: its feature stopped changing")
+                reason = NO_PROGRESS
+            if reason == NO_PROGRESS and module >= 0:
                 # The previous module stays: the new candidate found nothing better.
                 return self._assign_module(stream, candidate, frames, module)
             if reason:
                 code, eta = decisions.REASONS.index(reason), float(candidate.tested[0])
                 decisions.record_decision(row, decisions.REJECTED, -1, eta, code)
-                return self._event(stream, f"is rejected after {row['decided']} blocks: {reason}")
+                text = outcome_text(STATES[decisions.REJECTED], None, row["decided"], eta, reason)
+                return self._event(stream, f"is {text}")
         elif state == decisions.REJECTED:
-            final = decisions.REASONS[int(row["why"])] == decisions.NO_PROGRESS
+            final = decisions.REASONS[int(row["why"])] == NO_PROGRESS
             if not final and decisions.is_promising(candidate, self.config):
                 self._learn_again(stream, -1)
-                return self._event(stream, "is learned after all: something in it is slow")
+                return self._event(stream, "is learned again: it has a slow feature after all")
         elif decisions.output_changed(row, self._monitor_window):
             self._learn_again(stream, module)
-            return self._event(stream, f"no longer fits module {module + 1}")
+            return self._event(stream, f"is not explained by module {module + 1} any longer")
         if state != decisions.LEARNING and candidate.blocks >= most_blocks:
             del self._candidates[stream]
         return ()
@@ -310,13 +312,11 @@ class ProgressLearner:
         state = decisions.LEARNED if learned else decisions.EXPLAINED
         decisions.record_decision(row, state, index, eta)
         if index == before:
-            return self._event(stream, f"still shows what module {index + 1} gives")
-        by = "learned by" if learned else f"explained by {module.stream}'s"
-        what = f"{'has changed and is' if before >= 0 else 'is'} {by} module {index + 1}"
-        text = f"{what} after {row['decided']} blocks, slowness {eta:.4f}"
+            return self._event(stream, f"is still explained by module {index + 1}")
+        text = outcome_text(STATES[state], index + 1, int(row["decided"]), eta)
         if new and self._n_outputs > 1:
-            text += f", {int(module.slow.sum())} of {self._n_outputs} outputs slow"
-        return self._event(stream, text)
+            text += f"; {int(module.slow.sum())} of {self._n_outputs} outputs slow"
+        return self._event(stream, f"{'has changed and is' if before >= 0 else 'is'} {text}")
 
     def _learn_again(self, stream: int, module: int) -> None:
         """Set a decided stream back to being learned, with a new candidate."""

@@ -178,7 +178,7 @@ def _apply_to_each(
                 totals = _apply(application, source, output, frames, stop, as_lines)
             error = None if totals.damaged is None else str(totals.damaged)
             if totals.damaged is not None:
-                printing.status(f"{error}: outputs up to the damage are kept")
+                printing.status(f"{error}: the outputs before the damage are written")
                 code = totals.damaged.exit_code
             row = {"log": " ".join(words), "out": output and str(output), "frames": totals.frames}
             rows.append({**row, "error": error, "modules": totals.rows()})
@@ -233,9 +233,9 @@ def _print_rows(rows: Sequence[dict[str, Any]]) -> None:
             slowness = "-" if module["slowness"] is None else f"{module['slowness']:.4f}"
             shares = f"{module['alive']:.0%}", f"{module['known']:.0%}"
             cells.append((module["stream"], module["module"], slowness, *shares))
-        printing.table(("stream", "module", "slowness", "alive", "known"), cells)
+        printing.table(("stream", "module", "slowness", "alive", "explained"), cells)
         if row["out"] is not None:
-            printing.line(f"outputs {row['out']}")
+            printing.line(f"outputs written to {row['out']}")
 
 
 def _print_applied_logs(run: Path, applied: AppliedLogs, as_json: bool) -> None:
@@ -250,10 +250,10 @@ def _print_applied_logs(run: Path, applied: AppliedLogs, as_json: bool) -> None:
         return
     printing.line(
         f"{counted(len(applied.logs), 'log')}: {applied.computed} processed now, "
-        f"{applied.skipped} before; of these {len(applied.failed)} failed, or ended early"
+        f"{applied.skipped} processed before, {len(applied.failed)} failed or incomplete"
     )
     for row in applied.failed[:MOST_LINES]:
         printing.line(f"failed: {row['log']}: {row['error']}")
     if (more := len(applied.failed) - MOST_LINES) > 0:
-        printing.line(f"failed: {more} more, which --json lists")
-    printing.line(f"outputs {applied.out}")
+        printing.line(f"{more} more failed: list all with --json")
+    printing.line(f"outputs written to {applied.out}")

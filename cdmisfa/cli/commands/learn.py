@@ -173,11 +173,10 @@ def _opened(
     from recorder.log.files import refuse_existing
 
     live = any(map(is_live, words))
-    if (live and how["resumed"]) or (record_to is not None and not live):
-        raise UsageError(
-            "--record is for live streams, and --resume for all others: live streams cannot go "
-            "back, learn from a recording of them"
-        )
+    if live and how["resumed"]:
+        raise UsageError(f"{words[0]} is a live stream: --resume needs a source that can go back")
+    if record_to is not None and not live:
+        raise UsageError(f"{words[0]} is no live stream: {are_for(['--record'], 'live streams')}")
     flags = ("--loop", "--skip-damaged", "--episodes")
     unused = [flag for flag in flags if how[flag.removeprefix("--").replace("-", "_")]]
     if unused and (live or is_scene(words)):
@@ -220,25 +219,26 @@ def _learned(
 
 def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool) -> int:
     """Print the result of a run, write its report unless interrupted; return the exit code."""
-    from cdmisfa.experiments.loop import INTERRUPTED
+    from cdmisfa.core.outcomes import INTERRUPTED
     from cdmisfa.experiments.reports import write_report
 
     printing.result(result, as_json=as_json)
     folder = printing.quoted(result.run or "")
     if result.ended == INTERRUPTED:
         if folder and can_resume:
-            printing.status(f"go on with cdmisfa learn --resume -o {folder}")
+            printing.status(f"continue with cdmisfa learn --resume -o {folder}")
         return stop.exit_code
     if result.run is None:
         return 0
     try:
         page = write_report([result.run])
     except Exception as error:  # the run is complete, whatever makes its report fail
-        reason = f"{result.run} has no report ({one_line(error)})"
-        printing.warning(f"{reason}: cdmisfa report {folder} says why")
+        printing.warning(
+            f"no report was written ({one_line(error)}): try again with cdmisfa report {folder}"
+        )
         return 0
     if not as_json:
-        printing.line(f"report {page}")
+        printing.line(f"report written to {page}")
     return 0
 
 
@@ -298,5 +298,5 @@ def fork_command(
     ):
         result = _learned(session, stop, progress, rerun=not no_rerun)
     both = f"{printing.quoted(run)} {printing.quoted(output)}"
-    printing.status(f"both in one view: cdmisfa compare {both} --save both.rrd")
+    printing.status(f"compare both with cdmisfa compare {both} --save both.rrd")
     return _print_run(result, stop, can_resume=True, as_json=as_json)

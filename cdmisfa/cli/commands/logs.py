@@ -80,7 +80,7 @@ def _print_info(info: LogReport) -> None:
 
 def _print_run(info: LogReport, run: Mapping[str, Any]) -> None:
     """Print what a run learned, with which learner, and why it ended."""
-    from cdmisfa.experiments.loop import END_REASONS
+    from cdmisfa.core.outcomes import END_REASONS
 
     streams = run["streams"]
     more = len(streams) - MOST_STREAMS
@@ -94,9 +94,7 @@ def _print_run(info: LogReport, run: Mapping[str, Any]) -> None:
         printing.held_out(info.held_out)
     done = f"{counted(run['iterations'], 'iteration')} of {counted(run['tau'], 'frame')}"
     if info.ended is None:
-        printing.line(
-            f"not ended: {done} so far; it learns, or was stopped before its modules were kept"
-        )
+        printing.line(f"not finished after {done}: it is still learning, or was stopped")
     else:
         printing.line(f"ended after {done}: {END_REASONS.get(info.ended, info.ended)}")
 
@@ -212,14 +210,14 @@ def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
         printing.json_document(recovery.as_json())
     else:
         printing.table(
-            ("topic", "kept", "lost"),
+            ("topic", "saved", "lost"),
             [(c.topic, c.kept, "unknown" if c.lost is None else c.lost) for c in recovery.channels],
         )
         if recovery.lost:
             printing.table(("lost", "what"), [(p.where, p.what) for p in recovery.lost])
         for mended in recovery.mended:
             printing.status(f"{mended.where}: {mended.what}")
-        printing.line(f"written {output}")
+        printing.line(f"repaired file written to {output}")
     return 0 if recovery.complete else LogDamagedError.exit_code
 
 
@@ -275,10 +273,10 @@ def export_command(
     form = form or output.suffix.removeprefix(".")
     rows = export(path, output, form, lossless=lossless, about=printing.source, **how)
     if form == "csv":
-        printing.status(f"CSV leaves out {' and '.join(CSV_LEAVES_OUT)}: Parquet and npz hold them")
+        printing.status(f"CSV leaves out {' and '.join(CSV_LEAVES_OUT)}: Parquet and npz have them")
     videos = output.is_file() or next(output.rglob("*.mp4"), None) is not None
     if form in ("mp4", "lerobot") and videos and not lossless:
-        printing.status("H.264 changes pixels a little: --lossless keeps them all")
+        printing.status("H.264 changes pixels a little: --lossless keeps every pixel")
     if as_json:
         printing.document(path=" ".join(map(str, path)), file=str(output), rows=rows)
         return
@@ -337,7 +335,7 @@ def index_command(
     else:
         _print_index(indexed)
     if indexed.stopped:
-        printing.status("stopped before all logs were read: run the same command to continue")
+        printing.status("stopped before all logs were read: run the same command again to continue")
         return stop.exit_code
     return 0
 
@@ -348,7 +346,7 @@ def _print_index(indexed: Indexed) -> None:
 
     printing.line(
         f"{counted(indexed.logs, 'log')}, {counted(indexed.streams, 'stream')}: "
-        f"{indexed.read} read, {indexed.kept} unchanged, {len(indexed.gone)} gone, "
+        f"{indexed.read} read, {indexed.kept} unchanged, {len(indexed.gone)} removed, "
         f"{indexed.broken} with a problem"
     )
     if indexed.kinds:
@@ -360,4 +358,4 @@ def _print_index(indexed: Indexed) -> None:
         printing.line(f"{row['path']}: {row['problem']}")
     if (more := indexed.broken - len(indexed.problems)) > 0:
         printing.line(f"and {more} more logs with a problem")
-    printing.line(f"written {indexed.index}")
+    printing.line(f"index written to {indexed.index}")

@@ -99,15 +99,15 @@ def record_command(
         return _record_live(source, output, frames, limit, force, as_json, **how)
     if any(w not in SCENES and (Path(w).exists() or set("*?:") & set(w)) for w in source):
         command = f"cdmisfa convert {shlex.join(source)} -o REC"
-        raise UsageError(f"{source[0]} is a log, no scene: write it as a recording with {command}")
+        raise UsageError(f"{source[0]} is a log, not a scene: convert it with {command}")
     start = read_start(output) if resume else RecordingStart()
     _check_resumable(output, start.scene)
     scene = " ".join(source) or start.scene
     if not scene and resume and not (frames or split) and (files := recorded(output)):
-        printing.status(f"{output} is complete: nothing was left to record")
+        printing.status(f"{output} is complete: there is nothing to resume")
         return _print_recording(output, files, as_json)
     if not scene:
-        raise click.UsageError(f"name the SCENE, {' or '.join(SCENES)}")
+        raise click.UsageError(f"name a scene: {' or '.join(SCENES)}")
     seed = seed if seed is not None else start.seed or 0
     configuration = configure(scene, Layers.read(preset, settings), seed, inputs)
     with _writing(output, "recording", notice="") as (shown, stop):
@@ -157,7 +157,7 @@ def _record_live(
 
     refuse_existing(output, force=force, resumable=False)
     source, configuration = open_source(words, say=printing.status, **how)
-    notice = "finishing the recording; again to stop at once\n"
+    notice = "finishing the recording; press Ctrl-C again to stop at once\n"
     with contextlib.closing(source), stoppable(notice) as stop:
         frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)
         recorded = LiveRecorder(
@@ -214,7 +214,8 @@ def convert_command(
     from replay.open_sources import locations, open_external, refuse_non_logs
 
     if live := next(filter(is_live, source), None):
-        raise UsageError(f"{live} is a live stream: cdmisfa record {shlex.join(source)} -o REC")
+        command = f"cdmisfa record {shlex.join(source)} -o REC"
+        raise UsageError(f"{live} is a live stream: record it with {command}")
     paths = locations(source)
     refuse_non_logs(paths)
     if not resume:

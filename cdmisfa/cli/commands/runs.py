@@ -64,7 +64,8 @@ def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_j
     else:
         _print_comparison(rows)
         if save is not None:
-            printing.status(f"view {save}    look at it: cdmisfa view {printing.quoted(save)}")
+            command = f"cdmisfa view {printing.quoted(save)}"
+            printing.status(f"view written to {save}; open it with {command}")
     return NotReproducedError.exit_code if different and len(runs) == 2 else 0
 
 

@@ -116,7 +116,7 @@ def sweep_command(
         for row in failed:
             point = " ".join(f"{key}={value}" for key, value in row["point"].items())
             printing.line(f"failed: {point} seed {row['seed']}: {row['error']}")
-        printing.line(f"look at it: cdmisfa sweep {printing.quoted(output)} --summary")
+        printing.line(f"print the results with cdmisfa sweep {printing.quoted(output)} --summary")
     return 1 if failed else 0
 
 
@@ -286,10 +286,9 @@ def demo_command(output: Path | None, seed: int, frames: int, jobs: int, as_json
     ]  # fmt: skip
     printing.table(head, rows)
     printing.line()
-    printing.line(f"report     {report['report'].resolve().as_uri()}")
-    printing.line(
-        f"look at it {printing.quoted(sys.argv[0])} view {printing.quoted(report['run'])}"
-    )
+    printing.line(f"report written to {report['report'].resolve().as_uri()}")
+    command = f"{printing.quoted(sys.argv[0])} view {printing.quoted(report['run'])}"
+    printing.line(f"view the run with {command}")
 
 
 @contextmanager

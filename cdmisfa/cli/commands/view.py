@@ -71,14 +71,14 @@ def view_command(
     """
     if sum((save is not None, web, screenshot is not None)) > 1 or (at and (web or save)):
         raise click.UsageError(
-            "choose one of --save, --web and --screenshot; --at goes with a window or --screenshot"
+            "choose one of --save, --web and --screenshot; --at needs a window or --screenshot"
         )
     from recorder.log.files import refuse_taken, refuse_unless
     from replay.runs.folders import runs_in
 
     path, *beside = run
     if not beside and runs_in(path):
-        raise UsageError(f"{path} holds many runs: name one, or several to cdmisfa report")
+        raise UsageError(f"{path} holds several runs: view one of them, or use cdmisfa report")
     if screenshot is not None:
         refuse_unless(screenshot, "the screenshot is a PNG", ".png")
         refuse_taken(screenshot, force=force)
@@ -87,7 +87,7 @@ def view_command(
     content |= {"beside": beside, "about": printing.source}
     if save is not None:
         build_view(path, save, force=force, **content)
-        printing.status(f"view {save}")
+        printing.status(f"view written to {save}")
         return
     from replay.viewer import frame_at, open_window, served
     from replay.viewer import screenshot as draw
@@ -96,7 +96,7 @@ def view_command(
     with view_of(path, **content) as view:
         if screenshot is not None:
             draw(view, screenshot, frame)
-            printing.status(f"screenshot {screenshot}")
+            printing.status(f"screenshot written to {screenshot}")
         elif web:
             with served(view, port or 0) as (server, address):
                 printing.status(address)
@@ -130,9 +130,9 @@ def report_command(run: tuple[Path, ...], output: Path | None, force: bool, as_j
     from replay.storage.location import with_urls
 
     if output is None and any(with_urls(str(path)) != str(path) for path in run):
-        raise click.UsageError("for a run behind a URL name the page to write with -o F.html")
+        raise click.UsageError("the run is at a URL: name the report to write with -o F.html")
     page = write_report(run, output, force=force)
     if as_json:
         printing.document(report=page, bytes=page.stat().st_size)
     else:
-        printing.line(page)
+        printing.line(f"report written to {page}")
