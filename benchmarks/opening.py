@@ -112,7 +112,7 @@ def seconds(
 def main(*, quick: bool = False) -> None:
     """Measure, and write results/opening.json."""
     rows, learned = [], []
-    for size in (10, 100 if quick else 1000):
+    for size in (20, 100 if quick else 1000):
         with tempfile.TemporaryDirectory() as folder:
             path = write(Path(folder) / "log.mcap", size * MEGABYTE)
             first_picture(path)
