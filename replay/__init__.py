@@ -1,1 +1,1 @@
-"""Reading of logs and runs of cdmisfa, and showing what they hold."""
+"""Read logs and runs of cdmisfa, and show them: views, reports, exports, checks."""

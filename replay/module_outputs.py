@@ -1,7 +1,7 @@
-"""Outputs of modules on every logged frame of their own streams, also before their saves.
+"""Outputs of modules on every logged frame of their streams, also before they were saved.
 
-Signals hold a module's outputs only from its save on, and a stream that is learned is seldom
-watched again. A frozen module computes its outputs on the logged frames again.
+Signals have a module's outputs only after its save, and a learned stream is seldom attended again.
+So a frozen module computes its outputs on the logged frames again.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.modules import CHUNK, Module
 from replay.runs.log import Batch
 
-# Frames of a contact sheet with the least output, and of those with the greatest.
+# Frames of a contact sheet with the least, middle and greatest output each: five fit in a row.
 SAMPLE_FRAMES = 5
 
-# Frames from which those of middle output are picked.
+# Evenly spread frames from which those with the middle output are chosen.
 MIDDLE_CANDIDATES = 64
 
 
 class Subsample:
-    """Selects at most `most` rows, spread evenly over all that come, with no period of their own.
+    """Selects at most `most` rows, spread evenly but not periodically over all rows.
 
     Every second or third row of something periodic would show one phase of it alone; so row i is
     selected where the fraction of i times the golden ratio is small. The selection depends neither
@@ -41,7 +41,7 @@ class Subsample:
         step: how many of them a selected one represents.
 
     Example:
-        >>> rows = Thinned(4)
+        >>> rows = Subsample(4)
         >>> for start in range(0, 10, 5):
         ...     rows.add(np.arange(start, start + 5))
         >>> rows.columns[0].tolist(), rows.step
@@ -90,7 +90,7 @@ class ModuleOutputs:
     """A frozen module on the logged frames of its own stream, in memory that does not grow.
 
     Args:
-        module: frozen; it learned from frames like those of the run.
+        module: a frozen module with the frame shape of the run.
         spec: of the run's source.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Logs that words of a command line name, opened as sources of frames."""
+"""Open recordings, external logs and arrays as sources of frames."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def open_log(
         paths: the folder of a recording or its views' files, or external logs.
         inputs: how images of external logs become frames; with it paths are taken as such.
         loop: begin again at the end.
-        skip_damaged: leave out what is damaged.
+        skip_damaged: skip damaged parts.
 
     Raises:
         UsageError: no such log, a run, or as for `open_external`.
@@ -64,7 +64,7 @@ def open_for_viewing(
 ) -> LoggedSource:
     """Open logs to view or export them: every topic of images, aligned by time if need be.
 
-    Of up to `AT_ONCE` bytes all are checked, of more what is read.
+    Logs of up to `AT_ONCE` bytes are checked completely, larger ones as they are read.
 
     Raises:
         UsageError: as for `open_log`.
@@ -106,8 +106,8 @@ def open_recording(
     Args:
         paths: a recording's folder, or the files of its views, finished or `.partial`; or URLs.
         loop: begin again at the end.
-        skip_damaged: leave out, in every view, what is damaged in one of them, and of several files
-            one that cannot be read.
+        skip_damaged: skip, in every view, frames that are damaged in one of them, and of several
+            files those that cannot be read.
 
     Raises:
         NoRecordingError: a file is no view of a recording.
@@ -119,7 +119,7 @@ def open_recording(
     broken: list[LogDamagedError] = []
     with ExitStack() as failed:
         for path in [file for place in named for file in log_files(place)]:
-            if views.only_begun(path):
+            if views.has_no_frames(path):
                 continue
             try:
                 files.append(ViewFile(path, skip_damaged=skip_damaged))
@@ -155,8 +155,8 @@ def open_external(
             another in time are parts of one stream, unless they are aligned by index.
         inputs: how images become frames.
         loop: begin again at the end.
-        skip_damaged: leave out what is damaged, and broken images; of several logs also one that
-            cannot be read: `left_out` of the source says so, as its warnings do.
+        skip_damaged: skip damaged parts and broken images, and of several logs those that cannot
+            be read; `left_out` and `warnings` of the source list them.
 
     Raises:
         UsageError: no such log or topic, images smaller than a frame, or streams that need `align`.
@@ -191,9 +191,9 @@ def open_arrays(
 def _with_color(
     opened: Callable[[InputOptions], LoggedSource], inputs: InputOptions
 ) -> LoggedSource:
-    """Open a source in colours if its frames show in them what they do not show in grey."""
-    with opened(replace(inputs, color=True)) as shown:
-        color = shows_hue(shown)
+    """Open a source in colours if hue adds information to brightness; see `shows_hue`."""
+    with opened(replace(inputs, color=True)) as colored:
+        color = shows_hue(colored)
     source = opened(replace(inputs, color=color))
     source.notes = (CHOSEN[color],)
     return source
@@ -244,17 +244,17 @@ def locations(words: Sequence[str | Path]) -> list[Path]:
 
     Raises:
         UsageError: nothing matches a pattern, or a URL is of a kind that is not read.
-        CdmisfaError: a server does not give what a URL names.
+        CdmisfaError: a URL cannot be read.
     """
-    found: list[Path] = []
+    paths: list[Path] = []
     for word in words:
         pattern = isinstance(word, str) and not is_url(word) and any(c in word for c in "*?[")
         if not pattern or Path(word).exists():
-            found.append(location(word))
+            paths.append(location(word))
             continue
         matched = map(Path, glob.glob(str(word), recursive=True))
         logs = sorted((p for p in matched if p.suffix not in (".rrd", ".json")), key=natural_order)
         if not logs:
             raise UsageError(f"{word}: no file or folder matches this pattern")
-        found += logs
-    return found
+        paths += logs
+    return paths

@@ -42,14 +42,14 @@ CLAY: Rgb = (195, 140, 130)
 BRICK: Rgb = (190, 95, 90)
 BROWN: Rgb = (140, 115, 95)
 
-# Colours of what became of a stream: learning, learned, known, given up; none is a stream's.
+# Colours of the states of streams: not decided, learned, explained, rejected; no stream has one.
 STATES: tuple[Rgb, ...] = (SAND, PLUM, MIST, DARK)
 
 # Colours of lines that belong to no stream: a full colour is a stream's, and its module's. They are
 # seen on black, and on the white on which browsers show the viewer.
 PALE: tuple[Rgb, ...] = (STEEL, KHAKI, PLUM, MOSS, CLAY, BROWN)
 
-# Shades between white and a full colour: as many as eight bits can tell apart.
+# Shades between white and a full colour: as many as eight bits distinguish.
 STEPS = 255
 
 
@@ -59,12 +59,12 @@ def colour(index: int) -> Rgb:
 
 
 def pale(index: int) -> Rgb:
-    """Return the colour of line number `index`, from 0, of those that belong to no stream."""
+    """Return the colour of line number `index`, from 0, that belongs to no stream."""
     return PALE[index % len(PALE)]
 
 
 def faint(rgb: Rgb) -> Rgba:
-    """Return a colour through which half of what is behind it shows, be that black or white."""
+    """Return a half transparent colour, which is readable on black and on white."""
     return (*rgb, 0x80)
 
 
@@ -75,12 +75,12 @@ def packed(rgb: Colour) -> int:
 
 
 def packed_all(colours: Sequence[Colour]) -> NDArray[np.uint32]:
-    """Colours, (n,), as the viewer takes several of them without doubt."""
+    """Return colours as an (n,) array, the form that the viewer accepts for any n."""
     return np.array([packed(rgb) for rgb in colours], dtype=np.uint32)
 
 
 def shade(weights: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Weights as an image: blue below zero, white at zero, vermillion above.
+    """Return weights as an image: blue below zero, white at zero, vermillion above.
 
     Args:
         weights: (height, width); the largest magnitude gets the full colour.
@@ -95,7 +95,7 @@ def shade(weights: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def _shades() -> NDArray[np.uint8]:
-    """(2 STEPS + 1, 3) colours from blue over white to vermillion."""
+    """Return (2 STEPS + 1, 3) colours from blue over white to vermillion."""
     part = np.linspace(-1.0, 1.0, 2 * STEPS + 1)[:, None]
     white = np.array([255.0, 255.0, 255.0])
     low, high = np.array(BLUE, dtype=float), np.array(VERMILLION, dtype=float)

@@ -1,4 +1,4 @@
-"""Stored frames, of recordings and external logs: a known number, with gaps or without."""
+"""Base class of sources with stored frames: recordings and external logs, with or without gaps."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from replay.storage.identity import Identity
 # The frames [start, stop).
 Span = tuple[int, int]
 
-# Frames of an episode that are read at once for its mean.
+# Frames that are read at a time for the mean of an episode, to bound the memory.
 PIECE: Final = 64
 
-# Logs with up to this many bytes are hashed before anything else is done; longer ones later.
+# Logs with up to this many bytes are hashed when they are opened; larger ones after the run.
 AT_ONCE: Final = 64 * 1024 * 1024
 
-# Called with the number of bytes that were hashed, and of all bytes.
+# Called with the number of hashed bytes and the total.
 Progress = Callable[[int, int], None]
 
 
 class StoredSource(ClockedSource):
     """A source of stored frames: all of them once, or looped, lap after lap.
 
-    A derived class sets `_spec`, `_loop`, `frames`, `gaps` and, with gaps, `_held`.
+    A derived class sets `_spec`, `_loop`, `frames`, `gaps` and, with gaps, `_ranges`.
 
     Attributes:
-        frames: number of frames of every stream, those of gaps included.
+        frames: number of frames of every stream, including gaps.
         first_frame: number of the first frame.
         centre: "episode": frames are shown without the mean of their episode; see `episode`.
         held_out: frames at the end that `take` does not return; see `hold_out`.
@@ -60,7 +60,7 @@ class StoredSource(ClockedSource):
     warnings: tuple[str, ...] = ()
     _loop: bool
     # The frames of the first lap that each stream has.
-    _held: Sequence[Sequence[Span]]
+    _ranges: Sequence[Sequence[Span]]
     _means: dict[int, tuple[Span, NDArray[Any]]] | None = None
     _identities: Sequence[Identity] | None = None
 
@@ -137,7 +137,7 @@ class StoredSource(ClockedSource):
             return [(start, stop)]
         first, count = self.first_frame, self.frames
         laps = range((start - first) // count, (stop - 1 - first) // count + 1)
-        shifted = ((lap * count, span) for lap in laps for span in self._held[stream])
+        shifted = ((lap * count, span) for lap in laps for span in self._ranges[stream])
         return merged((max(low + by, start), min(high + by, stop)) for by, (low, high) in shifted)
 
     def episode(self, stream: int, t: int) -> Span:
@@ -151,8 +151,8 @@ class StoredSource(ClockedSource):
         """
         if not self.gaps:
             return self.first_frame, self.first_frame + self.frames
-        held, t = self._held[stream], self.first_frame + (t - self.first_frame) % self.frames
-        return held[bisect.bisect_right(held, t, key=lambda span: span[0]) - 1]
+        reserved, t = self._ranges[stream], self.first_frame + (t - self.first_frame) % self.frames
+        return reserved[bisect.bisect_right(reserved, t, key=lambda span: span[0]) - 1]
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t.
@@ -183,14 +183,14 @@ class StoredSource(ClockedSource):
         return {}
 
     def skipped_damage(self) -> list[str]:
-        """Return a line for each stream of which damaged parts were replaced or left out so far."""
+        """Return a line for each stream with damaged parts that were replaced or skipped so far."""
         return []
 
     def describe(self, progress: Progress = lambda done, size: None) -> Mapping[str, Any]:
         """Return the logs with the SHA-256 of all their bytes, and how they became frames.
 
         Args:
-            progress: called with the bytes that were hashed and all bytes, if there are many.
+            progress: called with the number of hashed bytes and the total, if there are many.
 
         Raises:
             LogDamagedError: a log is damaged, or was changed since it was opened.
@@ -244,14 +244,14 @@ class StoredSource(ClockedSource):
         block = self._block(stream, t, n)
         if self.centre == "run":
             return block
-        shown, at = [], 0
+        parts, at = [], 0
         while at < n:  # an episode ends where a lap does
             place = (t + at - self.first_frame) % self.frames
             count = min(n - at, self.frames - place)
             mean = self._mean(stream, self.first_frame + place)
-            shown.append(centred(block.frames[at : at + count], mean))
+            parts.append(centred(block.frames[at : at + count], mean))
             at += count
-        frames = shown[0] if len(shown) == 1 else np.concatenate(shown)
+        frames = parts[0] if len(parts) == 1 else np.concatenate(parts)
         return replace(block, frames=freeze(frames))
 
     def _mean(self, stream: int, t: int) -> NDArray[Any]:
@@ -280,10 +280,10 @@ class StoredSource(ClockedSource):
     def _exhausted(self, n: int) -> LogExhaustedError:
         left = max(self.end - self._t, 0)
         unbroken = " without a gap" if self.gaps else ""
-        held = f", before {self.held_out} held-out frames" if self.held_out else ""
+        reserved = f", before {self.held_out} held-out frames" if self.held_out else ""
         return LogExhaustedError(
-            f"{self._name()}: {left} frames are left at frame {self._t}{held}, but {n} are needed"
-            f"{unbroken}; {self.more}repeat it with --loop"
+            f"{self._name()}: {left} frames are left at frame {self._t}{reserved}, but {n} "
+            f"are needed{unbroken}; {self.more}repeat it with --loop"
         )
 
 

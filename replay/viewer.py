@@ -87,7 +87,7 @@ class Program(subprocess.Popen[bytes]):
         why = [line for line in lines if "panicked" in line] + lines[-1:] + ["no reason given"]
         return CdmisfaError(f"the viewer ended with code {self.returncode}: {why[0].strip()}")
 
-    def ask(self, question: Callable[[], Any]) -> Any:
+    def wait_for(self, condition: Callable[[], Any]) -> Any:
         """Repeat a question until its answer is true; Rerun's client raises until it has one.
 
         Raises:
@@ -98,12 +98,12 @@ class Program(subprocess.Popen[bytes]):
             if self.poll() is not None:
                 raise self._failure()
             with contextlib.suppress(OSError, RuntimeError, ValueError):
-                if answer := question():
+                if answer := condition():
                     return answer
             time.sleep(0.05)
         raise CdmisfaError(f"the viewer did not respond within {SECONDS:.0f} s")
 
-    def shown(self, port: str, frame: int | None) -> Any:
+    def connect(self, port: str, frame: int | None) -> Any:
         """Return Rerun's client of the viewer once that shows its view, at a frame.
 
         Args:
@@ -114,8 +114,8 @@ class Program(subprocess.Popen[bytes]):
 
         from replay.view.writer import FRAME
 
-        client = self.ask(lambda: ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy"))
-        self.ask(lambda: is_painted(client))
+        client = self.wait_for(lambda: ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy"))
+        self.wait_for(lambda: is_painted(client))
         if frame is not None:
             client.set_time(FRAME, sequence=frame, play_state="paused")
         return client
@@ -138,7 +138,7 @@ def open_window(view: Path, frame: int | None = None) -> None:
     port = str(free_port())
     with Program("--port", port, str(view)) as viewer:
         if frame is not None:
-            viewer.shown(port, frame)
+            viewer.connect(port, frame)
         viewer.until_end()
 
 
@@ -191,7 +191,7 @@ def _page(port: int, data: str, *words: str) -> Iterator[tuple[Program, str]]:
             return True
 
     with Program("--serve-web", "--web-viewer-port", str(port), *words) as server:
-        server.ask(answers)
+        server.wait_for(answers)
         yield server, f"http://{HOST}:{port}/?url={quote(data, safe='')}"
 
 
@@ -201,7 +201,7 @@ def screenshot(view: Path, out: Path, frame: int | None = None) -> None:
     Args:
         view: the file.
         out: the PNG file, which is replaced.
-        frame: where the time cursor stands; by default at the end.
+        frame: frame of the time cursor; by default the last.
 
     Raises:
         CdmisfaError: there is no driver, or the viewer fails.
@@ -211,10 +211,10 @@ def screenshot(view: Path, out: Path, frame: int | None = None) -> None:
     port = str(free_port())
     words = ("--headless", "--hide-welcome-screen", "--window-size", WINDOW)
     with Program(*words, "--port", port, str(view)) as viewer:
-        client = viewer.shown(port, frame)
+        client = viewer.connect(port, frame)
         time.sleep(SETTLE)
-        viewer.ask(lambda: is_painted(client))
-        png = bytes(viewer.ask(client.take_screenshot))
+        viewer.wait_for(lambda: is_painted(client))
+        png = bytes(viewer.wait_for(client.take_screenshot))
     with atomic_write(out) as partial:
         partial.write_bytes(png)
 

@@ -31,5 +31,5 @@ def shown(view: Path | str, size: str = "1200x800") -> Iterator[Callable[..., An
     """Show a view; yield a function that repeats a question to Rerun's client until it is true."""
     port = str(viewer.free_port())
     with Headless("--hide-welcome-screen", "--window-size", size, "--port", port, str(view)) as one:
-        client = one.shown(port, None)
-        yield lambda question: one.ask(lambda: question(client))
+        client = one.connect(port, None)
+        yield lambda question: one.wait_for(lambda: question(client))

@@ -148,9 +148,9 @@ def test_a_window_opens_at_a_moment(tmp_path, monkeypatch):
     records, seen = write_run(tmp_path / "run.mcap", VECTOR, 12), []
 
     class Window(Headless):
-        def shown(self, port, frame):
-            client = super().shown(port, frame)
-            seen.append(self.ask(client.get_state))
+        def connect(self, port, frame):
+            client = super().connect(port, frame)
+            seen.append(self.wait_for(client.get_state))
             self.terminate()
 
     monkeypatch.setattr(viewer, "has_display", lambda: True)
@@ -225,7 +225,10 @@ def test_without_a_driver_the_remedy_is_printed_once_the_input_is_right(
     for variable in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setenv(name, str(tmp_path / "none.json"))
-    for path, words in ((tmp_path, "mesa-vulkan-drivers"), (tmp_path / "other.rrd", "no file of")):
+    for path, words in (
+        (tmp_path, "mesa-vulkan-drivers"),
+        (tmp_path / "other.rrd", "not an .rrd file"),
+    ):
         done = cdmisfa("view", path, "--screenshot", tmp_path / "s.png")
         assert (done.code, words in done.err) == (2, True), done
 

@@ -1,1 +1,1 @@
-"""Many logs: an index of what is in them, and questions to it."""
+"""Many logs: an index of their streams, and many logs as episodes of one source."""

@@ -1,4 +1,4 @@
-"""One log as an episode: its frames, and what identifies it."""
+"""One log as an episode: its frames, its streams and its identity."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from replay.stored_source import Span
 # A log with at most this many bytes is hashed as a whole when it is opened first.
 SMALL: Final = 1 << 20
 
-# What is opened as one: a log, or the files of a recording's views.
+# Files that are opened as one log: an external log, or the views of a recording.
 Log = Sequence[Path]
 
 
 @dataclass(slots=True)
 class Episode:
-    """A log, and where it is on the clock of all.
+    """A log, and its place on the clock of all logs.
 
     Attributes:
         log: the files.
@@ -36,8 +36,8 @@ class Episode:
         spec: that of the log; a stream that is named by its file is called "stream".
         first: number of its first frame on its own clock.
         count: number of its frames.
-        held: for each stream the frames that it has, on its own clock; empty without gaps.
-        many: whether its stretches are episodes, as in a dataset.
+        ranges: frames of each stream, on the clock of the log; empty without gaps.
+        many: whether the log has several episodes, as a LeRobot dataset.
         identity: the identity of the log.
         scene: the scene that was recorded, or "".
         stated: how images became frames, as the description of a source states it.
@@ -52,7 +52,7 @@ class Episode:
     spec: SourceSpec
     first: int
     count: int
-    held: Sequence[Sequence[Span]]
+    ranges: Sequence[Sequence[Span]]
     many: bool
     identity: EpisodeIdentity
     scene: str
@@ -67,7 +67,7 @@ class Episode:
         if stream not in self.spec.streams:
             return
         frames = ((self.first, self.first + self.count),)
-        for low, high in self.held[self.spec.streams.index(stream)] if self.held else frames:
+        for low, high in self.ranges[self.spec.streams.index(stream)] if self.ranges else frames:
             start, end = (self.start + t - self.first for t in (low, high))
             if start < (end := min(end, self.start + self.whole)):
                 yield start, end
@@ -110,7 +110,7 @@ def sampled(source: LoggedSource) -> str:
 
 
 def _digest(logs: Sequence[Mapping[str, Any]]) -> str:
-    """Return what identifies a log: the checksum of its file, or one of all its files."""
+    """Return the checksum of a log: that of its file, or one over all of its files."""
     for name in ("sha256", "sample_sha256"):
         if len(logs) == 1 and name in logs[0]:
             return str(logs[0][name])
@@ -139,15 +139,15 @@ def episode_of(
     stated = source.origin() if source.recorded else source.described([])
     streams, fields = {}, stated.get("fields") or []
     for i, stream in enumerate(spec.streams):
-        own = fields[i] if fields and isinstance(fields[0], list) else fields
-        streams[stream] = source.framings[i], own, source.pixels(i)
+        names = fields[i] if fields and isinstance(fields[0], list) else fields
+        streams[stream] = source.framings[i], names, source.pixels(i)
     return Episode(
         log,
         name,
         spec,
         first=source.first_frame,
         count=source.frames,
-        held=tuple(map(tuple, source._held)) if source.gaps else (),
+        ranges=tuple(map(tuple, source._ranges)) if source.gaps else (),
         many=format == "dataset",
         identity=EpisodeIdentity(source, lambda: reopen(log)),
         scene=source.scene().get("scene", ""),

@@ -1,4 +1,4 @@
-"""Many logs as one source: each is an episode, and there is a gap between two of them."""
+"""Many logs as one source of frames: each log is an episode, with a gap between episodes."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from replay.open_sources import open_log
 from replay.storage.identity import Identity
 from replay.stored_source import Span, StoredSource
 
-# Number of warnings of a kind, as of logs that are left out, that are printed.
+# Printed warnings of one kind, as about skipped logs; further ones are counted.
 MOST_LINES: Final = 5
 
-# Episodes of one source, which the files of a run list.
+# Most episodes of one source: the files of a run list every one of them.
 MOST_EPISODES: Final = 20_000
 
-# What the description of a source states of how images became frames, the same for all logs.
+# Keys in the description of a source on how images become frames; they apply to all logs.
 _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "time", "stamp")
 
 Taken = TypeVar("Taken")
 
-# Called with the number of logs that were opened, and of all logs.
+# Called with the number of opened logs and the total.
 Progress = Callable[[float, float | None], None]
 
 
@@ -41,7 +41,7 @@ class EpisodeSource(StoredSource):
     lacks a stream is a gap in it. One log is open at a time.
 
     Attributes:
-        left_out: a line for each log that cannot be read, or not to its end.
+        left_out: a line for each log that cannot be read completely.
         framings: for each stream how an image becomes a frame, or None.
         changes: for each stream the first line that states how its images changed.
         turns: see `turn_to`.
@@ -66,7 +66,7 @@ class EpisodeSource(StoredSource):
             inputs: how images of external logs become frames.
             loop: begin again at the end.
             skip_damaged: skip damaged parts of a log; else the rest of the log is left out.
-            progress: called with the number of opened logs, and of all.
+            progress: called with the number of opened logs and the total.
 
         Raises:
             UsageError: none of them has frames.
@@ -110,10 +110,10 @@ class EpisodeSource(StoredSource):
         self.warnings = tuple(line for lines in (damaged, unfit, warnings) for line in _few(lines))
 
     def _set_clock(self, episodes: Sequence[Episode]) -> Iterator[str]:
-        """Put the logs with frames like those of the first one on one clock.
+        """Put logs with the frame shape, type and rate of the first log on one clock.
 
         Yields:
-            A line for each other log.
+            A line for each other log, which is skipped.
         """
         first = episodes[0]
         alike = [episode for episode in episodes if are_alike(episode.spec, first.spec)]
@@ -166,15 +166,15 @@ class EpisodeSource(StoredSource):
         return one.start, one.start + one.count
 
     def take(self, stream: int, n: int) -> Block:
-        """See `StoredSource.take`; what is damaged is left out."""
+        """See `StoredSource.take`; damaged parts are skipped."""
         return self._whole(super().take, stream, n)
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """See `StoredSource.take_all`; what is damaged is left out."""
+        """See `StoredSource.take_all`; damaged parts are skipped."""
         return self._whole(super().take_all, n)
 
     def _whole(self, take: Callable[..., Taken], *request: int) -> Taken:
-        """Take frames, again without what is damaged until nothing of them is."""
+        """Take frames; on damage skip the rest of that log and try again."""
         while True:
             try:
                 return take(*request)
@@ -182,7 +182,7 @@ class EpisodeSource(StoredSource):
                 self._leave_out(error)
 
     def pieces(self, stream: int, start: int, stop: int, n: int) -> Iterator[Block]:
-        """See `StoredSource.pieces`; what is damaged is left out."""
+        """See `StoredSource.pieces`; damaged parts are skipped."""
         for low, high in self.spans(stream, start, stop):
             for t in range(low, high, n):
                 try:
@@ -195,8 +195,8 @@ class EpisodeSource(StoredSource):
         """See `FrameSource.close`."""
         if self._open_now is not None:
             number, source = self._open_now
-            for stream, said in source.changes.items():
-                self.changes.setdefault(self._episodes[number].spec.streams[stream], said)
+            for stream, change in source.changes.items():
+                self.changes.setdefault(self._episodes[number].spec.streams[stream], change)
             source.close()
             self._open_now = None
 
@@ -251,7 +251,7 @@ class EpisodeSource(StoredSource):
         return open_log(log, self._inputs, skip_damaged=self._skip_damaged)
 
     def _leave_out(self, error: LogDamagedError) -> None:
-        """Leave out a log that is damaged, from the block that was read on."""
+        """Skip a damaged log from the current block on."""
         number, t = self._reading
         one = self._episodes[number]
         one.whole = 0 if self.centre == "episode" else min(t - one.start, one.whole)
@@ -290,11 +290,11 @@ class EpisodeSource(StoredSource):
 
 
 def _described(spec: SourceSpec) -> str:
-    """Return what the frames of a log are, in words."""
+    """Return shape, type and rate of the frames of a log as text."""
     return f"frames of {'x'.join(map(str, spec.frame_shape))} {spec.dtype} at {spec.fps:g} Hz"
 
 
 def _few(lines: Sequence[str]) -> Sequence[str]:
-    """Return the first lines, and how many more there are."""
+    """Return the first `MOST_LINES` lines and the number of further ones."""
     more = len(lines) - MOST_LINES
     return [*lines[:MOST_LINES], *([f"and {more} more like these"] if more > 0 else [])]

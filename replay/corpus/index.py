@@ -24,7 +24,7 @@ from replay.corpus.listing import INDEX, ListedLog, find_logs, may_be_corpus
 from replay.storage.location import is_url, location
 from replay.storage.paths import no_such
 
-# Logs that a process reads at a time.
+# Logs per task of a process: fewer cost time for messages, more delay an interrupt.
 BATCH: Final = 32
 
 # Logs with a problem that `index` prints, so that they fit on a screen.
@@ -33,7 +33,7 @@ MOST_PROBLEMS: Final = 20
 # Logs after which the index is written, so that a kill loses no more than these.
 SAVED_EVERY: Final = 5000
 
-# What all views of one recording state alike.
+# Metadata that is the same in all views of one recording.
 _SHARED: Final = ("scene", "seed", "config_sha256", "start_ns", "fps", "frame_shape", "dtype",
                   "truth")  # fmt: skip
 
@@ -68,7 +68,7 @@ class Indexed:
 
 
 class IndexedLog(NamedTuple):
-    """What is opened as one log: the files of a recording, or an external log.
+    """Files that are opened as one log: a recording, or an external log.
 
     Attributes:
         name: path relative to the index.
@@ -93,7 +93,7 @@ def index_logs(
     """Write the index of logs, or update an existing one.
 
     A log with the size and the time of change that the index has is not opened. An index that is
-    interrupted keeps what was read so far.
+    interrupted keeps the logs that were read so far.
 
     Args:
         words: folders, patterns, files and URLs.

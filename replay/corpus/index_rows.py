@@ -25,16 +25,16 @@ from replay.logs.stream import ChannelInfo
 from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import is_url, location
 
-# Rises whenever a column changes its meaning.
+# Increased whenever a column changes its meaning; an index of another version is refused.
 VERSION: Final = 2
 
 # Key of the Parquet file's metadata that holds the version.
 MARK: Final = b"cdmisfa.corpus"
 
-# Letters of a configuration in the index.
+# Longest configuration in the index, in characters; a longer one is omitted.
 MOST_TEXT: Final = 64 * 1024
 
-# Letters of a problem in the index.
+# Longest problem in the index, in characters; a longer one is cut.
 MOST_LETTERS: Final = 500
 
 _WORD: Final = pa.dictionary(pa.int32(), pa.string())
@@ -86,7 +86,7 @@ def read_rows(logs: Sequence[ListedLog], deep: bool) -> tuple[pa.Table, list[str
         try:
             if not problem:
                 streams = list(_streams_of(location(log.file), log, deep))
-        except Exception as error:  # whatever a broken file makes a library raise
+        except Exception as error:  # libraries raise anything for a broken file
             if not (is_url(log.file) or os.path.lexists(log.file)):
                 gone.append(log.path)
                 continue
@@ -185,7 +185,7 @@ def _hash_of(identity: Identity) -> str:
 
 
 def _configuration(metadata: Mapping[str, str]) -> str | None:
-    """Return what a log states of how it was made, as JSON, unless it is too long."""
+    """Return the configuration that a log states, as JSON; None if it is too long."""
     values: dict[str, Any] = dict(metadata)
     with contextlib.suppress(ValueError):
         manifest = parse_json(values.get("manifest", ""))

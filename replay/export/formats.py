@@ -1,4 +1,4 @@
-"""Export of a run's signals or of recorded frames, in one of several forms."""
+"""Export of a run's signals, or of the frames of logs, in one of several formats."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from replay.export.tables import TABLES
 from replay.logs.source import LoggedSource
 from replay.open_sources import Announce, holds_run, is_recording, open_for_viewing
 
-# Forms of the signals of a run, and forms of frames.
+# Formats of the signals of a run, and formats of frames.
 FORMS: Final = (*TABLES, "images", "mp4", "lerobot")
 
 # Endings of exported files: `force` replaces a folder only if it holds no others.
@@ -95,7 +95,7 @@ def _opened(
     """Yield each log, open until the next one.
 
     Raises:
-        UsageError: its frames do not fit the form or are unlike those of the first log, or as for
+        UsageError: its frames do not fit the form or differ from the first log, or as for
             `open_for_viewing`.
         LogDamagedError: one is damaged.
     """

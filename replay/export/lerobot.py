@@ -55,7 +55,7 @@ def write_dataset(
         logs: logs with equal streams, shapes and rates, each open until the next one.
         folder: the new folder.
         lossless: keep every pixel.
-        task: what is done, in words; by default what each log states.
+        task: description of the task; by default that of each log.
 
     Raises:
         UsageError: no frame is in every stream, the frame rate is not a whole number, or PyAV is
@@ -296,7 +296,10 @@ def image_stats(source: LoggedSource, stream: int, span: Span) -> Stats:
 
 
 def aggregated(parts: Sequence[Stats]) -> Stats:
-    """Return the statistics of all from those of parts; as LeRobot's, quantiles are means."""
+    """Return statistics over all parts from those of each part; quantiles are averaged.
+
+    LeRobot averages quantiles in the same way.
+    """
     counts = np.array([float(part["count"][0]) for part in parts])
 
     def mean(values: list[NDArray[Any]]) -> NDArray[Any]:

@@ -1,1 +1,1 @@
-"""What is in a log, whether it is whole, and saving what can be saved."""
+"""Describe, verify and recover logs."""

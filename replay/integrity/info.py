@@ -20,15 +20,7 @@ from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem, Segment
-from replay.integrity.report import (
-    Crc,
-    Kind,
-    LogReport,
-    SizeInfo,
-    State,
-    combined,
-    failed,
-)
+from replay.integrity.report import Crc, Kind, LogReport, SizeInfo, State, combined, failed
 from replay.integrity.run_facts import run_facts
 from replay.logs.formats.images import broken_images, image_files
 from replay.logs.open_logs import channels_of, is_external_format, log_format
@@ -225,7 +217,7 @@ def kind_of(reader: LogReader) -> Kind:
 
 
 def problems_of(reader: LogReader) -> tuple[Problem, ...]:
-    """Return the damage that the reader has found, and what is missing at the end."""
+    """Return the damage that the reader detected, and the missing end of a truncated log."""
     problems = [Problem(f"{reader.path}: {p.where}", p.what) for p in reader.problems]
     missing = [Problem(str(reader.path), reader.missing)] if reader.missing else []
     return (*problems, *missing)

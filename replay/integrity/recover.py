@@ -1,4 +1,4 @@
-"""Recover a damaged log: repair what it states twice, and write what can be read as a whole log.
+"""Recover a damaged log: repair redundant parts, and write the readable messages to a new log.
 
 The head of a chunk is also in the summary, and its message indexes follow from its messages. The
 checksum over all data shows whether anything else was wrong.
@@ -119,22 +119,22 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
             raise LogDamagedError(f"{src}: no message can be recovered; no file was written")
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
-            kept, unverified = _copy(reader, log)
-        lost = _lost_messages(reader, kept)
+            saved, unverified = _copy(reader, log)
+        lost = _lost_messages(reader, saved)
         channels = tuple(
             ChannelRecovery(
                 reader.channels[n].topic, count.messages, lost[n], count.start, count.end, dst.name
             )
-            for n, count in sorted(kept.items())
+            for n, count in sorted(saved.items())
         )
         return Recovery(str(dst), channels, _lost(reader), tuple(repaired), unverified)
 
 
 def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, ChannelCount], int]:
-    """Write what is readable.
+    """Write the readable records.
 
     Returns:
-        The messages kept of each channel, and the number of messages that no checksum proves.
+        The saved messages of each channel, and the number of messages without a checksum.
     """
     for record in reader.metadata:
         log.add_metadata(record.name, record.metadata)
@@ -146,14 +146,14 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, ChannelCount], int
             log_time=attachment.log_time,
             create_time=attachment.create_time,
         )
-    kept: dict[int, ChannelCount] = {}
+    saved: dict[int, ChannelCount] = {}
     written: dict[int, int] = {}
 
     def add_channels() -> None:
-        for number in sorted(reader.channels.keys() - kept.keys()):
+        for number in sorted(reader.channels.keys() - saved.keys()):
             channel = reader.channels[number]
             schema = reader.schemas.get(channel.schema_id)
-            kept[number] = ChannelCount()
+            saved[number] = ChannelCount()
             written[number] = log.add_channel(
                 channel.topic,
                 log.add_schema(schema.name, schema.encoding, schema.data) if schema else 0,
@@ -170,9 +170,9 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, ChannelCount], int
         for number, sequence, log_time, published, data in table.rows():
             if number in written:
                 log.write_all([(written[number], log_time, data, published, sequence)])
-        for number in kept.keys() & np.unique(table.channel).tolist():
-            kept[number].add(table.log_time[table.channel == number])
-    return kept, unverified
+        for number in saved.keys() & np.unique(table.channel).tolist():
+            saved[number].add(table.log_time[table.channel == number])
+    return saved, unverified
 
 
 def _lost(reader: LogReader) -> tuple[Problem, ...]:
@@ -191,22 +191,24 @@ def _lost(reader: LogReader) -> tuple[Problem, ...]:
     return tuple(problems)
 
 
-def _lost_messages(reader: LogReader, kept: dict[int, ChannelCount]) -> dict[int, int | None]:
+def _lost_messages(reader: LogReader, saved: dict[int, ChannelCount]) -> dict[int, int | None]:
     """Count lost messages by the writer's statistics, else by the index of each lost chunk."""
     stated = reader.statistics
     if stated is not None:
-        return {n: max(stated.channel_message_counts.get(n, 0) - kept[n].messages, 0) for n in kept}
+        return {
+            n: max(stated.channel_message_counts.get(n, 0) - saved[n].messages, 0) for n in saved
+        }
     counts = [s.channel_counts() for s in reader.segments if reader.table(s) is None]
     if reader.data_crc is None or None in counts:
-        return dict.fromkeys(kept)
-    return {n: sum(c.get(n, 0) for c in counts if c is not None) for n in kept}
+        return dict.fromkeys(saved)
+    return {n: sum(c.get(n, 0) for c in counts if c is not None) for n in saved}
 
 
 # Repair of heads and indexes of chunks
 
 
 class RepairedStore(Store):
-    """A log with some bytes replaced; `repaired` lists what was wrong."""
+    """A log with some bytes replaced; `repaired` lists the repairs."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -215,7 +217,7 @@ class RepairedStore(Store):
         self._parts: list[bytes] = []
 
     def put(self, at: int, right: bytes, where: str, what: str) -> None:
-        """Replace the bytes at a place, behind those of the last call, where they differ."""
+        """Replace the bytes at an offset if they differ; offsets must increase between calls."""
         present = self.read(at, len(right))
         overlaps = self._places and at < self._places[-1] + len(self._parts[-1])
         fits = sum(map(len, self._parts)) + len(right) <= _MOST_BYTES
@@ -272,9 +274,11 @@ def _indexes(store: Store, chunk: Segment, end: int, table: MessageTable) -> byt
         return b""
     made = b""
     while left:
-        there = np.frombuffer(store.read(chunk.data_end + len(made), max(map(len, left))), np.uint8)
+        stored = np.frombuffer(
+            store.read(chunk.data_end + len(made), max(map(len, left))), np.uint8
+        )
         indexes = [np.frombuffer(index, np.uint8) for index in left]
-        alike = [float((there[: len(i)] == i[: len(there)]).mean()) for i in indexes]
+        alike = [float((stored[: len(i)] == i[: len(stored)]).mean()) for i in indexes]
         best = int(np.argmax(alike))
         # Chance makes 1/256 of the bytes equal, and more for the zeros of small numbers.
         if alike[best] < 0.5 and not chunk.stated:

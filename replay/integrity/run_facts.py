@@ -1,4 +1,4 @@
-"""Read from a run's folder what was learned: by which learner, from which streams, how slow.
+"""Read the results of a run from its folder: learner, streams, modules and their slowness.
 
 The files of a run may come from anywhere: fields that make no sense are left out.
 """
@@ -24,7 +24,7 @@ _NO_SENSE: Final = (LookupError, TypeError, ValueError, AttributeError)
 
 
 def run_facts(place: Path, channels: Sequence[ChannelInfo]) -> dict[str, Any]:
-    """Return the fields of a report on what a run learned; none where a place is no run.
+    """Return the results of a run as fields of a report; empty if the place is not a run.
 
     Args:
         place: the folder of the run, or its log.

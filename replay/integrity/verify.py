@@ -141,8 +141,8 @@ class _Content:
         """Check the whole, after the last chunk."""
 
     @contextlib.contextmanager
-    def errors_kept(self) -> Iterator[None]:
-        """Keep the error at which a step of the check ends."""
+    def record_errors(self) -> Iterator[None]:
+        """Store the error that ends a step of the check."""
         try:
             yield
         except CdmisfaError as error:
@@ -162,7 +162,7 @@ class _ImageContent(_Content):
         rows = np.flatnonzero(np.isin(table.channel, list(self._decoders)))
         if len(rows):
             check_times(self.path, np.sort(table.log_time[rows]).astype(np.int64))
-        with limited(self.path, "its decoder", held=table.data.nbytes):
+        with limited(self.path, "its decoder", memory_bytes=table.data.nbytes):
             for row in rows.tolist():
                 self._decoders[int(table.channel[row])](table.view(row))
 
@@ -173,12 +173,12 @@ class _ViewContent(_Content):
     def __init__(self, path: Path, reader: LogReader) -> None:
         super().__init__(path, reader)
         self.view: ViewFile | None = None
-        with self.errors_kept():
+        with self.record_errors():
             self.view = ViewFile(path, reader=reader)
 
     def add(self, segment: Segment) -> None:
         if self.view is not None and self.error is None:
-            with self.errors_kept():
+            with self.record_errors():
                 self.view.check_chunk(segment)
 
     def finish(self) -> None:
@@ -187,7 +187,7 @@ class _ViewContent(_Content):
 
 
 class _RunContent(_Content):
-    """Compare a run with the record that it states of itself.
+    """Compare a run with its own final record.
 
     Args:
         path: log of the run, whole.
@@ -206,7 +206,7 @@ class _RunContent(_Content):
         self._hash, self._next = SignalsHash(), 0
         self._batches: BatchReader | None = None
         self._problems: list[Problem] = []
-        with self.errors_kept():
+        with self.record_errors():
             header, topics = header_in(reader), (SIGNALS_TOPIC,)
             if self._stated is not None:
                 self._batches = BatchReader(path, header, reader.channels, topics=topics)
@@ -214,21 +214,21 @@ class _RunContent(_Content):
     def add(self, segment: Segment) -> None:
         table = self.reader.table(segment)
         if self._batches is not None and self.error is None and table is not None:
-            with self.errors_kept():
+            with self.record_errors():
                 for batch in self._batches.take(table):
                     self._add_signals(batch)
 
     def finish(self) -> None:
         if self._batches is None or self.error is not None:
             return
-        with self.errors_kept():
+        with self.record_errors():
             self._add_signals(self._batches.rest())
         if self.error is None and self._hash.hexdigest() != self._stated:
             what = f"the signals of its {self._hash.count} iterations differ from the final record"
             self._problems.append(Problem(str(self.path), what))
 
     def problems(self) -> Iterator[Problem]:
-        """Yield where a run whose log is whole contradicts itself."""
+        """Yield contradictions between the intact log of a run and its other files."""
         yield from self._problems
         if self.error is not None:
             yield as_problem(self.path, self.error)
@@ -255,7 +255,7 @@ class _RunContent(_Content):
             yield Problem(str(view), f"is missing; {view_again(self._folder)}")
 
     def notes(self) -> Iterator[str]:
-        """Yield the files that nothing proves."""
+        """Yield a note for each file that cannot be verified."""
         if self._folder is not None and (view := self._folder / VIEW_FILE).is_file():
             yield f"{view} is not verified: {view_again(self._folder)}"
         if self._final is None:
@@ -277,7 +277,7 @@ def view_again(run: Path) -> str:
 
 
 def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Problem]:
-    """Yield missing frames and views of a recording, of which one file was checked or all."""
+    """Yield missing frames and views of a recording after checking one or all of its files."""
     folder = str(contents[0].path.parent)
     views = [content.view for content in contents if content.view is not None]
     for content in contents:

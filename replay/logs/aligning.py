@@ -1,4 +1,4 @@
-"""Streams of external logs on one clock, as options say, or a refusal with the options to give."""
+"""Align streams of external logs on one clock, or raise an error that names the needed options."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from replay.logs.stream import LogStream, joined
 
 
 class UnequalError(UsageError):
-    """Streams that are on no common clock unless they are aligned."""
+    """Streams that differ in time or rate and need an option for their alignment."""
 
 
 def align(
@@ -118,7 +118,7 @@ def _refuse_unequal(streams: Sequence[LogStream], times: Sequence[IntArray], fps
 
 
 def join_parts(streams: Sequence[LogStream]) -> list[LogStream]:
-    """Join logs with one topic of which each begins after another ends; others stay streams."""
+    """Join logs of one topic that follow one another in time; others remain separate streams."""
     result: list[LogStream] = []
     for topic in dict.fromkeys(stream.topic for stream in streams):
         alike = [stream for stream in streams if stream.topic == topic]

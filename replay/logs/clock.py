@@ -1,4 +1,4 @@
-"""The clock of a log: which row of each stream every frame shows, by the times of the rows.
+"""The clock of a log: the row of each stream for every frame, computed from the times of rows.
 
 All functions are pure; times are int64 nanoseconds, not decreasing.
 """
@@ -17,16 +17,16 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.manifest import ViewMetadata
 from replay.stored_source import Span, merged, outside
 
-# Most frames that streams are aligned to.
+# Most frames of aligned streams: a lost or wrong timestamp could otherwise fill the memory.
 MAX_FRAMES: Final = 2**31
 
-# A pause between two rows of more than this many median steps is a gap.
+# A pause of more than this many median steps is a gap; fewer would cut uneven cameras into pieces.
 GAP_STEPS: Final = 10
 
-# Rates that differ by less than this share are the same.
+# Rates that differ by less than this share count as equal: clocks of cameras drift.
 UNEVEN: Final = 0.01
 
-# Share of a frame by which the time of a row may differ from that of its frame.
+# Share of a frame by which the time of a row may deviate from that of its frame, as by jitter.
 JITTER: Final = 0.75
 
 # The row that each frame shows, (frames,), none after a later one.
@@ -54,7 +54,7 @@ def by_time(streams: Sequence[IntArray], fps: float) -> Clock:
     """Show in each frame the last row at or before its time, while every stream has rows.
 
     Raises:
-        UsageError: there is no such time, or the rate makes more frames than anybody can want.
+        UsageError: the streams do not overlap, or there are more than `MAX_FRAMES` frames.
     """
     start, stop = overlap(streams)
     if stop < start:
@@ -84,7 +84,7 @@ def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> Clock:
         gaps: show the last row longer where the first stream, and so all, pause.
 
     Raises:
-        UsageError: the pauses make more frames than anybody can want.
+        UsageError: there are more than `MAX_FRAMES` frames.
     """
     first, count = streams[0], min(map(len, streams))
     begins = [int(i) for i in pauses(first) if i < count] if gaps else []

@@ -1,4 +1,4 @@
-"""Whether the first frames of a log show in their colours what they do not show in grey."""
+"""Decide whether a log needs colour: whether hue adds information to brightness."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from replay.stored_source import StoredSource
 
-# Frames at the beginning that are looked at.
+# Frames at the start of a log that are examined.
 LOOKED: Final = 2000
 
-# One frame in so many is: what lasts is the same in two of them, and noise is not.
+# Frames from one examined frame to the next: lasting changes correlate over it, noise does not.
 STEP: Final = 5
 
-# Parts of a picture's height, and of its width, whose mean colours are compared.
+# Cells across and down an image, whose mean colours are compared.
 _CELLS = 8
 
 # Of red, green and blue, as grey frames show them.
@@ -30,14 +30,14 @@ _FEWEST = 20
 # Hue is worth three times the pixels from this share of the variance of brightness on.
 _SHARE = 0.1
 
-# Share of its variance that must last from one frame looked at to the next.
+# Share of its variance that must persist from one examined frame to the next.
 _LASTING = 0.3
 
-# Variance, in steps of a pixel squared, below which hue is the rounding of pictures.
+# Variance, in steps of a pixel squared, below which hue is due to rounding in images.
 _LEAST = 0.25
 
 
-# What was chosen, in words.
+# Note on the choice.
 CHOSEN: Final = {
     True: "--color auto: hue varies independently of brightness, so frames have colour",
     False: "--color auto: hue adds nothing to brightness, so frames are grey",
@@ -84,7 +84,7 @@ def _lasting(x: NDArray[np.float64]) -> float:
 
 
 def _in_cells(plane: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the mean of each cell of pictures (n, height, width), (n, cells)."""
+    """Return the mean of each cell of images (n, height, width), (n, cells)."""
     for axis in (1, 2):
         size = plane.shape[axis]
         starts = np.unique(np.arange(_CELLS) * size // _CELLS)

@@ -71,9 +71,9 @@ class Images:
     def _decode(self, number: int, row: int) -> Future[ByteArray] | None:
         """Fetch a row in this thread, and let another decode it; None for other images."""
         stream, data = self._streams[number], None
-        if stream.picture is not None:
+        if stream.compressed is not None:
             with contextlib.suppress(CdmisfaError):  # the caller shall see it
-                data = stream.taken(row, stream.picture)
+                data = stream.taken(row, stream.compressed)
         if data is None:
             return None
         return self._threads.submit(compressed_image, data, color=self._color, most=AT_ONCE)
@@ -126,7 +126,7 @@ class Images:
         raise broken[row]
 
     def broken_lines(self) -> list[str]:
-        """Return a line for each stream of which broken images were replaced so far."""
+        """Return a line for each stream with broken images that were replaced so far."""
         lines = []
         for stream, broken in sorted(self._broken.items()):
             if broken:

@@ -1,4 +1,4 @@
-"""The format of a log, by its path, and its streams."""
+"""Detect the format of a log by its path, and open its streams."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _BY_ENDING: Final[Mapping[str, Format]] = {
     **dict.fromkeys(arrays.ENDINGS, "arrays"),
 }
 
-# Endings of logs in one file, but MCAP's.
+# Endings of logs in one file, without that of MCAP.
 ENDINGS: Final = tuple(_BY_ENDING)
 
 # Topics that mean every one with images.
@@ -104,7 +104,7 @@ class OpenLogs:
             files: the logs.
             options: the topics, and whether images or fields are read.
             opened: closes the logs.
-            skip_damaged: leave out what is damaged, of several logs also one that cannot be read.
+            skip_damaged: skip damaged parts, and of several logs those that cannot be read.
 
         Raises:
             UsageError: no log has a topic.
@@ -188,7 +188,7 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
 
     Args:
         path: the log.
-        whole: read all of a bag, of which otherwise an index may do.
+        whole: read all messages of a bag, not only its index.
 
     Raises:
         LogDamagedError: it cannot be read.

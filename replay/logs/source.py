@@ -31,7 +31,7 @@ from replay.logs.stream import BROKEN, LogStream, Rows
 from replay.storage.identity import Identity, McapIdentity
 from replay.stored_source import Span, StoredSource, outside
 
-# Frames behind a block that are decoded ahead, at least: some show the same image.
+# Least number of frames that are decoded ahead of a block, as several can show the same image.
 LIKELY: Final = 32
 
 COLORS: Final = "red, green and blue beside one another"
@@ -86,7 +86,7 @@ class LoggedSource(StoredSource):
         if self.recorded:
             self.more = "record more frames, or "
         self.changes: dict[int, str] = {}
-        self._shown: dict[int, tuple[int, Shown]] = {}
+        self._last_frames: dict[int, tuple[int, Shown]] = {}
         self._together = False
         self._images: Images | None = None
         try:
@@ -129,7 +129,7 @@ class LoggedSource(StoredSource):
         if self.recorded:
             self.gaps = facts.gaps
         end = self.first_frame + self.frames
-        self._held = [outside(own, self.first_frame, end) for own in clock.gaps]
+        self._ranges = [outside(spans, self.first_frame, end) for spans in clock.gaps]
         self.pauses = dict(zip(names, clock.gaps, strict=True))
         self.alignment: dict[str, dict[str, int]] = {}
         if self.to_judge:
@@ -162,14 +162,14 @@ class LoggedSource(StoredSource):
         return Block(stream, t, freeze(frames), freeze(truth))
 
     def _frames(self, stream: int, t: int, rows: Rows) -> tuple[NDArray[Any], FloatArray]:
-        """Return the frames of rows, of which the first is shown at t, and their ground truth."""
+        """Return the frames of rows, the first of them at frame t, and their ground truth."""
         log, framing = self.streams[stream], self.framings[stream]
         if log.read is not None:
             images, truth = log.read(rows)
             if framing is None or images.shape[1:] == framing.shape:
                 return images, truth
             return np.stack([framing.frame(image) for image in images]), truth
-        if log.picture is not None:
+        if log.compressed is not None:
             self._expect(stream, t, rows)
         frames = np.empty((len(rows), *self._spec.frame_shape), self._spec.dtype)
         for i, row in enumerate(rows if isinstance(rows, range) else rows.tolist()):
@@ -177,9 +177,9 @@ class LoggedSource(StoredSource):
         return frames, np.empty((len(rows), 0))
 
     def _expect(self, stream: int, t: int, rows: Rows) -> None:
-        """Decode rows from frame t on ahead, and those that are likely asked for behind them.
+        """Decode ahead the rows from frame t on, and those that are probably requested next.
 
-        These are of the next stream at the same frames, if all are taken, else what follows.
+        These are the same frames of the next stream if all streams are read, else the next frames.
         """
         assert self._images is not None
         after, start = stream, t + len(rows)
@@ -192,14 +192,14 @@ class LoggedSource(StoredSource):
         next_rows = np.asarray(self._clock.rows[after])[(ahead - self.first_frame) % self.frames]
         places = [(stream, int(row)) for row in rows]
         places += [(after, row) for row in next_rows.tolist()]
-        shown = {(number, row) for number, (row, _) in self._shown.items()}
-        self._images.expect(place for place in places if place not in shown)
+        last = {(number, row) for number, (row, _) in self._last_frames.items()}
+        self._images.expect(place for place in places if place not in last)
 
     def _frame(self, stream: int, row: int, image: Shown | None = None) -> Shown:
         """Return a stream's image as a frame; decoded once if it is repeated."""
-        shown = self._shown.get(stream)
-        if shown is not None and shown[0] == row:
-            return shown[1]
+        last = self._last_frames.get(stream)
+        if last is not None and last[0] == row:
+            return last[1]
         framing, log = self.framings[stream], self.streams[stream]
         assert framing is not None
         assert self._images is not None
@@ -212,7 +212,7 @@ class LoggedSource(StoredSource):
             frame = framing.frame(image)
         except UsageError as error:
             raise type(error)(f"{log.path}: {error}") from None
-        self._shown[stream] = (row, frame)
+        self._last_frames[stream] = (row, frame)
         return frame
 
     def close(self) -> None:
@@ -295,9 +295,9 @@ class LoggedSource(StoredSource):
         if not self.recorded:
             return {}
         reader = self.streams[0].views[0].reader
-        own = next((one for one in reader.attachments if one.name == CONFIG_NAME), None)
+        entry = next((one for one in reader.attachments if one.name == CONFIG_NAME), None)
         try:
-            stated = parse_json(bytes(reader.attachment_data(own)))[section] if own else {}
+            stated = parse_json(bytes(reader.attachment_data(entry)))[section] if entry else {}
         except (ValueError, LookupError, TypeError):
             return {}
         return stated if isinstance(stated, dict) else {}
@@ -354,7 +354,9 @@ class LoggedSource(StoredSource):
         options = self._options
         chosen: dict[str, Any] = {}
         if any(self.pauses.values()):
-            chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
+            chosen["gaps"] = {
+                name: [list(gap) for gap in spans] for name, spans in self.pauses.items()
+            }
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
         if options.fit != "crop" or any(framing.lossy for framing in self.framings if framing):
             chosen["fit"] = options.fit

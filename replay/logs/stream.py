@@ -19,7 +19,7 @@ from recorder.images.pixels import MalformedImage, Shown
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord
 
-# Log times from here on are beyond any clock, in nanoseconds.
+# Log times from here on count as damage, in nanoseconds: the year 2116.
 LAST_NS: Final = 2**62
 
 Result = TypeVar("Result")
@@ -36,7 +36,7 @@ class NothingLoggedError(LogDamagedError):
     """A log that was cut before its first message."""
 
 
-# Errors of one image, behind which there may be whole ones.
+# Errors of a single image; later images may be readable.
 BROKEN: Final = (MalformedImage, MalformedRecord, UnreadableError)
 
 
@@ -49,27 +49,28 @@ class LogStream:
 
     Attributes:
         path: the log.
-        topic: the topic, or the name of what has no topics.
+        topic: the topic; in formats without topics the name of the file or column.
         count: number of rows.
         times: (count,) nanoseconds, not decreasing; None of rows at any even rate.
         begins: time of the first row where `times` is None, nanoseconds.
         fetch: reads the stored bytes of a row; not in several threads.
         decode: turns them into an image, gray and of its own size, or numbers (I,).
-        picture: returns the JPEG or PNG in them, which threads can decode ahead; None of others.
+        compressed: returns the JPEG or PNG in these bytes, which threads can decode ahead; None if
+            the images have another encoding.
         read: returns the frames or images of rows, (n, ...), and their ground truth, (n, D).
-        held: returns the bytes of the memory budget that `fetch` holds.
-        program: the library that decodes, for errors.
-        where: how an error names a row.
-        stamp: returns the time that the header in them states, nanoseconds; None of others.
-        pixel_format: returns the format of pixels that they state; None of others.
-        encoding: how its images are stored, for what is not in messages.
+        memory_bytes: returns the bytes of the memory budget that `fetch` holds.
+        program: name of the decoding library in errors.
+        where: returns the name of a row in errors.
+        stamp: returns the time in their header, nanoseconds; None without a header.
+        pixel_format: returns the pixel format that they state; None if they state none.
+        encoding: encoding of its images in formats without messages.
         recipe: how an image becomes a frame, for the record.
         fields: the numbers that are taken instead of images, in their order.
         warnings: a line for each thing that the user should know.
-        remarks: a line for each thing that its format cannot prove.
-        missing: what a file that was cut lacks; "" of others.
+        remarks: a line for each property that its format cannot prove, as checksums.
+        missing: the missing part of a truncated file, or "".
         reader: the MCAP file, if all rows are in one.
-        digest: returns what identifies an array of the caller, as JSON values.
+        digest: returns name, type, shape and hash of an array of the caller, as JSON values.
         views: the files of a view of our recordings, by first frame; rows are then frame numbers.
     """
 
@@ -80,9 +81,9 @@ class LogStream:
     begins: int = 0
     fetch: Callable[[int], Any] = int
     decode: Callable[[Any], Shown] = np.asarray
-    picture: Callable[[Any], bytes | None] | None = None
+    compressed: Callable[[Any], bytes | None] | None = None
     read: Callable[[Rows], tuple[NDArray[Any], FloatArray]] | None = None
-    held: Callable[[], int] = int
+    memory_bytes: Callable[[], int] = int
     program: str = "its decoder"
     where: Callable[[int], str] | None = None
     stamp: Callable[[Any], int] | None = None
@@ -123,7 +124,7 @@ class LogStream:
 
     def taken(self, row: int, function: Callable[[Any], Result]) -> Result:
         """Apply a function to the stored bytes of a row; raises as `image`."""
-        with limited(self.path, self.program, held=self.held()):
+        with limited(self.path, self.program, memory_bytes=self.memory_bytes()):
             return function(self.fetch(row))
 
     def name_of(self, row: int) -> str:
@@ -141,7 +142,7 @@ class LogStream:
 
         changes: dict[str, Any] = {"fetch": at(self.fetch), "where": at(self.name_of)}
         if (read := self.read) is not None:
-            changes["read"] = lambda own: read(picked(rows, own))
+            changes["read"] = lambda wanted: read(picked(rows, wanted))
         return replace(self, count=len(rows), times=times, **changes)
 
 
@@ -155,18 +156,18 @@ def joined(parts: Sequence[LogStream]) -> LogStream:
     """Return streams with times as one, by time, ties in the order of the streams."""
     times = np.concatenate([part.times for part in parts if part.times is not None])
     order = np.argsort(times, kind="stable")
-    of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
+    part_of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
     rows = np.concatenate([np.arange(part.count) for part in parts])[order]
 
     def fetch(row: int) -> tuple[LogStream, Any]:
-        part, own = parts[of[row]], int(rows[row])
-        return part, part.image(own) if part.read else part.fetch(own)
+        part, part_row = parts[part_of[row]], int(rows[row])
+        return part, part.image(part_row) if part.read else part.fetch(part_row)
 
     def of_part(attribute: str, default: Any = None) -> Callable[[tuple[LogStream, Any]], Any]:
         def function(stored: tuple[LogStream, Any]) -> Any:
             part, data = stored
-            own = getattr(part, attribute)
-            return own(data) if own else default
+            method = getattr(part, attribute)
+            return method(data) if method else default
 
         return function
 
@@ -178,10 +179,10 @@ def joined(parts: Sequence[LogStream]) -> LogStream:
         times=times[order],
         fetch=fetch,
         decode=of_part("decode"),
-        picture=of_part("picture"),
+        compressed=of_part("compressed"),
         read=None,
-        held=lambda: max(part.held() for part in parts),
-        where=lambda row: parts[of[row]].name_of(int(rows[row])),
+        memory_bytes=lambda: max(part.memory_bytes() for part in parts),
+        where=lambda row: parts[part_of[row]].name_of(int(rows[row])),
         pixel_format=of_part("pixel_format", ""),
         warnings=[note, *(warning for part in parts for warning in part.warnings)],
     )
@@ -213,17 +214,18 @@ def explained(path: object, program: str, remedy: str = "") -> Iterator[None]:
 
 
 @contextmanager
-def limited(path: object, program: str, *, held: int = 0, remedy: str = "") -> Iterator[None]:
-    """As `explained`, within the memory budget of what others may have written.
+def limited(
+    path: object, program: str, *, memory_bytes: int = 0, remedy: str = ""
+) -> Iterator[None]:
+    """Do as `explained` within the memory budget for untrusted files.
 
-    The memory that PyArrow takes is then the system's, as its own pool reserves some that no
-    budget counts.
+    PyArrow then uses the system's memory, because its own pool reserves memory outside any budget.
     """
     if program == "PyArrow":
         import pyarrow
 
         pyarrow.set_memory_pool(pyarrow.system_memory_pool())
-    with explained(path, program, remedy), budget(max(BUDGET - held, 0)):
+    with explained(path, program, remedy), budget(max(BUDGET - memory_bytes, 0)):
         yield
 
 

@@ -1,4 +1,4 @@
-"""What a report shows of a run, gathered in one pass over its log."""
+"""Data of a report on a run, read in one pass over its log."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from replay.truth_fits import TruthFit, truth_fits
 
 TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 
-# Frames on which a module's outputs are drawn and fitted: as many dots as a plot can show.
+# Frames on which a module's outputs are drawn and fitted: more dots would overlap in a plot.
 MOST_OUTPUTS = 2000
 
 # Last frames of a stream on which all outputs of its module are drawn side by side.
@@ -37,7 +37,7 @@ RECENT = 80
 # Last frames of a stream of numbers that its card shows.
 VALUES = 200
 
-# Modules whose outputs are computed: the time to read a run grows with their number.
+# Most modules whose outputs are computed: the time to read a run grows with their number.
 MOST_MODULES = 40
 
 # Events that are listed: the first and the last of a run.

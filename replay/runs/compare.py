@@ -299,9 +299,9 @@ def short_names(runs: Sequence[Path]) -> list[str]:
     folders = [run_log(run).resolve().parent.parts for run in runs]
     names = []
     for folder in folders:
-        others = [other for other in folders if other != folder]
+        other_folders = [other for other in folders if other != folder]
         few = 1
-        while any(other[-few:] == folder[-few:] for other in others):
+        while any(other[-few:] == folder[-few:] for other in other_folders):
             few += 1
         names.append("/".join(folder[-few:]))
     return names

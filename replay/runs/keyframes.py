@@ -80,15 +80,15 @@ def _keyframes(
     """Keyframes in the order of the file, or from its end on."""
     step = -1 if backwards else 1
     with LogReader(log) as reader:
-        own = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
+        numbers = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
         for segment in reader.segments[::step]:
             counts = segment.channel_counts()
-            if counts is not None and not own & counts.keys():
+            if counts is not None and not numbers & counts.keys():
                 continue
             table = reader.table(segment)
             if table is None:
                 continue
-            for row in np.flatnonzero(np.isin(table.channel, list(own)))[::step].tolist():
+            for row in np.flatnonzero(np.isin(table.channel, list(numbers)))[::step].tolist():
                 if not wanted(int(table.records["sequence"][row])):
                     continue
                 with contextlib.suppress(LogDamagedError):

@@ -1,4 +1,4 @@
-"""Reading run.mcap: what a run was started with, and its messages in batches of iterations."""
+"""Read run.mcap: the settings of a run, and its messages in batches of iterations."""
 
 from __future__ import annotations
 
@@ -109,22 +109,22 @@ def read_header(path: Path) -> RunHeader:
 def header_in(reader: LogReader) -> RunHeader:
     """Return the header of a run's log that is open; raises as `read_header`."""
     log = reader.path
-    found = next((r.metadata for r in reader.metadata if r.name == RUN_METADATA), None)
-    if found is None:
+    metadata = next((r.metadata for r in reader.metadata if r.name == RUN_METADATA), None)
+    if metadata is None:
         raise UsageError(
             f"{log} is not the log of a run: give the folder of a run or its {RUN_FILE}"
         )
-    schema = found.get("schema", "")[:20]
+    schema = metadata.get("schema", "")[:20]
     if not (schema.isascii() and schema.isdigit() and 0 < int(schema) < 10**9):
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken (schema {schema!r})")
     if int(schema) != SCHEMA_VERSION:  # asked first: all else may look different in it
         written = f"{log} was written with version {schema} of the signals"
         raise UsageError(f"{written}: read it with the version of cdmisfa that wrote it")
     try:
-        spec = parse_json(found["spec"])
+        spec = parse_json(metadata["spec"])
         for name in ("streams", "frame_shape", "truth"):
             spec[name] = tuple(spec[name])
-        return RunHeader(SourceSpec(**spec), parse_json(found["manifest"], MAX_LIST))
+        return RunHeader(SourceSpec(**spec), parse_json(metadata["manifest"], MAX_LIST))
     except (KeyError, TypeError, ValueError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
@@ -239,8 +239,8 @@ class BatchReader:
         wanted = np.isin(table.channel, list(self._wanted))
         frames = self._spec.frames_at(table.log_time)
         if self._spec.images and self._every > 1:
-            shown = [n for n, topic in self._wanted.items() if topic == WATCHED_TOPIC]
-            wanted &= ~np.isin(table.channel, shown) | (frames % self._every == 0)
+            watched_channels = [n for n, topic in self._wanted.items() if topic == WATCHED_TOPIC]
+            wanted &= ~np.isin(table.channel, watched_channels) | (frames % self._every == 0)
         if not wanted.all():
             table, frames = table.select(wanted), frames[wanted]
         data = memoryview(table.data.data)

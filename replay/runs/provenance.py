@@ -92,26 +92,26 @@ def changed_files(source: Any, present: Any) -> list[str]:
     """
     changed = []
     for key in FILE_LISTS:
-        files, others = _files(source, key), _files(present, key)
-        if len(files) == len(others):
+        files, paired = _files(source, key), _files(present, key)
+        if len(files) == len(paired):
             changed += [
                 file
-                for file, other in zip(files, others, strict=True)
+                for file, other in zip(files, paired, strict=True)
                 if any(file[k] != other[k] for k in HASHES & file.keys() & other.keys())
             ]
-        elif others:
-            names = {file.get("file") for file in others}
+        elif paired:
+            names = {file.get("file") for file in paired}
             changed += [file for file in files if file.get("file") not in names]
     return [str(file.get("file")) for file in changed]
 
 
 def _update_files(source: Any, other: Any, update: Callable[[File, File], File]) -> Any:
-    """Return a source whose files are updated by those of another with as many files."""
+    """Return a source whose files are updated by the files of another source, pair by pair."""
     updated = source
     for key in FILE_LISTS:
-        files, others = _files(source, key), _files(other, key)
-        if files and len(files) == len(others):
-            updated = {**updated, key: [update(*pair) for pair in zip(files, others, strict=True)]}
+        files, paired = _files(source, key), _files(other, key)
+        if files and len(files) == len(paired):
+            updated = {**updated, key: [update(*pair) for pair in zip(files, paired, strict=True)]}
     return updated
 
 

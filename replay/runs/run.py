@@ -15,7 +15,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from cdmisfa.modules import Module
-from replay.runs.columns import Blocks, SignalColumns, has_values
+from replay.runs.columns import Blocks, SignalColumns
 from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import RunHeader, read_columns, read_header
 from replay.runs.modules import load_modules
@@ -125,7 +125,6 @@ class Outline:
         saved: saves in order.
         last: phase since the last save.
         lines: values of each signal in `LINES`, (n,) or flattened.
-        progress: names of the signals that have a value anywhere in the run.
         states: (S,) final state of each stream, as codes of the signal `state`.
         changes: (n, 3) block, stream and new code of every change of a state, ordered by block.
     """
@@ -142,7 +141,6 @@ class Outline:
     saved: tuple[Save, ...]
     last: Phase | None
     lines: dict[str, FloatArray]
-    progress: frozenset[str]
     states: tuple[int, ...]
     changes: IntArray = field(default_factory=lambda: np.empty((0, 3), np.int64))
 
@@ -166,7 +164,6 @@ class Tally:
         }
         self._saved: list[Save] = []
         self._modules = self._tau = self._outputs = 0
-        self._told: set[str] = set()
         self._states: tuple[int, ...] = (NO_STATE,) * len(header.spec.streams)
         self._changes = [np.empty((0, 3), np.int64)]
         self._count = 0
@@ -178,8 +175,6 @@ class Tally:
             parts.append(columns[name].reshape(-1).copy())  # a view would hold the whole batch
         self._modules = max(self._modules, columns["y_frozen"].shape[1])
         self._saved += [Save.of(columns, row) for row in np.flatnonzero(columns["saved"]).tolist()]
-        unsure = SIGNALS.keys() - self._told
-        self._told |= {name for name in unsure if has_values(name, columns[name])}
         rows, streams = np.nonzero(np.diff(columns["state"], axis=0, prepend=[self._states]))
         codes = columns["state"][rows, streams]
         self._changes.append(np.column_stack([self._count + rows, streams, codes]))
@@ -214,14 +209,13 @@ class Tally:
             saved=tuple(self._saved),
             last=last,
             lines={name: values[name] for name in LINES},
-            progress=frozenset(self._told),
             states=self._states,
             changes=np.concatenate(self._changes),
         )
 
 
 def read_outline(path: Path) -> Outline:
-    """Read the outline of a run; see `read_batches` for what it raises."""
+    """Read the outline of a run; raises as `read_batches`."""
     tally = Tally(read_header(path))
     for columns in read_columns(path, tally.header):
         tally.add(columns)

@@ -36,10 +36,10 @@ class RunWriter(Sink):
         path: the file's name once it is finished.
         spec: what the source delivers.
         manifest: what the run was started with, see `RunHeader`, as JSON values.
-        force: overwrite what is there.
+        force: overwrite an existing run.
         watched_every: keep every this many frames of images; vectors are all kept.
         phi_every: keep the weights every this many iterations, on each save, where a learner that
-            has weights of each stream goes on to another one, and at the end.
+            has weights of each stream switches to another one, and at the end.
 
     Raises:
         UsageError: the file exists and `force` is not set.
@@ -110,8 +110,8 @@ class RunWriter(Sink):
         if self._images:
             encode, every = self._images[block.stream], self._watched_every
             for i in range(-t % every, len(block), every):
-                shown = self.spec.time_ns(t + i)
-                messages.append((log.WATCHED_TOPIC, shown, encode(shown, block.frames[i])))
+                log_time = self.spec.time_ns(t + i)
+                messages.append((log.WATCHED_TOPIC, log_time, encode(log_time, block.frames[i])))
         else:
             frames = block.frames.reshape(len(block), -1)
             messages.append((log.WATCHED_TOPIC, at, codec.encode_matrix(t, frames)))
@@ -127,7 +127,7 @@ class RunWriter(Sink):
             self.flush()
 
     def finish(self) -> None:
-        """Write the last weights; the file stays open for what is written until `close`."""
+        """Write the last weights; the file stays open until `close`."""
         if self._without_weights is not None:
             at, k, t, learner = self._without_weights
             self._write(k, (log.PHI_TOPIC, at, codec.encode_matrix(t, learner.phi)))
@@ -149,7 +149,7 @@ class RunWriter(Sink):
         return self._log.size
 
     def keyframe(self, keyframe: Keyframe, *, again: bool = False) -> None:
-        """Write where the run stands, in a chunk of its own; all is handed to the system.
+        """Write a keyframe in a chunk of its own, and hand all data to the operating system.
 
         Args:
             keyframe: once for each iteration.
@@ -212,8 +212,8 @@ class RunWriter(Sink):
     def _write(self, iteration: int, *messages: tuple[str, int, bytes]) -> None:
         """Write messages of an iteration: topic, log time and data of each."""
         number, channels = iteration & 0xFFFFFFFF, self._channels
-        found = [(channels[topic], at, data, at, number) for topic, at, data in messages]
-        self._log.write_all(found)
+        records = [(channels[topic], at, data, at, number) for topic, at, data in messages]
+        self._log.write_all(records)
 
 
 def _records(messages: Sequence[bytes], where: str) -> Iterator[BlockSignals]:

@@ -1,1 +1,1 @@
-"""Where bytes lie, a path or URL: what is there, reading it, and results on their way there."""
+"""Files and URLs: find logs, read arrays, and compute the identity of a log."""

@@ -1,4 +1,4 @@
-"""Where a log is: a path, or a URL, of which fsspec makes a copy on this machine."""
+"""Resolve the location of a log: a path, or a URL that is copied to this machine by fsspec."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def with_urls(text: str) -> str:
 
 @functools.cache
 def _copied(address: str) -> Path:
-    shown = _SECRET.sub("", address)
-    scheme, _, place = shown.partition("://")
+    public_url = _SECRET.sub("", address)
+    scheme, _, place = public_url.partition("://")
     if scheme not in SCHEMES:
         raise UsageError(f"{scheme}:// is not supported: use {', '.join(SCHEMES)}, or a path")
     key = hashlib.sha256(address.encode()).hexdigest()[:16]
@@ -68,14 +68,14 @@ def _copied(address: str) -> Path:
         _copy(scheme, address, target)
     except ImportError as error:
         raise UsageError(
-            f"{shown}: reading URLs needs further packages ({one_line(error)}): "
+            f"{public_url}: reading URLs needs further packages ({one_line(error)}): "
             "pip install 'cdmisfa[cloud]'"
         ) from None
     except FileNotFoundError:
-        raise CdmisfaError(f"{shown}: no such file") from None
+        raise CdmisfaError(f"{public_url}: no such file") from None
     except Exception as error:  # whatever fsspec's file systems raise
-        what = one_line(error).replace(address, shown)
-        raise CdmisfaError(f"{shown}: {what}") from error
+        what = one_line(error).replace(address, public_url)
+        raise CdmisfaError(f"{public_url}: {what}") from error
     return target
 
 

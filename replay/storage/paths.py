@@ -39,12 +39,12 @@ def log_files(path: str | Path) -> list[Path]:
 
 
 def no_such(path: Path, words: Iterable[str] = (), remedy: str = "") -> UsageError:
-    """Return the error about a path that does not exist: it names what is written nearly so.
+    """Return the error about a path that does not exist, with the nearest existing name.
 
     Args:
-        path: as it was named.
-        words: what else may have been meant.
-        remedy: what is said where nothing is near.
+        path: the path as the user gave it.
+        words: further names that the user may have meant.
+        remedy: text if no name is near.
     """
     beside = [path.parent / p.name for p in path.parent.iterdir()] if path.parent.is_dir() else ()
     known = {str(name).lower(): name for name in (*beside, *words)}

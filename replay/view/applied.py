@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.modules import Module, columns_of
 from replay.view.build import recording_to, view_entities
-from replay.view.layouts import RECENT_FRAMES, blueprint, curve_view, images
+from replay.view.layouts import RECENT, blueprint, curve_view, images
 from replay.view.writer import MOST_STREAMS, ViewWriter, drawable, part
 
 if TYPE_CHECKING:
@@ -84,9 +84,7 @@ class ViewSink:
         )
         outputs = [
             curve_view(
-                f"Outputs of module {m.index} [SD]",
-                [f"/outputs/{stream}/{m.index}"],
-                recent=RECENT_FRAMES,
+                f"Outputs of module {m.index} [SD]", [f"/outputs/{stream}/{m.index}"], recent=RECENT
             )
             for m, _ in self._modules
         ]

@@ -18,7 +18,7 @@ from replay.view.writer import FRAME, ITERATION, Range
 Views = list[rrb.View | rrb.Container]
 
 # Frames of a plot up to the time cursor: few enough that single frames are visible.
-RECENT_FRAMES = 300
+RECENT = 300
 
 # Blocks of a state timeline up to the time cursor: few enough that single blocks are visible.
 RECENT_BLOCKS = 50
@@ -49,7 +49,7 @@ class Panel:
             the input, the weights, or the summary.
         height: relative height; state timelines have a fixed height per row.
         beside: place the panel to the right of the previous one.
-        state_rows: number of state timelines, without those of `per_stream`.
+        state_rows: number of state timelines, not counting `per_stream`.
         per_stream: add one state timeline for each stream.
         low: least value of the y axis.
         high: greatest value of the y axis.

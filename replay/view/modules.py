@@ -86,11 +86,11 @@ def _numbers(phi: FloatArray) -> list[str]:
 
 
 class Weights:
-    """Writes the weights of what learns from the watched stream, as far as the log has them.
+    """Writes the weights of the candidate of the attended stream, as far as they are logged.
 
-    In a run of the progress learner each stream has its candidate, and the log has the weights of
-    the candidate whose stream comes next. They are shown once that stream is watched; until then
-    those that its candidate had last, or none (white).
+    In a run of the progress learner each stream has a candidate, and the log has the weights of
+    the candidate whose stream is next. They are shown once that stream is attended; until then
+    its previous weights are shown, or none (white).
 
     Args:
         writer: of the recording.
@@ -199,7 +199,7 @@ class ModulesView:
         return self._notes
 
     def _saved(self, columns: SignalColumns, weights: dict[int, FloatArray]) -> None:
-        """Mark where modules were saved; show weights of those that are not known otherwise."""
+        """Mark the frames of saves, and show the weights of modules that are not in modules.npz."""
         for i in np.flatnonzero(columns["saved"]).tolist():
             number, stream = int(columns["module"][i]), int(columns["stream"][i])
             t, iteration = int(columns.frames[i]), int(columns.iterations[i])

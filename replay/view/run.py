@@ -1,6 +1,6 @@
 """A run as rows of a Rerun recording: every signal as it is, and curves for people.
 
-`/signals/<name>` holds a signal's values for every iteration, those of run.mcap. A signal that the
+`/signals/<name>` has the values of a signal for every iteration, as in run.mcap. A signal that the
 run never has gets no entity. Lines end where frames, or frames of their stream, were not watched.
 """
 
@@ -45,7 +45,7 @@ SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi
 HARDLY_WATCHED = 1000.0
 
 # Blocks over which the share of each stream is taken.
-RECENT = 50
+SHARE_BLOCKS = 50
 
 WATCHED_NAME = "world/watched/name"
 
@@ -56,7 +56,7 @@ class RunView:
     Args:
         writer: of the recording.
         header: of the run's log.
-        streams: those that get lines and lanes of their own.
+        streams: the streams with lines and state timelines.
         folder: of the run.
         every: frames from one pose of the scene to the next.
         modules: of the run, where they are known.
@@ -164,7 +164,7 @@ class SignalCurves:
     Args:
         writer: of the recording.
         header: of the run's log.
-        streams: those that get lines of their own.
+        streams: the streams with lines.
     """
 
     def __init__(self, writer: ViewWriter, header: RunHeader, streams: Sequence[int]) -> None:
@@ -259,10 +259,10 @@ class SignalCurves:
         blocks = np.concatenate([self._recent, watched])
         sums = np.cumsum(blocks, axis=0)
         end = np.arange(len(self._recent), len(blocks))
-        before = end - RECENT
+        before = end - SHARE_BLOCKS
         shares = sums[end] - np.where(before[:, None] < 0, 0, sums[np.maximum(before, 0)])
-        self._recent = blocks[-RECENT:]
-        values = shares / np.minimum(end + 1, RECENT)[:, None]
+        self._recent = blocks[-SHARE_BLOCKS:]
+        values = shares / np.minimum(end + 1, SHARE_BLOCKS)[:, None]
         names, rgbs = zip(*((self._names[s], colour(s)) for s in self._streams), strict=True)
         return Curve("decision/attention", names, values, rgbs)
 

@@ -10,7 +10,7 @@ from replay.runs.log import PHI_EVERY
 from replay.runs.run import Outline
 from replay.view import layouts
 from replay.view.image_grid import GRID, grid_bounds, sheet_size
-from replay.view.layouts import RECENT_FRAMES, Panel, Tab, Views, beside, curve_view, images
+from replay.view.layouts import RECENT, Panel, Tab, Views, beside, curve_view, images
 from replay.view.writer import MOST_STREAMS, Range, ViewWriter, drawable
 
 # Modules that have a page each; of more, those that stand on one page.
@@ -148,7 +148,7 @@ class RunLayout:
             title,
             entities,
             self._end,
-            recent=RECENT_FRAMES if panel.kind == "recent" else 0,
+            recent=RECENT if panel.kind == "recent" else 0,
             span=self._span(panel, entities),
             legend=panel.legend and several,
         )
@@ -215,10 +215,7 @@ class RunLayout:
             entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
             windows: Views = [
                 curve_view(
-                    f"Output in the last {RECENT_FRAMES} frames {words}",
-                    entities,
-                    end,
-                    start=end - RECENT_FRAMES,
+                    f"Output in the last {RECENT} frames {words}", entities, end, start=end - RECENT
                 )
                 for words, end in ends.items()
             ]
@@ -249,10 +246,8 @@ class RunLayout:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
-        values = curve_view(name, ["/world/watched"], recent=RECENT_FRAMES)
-        whose = layouts.state_rows(
-            "Attended stream", ["/attended/each_block"], recent=RECENT_FRAMES
-        )
+        values = curve_view(name, ["/world/watched"], recent=RECENT)
+        whose = layouts.state_rows("Attended stream", ["/attended/each_block"], recent=RECENT)
         return rrb.Vertical(values, whose, row_shares=[3, 2])
 
     def _weights(self, path: str, name: str) -> rrb.View:

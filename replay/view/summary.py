@@ -24,7 +24,7 @@ NAMED = 4
 
 
 def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str:
-    """Return the summary of a run as Markdown: what it learned, why it ended, settings.
+    """Return the summary of a run as Markdown: modules or streams, reason for the end, settings.
 
     Args:
         outline: the run in short.

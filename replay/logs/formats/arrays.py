@@ -25,7 +25,7 @@ from replay.storage.arrays import NOT_ARRAYS
 
 ENDINGS: Final = (".npy", ".npz")
 
-# Frames a second by default, as arrays have no times.
+# Default rate in frames per second, as arrays have no times.
 FPS: Final = 50.0
 
 # How arrays of other types than uint8 become frames, for the record.
@@ -43,7 +43,7 @@ _FORMS: Final = (
 def streams(
     path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
-    """Open a file of NumPy, of which an .npz has a stream for each array.
+    """Open a file of NumPy; each array of an .npz is a stream.
 
     Raises:
         UsageError: no such array, or one that holds no frames.
@@ -108,7 +108,7 @@ def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
             if sum(member.file_size for member in stored.zip.infolist()) > BUDGET:
                 raise UsageError(f"{path}: the arrays exceed {BUDGET >> 20} MiB: save each as .npy")
             arrays = {name: stored[name] for name in stored.files}
-    except NOT_ARRAYS as error:  # NumPy would advise to run what the file holds
+    except NOT_ARRAYS as error:  # NumPy's own message advises allow_pickle=True, which is unsafe
         why = "it has Python objects or other data" if "pickle" in str(error) else one_line(error)
         raise LogDamagedError(f"{path} is not a file of NumPy arrays: {why}") from error
     if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):

@@ -105,7 +105,7 @@ def streams(
 
     Raises:
         CdmisfaError: the package rosbags is missing.
-        UsageError: no such topic, or not what is asked for on it.
+        UsageError: no such topic, or it has no images or fields as requested.
         LogDamagedError: rosbags cannot read it.
     """
     with open_bag(path) as bag:

@@ -1,7 +1,7 @@
-"""Whether a video's file has all that its container states.
+"""Detect truncated video files, by the lengths that their containers state.
 
-A container is a row of parts, each after its name and length. Of a file that was cut one is not all
-there; FFmpeg would give what comes before as if it were all.
+A container is a sequence of parts, each with a name and a length. In a truncated file one part is
+incomplete; FFmpeg would silently return the frames before it.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from cdmisfa.core.untrusted import opened_regular
 
 
 class Extent(NamedTuple):
-    """How far a file goes.
+    """Completeness of a file.
 
     Attributes:
-        missing: what it lacks of what it states, in words; "" where nothing is known to be.
-        stated: whether it states where it ends, so that a missing end is known.
+        missing: description of the missing part; "" if none is known.
+        stated: whether the file states its length, so that a missing end is detected.
     """
 
     missing: str = ""
@@ -57,7 +57,7 @@ def _zeros(at: int) -> Extent:
 
 
 def _at(file: BinaryIO, place: int, count: int) -> bytes:
-    """Return the bytes at a place, zeros for those that the file does not have."""
+    """Return `count` bytes from an offset, padded with zeros at the end of the file."""
     file.seek(place)
     return file.read(count).ljust(count, b"\0")
 
@@ -126,7 +126,7 @@ _NAMES: Final = {_SEGMENT: "its segment", _CLUSTER: "a cluster"}
 
 
 def _number(data: bytes, *, keep: bool = True) -> tuple[int, int, bool]:
-    """Return a number of variable width, that width, and whether it stands for an unknown length.
+    """Return a number of variable width, its width, and whether it means an unknown length.
 
     Args:
         data: begins with it.

@@ -39,7 +39,7 @@ def streams(
         count=len(files),
         fetch=lambda row: read_regular(files[row], MAX_IMAGE),
         decode=partial(compressed_image, color=options.color is True),
-        picture=bytes,
+        compressed=bytes,
         where=lambda row: str(files[row]),
         encoding=" ".join(sorted(endings)),
         remarks=[] if endings == {"png"} else [remark],

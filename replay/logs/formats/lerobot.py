@@ -27,7 +27,7 @@ from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, explaine
 
 INFO: Final = "meta/info.json"
 
-# Frames that would fit between two episodes, of which nobody knows when they were.
+# Length of the gap between two episodes, in frames: the dataset does not state their times.
 PAUSE: Final = 20
 
 _IMAGES: Final = ("video", "image")
@@ -87,8 +87,8 @@ def streams(
             times=camera.dataset.times,
             fetch=camera.fetch,
             decode=camera.decode,
-            picture=None if camera.video else bytes,
-            held=camera.held,
+            compressed=None if camera.video else bytes,
+            memory_bytes=camera.memory_bytes,
             program="LeRobot's layout",
             recipe=VIDEO_RECIPE if camera.video else RECIPE,
             warnings=camera.dataset.notes(topic),
@@ -132,7 +132,7 @@ class _Camera:
             self._images = self._table(file) if not self.video else VideoFile(file, self._color)
             self._file = file
         if not self.video:
-            return self._picture(place)
+            return self._compressed(place)
         times = self._images.times
         if place >= len(times) or abs(times[place] / NANOSECONDS * self._fps - place) >= 0.5:
             raise MalformedRecord(f"{name} has no frame at {place / self._fps:g} s")
@@ -144,9 +144,9 @@ class _Camera:
             return compressed_image(stored, color=self._color)
         return np.asarray(self._images.image(stored))
 
-    def held(self) -> int:
+    def memory_bytes(self) -> int:
         """Return bytes of the file that is open."""
-        return int(getattr(self._images, "held" if self.video else "nbytes", 0))
+        return int(getattr(self._images, "memory_bytes" if self.video else "nbytes", 0))
 
     def close(self) -> None:
         """Close the file that is open; harmless when called twice."""
@@ -163,7 +163,7 @@ class _Camera:
                 raise MemoryError
         return table
 
-    def _picture(self, index: int) -> bytes:
+    def _compressed(self, index: int) -> bytes:
         table = self._images
         row = index - int(table["index"][0].as_py())
         value = table[self._topic][row].as_py() if 0 <= row < table.num_rows else None
@@ -174,7 +174,7 @@ class _Camera:
 
 
 def _numbers(path: Path, options: InputOptions) -> LogStream:
-    """Return numbers of a dataset, as observation.state and action, those of each frame one row."""
+    """Return fields of a dataset, as observation.state and action, one row of numbers a frame."""
     topic, names, what = path.resolve().name, options.fields, ", ".join(options.fields)
     check_topics(path, topic, options.topics)
     known = features(path)[0]
@@ -185,7 +185,7 @@ def _numbers(path: Path, options: InputOptions) -> LogStream:
     if not files:
         raise LogDamagedError(f"{path}: the tables of frames (data/*.parquet) are missing")
     numbers = np.concatenate([_columns(file, names) for file in files])
-    with limited(path, "LeRobot's layout", held=numbers.nbytes):
+    with limited(path, "LeRobot's layout", memory_bytes=numbers.nbytes):
         starts = dataset.starts
         firsts = np.array([int(row["dataset_from_index"]) for row in dataset.rows]) - starts[:-1]
         frames = numbers[np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))]
@@ -211,8 +211,8 @@ def dataset_channels(path: Path) -> list[ExternalChannel]:
 
 
 def features(path: Path) -> tuple[list[str], list[str]]:
-    """Return the features of a dataset that are numbers, and those that are images."""
-    kinds = {name: str(own.get("dtype")) for name, own in _info(path)["features"].items()}
+    """Return the names of numeric features of a dataset, and of its images."""
+    kinds = {name: str(feature.get("dtype")) for name, feature in _info(path)["features"].items()}
     numbers = [name for name, kind in kinds.items() if kind.startswith(("float", "int", "bool"))]
     return numbers, [name for name, kind in kinds.items() if kind in _IMAGES]
 

@@ -29,7 +29,7 @@ def streams(
     A part may lack a topic, and an empty part is left out.
 
     Raises:
-        UsageError: no such topic, or not what is asked for on it.
+        UsageError: no such topic, or it has no images or fields as requested.
         LogDamagedError: the log is damaged.
     """
     readers: list[LogReader] = []
@@ -63,7 +63,7 @@ def streams(
             options,
             messages.times,
             messages.fetch,
-            held=messages.held,
+            memory_bytes=messages.memory_bytes,
             reader=None if path.is_dir() else readers[0],
             warnings=[*joined, *left_out, *(w for reader in readers for w in reader.warnings)],
         )
@@ -76,7 +76,7 @@ class Messages:
 
     Args:
         channels: of the topic, each with the reader of its file.
-        expected: the chunks that each reader was last told to expect, by whatever topic.
+        expected: chunks that each reader expects next, shared by all topics.
 
     Attributes:
         times: (n,) log times, nanoseconds.
@@ -96,11 +96,11 @@ class Messages:
         parts: list[NDArray[np.uint64]] = [np.empty(0, np.uint64)]
         for reader, numbers in self._channels.items():
             by_chunk = _by_index if reader.by_index else _by_pass
-            found = list(by_chunk(reader, numbers))
-            self._segments[reader] = [segment for segment, _ in found]
-            self._chunks += [(reader, segment) for segment, _ in found]
-            parts += [own for _, own in found]
-        times, counts = np.concatenate(parts), [len(own) for own in parts[1:]]
+            chunks = list(by_chunk(reader, numbers))
+            self._segments[reader] = [segment for segment, _ in chunks]
+            self._chunks += [(reader, segment) for segment, _ in chunks]
+            parts += [log_times for _, log_times in chunks]
+        times, counts = np.concatenate(parts), [len(part) for part in parts[1:]]
         order = np.argsort(times, kind="stable")
         self.times = times[order].astype(np.int64)
         self._chunk_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)[order]
@@ -122,12 +122,12 @@ class Messages:
         if number != self._now[0]:
             self._now = number, _rows_of(table, self._channels[reader])
             self._bytes = table.data.nbytes
-        own, place = self._now[1], int(self._row_in[row])
-        if place >= len(own) or int(table.log_time[own[place]]) != int(self.times[row]):
+        rows, place = self._now[1], int(self._row_in[row])
+        if place >= len(rows) or int(table.log_time[rows[place]]) != int(self.times[row]):
             raise MalformedRecord("its chunk has other messages than the summary states")
-        return table.view(int(own[place]))
+        return table.view(int(rows[place]))
 
-    def held(self) -> int:
+    def memory_bytes(self) -> int:
         """Return bytes of the chunk that was read last."""
         return self._bytes
 
@@ -182,13 +182,13 @@ def topics_in(reader: LogReader) -> list[str]:
 def decoders_in(reader: LogReader) -> dict[int, Decoder]:
     """Return the decoder of each channel of images."""
     channels = [(c.topic, message_kind(reader, c), c.id) for c in reader.channels.values()]
-    topics, found = topics_in(reader), dict[int, Decoder]()
+    topics, decoders = topics_in(reader), dict[int, Decoder]()
     options = InputOptions(topics=tuple(topics))
     for _, kind, numbers in choose_topics(reader.path, channels, options) if topics else ():
         decode = decoder_of(kind, options)
         assert decode is not None
-        found |= dict.fromkeys(numbers, decode)
-    return found
+        decoders |= dict.fromkeys(numbers, decode)
+    return decoders
 
 
 def message_kind(reader: LogReader, channel: Channel) -> MessageKind:

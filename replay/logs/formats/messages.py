@@ -56,7 +56,7 @@ def choose_topics(
     Args:
         path: the log.
         channels: the topic, the kind of the messages, and the channel itself.
-        options: `topics`, which may be left out if there is one, and what is taken of them.
+        options: `topics`, optional if there is only one, and whether images or fields are read.
 
     Returns:
         Topic, kind and channels of each.
@@ -66,10 +66,10 @@ def choose_topics(
         UsageError: its messages are of several kinds.
     """
     readable: dict[str, dict[MessageKind, tuple[MessageKind, list[Channel]]]] = {}
-    others: dict[str, str] = {}
+    unreadable: dict[str, str] = {}
     for topic, kind, channel in channels:
         if decoder_of(kind, options) is None:
-            others[topic] = f"{kind.schema} in {kind.encoding or 'no encoding'}"
+            unreadable[topic] = f"{kind.schema} in {kind.encoding or 'no encoding'}"
         else:
             alike = kind if options.fields else MessageKind(kind.schema, kind.encoding)
             kinds = readable.setdefault(topic, {})
@@ -77,23 +77,29 @@ def choose_topics(
     topics = options.topics
     chosen = [topic for topic in readable if not topics or fits_topic(topic, topics)]
     if not chosen or (not topics and len(chosen) > 1):
-        raise NoTopicError(f"{path}: {_why_none(readable, others, options)}")
+        raise NoTopicError(f"{path}: {_why_none(readable, unreadable, options)}")
     if mixed := next((topic for topic in chosen if len(readable[topic]) > 1), None):
         listed = ", ".join(f"{kind.schema} in {kind.encoding}" for kind in readable[mixed])
         raise UsageError(f"{path}: {mixed} has messages of several types: {listed}")
     return [(topic, *next(iter(readable[topic].values()))) for topic in chosen]
 
 
-def _why_none(readable: Iterable[str], others: Mapping[str, str], options: InputOptions) -> str:
-    """Say why no topic is chosen, given those that can be read and the kinds of the others."""
+def _why_none(readable: Iterable[str], unreadable: Mapping[str, str], options: InputOptions) -> str:
+    """Return the reason why no topic is chosen.
+
+    Args:
+        readable: topics that can be read.
+        unreadable: types of the messages on all other topics.
+        options: the requested topics.
+    """
     what = "messages with fields" if options.fields else "images"
-    if not readable and not any(topic in others for topic in options.topics):
+    if not readable and not any(topic in unreadable for topic in options.topics):
         if options.fields:
             return "it has no messages with known fields"
         return "it has no images; for numbers use --field"
     wrong = "choose one --topic or more"
     if topics := ", ".join(options.topics):
-        kind = next((others[topic] for topic in options.topics if topic in others), "")
+        kind = next((unreadable[topic] for topic in options.topics if topic in unreadable), "")
         images = f"{topics} has {kind}, which is not a supported image ({', '.join(SCHEMAS)})"
         wrong = images if kind and not options.fields else f"no topic {topics}"
     return f"{wrong}; it has {what} on: {', '.join(sorted(readable)) or 'none'}"
@@ -114,8 +120,8 @@ def message_stream(
         path: the log.
         topic: the topic.
         kind: of its messages.
-        options: what is taken of them.
-        times: when each was logged, nanoseconds, in order.
+        options: whether images or fields are read.
+        times: log times in nanoseconds, in order.
         fetch: reads a message.
         about: further attributes of the stream.
 
@@ -126,6 +132,7 @@ def message_stream(
     decode = decoder_of(kind, options)
     assert decode is not None
     names = kind.schema, kind.encoding
+    is_packed = names in PACKED and not options.fields
     stream = LogStream(
         path=path,
         topic=topic,
@@ -133,7 +140,7 @@ def message_stream(
         times=times,
         fetch=fetch,
         decode=decode,
-        picture=partial(packed_picture, *names) if names in PACKED and not options.fields else None,
+        compressed=partial(packed_picture, *names) if is_packed else None,
         stamp=stamp_of(kind) if options.stamp == "header" else None,
         pixel_format=partial(stated_format, *names),
         recipe=NUMBERS_RECIPE if options.fields else RECIPE,
@@ -218,12 +225,12 @@ class _Video:
         self._next = -1
         for at in range(start, row + 1):
             try:
-                shown = self._packets(self._messages.fetch(at))
+                image = self._packets(self._messages.fetch(at))
             except (MalformedImage, MalformedRecord) as error:
                 self._broken[at] = error
                 raise
         self._next = row + 1
-        return shown
+        return image
 
     def _begins(self, row: int) -> bool:
         try:

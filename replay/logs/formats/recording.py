@@ -62,7 +62,7 @@ class ViewFile:
 
         Args:
             path: the file.
-            skip_damaged: leave out what is damaged.
+            skip_damaged: skip damaged parts.
             reader: of the file, which the caller closes; then no frame is known until
                 `check_chunk` was called with each chunk, and `finish`.
 
@@ -301,11 +301,11 @@ class _ChannelRows:
             self.starts.append(self.starts[-1] + count)
         return count > 0
 
-    def _number(self, times: NDArray[np.uint64], row: int, found: list[_RowRange]) -> None:
+    def _number(self, times: NDArray[np.uint64], row: int, ranges: list[_RowRange]) -> None:
         """Add the frames of messages from `row` on to the ranges found."""
         frames = self._facts.frames_at(times)
         exact = self._facts.times(frames) == times
-        before = found[-1].stop if found else self._facts.first_frame
+        before = ranges[-1].stop if ranges else self._facts.first_frame
         steps = np.diff(frames, prepend=before - 1)
         wrong = np.flatnonzero(~exact | (steps < 1 if self._may_lack else steps != 1))
         if len(wrong):
@@ -318,11 +318,11 @@ class _ChannelRows:
         edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
         for low, high in itertools.pairwise(edges):
             start, count = int(frames[low]), high - low
-            last = found[-1] if found else None
+            last = ranges[-1] if ranges else None
             if last and last.stop == start and last.row + start - last.start == row + low:
-                found[-1] = last._replace(stop=start + count)
+                ranges[-1] = last._replace(stop=start + count)
             else:
-                found.append(_RowRange(start, start + count, row + low))
+                ranges.append(_RowRange(start, start + count, row + low))
 
     def _times(self, number: int) -> NDArray[np.uint64]:
         """Log times of the channel's messages in a chunk."""

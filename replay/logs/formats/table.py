@@ -40,7 +40,7 @@ def streams(
 ) -> list[LogStream]:
     """Read the numbers of a table as one stream, in the order of time.
 
-    The columns are those that `options.fields` names, or all of numbers but the times; a column of
+    The columns are `options.fields`, or by default all numeric ones except the times; a column of
     lists or of structures is a message, with the fields that `Field` names. Times are in the
     column `options.time`: dates, or numbers of seconds, or of another unit as in `stamp:ns`.
     Without it the rows are at an even rate.

@@ -27,13 +27,13 @@ from replay.logs.stream import LogStream, UnreadableError, limited
 ENDINGS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
 _UNTIMED: Final = ("avi", "asf")
 
-# Containers without an index, in which FFmpeg may find a place behind the one that is sought.
+# Containers without an index, in which a seek of FFmpeg may end after the requested time.
 _UNSURE: Final = ("mpeg", "mpegts")
 
 _BEGIN: Final = -(2**40)
 _NOWHERE: Final = 2**62
 
-# Frames that are decoded and passed over rather than sought.
+# Frames ahead that are decoded and dropped, as seeking to the next key frame would take longer.
 _FORWARD: Final = 256
 
 
@@ -55,7 +55,7 @@ def streams(
         count=len(video.times),
         times=video.times,
         decode=video.image,
-        held=lambda: video.held,
+        memory_bytes=lambda: video.memory_bytes,
         program="FFmpeg",
         where=lambda row: f"{path}: at {float(int(video.stamps[row]) * video.tick):g} s",
         encoding=video.encoding,
@@ -74,16 +74,16 @@ class VideoFile:
         times: (n,) presentation times, nanoseconds.
         stamps: (n,) the same, in ticks.
         tick: length of a tick, in seconds.
-        held: bytes of memory that the open file takes.
+        memory_bytes: bytes of memory that the open file takes.
         encoding: name of the codec.
-        missing: what a file that was cut lacks; "" of others.
+        missing: the missing part of a truncated file, or "".
         warnings: a line for each thing that it lacks.
         remarks: a line for each thing that nothing proves.
     """
 
     def __init__(self, path: Path, color: bool = False) -> None:
         self.path = path
-        self._shown = frame_colors if color else frame_gray
+        self._to_pixels = frame_colors if color else frame_gray
         self._av = pyav(f"{path} is a video, which")
         self._next = _NOWHERE
         self._cut = _NOWHERE  # time of the last frame of a file that was cut, which may be a part
@@ -101,7 +101,7 @@ class VideoFile:
             if isinstance(error, UnreadableError) and self.missing:
                 raise LogDamagedError(f"{path}: cut short: {self.missing}") from None
             raise
-        self.held = data_bytes() - before
+        self.memory_bytes = data_bytes() - before
         self.warnings = [self.missing] if self.missing else []
         self.remarks = ["a video has no checksums, so damaged pixels may be undetected"]
         if not self.missing and not extent.stated:
@@ -122,7 +122,9 @@ class VideoFile:
         stream.thread_type = "NONE"
         context = stream.codec_context
         context.thread_count = 1
-        context.options = {"err_detect": "explode"}  # rather than made up pixels
+        context.options = {
+            "err_detect": "explode"
+        }  # else FFmpeg conceals errors with invented pixels
         if not 0 < context.width * context.height <= MAX_PIXELS:
             size = f"{context.width}x{context.height}"
             raise LogDamagedError(f"{self.path}: images of {size} pixels are not supported")
@@ -136,7 +138,7 @@ class VideoFile:
             if packet.size and not packet.is_discard:
                 timed &= packet.pts is not None
                 stamps.append(packet.pts or 0)
-        # A container without times may hold images that wait for later ones (B-frames).
+        # A container without times may have B-frames, which are not stored in order of display.
         waits = container in _UNTIMED and context.name in ("h264", "hevc") and context.has_b_frames
         if not timed or (waits and (np.diff(stamps) >= 0).all()):
             raise UsageError(
@@ -175,7 +177,7 @@ class VideoFile:
         if frame is None:
             raise MalformedRecord("the video is broken, no frame can be decoded")
         self._next = row + 1
-        return self._shown(frame)
+        return self._to_pixels(frame)
 
     def _decoded(self) -> Iterator[Any]:
         for packet in self._container.demux(self._stream):

@@ -66,8 +66,8 @@ def _stream(parts: Sequence[ViewFile]) -> LogStream:
             _, stop, view = placed[bisect.bisect_right(starts, first) - 1]
             end = min(at + stop - first, len(rows))
             if not isinstance(rows, range):  # frames may be left out
-                own = rows[at:end]
-                end = at + int(np.count_nonzero(own - np.arange(len(own)) == first))
+                numbers = rows[at:end]
+                end = at + int(np.count_nonzero(numbers - np.arange(len(numbers)) == first))
             view.take(first, frames[at:end], truth[at:end])
             at = end
         return frames, truth
@@ -122,8 +122,8 @@ def _unfit(views: Sequence[ViewFile], view: ViewFile, what: str) -> CdmisfaError
     return SeveralRecordingsError(f"{refused}, or align their streams with --align index")
 
 
-def only_begun(path: Path) -> bool:
-    """Return whether a file is a further part of which its recorder had written no frame yet."""
+def has_no_frames(path: Path) -> bool:
+    """Return whether a file is a later part of a recording that has no frames yet."""
     if not _FURTHER_PART.fullmatch(path.name):
         return False
     try:
