@@ -1,4 +1,4 @@
-"""Learn slow features from arrays, logs, simulated scenes or cameras.
+"""Learn slow features from arrays, logs, simulated scenes or cameras:
 
     run = learn("oscillatory", max_modules=1)
     table = run.signals.to_arrow()

@@ -56,7 +56,6 @@ class WatchEnv(Env):
         signals: `BlockSignals` of the last step; None before the first one of an episode.
 
     Raises:
-        UsageError: Gymnasium is missing, or the learner or a setting does not exist.
         UsageError: Gymnasium is missing, or there is no such learner, setting or observation.
 
     Example:

@@ -74,7 +74,7 @@ def exit_codes() -> str:
 
 def signals() -> str:
     """Return the table of the signals that every run records."""
-    columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "about")
+    columns = ("name", "about", "symbol", "unit", "dims", "equation")
     rows = [[getattr(signal, column) for column in columns] for signal in SIGNALS.values()]
     return markdown(columns, [[f"`{name}`", *cells] for name, *cells in rows])
 

@@ -68,19 +68,19 @@ class SteppedSource(ForwardSource):
 
 
 class ArraySource(SteppedSource):
-    """Frames that the caller makes, one after the other, as streams.
+    """Source of frames that a program computes one after the other.
 
-    For arrays that exist as a whole, `cdmisfa.Recording` has a source that can go back, too.
+    Use `cdmisfa.Recording` for complete arrays: its source can also go back.
 
     Args:
-        streams: for each stream, by its name, an array (n, height, width) of uint8 or (n, I) of
-            float64, or any iterable of such frames.
-        fps: frames a second.
-        start_ns: log time of frame 0, in nanoseconds.
+        streams: mapping of a stream's name to its frames: an array (n, height, width) of uint8 or
+            (n, I) of float64, or any iterable of such frames.
+        fps: frames per second.
+        start_ns: log time of frame 0 (ns).
 
     Raises:
-        UsageError: there is no stream, or a frame has another shape or type than the first, or
-            holds NaN or infinity; as soon as such a frame comes.
+        UsageError: there is no stream, or a frame differs from the first in shape or type, or
+            contains NaN or infinity; raised when the frame is taken.
     """
 
     def __init__(
@@ -122,24 +122,25 @@ def _checked(spec: SourceSpec, rows: Iterable[Sequence[NDArray[Any]]]) -> Iterat
 
 
 class GymSource(SteppedSource):
-    """Environments that render, one a stream, stepped together; a seed repeats all frames.
+    """Source of the rendered images of Gymnasium environments, one stream for each.
 
-    An episode that ends is followed by another. The ground truth is the numbers of each
-    observation, of the action that follows it, and whether an episode begins with it.
+    All environments are stepped together, and a new episode follows one that ends. The same seed
+    gives the same frames. The ground truth has the numbers of the observation, of the next action,
+    and whether an episode begins.
 
     Args:
-        tasks: a list of the environments' ids, or environments made with `render_mode="rgb_array"`.
-        names: of the streams; by default the ids.
-        size: (height, width) of a frame; by default `default_size` of the first's images.
-        fit: how images of another aspect ratio become frames: see `fitted`.
-        fps: frames a second; by default as the first environment states.
-        seed: of the environments and of random actions.
-        policy: chooses the action for an observation; by default actions are random.
-        hold: frames for which an action is kept.
-        color: show red, green and blue beside one another.
+        tasks: ids of environments, or environments made with `render_mode="rgb_array"`.
+        names: names of the streams; None: the ids.
+        size: (height, width) of a frame; None: that of the images, at most 48x128 pixels.
+        fit: "crop", "pad" or "stretch" images of another aspect ratio.
+        fps: frames per second; None: as the first environment states.
+        seed: seed of the environments and of random actions.
+        policy: function that returns the action for an observation; None: random actions.
+        hold: number of frames for which an action is repeated.
+        color: True to put red, green and blue side by side.
 
     Raises:
-        UsageError: Gymnasium is missing, or there is no such environment.
+        UsageError: Gymnasium is missing, or an environment does not exist.
     """
 
     def __init__(

@@ -198,17 +198,17 @@ _IMAGES = "give uint8 of (n, height, width) or (n, height, width, 3), or floats 
 
 @dataclass(frozen=True, slots=True)
 class Recipe(Section):
-    """How a raw image, or numbers, become a frame; a learned module carries it.
+    """How a raw image or numbers become a frame; each module has the recipe of its stream.
 
     Attributes:
-        shape: of a frame, (height, width) or (values,).
-        fit: how an image of another aspect ratio becomes a frame: see `fitted`.
-        color: whether a frame shows red, green and blue beside one another.
-        range: distances in metres that are black and white, or the range that numbers are kept in.
-        fields: the names of the numbers.
-        pixels: the source's Bayer format, as bayer_rggb8, or "".
-        raw: (height, width) of the source's images; empty if the source did not state it.
-        centre: "episode" if frames lack the mean of their episode; see `centred`.
+        shape: shape of a frame, (height, width) or (values,).
+        fit: "crop", "pad" or "stretch" images of another aspect ratio.
+        color: whether a frame shows red, green and blue side by side.
+        range: distances in metres that are shown black and white, or limits of the numbers.
+        fields: names of the numbers.
+        pixels: Bayer format of the source, such as "bayer_rggb8", or "".
+        raw: (height, width) of the images of the source; empty if unknown.
+        centre: "episode" if the mean of its episode is subtracted from each frame.
     """
 
     prefix: ClassVar[str] = "recipe"
@@ -223,12 +223,12 @@ class Recipe(Section):
 
     @classmethod
     def of(cls, described: Mapping[str, Any], shape: tuple[int, ...], stream: int = 0) -> Self:
-        """Return the recipe of a source, by its description.
+        """Return the recipe that the description of a source states.
 
         Args:
-            described: see `FrameSource.describe`.
-            shape: of its frames.
-            stream: index of the stream whose numbers are meant.
+            described: description, see `FrameSource.describe`.
+            shape: shape of the frames.
+            stream: index of the stream, if frames are numbers.
         """
         bounds = described.get("range_metres") or described.get("range")
         names = described.get("fields") or []
@@ -276,7 +276,7 @@ class Recipe(Section):
     def frames(self, images: Any) -> NDArray[Any]:
         """Turn an iterable of n raw images into frames, (n, *shape); see `make_frame`.
 
-        The mean of their episode stays in them.
+        The mean of their episode is not subtracted.
         """
         if self.size is None:
             return _numbers(images, self)
@@ -286,24 +286,24 @@ class Recipe(Section):
 
 
 def make_frame(image: Any, recipe: Recipe) -> Shown:
-    """Turn a raw image, or numbers, into the frame that a learner learned from.
+    """Turn a raw image or numbers into a frame as the module saw it in learning.
 
-    Colours become gray, as a source makes them, or stay beside one another, 16 bits count by their
-    high byte, a Bayer pattern is taken apart, distances are shown from black to white; then the
-    image is cut, padded or stretched, and its areas are averaged.
+    Colors become gray or are put side by side, 16-bit pixels are reduced to their high byte, a
+    Bayer pattern is decoded, and distances become gray levels. Then the image is cropped, padded
+    or stretched, and reduced by averaging areas.
 
     Args:
-        image: (height, width) uint8 or uint16, (height, width, 3) or 4 red, green, blue uint8,
-            distances as uint16 in millimetres or floats in metres, or the bytes of a JPEG or PNG,
-            which is turned as its EXIF states; for a recipe of numbers (values,) of any type.
-        recipe: of the learned module.
+        image: (height, width) of uint8 or uint16; (height, width, 3) or 4 of uint8: red, green,
+            blue; distances as uint16 in millimetres or floats in metres; or the bytes of a JPEG or
+            PNG file, which is rotated as its EXIF states. For a recipe of numbers: (values,).
+        recipe: recipe of the module.
 
     Returns:
         The frame, of `recipe.shape`: uint8, or float64 for numbers.
 
     Raises:
-        UsageError: the image has another type, is smaller than a frame, or is upright if the
-            source's images were not.
+        UsageError: the image has another type, is smaller than a frame, or is upright although the
+            images of the source were not.
     """
     if recipe.size is None:
         return np.asarray(_numbers([image], recipe)[0])

@@ -86,10 +86,10 @@ class OscillatoryConfig(SceneConfig):
 
 
 class OscillatorySource(ClockedSource):
-    """Deterministic two-dimensional streams on the common clock.
+    """Source of the paper's oscillatory streams: two numbers a frame.
 
     Args:
-        streams: names of streams in `STREAMS`.
+        streams: names of streams: any of "x1", "x2", "x3" and "zero".
         fps: frames per second.
         start_ns: log time of frame 0 (ns).
         length: number of frames of the streams; None: endless.
