@@ -25,7 +25,7 @@ from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.recursive import RecursiveFeature
 from recorder.cameras.readers import Camera
 from recorder.cameras.video import VideoCamera
-from recorder.images.pixels import Shown
+from recorder.images.pixels import Content
 from recorder.world.oscillatory import OscillatorySource
 
 
@@ -83,10 +83,10 @@ class Readings:
 
     name, finite, rate = "readings", True, 50.0
 
-    def __init__(self, *shown: Shown) -> None:
+    def __init__(self, *shown: Content) -> None:
         self._shown = shown
 
-    def images(self) -> Iterator[tuple[int, Shown]]:
+    def images(self) -> Iterator[tuple[int, Content]]:
         return ((0, shown) for shown in self._shown)
 
     def describe(self) -> Mapping[str, Any]:
@@ -110,7 +110,7 @@ class TestNumbers(CameraContract):
         [np.ones((0, 4), np.uint8)] * 3,
     ],
 )
-def test_a_camera_that_shows_something_else_breaks_its_contract(shown: list[Shown]) -> None:
+def test_a_camera_that_shows_something_else_breaks_its_contract(shown: list[Content]) -> None:
     class Wrong(CameraContract):
         def open(self) -> Camera:
             return Readings(*shown)

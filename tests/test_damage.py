@@ -78,7 +78,7 @@ BAD = "its CRC does not match"
 FEW = "cut short: the file ends within a record|no message can be recovered"
 BARE = "it has no checksums, so that changed bytes cannot be noticed"
 HEAD = "it is not the chunk in the summary|the length of a chunk contradicts its data"
-NO_PNG = "its JPEG or PNG is broken|it does not begin as a PNG|its PNG is cut short"
+NO_PNG = "its JPEG or PNG is damaged|it does not begin as a PNG|its PNG is cut short"
 INDEX = "index contradicts its messages|other messages than the summary|data section: " + BAD
 
 TABLE: dict[str, dict[str, tuple[str, str, str]]] = {

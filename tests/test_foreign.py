@@ -212,7 +212,7 @@ def test_an_image_is_averaged_over_areas() -> None:
     image = RANDOM.integers(0, 256, (96, 256), np.uint8)
     expected = image.reshape(48, 2, 128, 2).mean(axis=(1, 3))
     assert abs(shrink(image, 48, 128) - expected).max() <= 1
-    with pytest.raises(UsageError, match="smaller than 128x100: choose larger images"):
+    with pytest.raises(UsageError, match="smaller than 128x100: choose a smaller --size"):
         shrink(image, 100, 128)
 
 

@@ -130,7 +130,7 @@ def test_a_part_is_written_as_minutes_and_seconds(cdmisfa: Cdmisfa, tmp_path: Pa
     words = ("learn", log, "-o", out, "--start", "1", "--end", "0:08", "--max-iterations", 1)
     done = cdmisfa(*words, "--no-rerun")
     assert done.code == 0
-    assert "320x240, shown as 80x60" in done.err
+    assert "320x240, resized to 80x60" in done.err
     source = json.loads((out / "run.json").read_text())["source"]
     assert (source["frames"], source["rate"], source["size"]) == (350, 50.0, [60, 80])
     assert list(source["gaps"].values()) == [[[50, 200]]]

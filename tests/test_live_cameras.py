@@ -249,7 +249,7 @@ class Cameras:
         return thread.join
 
 
-GONE, HANGS = "right is gone: unplugged", "right: no image for 0.3 s"
+GONE, HANGS = "right is lost: unplugged", "right: no image for 0.3 s"
 
 
 @pytest.mark.parametrize(
@@ -279,7 +279,7 @@ def test_a_camera_that_is_lost_is_a_gap_or_the_end(on_loss: Any, why: str, then:
         if (on_loss, why) != ("wait", GONE):
             right.give(*[flat(7)] * 3)
         if why == HANGS:
-            wait_for(lambda: "right shows images again" in cameras.said, seconds=20)
+            wait_for(lambda: "right delivers images again" in cameras.said, seconds=20)
         assert cameras.said[0] == why + then
         assert (right.opened > 1) is (on_loss == "reconnect")
         assert source.alignment["right"]["missing"] > 0
@@ -292,7 +292,9 @@ def test_a_full_queue_is_emptied_and_says_so() -> None:
     source = cameras.source()
     cameras.hands[0].give(*[flat(k) for k in range(25)])
     wait_for(lambda: source.alignment["left"]["lost"] == 20, seconds=20)
-    assert cameras.said == 2 * ["left: discarded 10 images: they came faster than they were used"]
+    assert cameras.said == 2 * [
+        "left: discarded 10 images: they arrived faster than they were used"
+    ]
     cameras.close(source)
 
 

@@ -174,7 +174,7 @@ def test_a_web_camera_that_breaks_is_connected_to_anew(web_camera: str) -> None:
     options = InputOptions(size=(48, 64), rate=25)
     with open_live([web_camera], options, say=said.append) as source:
         blocks = [block for _ in range(3) for block in source.take_all(25)]
-    assert said[0] == "stream is gone: Input/output error: reconnecting"
+    assert said[0] == "stream is lost: Input/output error: reconnecting"
     assert len(blocks) >= 2
     assert source.alignment["stream"]["missing"] > 0  # type: ignore[attr-defined]
 
@@ -212,7 +212,7 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
         with open_live(words, InputOptions(range=(1, 3))) as source:
             assert source.take(0, 2).frames[1, 0].tolist() == [0, 0, 128, 255, 255]
             assert source.describe()["range_metres"] == [1, 3]
-        with pytest.raises(UsageError, match=r"say which to show, as --set input\.range"):
+        with pytest.raises(UsageError, match=r"set their range, such as --set input\.range"):
             open_live(words, InputOptions())
 
 
@@ -231,7 +231,7 @@ def test_images_and_numbers_of_a_running_robot_are_recorded_and_learned_from(
     assert run["source"]["fields"] == ["k"]
     with open_recording(tmp_path / "k" / "rec") as source:
         assert (np.diff(source.take(0, 20).frames[:, 0]) <= 3).all()
-    with pytest.raises(UsageError, match="there is no z, it has k"):
+    with pytest.raises(UsageError, match="there is no z: it has k"):
         open_live([f"{robot.address}/words"], InputOptions(fields=("z",)))
 
 
@@ -248,7 +248,7 @@ def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
 REFUSED = {
     "learn av:nothing.mkv": "av:nothing.mkv cannot be opened",
     "record rtsp://me:secret@127.0.0.1:9/x -o x": "rtsp://127.0.0.1:9/x cannot",
-    "record gym:Nothing-v0 -o x": "gym:Nothing-v0 cannot be made",
+    "record gym:Nothing-v0 -o x": "gym:Nothing-v0 cannot be created",
     f"convert {TEST} -o x": "is a live stream: cdmisfa record",
 }
 

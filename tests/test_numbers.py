@@ -58,13 +58,13 @@ def test_a_field_names_numbers(path: str, found: list[float]) -> None:
 @pytest.mark.parametrize(
     ("path", "why"),
     [
-        ("velocity", "there is no velocity, it has position, on, pose"),
-        ("pose.position.z", "there is no z, it has x, y"),
-        ("pose", "is no number but dict: name one of position"),
-        ("name", "is no number but a text"),
-        ("position[3]", "there are 3 members only"),
+        ("velocity", "there is no velocity: it has position, on, pose"),
+        ("pose.position.z", "there is no z: it has x, y"),
+        ("pose", "is not a number but dict: name one of position"),
+        ("name", "is not a number but a text"),
+        ("position[3]", "the list has 3 members"),
         ("position[0:0]", "hold 0 numbers"),
-        ("a[x]", "is no field"),
+        ("a[x]", "is not a field"),
     ],
 )
 def test_what_is_no_number_is_refused_in_words(path: str, why: str) -> None:
@@ -74,7 +74,7 @@ def test_what_is_no_number_is_refused_in_words(path: str, why: str) -> None:
 
 def test_what_is_not_finite_is_refused_or_kept_in_a_range() -> None:
     ranges = {"ranges": [0.5, float("inf"), float("nan"), 50.0, -1.0]}
-    with pytest.raises(UsageError, match=r"holds inf at place 1.* as --set input.range"):
+    with pytest.raises(UsageError, match=r"holds inf at index 1.* such as --set input.range"):
         numbers_of([Field("ranges")], ranges, None)
     kept = numbers_of([Field("ranges")], ranges, (0.1, 10.0))
     assert kept.tolist() == [0.5, 0.1, 0.1, 10.0, 0.1]
@@ -167,7 +167,7 @@ def test_fields_of_protobuf_are_found_by_their_definition(tmp_path: Path) -> Non
     fields = ["pose.position.x", "pose.orientation.w"]
     with external(path, fields=fields) as source:
         assert source.take(0, 5).frames.tolist() == [[i, -i] for i in range(5)]
-    with pytest.raises(UsageError, match="there is no pos, it has timestamp, frame_id, pose"):
+    with pytest.raises(UsageError, match="there is no pos: it has timestamp, frame_id, pose"):
         external(path, fields=["pos"])
 
 
@@ -232,7 +232,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
     [
         ({}, "set --rate in frames per second, or the column of times.* --set input.time"),
         ({"fields": ["z"], "rate": 5}, "no column z; it has s, a, word"),
-        ({"fields": ["word"], "rate": 5}, "t.csv: --field word: it is no number but a text"),
+        ({"fields": ["word"], "rate": 5}, "t.csv: --field word: it is not a number but a text"),
         ({"time": "word"}, r"word \(string\) has no times after 1970"),
         ({"time": "s:h"}, r"no column s:h; .* a unit \(s, ms, us, ns\)"),
         ({"time": "big"}, r"big \(int64\) has no times .* or in s: state the unit"),

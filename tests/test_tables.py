@@ -53,7 +53,7 @@ def test_a_word_among_numbers_is_an_error_that_names_the_line(tmp_path: Path, ce
 def test_a_column_of_words_alone_is_left_out(tmp_path: Path) -> None:
     path = written(tmp_path, {i: f"{i / 10},{i},ok" for i in range(ROWS)})
     assert taken(path) == ([[i] for i in range(ROWS)], ())
-    with pytest.raises(UsageError, match="--field b: it is no number but a text"):
+    with pytest.raises(UsageError, match="--field b: it is not a number but a text"):
         taken(path, fields=["b"])
 
 

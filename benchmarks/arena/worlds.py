@@ -14,7 +14,7 @@ from PIL import Image
 
 from benchmarks.arena.pictures import HEIGHT, WIDTH, Footage, Rng, stateless, wandering
 from cdmisfa.core.arrays import ByteArray
-from recorder.cameras.stepped import gray_picture, make_environment, play
+from recorder.cameras.stepped import gray_image, make_environment, play
 from recorder.images.pixels import shrink
 from recorder.world.icub.world import silenced
 
@@ -81,7 +81,7 @@ def _play(
 
 def _framed(image: Any) -> ByteArray:
     """Return a colour image, (height, width, 3), as a frame."""
-    return shrink(gray_picture(image), HEIGHT, WIDTH)
+    return shrink(gray_image(image), HEIGHT, WIDTH)
 
 
 def robot(rng: Rng, n: int, model: str, distance: float) -> Footage:

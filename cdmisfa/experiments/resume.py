@@ -42,13 +42,9 @@ FIXED = ("learner.algorithm", "learner.expansion", "learner.tau")
 
 @dataclass(frozen=True, slots=True)
 class ConfigSpan:
-    """Configuration and seed of a run's learner from an iteration on; each fork adds one.
+    """Configuration and seed of a run's learner from iteration `start` on; each fork adds one.
 
-    Attributes:
-        start: the iteration.
-        config: the learner's configuration.
-        seed: the seed.
-        changed: [old, new] values of the keys that differ from the previous span.
+    `changed` has the [old, new] values of the keys that differ from the previous span.
     """
 
     start: int
@@ -67,9 +63,7 @@ def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, 
         span = ConfigSpan(int(fork["at"]), config, seed, dict(fork["changed"]))
         return (*config_history(log, fork["before"]), span)
     except (LookupError, TypeError, ValueError, RecursionError) as error:
-        raise LogDamagedError(
-            f"{log} does not state the configuration of its learner: learn it again"
-        ) from error
+        raise LogDamagedError(f"{log} lacks its learner's configuration: learn it again") from error
 
 
 def fork_span(
@@ -124,8 +118,7 @@ def reconfigured(learner: Learner, span: ConfigSpan, spec: SourceSpec) -> Learne
         new.restore(LearnerState(state.arrays, state.modules, policy_rng))
     except ValueError as error:
         raise UsageError(
-            f"the settings do not fit the learned state ({error}): fork with keys that keep its "
-            "shape"
+            f"the settings do not fit the learned state ({error}): set keys that keep its shape"
         ) from error
     return new
 
@@ -177,12 +170,8 @@ class Recomputation:
     def after(cls, run: Path, iterations: int, source: Sequence[str] | SeekableSource = ()) -> Self:
         """Compute a run again up to an iteration; the learner is the same bit for bit.
 
-        The computed signals are compared with the log. The caller closes the result.
-
-        Args:
-            run: the run's folder, or its log.
-            iterations: number of iterations; 0 is the beginning.
-            source: see the class.
+        The computed signals are compared with the log. The caller closes the result. For the
+        arguments see the class; 0 iterations are the beginning.
 
         Raises:
             UsageError: the run or the iteration does not exist, or a source is needed and missing.
@@ -291,9 +280,7 @@ class Recomputation:
             if count <= 0:
                 return
             if int(columns.iterations[0]) != at:
-                raise LogDamagedError(
-                    f"{self.log}: iteration {at} is missing: look at it with cdmisfa verify"
-                )
+                raise LogDamagedError(f"{self.log}: iteration {at} is missing: see cdmisfa verify")
             yield columns.rows(0, count)
             at += count
 
@@ -354,11 +341,8 @@ def _first_element(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], s
 class Checked:
     """Result of computing the iterations [start, stop) of a run again.
 
-    Attributes:
-        start: the first iteration.
-        stop: the iteration after the last.
-        difference: the first difference from the log; None if there is none.
-        other_files: files of the source that changed since the run learned from them.
+    `difference` is the first difference from the log, `other_files` are files of the source that
+    changed since the run learned from them.
     """
 
     start: int
@@ -397,11 +381,8 @@ def check_run(
 ) -> Checked:
     """Compute the iterations [start, stop) of a run again, and compare signals and keyframes.
 
-    Args:
-        run: the run's folder, or its log.
-        source: see `Recomputation`.
-        start: learning begins at the newest keyframe at or before this iteration.
-        stop: the iteration after the last; None: the end of the log.
+    Learning begins at the newest keyframe at or before `start`, and ends at the end of the log if
+    `stop` is None. For `run` and `source` see `Recomputation`.
 
     Raises:
         UsageError: the run, its source or an iteration does not exist.
@@ -409,8 +390,7 @@ def check_run(
     """
     with Recomputation(run, start, source) as recomputation:
         first = recomputation.learner.iteration
-        keyframes = read_keyframes(recomputation.log, first)
-        at, difference = recomputation.compare(stop, keyframes)
+        at, difference = recomputation.compare(stop, read_keyframes(recomputation.log, first))
         changed = tuple(recomputation.other_files())
         if difference is None and 0 < at <= start:
             recomputation.compare(start + 1)  # raises the error of a log that ends before

@@ -21,7 +21,7 @@ from cdmisfa.modules import Module
 from recorder.cameras.words import is_live
 from recorder.config import RecordConfig
 from recorder.images.framing import Recipe
-from recorder.images.options import OF_EVERY_SOURCE, InputOptions
+from recorder.images.options import COMMON_KEYS, InputOptions
 from recorder.images.options import OPTIONS as INPUTS
 from recorder.log.files import (
     locked_folder,
@@ -157,7 +157,7 @@ def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
 
         # The frames of a recording are made already, so that most input options do not apply.
         if not may_be_corpus(words) and is_recording(words):
-            chosen, keys = {}, {name: keys[name] for name in OF_EVERY_SOURCE if name in keys}
+            chosen, keys = {}, {name: keys[name] for name in COMMON_KEYS if name in keys}
     inputs = InputOptions(**chosen).configured(keys)
     opening: Any = {name: bool(options.get(name)) for name in OPENING}
     return open_logs(words, inputs=inputs, **opening)

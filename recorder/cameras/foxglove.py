@@ -1,7 +1,7 @@
 """Images and numbers of a running robot, through the Foxglove WebSocket protocol.
 
-A client with what a camera needs: the server advertises its channels, the client subscribes to one,
-and its messages come. foxglove_bridge serves a ROS 2 robot so.
+The server advertises channels, the client subscribes to one and receives its messages.
+foxglove_bridge serves a ROS 2 robot in this way.
 """
 
 from __future__ import annotations
@@ -21,41 +21,40 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.live import Steady
 from recorder.images.messages import Decoder, MessageKind, decoder_of
 from recorder.images.options import IMAGES, RECIPE, InputOptions
-from recorder.images.pixels import Shown
+from recorder.images.pixels import Content
 from recorder.images.videos import VideoPackets
 
-# Names of the protocol, the newer first.
+# Names of the protocol, the newer one first.
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 
 _SUBSCRIPTION: Final = 1
 _DATA: Final = 1
 
-# Seconds in which the server must answer.
+# Seconds within which the server must answer.
 _TIMEOUT: Final = 10.0
 
 # Seconds to wait for a topic that the server does not have yet.
 TOPIC_SECONDS: Final = 5.0
 
-# Times to subscribe again: servers name a new channel a moment before they know it.
+# Number of further attempts to subscribe, and seconds between them: servers advertise a new channel
+# a moment before they accept a subscription.
 _TRIES: Final = 5
+_RETRY_SECONDS: Final = 0.2
 
-# Seconds before each of these times.
-_AGAIN: Final = 0.2
-
-# Header of a message: opcode, subscription, log time in nanoseconds.
+# Header of a message: opcode, subscription, log time (ns).
 HEADER: Final = struct.Struct("<BIQ")
 
-# Errors in the threads of websockets are raised here, too: it need not log them with a traceback.
+# This module raises the errors in websockets' threads itself: they need no logged traceback.
 logging.getLogger("websockets").addHandler(logging.NullHandler())
 
 
 class FoxgloveCamera:
-    """A topic of images, or of messages with fields, of a server.
+    """A topic with images, or with messages that have fields, of a Foxglove server.
 
     Args:
-        host: of the server, with its port.
-        topic: its name; "" for the only one of images.
-        name: of the stream.
+        host: host of the server, with its port.
+        topic: name of the topic; "" for the only one with images.
+        name: name of the stream.
         options: the fields to read, the range of distances, and whether to decode colours.
 
     Raises:
@@ -69,15 +68,18 @@ class FoxgloveCamera:
     def __init__(self, host: str, topic: str, name: str, options: InputOptions = IMAGES) -> None:
         self.name, self._options = name, options
         self._server, self._topic = f"ws://{host}", topic.rstrip("/")
-        self._where = f"foxglove://{host.rpartition('@')[2]}"
+        self._public_address = f"foxglove://{host.rpartition('@')[2]}"
         try:
             import websockets.sync.client as client
         except ImportError:
-            raise UsageError(f"{self._where} needs pip install 'cdmisfa[foxglove]'") from None
+            raise UsageError(
+                f"{self._public_address} needs a package that is missing: "
+                "pip install 'cdmisfa[foxglove]'"
+            ) from None
         self._client = client
 
-    def images(self) -> Iterator[tuple[int, Shown]]:
-        """See `Camera`."""
+    def images(self) -> Iterator[tuple[int, Content]]:
+        """Connect, and yield the images of the topic; see `Camera`."""
         try:
             connection = self._client.connect(
                 self._server,
@@ -87,12 +89,14 @@ class FoxgloveCamera:
                 open_timeout=_TIMEOUT,
                 proxy=None,
             )
-        except Exception as error:  # of the network, the address or the protocol
-            raise CdmisfaError(f"{self._where} does not answer: {one_line(error)}") from None
+        except Exception as error:  # various exceptions of network, address and protocol
+            raise CdmisfaError(
+                f"{self._public_address} does not answer: {one_line(error)}"
+            ) from None
         with connection:
             number, decode = self._find(connection)
-            wanted = [{"id": _SUBSCRIPTION, "channelId": number}]
-            subscribe = json.dumps({"op": "subscribe", "subscriptions": wanted})
+            subscriptions = [{"id": _SUBSCRIPTION, "channelId": number}]
+            subscribe = json.dumps({"op": "subscribe", "subscriptions": subscriptions})
             connection.send(subscribe)
             tries, steady = _TRIES, Steady()
             video = decode if isinstance(decode, VideoPackets) else None
@@ -103,7 +107,7 @@ class FoxgloveCamera:
                         return
                     if event.get("op") == "status" and event.get("level") in (1, 2) and tries:
                         tries -= 1
-                        time.sleep(_AGAIN)
+                        time.sleep(_RETRY_SECONDS)
                         connection.send(subscribe)
                     continue
                 if len(message) < HEADER.size:
@@ -115,21 +119,21 @@ class FoxgloveCamera:
                 age = steady.age(time.monotonic(), log_time / NANOSECONDS if log_time else None)
                 data = message[HEADER.size :]
                 if video is None or video.begins(data):
-                    video = None  # a video is shown from its first key frame on
+                    video = None  # a video begins with its first key frame
                     yield age, decode(data)
 
     def describe(self) -> Mapping[str, Any]:
         """Return the server and the topic."""
-        return {"camera": f"{self._where}{self._topic}"}
+        return {"camera": f"{self._public_address}{self._topic}"}
 
     def _find(self, connection: Any) -> tuple[int, Decoder]:
-        """Wait for the topic; return the number of its channel, and the decoder of its messages."""
+        """Wait for the topic; return the id of its channel, and the decoder of its messages."""
         channels: dict[str, Mapping[str, Any]] = {}
         decoders: dict[str, Decoder] = {}
         end = time.monotonic() + TOPIC_SECONDS
-        while (left := end - time.monotonic()) > 0 and (self._topic or len(decoders) < 2):
+        while (rest := end - time.monotonic()) > 0 and (self._topic or len(decoders) < 2):
             try:
-                event = _event(connection.recv(timeout=left))
+                event = _event(connection.recv(timeout=rest))
             except TimeoutError:
                 break
             for channel in event["channels"] if event.get("op") == "advertise" else ():
@@ -143,12 +147,12 @@ class FoxgloveCamera:
             if topic in channels:
                 kind = channels[topic].get("schemaName")
                 lacks = "no fields" if self._options.fields else "no images: use --field"
-                raise CdmisfaError(f"{self._where}{topic} is {kind}, with {lacks}")
-        wanted = "messages with fields" if self._options.fields else "images"
-        what = f"has no topic {self._topic}" if self._topic else "has not one such topic"
+                raise CdmisfaError(f"{self._public_address}{topic} is {kind}, with {lacks}")
+        content = "messages with fields" if self._options.fields else "images"
+        problem = f"has no topic {self._topic}" if self._topic else "does not have one such topic"
         known = ", ".join(sorted(decoders)) or "nothing"
-        remedy = f"; name one as {self._where}/TOPIC" if decoders else ""
-        raise CdmisfaError(f"{self._where} {what}: it has {wanted} on {known}{remedy}")
+        remedy = f": name one as {self._public_address}/TOPIC" if decoders else ""
+        raise CdmisfaError(f"{self._public_address} {problem}: it has {content} on {known}{remedy}")
 
 
 def _kind(channel: Mapping[str, Any]) -> MessageKind:
@@ -163,6 +167,6 @@ def _kind(channel: Mapping[str, Any]) -> MessageKind:
 
 
 def _event(message: str | bytes) -> Mapping[str, Any]:
-    """Return a text message of the server; {} for binary ones."""
+    """Return a text message of the server as a mapping; {} for a binary message."""
     event = parse_json(message) if isinstance(message, str) else {}
     return event if isinstance(event, dict) else {}

@@ -1,8 +1,8 @@
-"""Live streams on one clock: when images were taken, and which image a stream shows at each tick.
+"""`LiveSource`: live streams on one clock, with the times at which images were taken.
 
-At a tick a stream shows its last image at or before it, as `--align time` does for logs. After
-`hold` seconds an image is no longer shown: the stream has a gap. An image keeps its time: if it
-comes when the ticks at and after its time are decided, it is late, and changes none of them.
+At a tick a stream has its last image at or before it, as `--align time` does for logs. An image
+older than `hold` seconds is not used: the stream then has a gap. An image keeps its time: if it
+arrives after the ticks at and after its time were decided, it is late and changes none of them.
 """
 
 from __future__ import annotations
@@ -18,40 +18,41 @@ from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request,
 from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.cameras.readers import CameraState, Readers, Stamped
-from recorder.images.pixels import Shown
+from recorder.images.pixels import Content
 
-# Seconds for which a tick waits for an image that is on its way.
-PATIENCE: Final = 0.2
+# Seconds that a tick waits for images that can still arrive. Longer waits delay all streams,
+# shorter ones make images late.
+TICK_WAIT: Final = 0.2
 
-# Seconds in which every camera must show its first image.
+# Seconds within which every camera must deliver its first image.
 START: Final = 30.0
 
-# Counts of each stream: images that came; ticks that show the image of the tick before; images
-# that no tick shows, as a newer one had come; images that came after a tick was decided which
-# should have shown them; images no newer than one before them, which are not shown; ticks without
-# an image.
+# Counters of each stream: images that arrived; ticks that use the image of the previous tick;
+# images that no tick uses, because a newer one had arrived; images that arrived after a tick was
+# decided that should have used them; images that are not newer than an earlier one, and are not
+# used; ticks without an image.
 COUNTED: Final = ("messages", "repeated", "dropped", "late", "disordered", "missing")
 
-# Seconds a second by which a camera's clock may be slow.
+# Drift of a camera's clock that is followed, in seconds a second; crystals drift by 1e-4 at most.
 DRIFT: Final = 1e-3
 
-# Seconds by which presentation times differ from those due if they start again.
+# Seconds by which presentation times must jump to count as restarted.
 JUMP: Final = 1.0
 
-# Images in a row that are later than `JUMP` before presentation times count as started again.
+# Number of consecutive images later than `JUMP` after which presentation times count as restarted.
 LATE: Final = 60
 
 _POLL: Final = NANOSECONDS // 10
 
-# Images by which a camera's rate is measured if the camera does not state it.
+# Images from which the rate of a camera is measured if it does not state one.
 _MEASURED: Final = 12
 
 
 class Steady:
-    """Estimates when images were taken by their presentation times, which have no network jitter.
+    """Estimator of when images were taken, by their presentation times, without network jitter.
 
-    The image with the least delay so far sets the offset between the two clocks. The least delay
-    is forgotten slowly, as clocks drift.
+    The image with the smallest delay so far sets the offset between both clocks. The smallest delay
+    is increased slowly, because clocks drift.
     """
 
     def __init__(self) -> None:
@@ -60,11 +61,11 @@ class Steady:
         self._late = 0
 
     def age(self, now: float, presented: float | None) -> int:
-        """Return how many nanoseconds ago an image that comes now was taken.
+        """Return how long ago an image that arrives now was taken (ns).
 
         Args:
-            now: seconds of a monotonic clock.
-            presented: the image's own time in seconds; None if it has none.
+            now: time of a monotonic clock (s).
+            presented: presentation time of the image (s); None if it has none.
         """
         if presented is None:
             return 0
@@ -78,11 +79,11 @@ class Steady:
 
 
 class _Stream:
-    """The images of one stream, and the last one shown.
+    """The images of one stream, and the image used last.
 
     Attributes:
         counts: see `COUNTED`.
-        newest: time of the newest image, -1 before the first.
+        newest: time of the newest image (ns); -1 before the first.
     """
 
     def __init__(self, state: CameraState) -> None:
@@ -103,8 +104,8 @@ class _Stream:
         self.newest = stamped.time_ns
         self._coming.append(stamped)
 
-    def show(self, tick: int, hold: int) -> Shown | None:
-        """Return the image at a tick, None for a gap; both in nanoseconds."""
+    def image_at(self, tick: int, hold: int) -> Content | None:
+        """Return the image at a tick (ns), or None if it is older than `hold` (ns)."""
         while self._coming and self._coming[0].time_ns <= tick:
             self.counts["dropped"] += not self._used
             self._last, self._used = self._coming.popleft(), False
@@ -117,24 +118,25 @@ class _Stream:
 
 
 class LiveSource(ForwardSource):
-    """Cameras as a source of frames, with gaps if a stream has no image.
+    """Cameras as a source of frames, with gaps while a stream has no image.
 
-    The source cannot go back: record its frames to have them again. `take_all` returns a block for
-    each unbroken stretch of a stream, and none for a stream without images. The source ends with
-    the first stream that ends.
+    The source cannot go back: record it to have its frames again. `take_all` returns a block for
+    each stretch of a stream without a gap, and none for a stream without images. The source ends
+    with the first stream that ends.
 
     Args:
-        readers: of the cameras, whose images have one size; closed with the source.
-        names: of the streams.
-        about: what identifies the cameras.
-        rate: ticks a second; by default the first camera's rate, stated or measured.
-        hold: seconds for which an image replaces missing ones.
+        readers: readers of the cameras, whose images have one size; they are closed with the
+            source.
+        names: names of the streams.
+        about: identity of the cameras.
+        rate: ticks a second; None: rate of the first camera, stated or measured.
+        hold: time for which an image replaces missing ones (s).
 
     Attributes:
-        stop: called while waiting; true ends the wait as if the cameras had ended.
+        stop: called while waiting; True ends the wait as if the cameras had ended.
 
     Raises:
-        UsageError: a camera shows nothing, or states no rate.
+        UsageError: a camera delivers no image, or has no rate.
     """
 
     gaps = True
@@ -153,16 +155,16 @@ class LiveSource(ForwardSource):
         self._hold = round(hold * NANOSECONDS)
         self._streams = [_Stream(state) for state in readers.states]
         self._tick, self._decided = 0, -1
-        self._ahead: deque[list[Shown | None]] = deque()
+        self._ahead: deque[list[Content | None]] = deque()
         self._ends: int | None = None
-        self._why = ""
+        self._end_reason = ""
         try:
             firsts = self._first_images(names, measure=rate is None)
             fps = rate or readers.states[0].camera.rate or _measured_rate(firsts[0])
         except BaseException:
             readers.close()
             raise
-        # Half a tick later, so that a camera at the rate of the clock may jitter by as much.
+        # Half a tick later, so that a camera with the rate of the clock can jitter by as much.
         start = max(images[0].time_ns for images in firsts) + round(NANOSECONDS / fps / 2)
         image = firsts[0][0].image
         self._spec = SourceSpec(tuple(names), image.shape, str(image.dtype), (), fps, start)
@@ -174,7 +176,7 @@ class LiveSource(ForwardSource):
 
     @property
     def alignment(self) -> dict[str, dict[str, int]]:
-        """The counts of each stream so far: `COUNTED`, and the images that its queue lost."""
+        """The counters of each stream, see `COUNTED`, and the images that its queue lost."""
         streams = zip(self._spec.streams, self._streams, strict=True)
         return {name: {**stream.counts, "lost": stream.state.lost} for name, stream in streams}
 
@@ -182,7 +184,7 @@ class LiveSource(ForwardSource):
         """Return the frames of all streams at the next n ticks, a block for each stretch.
 
         Raises:
-            LogExhaustedError: a camera ended before; t stays.
+            LogExhaustedError: a camera ended before; t does not move.
             ValueError: n < 1.
         """
         check_request(self._spec, 0, n)
@@ -191,8 +193,8 @@ class LiveSource(ForwardSource):
         rows = [self._ahead.popleft() for _ in range(n)]
         blocks: list[Block] = []
         for stream, column in enumerate(zip(*rows, strict=True)):
-            shown = enumerate(column, self._t)
-            for is_gap, stretch in groupby(shown, lambda tick: tick[1] is None):
+            images_at = enumerate(column, self._t)
+            for is_gap, stretch in groupby(images_at, lambda tick: tick[1] is None):
                 if not is_gap:
                     ticks, images = zip(*stretch, strict=True)
                     empty = freeze(np.empty((len(images), 0)))
@@ -201,44 +203,44 @@ class LiveSource(ForwardSource):
         return tuple(blocks)
 
     def describe(self) -> Mapping[str, Any]:
-        """Return what identifies the cameras, and how their images became frames."""
+        """Return the identity of the cameras, and how their images become frames."""
         return {"kind": "cameras", **self._about}
 
     def close(self) -> None:
         """Close the cameras."""
         self._readers.close()
 
-    def _next_tick(self) -> list[Shown | None]:
-        """Wait for the next tick and return the image of every stream."""
+    def _next_tick(self) -> list[Content | None]:
+        """Wait for the next tick, and return the image of every stream."""
         tick = time_of(self._tick, self._spec.fps, self._spec.start_ns)
-        deadline = tick + round(PATIENCE * NANOSECONDS)
+        deadline = tick + round(TICK_WAIT * NANOSECONDS)
         while True:
-            now = self._readers.now()  # before the queues, so that all images until then are seen
+            now = self._readers.now()  # before reading the queues, so that no image is missed
             waiting = [self._take_images(stream, tick) for stream in self._streams]
             if self._ends is not None and tick > self._ends:
-                raise LogExhaustedError(self._why)
+                raise LogExhaustedError(self._end_reason)
             if not any(waiting) or now >= deadline:
                 self._tick, self._decided = self._tick + 1, tick
-                return [stream.show(tick, self._hold) for stream in self._streams]
+                return [stream.image_at(tick, self._hold) for stream in self._streams]
             if self.stop():
                 raise LogExhaustedError(f"stopped while waiting for frame {self._tick}")
             self._readers.wait(min(deadline, now + _POLL))
 
     def _take_images(self, stream: _Stream, tick: int) -> bool:
-        """Take a stream's images from its queue; return whether one for the tick may still come."""
+        """Take images from a stream's queue; return True if one for the tick can still arrive."""
         while stream.newest <= tick:
-            why = stream.state.over  # before the queue, as above
+            reason = stream.state.over  # before reading the queue, as above
             stamped = self._readers.take(stream.state)
             if stamped is None:
-                if why and self._ends is None:
+                if reason and self._ends is None:
                     step = round(NANOSECONDS / self._spec.fps)
-                    self._ends, self._why = stream.newest + step, why
-                return not why
+                    self._ends, self._end_reason = stream.newest + step, reason
+                return not reason
             stream.put(stamped, self._decided)
         return False
 
     def _first_images(self, names: Sequence[str], *, measure: bool) -> list[list[Stamped]]:
-        """Wait for the first image of each stream, and for those that measure the first's rate."""
+        """Wait for the first image of each stream, and for those that measure the rate."""
         readers = self._readers
         images: list[list[Stamped]] = [[] for _ in names]
         deadline = readers.now() + round(START * NANOSECONDS)
@@ -246,14 +248,16 @@ class LiveSource(ForwardSource):
             now = readers.now()
             missing = []
             for name, state, stamps in zip(names, readers.states, images, strict=True):
-                why = state.over
+                reason = state.over
                 measured = measure and stamps is images[0] and not state.camera.rate
-                wanted = _MEASURED if measured else 1
-                while len(stamps) < wanted and (stamped := readers.take(state)):
+                needed = _MEASURED if measured else 1
+                while len(stamps) < needed and (stamped := readers.take(state)):
                     stamps.append(stamped)
-                if not stamps and (why or now >= deadline):
-                    raise UsageError(why or f"{name} shows no image: check the camera and its name")
-                if not why and len(stamps) < wanted:
+                if not stamps and (reason or now >= deadline):
+                    raise UsageError(
+                        reason or f"{name} delivers no image: check the camera and its name"
+                    )
+                if not reason and len(stamps) < needed:
                     missing.append(name)
             if not missing or now >= deadline:
                 return images
@@ -261,7 +265,7 @@ class LiveSource(ForwardSource):
 
 
 def _measured_rate(images: Sequence[Stamped]) -> float:
-    """Return images a second, by the median of the steps between them, with three digits."""
+    """Return the rate of images (1/s) from the median of their intervals, with three digits."""
     steps = np.diff([stamped.time_ns for stamped in images])
     if not len(steps) or np.median(steps) <= 0:
         raise UsageError("the first camera states no rate: set one with --rate")

@@ -1,4 +1,4 @@
-"""Read cameras, each in a thread of its own, and recover those that are lost."""
+"""Read cameras, each in a thread of its own, and reconnect to lost ones."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from recorder.images.framing import Framing, framings, size_of
 from recorder.images.options import Fit, OnLoss, Size
-from recorder.images.pixels import Shown
+from recorder.images.pixels import Content
 
-# Most bytes of images in the queue of one camera.
+# Largest total size of the images in the queue of one camera (bytes).
 QUEUE_BYTES: Final = 64 * 1024 * 1024
 
-# Seconds from a loss to the first try to reconnect, and the longest time between two tries.
+# Seconds from a loss to the first attempt to reconnect, and longest time between two attempts.
 _DELAYS: Final = (0.5, 30.0)
 
-# Seconds for which closing waits for the threads; they are daemons, and end with the process.
-_LEAVE: Final = 0.5
+# Seconds that closing waits for the threads; they are daemons, and end with the process.
+_CLOSE_WAIT: Final = 0.5
 
 
 class Stamped(NamedTuple):
-    """An image of a camera, and the time when it was taken or came, by the clock of all cameras."""
+    """Image of a camera, and the time when it was taken or arrived, by the clock of all cameras."""
 
     time_ns: int
-    image: Shown
+    image: Content
 
 
 class Camera(Protocol):
-    """A stream of images from outside, opened and read in a thread of its own.
+    """Interface of a stream of images that is opened and read in a thread of its own.
 
     Attributes:
-        name: of its stream.
-        finite: whether its end is an end, and not a loss to recover from.
+        name: name of the stream.
+        finite: True if the camera can end, False if its end is a loss to recover from.
         rate: images a second that it states; None if it states none, or is not open yet.
     """
 
@@ -46,36 +46,36 @@ class Camera(Protocol):
 
     @property
     def rate(self) -> float | None:
-        """See above."""
+        """Images a second that the camera states, or None."""
 
-    def images(self) -> Iterator[tuple[int, Shown]]:
-        """Open the camera and yield its images as they come, until it ends.
+    def images(self) -> Iterator[tuple[int, Content]]:
+        """Open the camera, and yield its images as they arrive, until it ends.
 
         Yields:
-            How many nanoseconds ago the image was taken, 0 if only its coming is known; and the
-            image at its own size, gray, (height, width) uint8, or in colours, (height, width, 3)
-            uint8; or numbers, (I,) float64, finite and as many each time.
+            The age of the image (ns), 0 if only its arrival is known, and the image in its own
+            size: gray (height, width) uint8, colour (height, width, 3) uint8, or finite numbers
+            (I,) float64, equally many each time.
 
         Raises:
-            Exception: the camera cannot be opened, or is gone.
+            Exception: the camera cannot be opened, or is lost.
         """
 
     def describe(self) -> Mapping[str, Any]:
-        """Return what identifies the camera, as JSON values, without secrets."""
+        """Return the identity of the camera as JSON values, without secrets."""
 
 
 class CameraFrames:
-    """Turns the images of several cameras into frames, all of one size.
+    """Converter of the images of several cameras to frames of one size.
 
-    The default size is the `default_size` of the first camera's first image; earlier images of
-    other cameras are skipped.
+    The default size is the `default_size` for the first image of the first camera; earlier images
+    of other cameras are skipped.
 
     Args:
-        names: of the cameras.
+        names: names of the cameras.
         size: (height, width) of a frame, or None.
         fit: see `fitted`.
-        color: show red, green and blue beside one another.
-        say: receives a line about what is cut or added, and about images that change their size.
+        color: True to show the red, green and blue images side by side.
+        say: called with a line about cropping or padding, and about images that change their size.
     """
 
     def __init__(
@@ -89,15 +89,15 @@ class CameraFrames:
     ) -> None:
         self._names, self._say = names, say
         self._size, self._fit, self._color = size, fit, color
-        self._first: Shown | None = None
+        self._first: Content | None = None
         self._framings: dict[int, Framing] = {}
         self._changed: set[int] = set()
 
-    def frame(self, camera: int, image: Shown) -> Shown | None:
-        """Turn an image into a frame; return None while the size of frames is unknown.
+    def frame(self, camera: int, image: Content) -> Content | None:
+        """Convert an image to a frame; return None while the size of frames is unknown.
 
         Raises:
-            UsageError: the image is smaller than a frame, or has other numbers than the first.
+            UsageError: the image is smaller than a frame, or the number of values changed.
         """
         name = self._names[camera]
         if camera not in self._framings:
@@ -123,20 +123,21 @@ class CameraFrames:
 
 @dataclass(eq=False)
 class CameraState:
-    """The state of a camera that is being read.
+    """State of a camera that is being read.
 
     Attributes:
-        number: of the camera.
-        last_ns: time of its last image, or of the start of reading.
+        number: index of the camera.
+        camera: the camera.
+        last_ns: time of its last image, or of the start of reading (ns).
         connection: number of the thread that reads the camera: a thread that hangs is abandoned,
-            and may still return.
-        queue: images that nobody took yet.
-        bytes: of the queue.
+            and can still return later.
+        queue: images that were not taken yet.
+        bytes: total size of the queue.
         lost: number of images that were discarded because the queue was full.
-        over: why no more images come; "" while they may.
-        silent: whether its silence has been reported.
-        started: whether any image ever came.
-        away: whether it is not being read: it is gone, or its next connection is not due yet.
+        over: reason for which no more images arrive; "" while they can.
+        silent: True if its silence was reported.
+        started: True if an image has arrived.
+        away: True while the camera is not read, until it is reconnected.
     """
 
     number: int
@@ -153,28 +154,28 @@ class CameraState:
 
 
 class Readers:
-    """Reads cameras, each in a thread, and queues their images until they are taken.
+    """Readers of several cameras; each reads in a thread and queues images until they are taken.
 
-    A full queue is emptied, so that the loss is one gap and not every other image. A camera that
-    never showed an image ends with its error. One that stalls or goes away later is waited for,
-    reconnected with growing delays, or ended, as `on_loss` says.
+    A full queue is emptied, so that the loss is one gap and not every second image. A camera that
+    never delivered an image ends with its error. One that stalls or is lost later is waited for,
+    reconnected with growing delays, or ended, according to `on_loss`.
 
     Args:
-        cameras: opened in their threads.
-        frame: turns an image of the camera with this number into a frame; None skips the image.
-        on_loss: see above.
-        stall: seconds without an image after which a camera has stalled.
-        queue_bytes: most bytes in the queue of one camera.
-        say: receives a line for every change of a camera's state.
+        cameras: cameras, which are opened in their threads.
+        frame: converts an image of the camera with a number to a frame; None skips the image.
+        on_loss: "reconnect", "wait" or "end".
+        stall: time without an image after which a camera has stalled (s).
+        queue_bytes: largest total size of the queue of one camera.
+        say: called with a line for every change of a camera's state.
 
     Attributes:
-        states: of the cameras, in their order.
+        states: states of the cameras, in their order.
     """
 
     def __init__(
         self,
         cameras: Sequence[Camera],
-        frame: Callable[[int, Shown], Shown | None] = lambda camera, image: image,
+        frame: Callable[[int, Content], Content | None] = lambda camera, image: image,
         *,
         on_loss: OnLoss = "reconnect",
         stall: float = 5.0,
@@ -183,7 +184,7 @@ class Readers:
     ) -> None:
         self._frame, self._on_loss, self._say = frame, on_loss, say
         self._stall, self._limit = round(stall * NANOSECONDS), queue_bytes
-        # Time never goes back while cameras are read, even if somebody sets the wall clock.
+        # Monotonic time plus a constant offset: it never goes back if the wall clock is set.
         self._offset = time.time_ns() - time.monotonic_ns()
         self._lock = threading.Lock()
         self._news, self._closed = threading.Event(), threading.Event()
@@ -191,11 +192,11 @@ class Readers:
         self._threads = [self._connect(state) for state in self.states]
 
     def now(self) -> int:
-        """Return the time since 1970 in nanoseconds."""
+        """Return the time since 1970 (ns)."""
         return time.monotonic_ns() + self._offset
 
     def take(self, state: CameraState) -> Stamped | None:
-        """Remove and return the oldest image in the queue of a camera; None if it is empty."""
+        """Remove and return the oldest image in a camera's queue; None if the queue is empty."""
         with self._lock:
             if not state.queue:
                 return None
@@ -204,7 +205,7 @@ class Readers:
             return stamped
 
     def wait(self, until: int) -> None:
-        """Return when an image came in since the last wait, or at a time."""
+        """Wait until an image arrives or the time `until` (ns) is reached."""
         for state in self.states:
             read = state.started and not state.away and not state.over
             if read and self.now() - state.last_ns > self._stall:
@@ -215,7 +216,7 @@ class Readers:
     def close(self) -> None:
         """Stop reading; a camera that hangs is abandoned."""
         self._closed.set()
-        end = time.monotonic() + _LEAVE
+        end = time.monotonic() + _CLOSE_WAIT
         for thread in self._threads:
             thread.join(max(end - time.monotonic(), 0))
 
@@ -226,7 +227,7 @@ class Readers:
         return thread
 
     def _read(self, state: CameraState, connection: int) -> None:
-        """Read a camera until it is over; reconnect to it if that is asked for."""
+        """Read a camera until it is over; reconnect to it if `on_loss` says so."""
         shortest, longest = _DELAYS
         delay, name = shortest, state.camera.name
         while self._is_current(state, connection):
@@ -240,11 +241,11 @@ class Readers:
                     if not self._put(state, connection, Stamped(taken, frame)):
                         return
                     received, delay = True, shortest
-                why = f"{name} ended{'' if state.started else ' before an image of it came'}"
+                reason = f"{name} ended{'' if state.started else ' before an image of it arrived'}"
             except CdmisfaError as error:
-                why = str(error)
-            except Exception as error:  # whatever the library of the camera raises
-                why = f"{name} is gone: {one_line(error)}"
+                reason = str(error)
+            except Exception as error:  # libraries of cameras raise various exceptions
+                reason = f"{name} is lost: {one_line(error)}"
             if not self._is_current(state, connection):
                 return
             state.away = True
@@ -252,14 +253,14 @@ class Readers:
             alone = all(other.away or other.over for other in self.states)
             ends = state.camera.finite or self._on_loss == "end" or (waits and alone)
             if ends or not state.started:
-                state.over = why
+                state.over = reason
                 self._news.set()
                 return
             if waits:
-                self._say(f"{why}: the other cameras continue without it")
+                self._say(f"{reason}: the other cameras continue without it")
                 return
             if received or delay == shortest:
-                self._say(f"{why}: reconnecting")
+                self._say(f"{reason}: reconnecting")
             self._closed.wait(delay)
             state.away, state.last_ns = False, self.now()
             delay = min(2 * delay, longest)
@@ -278,26 +279,28 @@ class Readers:
                 state.lost += count
                 state.queue.clear()
                 state.bytes = 0
-                self._say(f"{name}: discarded {count} images: they came faster than they were used")
+                self._say(
+                    f"{name}: discarded {count} images: they arrived faster than they were used"
+                )
             state.queue.append(stamped)
             state.bytes += size
-            back = state.silent
+            resumed = state.silent
             state.last_ns, state.silent, state.started = self.now(), False, True
         self._news.set()
-        if back:
-            self._say(f"{name} shows images again")
+        if resumed:
+            self._say(f"{name} delivers images again")
         return True
 
     def _handle_stall(self, state: CameraState) -> None:
         reported, state.silent = state.silent, True
-        why = f"{state.camera.name}: no image for {self._stall / NANOSECONDS:g} s"
+        reason = f"{state.camera.name}: no image for {self._stall / NANOSECONDS:g} s"
         if self._on_loss == "end":
-            state.over = why
+            state.over = reason
             self._news.set()
         elif not reported:
-            self._say(f"{why}: {'waiting' if self._on_loss == 'wait' else 'reconnecting'}")
+            self._say(f"{reason}: {'waiting' if self._on_loss == 'wait' else 'reconnecting'}")
         if self._on_loss == "reconnect":
             with self._lock:
-                state.connection += 1  # abandons the thread that hangs
+                state.connection += 1  # abandons the thread, which hangs
                 state.last_ns = self.now()
             self._threads[state.number] = self._connect(state)

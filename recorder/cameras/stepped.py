@@ -1,6 +1,6 @@
-"""Streams that wait for their reader: arrays of the caller, and environments of Gymnasium.
+"""Sources that advance only when they are read: arrays of the caller, and Gymnasium environments.
 
-They are iterators of frames, which take a step together.
+Their streams are iterators of frames that advance together.
 """
 
 from __future__ import annotations
@@ -23,26 +23,27 @@ from cdmisfa.core.names import ACTION, BEGINS
 from recorder.images.framing import framings
 from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
 
+# Largest seed that Gymnasium's spaces accept on every system.
 LARGEST_SEED: Final = 2**31 - 1
 
-# Frames a second of an environment that states no rate.
-FPS: Final = 30.0
+# Frames a second of an environment that does not state a rate.
+DEFAULT_FPS: Final = 30.0
 
-# The frame of each stream, and the ground truth at it, (D,) float64.
+# The frame of each stream, and the ground truth (D,) float64.
 Step = tuple[Sequence[Any], FloatArray]
 
-# Chooses the action for an observation.
+# Returns the action for an observation.
 Policy = Callable[[Any], Any]
 
 
 class SteppedSource(ForwardSource):
-    """A source of streams that are iterators, on one clock; it ends with the first of them.
+    """Base of sources whose streams are iterators on one clock; it ends with the first of them.
 
-    The source cannot go back. Derived classes add `describe`.
+    The source cannot go back. Derived classes define `describe`.
 
     Args:
-        spec: of the source.
-        steps: the frames, step by step.
+        spec: properties of the source.
+        steps: frames and truth of all streams, step by step.
     """
 
     def __init__(self, spec: SourceSpec, steps: Iterator[Step]) -> None:
@@ -50,12 +51,12 @@ class SteppedSource(ForwardSource):
         self._ahead: list[Step] = []
 
     def take_all(self, n: int) -> tuple[Block, ...]:
-        """See `FrameSource`."""
+        """Return the next n frames of every stream; see `FrameSource`."""
         check_request(self._spec, 0, n)
         self._ahead += islice(self._steps, max(n - len(self._ahead), 0))
         if len(self._ahead) < n:
             raise LogExhaustedError(
-                f"{len(self._ahead)} frames are left at frame {self._t}, {n} are needed"
+                f"{len(self._ahead)} frames are left at frame {self._t}, but {n} are needed"
             )
         steps, self._ahead = self._ahead[:n], self._ahead[n:]
         truth = freeze(np.stack([values for _, values in steps]))
@@ -88,7 +89,7 @@ class ArraySource(SteppedSource):
     ) -> None:
         if not isinstance(streams, Mapping) or not streams:
             raise UsageError(
-                f"streams of {type(streams).__name__} given, or none: name each, as "
+                f"streams are {type(streams).__name__}, or none: give names, as in "
                 '{"left": frames}, with an array (n, height, width) of uint8 or (n, I) of float64, '
                 "or an iterable of such frames"
             )
@@ -99,24 +100,24 @@ class ArraySource(SteppedSource):
         shape, dtype = first[0].shape, str(first[0].dtype)
         spec = SourceSpec(tuple(streams), shape, dtype, (), fps, start_ns, length)
         steps = _checked(spec, chain([first], rows))
-        super().__init__(spec, chain([next(steps)], steps))  # rejects the first frames at once
+        super().__init__(spec, chain([next(steps)], steps))  # checks the first frames at once
 
     def describe(self) -> Mapping[str, Any]:
-        """Return the kind of source, and its streams."""
+        """Return the kind of the source, and the names of its streams."""
         return {"kind": "arrays", "streams": list(self._spec.streams)}
 
 
 def _checked(spec: SourceSpec, rows: Iterable[Sequence[NDArray[Any]]]) -> Iterator[Step]:
-    """Yield the frames of all streams, of one size and type, and of finite numbers."""
+    """Check frames of all streams for shape, type and finite values, and yield them."""
     for t, row in enumerate(rows):
         for name, frame in zip(spec.streams, row, strict=True):
             alike = frame.shape == spec.frame_shape and str(frame.dtype) == spec.dtype
             plain = (spec.dtype, frame.ndim) in (("uint8", 2), ("float64", 1))
             if not alike or not plain or not np.isfinite(frame).all():
                 raise UsageError(
-                    f"{name} shows {frame.dtype} of shape {frame.shape} at frame {t}, counted from "
-                    "0: give frames (height, width) of uint8 or (I,) of finite float64, of one "
-                    "size and type for all streams"
+                    f"frame {t} of {name} is {frame.dtype} {frame.shape}: give frames (height, "
+                    "width) of uint8 or (I,) of finite float64, with one shape and type for all "
+                    "streams"
                 )
         yield row, np.empty(0)
 
@@ -161,15 +162,15 @@ class GymSource(SteppedSource):
         ]
         tasks = [str(getattr(e.spec, "id", e)) for e in environments]
         names = tuple(names or tasks)
-        fps = float(fps or environments[0].metadata.get("render_fps") or FPS)
+        fps = float(fps or environments[0].metadata.get("render_fps") or DEFAULT_FPS)
         steps = self._played(seed, hold, policy, color=color)
         first = next(steps)
-        made = framings(first[0], size, fit, color=color)
+        chosen = framings(first[0], size, fit, color=color)
         frames = (
-            ([f.frame(image) for f, image in zip(made, images, strict=True)], values)
+            ([f.frame(image) for f, image in zip(chosen, images, strict=True)], values)
             for images, values in chain([first], steps)
         )
-        spec = SourceSpec(names, made[0].shape, "uint8", self._truth(names), fps, START_NS)
+        spec = SourceSpec(names, chosen[0].shape, "uint8", self._truth(names), fps, START_NS)
         super().__init__(spec, frames)
         self._about = {
             "kind": "gym",
@@ -184,7 +185,7 @@ class GymSource(SteppedSource):
         }
 
     def _truth(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Name the columns of truth: all observations, then all actions, then all beginnings."""
+        """Return names of the columns of truth: observations, actions, and beginnings."""
         plain = [re.sub(r"[^0-9A-Za-z]", "_", name) for name in names]
         named = list(zip(plain, self._environments, strict=True))
         observed = [f"{n}_{i}" for n, e in named for i in range(_count(e.observation_space))]
@@ -194,24 +195,26 @@ class GymSource(SteppedSource):
     def _played(
         self, seed: int, hold: int, policy: Policy | None, *, color: bool
     ) -> Iterator[Step]:
-        """Step all environments together, and render each."""
+        """Step all environments together, and render them."""
         environments = self._environments
         generators = [np.random.default_rng([seed, i]) for i in range(len(environments))]
         played = [
             play(e, rng, hold, policy) for e, rng in zip(environments, generators, strict=True)
         ]
         for step in zip(*played, strict=True):
-            seen, actions, begins = zip(*step, strict=True)
-            spaces = [(e.observation_space, o) for e, o in zip(environments, seen, strict=True)]
+            observations, actions, begins = zip(*step, strict=True)
+            spaces = [
+                (e.observation_space, o) for e, o in zip(environments, observations, strict=True)
+            ]
             spaces += [(e.action_space, a) for e, a in zip(environments, actions, strict=True)]
             numbers = [np.ravel(values) for space, values in spaces if _count(space)]
             images = [np.asarray(e.render()) for e in environments]
             if not color:
-                images = [gray_picture(image) for image in images]
+                images = [gray_image(image) for image in images]
             yield images, np.concatenate([*numbers, begins]).astype(np.float64)
 
     def describe(self) -> Mapping[str, Any]:
-        """Return the environments, their seed, and how they were played."""
+        """Return the environments, their seed, and how actions were chosen."""
         return self._about
 
     def close(self) -> None:
@@ -223,58 +226,58 @@ class GymSource(SteppedSource):
 def play(
     environment: Any, rng: np.random.Generator, hold: int, policy: Policy | None = None
 ) -> Iterator[tuple[Any, Any, bool]]:
-    """Yield the observations of an environment, step by step, for ever.
+    """Yield the observations of an environment, step by step, without end.
 
     Args:
-        environment: reset here.
-        rng: generates its seed, and that of random actions.
-        hold: steps for which an action is kept.
-        policy: chooses the action for an observation; by default actions are random.
+        environment: the environment, which is reset first.
+        rng: generator of its seed, and of the seed of random actions.
+        hold: number of steps for which an action is repeated.
+        policy: returns the action for an observation; None: random actions.
 
     Yields:
         An observation, the action for it, and whether an episode begins with it.
     """
-    seen, _ = environment.reset(seed=int(rng.integers(LARGEST_SEED)))
+    observation, _ = environment.reset(seed=int(rng.integers(LARGEST_SEED)))
     environment.action_space.seed(int(rng.integers(LARGEST_SEED)))
     begins = True
     for t in count():
         if t % hold == 0:
-            action = environment.action_space.sample() if policy is None else policy(seen)
+            action = environment.action_space.sample() if policy is None else policy(observation)
         if t:
-            yield seen, action, begins
+            yield observation, action, begins
             begins = False
-        seen, _, ended, cut, _ = environment.step(action)
+        observation, _, ended, cut, _ = environment.step(action)
         if ended or cut:
-            seen, _ = environment.reset()
+            observation, _ = environment.reset()
             begins = True
 
 
 def make_environment(task: str, **options: Any) -> Any:
-    """Make an environment of Gymnasium that renders.
+    """Return a Gymnasium environment that renders.
 
     Args:
-        task: its id.
-        options: its own.
+        task: id of the environment.
+        options: arguments of the environment.
 
     Raises:
-        UsageError: Gymnasium is missing, or there is no such environment.
+        UsageError: Gymnasium is missing, or the environment does not exist.
     """
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs no screen
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # so that pygame needs no screen
     try:
         import gymnasium
 
         return gymnasium.make(task, render_mode="rgb_array", **options)
-    except Exception as error:  # whatever an environment raises
+    except Exception as error:  # environments raise various exceptions
         remedy = ": pip install 'cdmisfa[gym]'" if isinstance(error, ImportError) else ""
-        raise UsageError(f"gym:{task} cannot be made: {one_line(error)}{remedy}") from None
+        raise UsageError(f"gym:{task} cannot be created: {one_line(error)}{remedy}") from None
 
 
-def gray_picture(seen: Any) -> ByteArray:
+def gray_image(image: Any) -> ByteArray:
     """Convert a colour image, (height, width, 3), to gray, (height, width) uint8."""
-    return np.asarray(Image.fromarray(seen).convert("L"))
+    return np.asarray(Image.fromarray(image).convert("L"))
 
 
 def _count(space: Any) -> int:
-    """Return how many numbers a value of a space has; 0 for an image, and for no array."""
+    """Return the number of values of a space; 0 for images, and for spaces that are not arrays."""
     shape = getattr(space, "shape", None)
     return int(np.prod(shape)) if shape is not None and len(shape) < 2 else 0

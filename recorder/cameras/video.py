@@ -1,4 +1,4 @@
-"""Whatever PyAV opens as a camera: devices, network streams, videos, FFmpeg's test images."""
+"""`VideoCamera`: devices, network streams, videos and FFmpeg's test images, opened by PyAV."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from recorder.images.options import VIDEO_RECIPE
 from recorder.images.pixels import MAX_PIXELS
 from recorder.images.videos import frame_colors, frame_gray, most_pixels, pyav
 
-# Seconds that opening or reading a network stream may take.
+# Seconds that opening or reading a network stream can take.
 TIMEOUT: Final = 10.0
 
-# Pixels by which FFmpeg makes an image wider and higher at most before it checks its size.
+# Largest number of pixels by which FFmpeg pads width and height before it checks the size.
 PADDED: Final = 64
 
-# FFmpeg's flag of formats without times (AVFMT_NOTIMESTAMPS): it invents some, at 25 Hz.
+# FFmpeg's flag AVFMT_NOTIMESTAMPS of formats without times, for which it invents times at 25 Hz.
 _TIMELESS: Final = 0x80
 
 _NETWORK: Final = re.compile(r"[a-z][a-z0-9+]+://", re.IGNORECASE)
@@ -32,17 +32,17 @@ _SECRET: Final = re.compile(r"(?<=://)[^/@]*@")
 class VideoCamera:
     """A device, a network stream or a file that PyAV opens.
 
-    Images come no earlier than their presentation times say, so that a file plays at its own pace.
-    A network stream of a format without times, as MJPEG of a web camera, states no rate, and its
-    images count as taken when they come.
+    Images are delivered no earlier than their presentation times, so that a file plays at its own
+    speed. A network stream in a format without times, such as MJPEG, states no rate, and its images
+    count as taken when they arrive.
 
     Args:
         word: `camera:DEVICE`, `av:FORMAT:ADDRESS`, `av:ADDRESS`, or a URL.
-        name: of the stream.
-        color: decode colours.
+        name: name of the stream.
+        color: True to decode colours.
 
     Raises:
-        UsageError: PyAV is missing, or there is no such device.
+        UsageError: PyAV is missing, or the device does not exist.
     """
 
     recipe = VIDEO_RECIPE
@@ -62,23 +62,23 @@ class VideoCamera:
             stated = address and not address.startswith("//") and form in self._av.formats_available
             self._form, self._address = (form, address) if stated else (None, rest)
         self._remote = _NETWORK.match(self._address) is not None
-        # A path in /dev/shm is a file.
+        # A path in /dev/shm is a regular file.
         device = self._address.startswith("/dev/") and not Path(self._address).is_file()
         self.finite = not self._remote and not device
         self._convert = frame_colors if color else frame_gray
 
     def images(self) -> Iterator[tuple[int, ByteArray]]:
-        """See `Camera`."""
+        """Open the camera, and yield its images; see `Camera`."""
         with self._open() as container:
             if not container.streams.video:
-                raise CdmisfaError(f"{self._public_word}: there is no video in it")
+                raise CdmisfaError(f"{self._public_word} has no video: name another source")
             video = container.streams.video[0]
             context = video.codec_context
             self._check_size(context, context.codec)
             padded = (context.width + PADDED) * (context.height + PADDED)
-            most = max(most_pixels(context.format, context.codec), padded)
-            context.options = {"max_pixels": str(most)}
-            context.thread_count = 1  # every camera has a thread of its own
+            limit = max(most_pixels(context.format, context.codec), padded)
+            context.options = {"max_pixels": str(limit)}
+            context.thread_count = 1  # each camera has a thread of its own already
             timed = not (self._remote and container.format.flags & _TIMELESS)
             stated = timed and (video.average_rate or video.guessed_rate)
             self.rate = float(stated) if stated else None
@@ -93,15 +93,15 @@ class VideoCamera:
                         time.sleep(max(start + presented - now, 0))
                     yield steady.age(time.monotonic(), presented), self._convert(frame)
             except (OSError, ValueError, self._av.FFmpegError) as error:
-                raise CdmisfaError(f"{self.name} is gone: {_reason(error)}") from None
+                raise CdmisfaError(f"{self.name} is lost: {_reason(error)}") from None
 
     def describe(self) -> Mapping[str, Any]:
-        """Return the word, without a password."""
+        """Return the word that names the camera, without a password."""
         return {"camera": self._public_word}
 
     def _open(self) -> Any:
-        """Open the container within the memory budget; decoding runs without one, in threads."""
-        options = {"max_pixels": str(2 * MAX_PIXELS)}  # twice, as a decoder may pad an image
+        """Open the container within the memory budget; decoding runs in threads, without it."""
+        options = {"max_pixels": str(2 * MAX_PIXELS)}  # twice, because a decoder may pad images
         if self._address.startswith("rtsp"):
             options["rtsp_transport"] = "tcp"
         if self._remote:
@@ -116,19 +116,19 @@ class VideoCamera:
             raise CdmisfaError(f"{self._public_word} cannot be opened: {_reason(error)}") from None
 
     def _check_size(self, image: Any, codec: Any) -> None:
-        """Reject images that take too much memory, by a stated width, height and format."""
-        most = most_pixels(image.format, codec)
-        if not 0 < image.width * image.height <= most:
+        """Check that images do not take too much memory, by width, height and format."""
+        limit = most_pixels(image.format, codec)
+        if not 0 < image.width * image.height <= limit:
             raise CdmisfaError(
-                f"{self._public_word}: images of {image.width}x{image.height}, live ones of this "
-                f"kind have 1 to {most} pixels"
+                f"{self._public_word}: images of {image.width}x{image.height}: live images of this "
+                f"kind can have 1 to {limit} pixels"
             )
 
 
 def _reason(error: Exception) -> str:
-    """Return the text of an error of FFmpeg without the address, which may hold a password."""
+    """Return the text of an FFmpeg error without the address, which can contain a password."""
     if isinstance(error, MemoryError):
         return f"it takes more than {BUDGET >> 20} MiB of memory, the limit"
-    if type(error).__name__ == "ExitError":  # of FFmpeg's reads that take too long
+    if type(error).__name__ == "ExitError":  # FFmpeg's error for a read that timed out
         return "it did not answer in time"
     return str(getattr(error, "strerror", None) or _SECRET.sub("", one_line(error)))

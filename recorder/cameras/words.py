@@ -1,4 +1,4 @@
-"""Open live streams by the words that name them on the command line."""
+"""Live streams by the words that name them on the command line."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.names import stream_names
 from recorder.images.options import COLOR_RECIPE, NUMBERS_RECIPE, InputOptions
 
-# Endings of http addresses that are live streams; others are logs.
-_STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
+# Endings of http addresses that are live streams; other addresses are logs.
+_LIVE_ENDINGS: Final = (".mjpg", ".mjpeg", ".m3u8")
 
 
-# What the words of cameras begin with: `FoxgloveCamera` opens the first, `VideoCamera` the others.
+# Schemes of live streams; `FoxgloveCamera` opens the first, `VideoCamera` the others.
 CAMERAS = ["foxglove", "camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp"]
 
 
@@ -24,7 +24,7 @@ def is_live(word: str) -> bool:
     """Return whether a word on the command line names a live stream."""
     scheme, colon, rest = word.partition(":")
     if scheme.lower() in ("http", "https"):
-        return re.split("[?#]", rest)[0].lower().endswith(_STREAMED)
+        return re.split("[?#]", rest)[0].lower().endswith(_LIVE_ENDINGS)
     return bool(colon) and scheme.lower() in ("gym", *CAMERAS)
 
 
@@ -38,22 +38,22 @@ def open_live(
     """Open live streams on one clock.
 
     Args:
-        words: a stream each.
-        options: see there.
-        seed: of simulated tasks.
-        say: receives a line when a camera's state changes.
+        words: one word for each stream.
+        options: input options; those of logs are refused.
+        seed: seed of simulated tasks.
+        say: called with a line when the state of a camera changes.
 
     Raises:
-        UsageError: a word names no live stream, an option is for logs, a
-            package is missing, or a camera cannot be opened.
+        UsageError: a word does not name a live stream, an option is for logs, a package is
+            missing, or a camera cannot be opened.
     """
     from recorder.cameras.live import LiveSource
     from recorder.cameras.readers import CameraFrames, Readers
 
     if stored := [word for word in words if not is_live(word)]:
         raise UsageError(
-            f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
-            "and logs apart"
+            f"{stored[0]} is not a live stream, but other sources are: record these, and use "
+            "recordings and logs separately"
         )
     of_logs = options.named(("topics", "start", "end", "align", "centre", "holdout"))
     of_logs += ["--color auto"] if options.color == "auto" else []
@@ -69,11 +69,11 @@ def open_live(
 
         if set(schemes) != {"gym"}:
             raise UsageError(
-                "gym: is simulated as fast as it is watched, and cameras are not: record each apart"
+                "gym: is simulated and cannot be combined with cameras: record each separately"
             )
         tasks = [word.partition(":")[2] for word in words]
-        how: dict[str, Any] = {"size": options.size, "fit": options.fit, "fps": options.rate}
-        return GymSource(tasks, names=names, seed=seed, color=color, **how)
+        framing: dict[str, Any] = {"size": options.size, "fit": options.fit, "fps": options.rate}
+        return GymSource(tasks, names=names, seed=seed, color=color, **framing)
     cameras = [_camera(word, name, options) for word, name in zip(words, names, strict=True)]
     about: dict[str, Any] = {
         "cameras": [dict(camera.describe()) for camera in cameras],
@@ -102,7 +102,7 @@ def _camera(word: str, name: str, options: InputOptions) -> Any:
 
 
 def live_names(words: Sequence[str]) -> tuple[str, ...]:
-    """Name each stream, so that a file can have the name: rtsp://host/left is left."""
+    """Return a name for each stream that can be a file name: rtsp://host/left becomes left."""
     return stream_names([_stream_of(word) for word in words])
 
 
@@ -119,6 +119,6 @@ def _stream_of(word: str) -> str:
 
 
 def _host_and_path(word: str) -> tuple[str, str]:
-    """Split SCHEME://HOST/PATH?QUERY; both are empty for words of another form."""
+    """Return host and path of SCHEME://HOST/PATH?QUERY; both empty for other words."""
     match = re.match(r"\w+://([^/?#]*)([^?#]*)", word)
     return (match[1], match[2]) if match else ("", "")

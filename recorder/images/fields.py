@@ -1,4 +1,4 @@
-"""Numbers in a message: a path names them, and they are read as a vector."""
+"""Numbers in the fields of a message: a path names them, and they are read as a vector."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from cdmisfa.core.errors import UsageError
 from recorder.images.options import Depth
 from recorder.images.pixels import MalformedImage
 
-# Most numbers of a message: more than any scan has.
-MOST: Final = 100_000
+# Largest number of values from a message, more than any laser scan has.
+MAX_NUMBERS: Final = 100_000
 
-# Up to here float64 holds every whole number.
+# Largest value up to which float64 represents every whole number.
 EXACT: Final = 2.0**53
 
 _STEP: Final = re.compile(r"\.?([^.\[\]]+)|\[(\d{1,9})\]|\[(\d{0,9}):(\d{0,9})\]")
@@ -33,20 +33,20 @@ def is_path(text: str) -> bool:
 class Field:
     """A path to numbers in a message: `position`, `pose.position.x`, `ranges[0:100]`, `p[2].x`.
 
-    A name behind a list, or behind a part of one, is looked up in each of its members.
+    A name after a list, or after a part of one, is looked up in each of its members.
 
     Args:
-        path: as the user wrote it.
-        plain: the path is a name, whatever characters it has.
+        path: the path as the user wrote it.
+        plain: True if the path is one name, whatever its characters.
 
     Raises:
-        UsageError: the text is no path.
+        UsageError: the text is not a path.
     """
 
     def __init__(self, path: str, *, plain: bool = False) -> None:
         if not plain and not is_path(path):
             raise UsageError(
-                f"--field {path} is no field: write names with dots, an index or a part of "
+                f"--field {path} is not a field: write names with dots, an index or a part of "
                 "it, as pose.position.x or ranges[0:100]"
             )
         self.path = path
@@ -57,7 +57,7 @@ class Field:
         """Return the numbers at the path in a message; NaN for null.
 
         Raises:
-            UsageError: the message has no such field, or no number there.
+            UsageError: the message has no such field, or it is not a number.
             MalformedImage: a number or the nesting is too large.
         """
         numbers: list[float] = []
@@ -66,7 +66,7 @@ class Field:
         except LookupError as error:
             raise UsageError(f"--field {self.path}: {error.args[0]}") from None
         except (OverflowError, RecursionError):
-            raise MalformedImage(f"--field {self.path} is of no size that is read") from None
+            raise MalformedImage(f"--field {self.path} is too large or nested too deep") from None
         return numbers
 
 
@@ -78,7 +78,7 @@ def _step(match: re.Match[str]) -> _Step:
 
 
 def _value(value: Any, steps: Sequence[_Step]) -> Any:
-    """Follow steps into a message; raise LookupError with words for the user."""
+    """Follow steps into a message; raise a LookupError with a message for the user."""
     for place, step in enumerate(steps):
         if value is None and not isinstance(step, slice):
             return None
@@ -87,20 +87,20 @@ def _value(value: Any, steps: Sequence[_Step]) -> Any:
                 return [_value(member, steps[place:]) for member in value]
             names = members(value)
             if step not in names:
-                raise LookupError(f"there is no {step}, it has {', '.join(names) or 'no fields'}")
+                raise LookupError(f"there is no {step}: it has {', '.join(names) or 'no fields'}")
             value = field_value(value, step)
         elif not _is_list(value):
-            raise LookupError("an index is for a list only")
+            raise LookupError("it is not a list: leave out the index")
         else:
             last = (step.stop or step.start + 1) if isinstance(step, slice) else step + 1
             if last > len(value):
-                raise LookupError(f"there are {len(value)} members only, all of them are [0:]")
+                raise LookupError(f"the list has {len(value)} members: take all of them with [0:]")
             value = value[step]
     return value
 
 
 def _collect(value: Any, numbers: list[float]) -> None:
-    """Append all numbers of a value; raise LookupError with words for the user."""
+    """Append all numbers of a value; raise a LookupError with a message for the user."""
     if value is None:
         numbers.append(np.nan)
     elif isinstance(value, bool | int | float | np.generic):
@@ -113,19 +113,19 @@ def _collect(value: Any, numbers: list[float]) -> None:
     else:
         kind = "a text" if isinstance(value, str) else type(value).__name__
         names = f": name one of {', '.join(members(value))}" if members(value) else ""
-        raise LookupError(f"it is no number but {kind}{names}")
+        raise LookupError(f"it is not a number but {kind}{names}")
 
 
 def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> FloatArray:
-    """Return the numbers of all fields of a message, one after the other, (I,) float64.
+    """Return the numbers of all fields of a message in order, (I,) float64.
 
     Args:
         fields: paths to the numbers.
-        message: decoded.
-        bounds: the range that numbers are kept in; those that are not finite become the first.
+        message: the decoded message.
+        bounds: range to limit numbers to; values that are not finite become its lower bound.
 
     Raises:
-        UsageError: a field is missing, is no number, or is not finite without bounds.
+        UsageError: a field is missing or not a number, or is not finite without bounds.
         MalformedImage: a field is too large.
     """
     numbers: list[float] = []
@@ -135,24 +135,24 @@ def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> F
             place = int(np.flatnonzero(~np.isfinite(part))[0])
             value = "NaN or null" if np.isnan(part[place]) else part[place]
             raise UsageError(
-                f"--field {field.path} holds {value} at place {place}, which is no finite "
-                "number: leave it out, or keep numbers in a range, as --set input.range=0.1,10"
+                f"--field {field.path} holds {value} at index {place}, which is not finite: leave "
+                "it out, or limit numbers to a range such as --set input.range=0.1,10"
             )
         numbers += part
-    if not 0 < len(numbers) <= MOST:
-        raise UsageError(f"its fields hold {len(numbers)} numbers: choose from 1 to {MOST}")
+    if not 0 < len(numbers) <= MAX_NUMBERS:
+        raise UsageError(f"its fields hold {len(numbers)} numbers: choose from 1 to {MAX_NUMBERS}")
     return bounded(np.array(numbers, np.float64), bounds)
 
 
 def bounded(numbers: FloatArray, bounds: Depth | None) -> FloatArray:
-    """Keep numbers within bounds; those that are not finite become the first of them."""
+    """Limit numbers to bounds; values that are not finite become the lower bound."""
     if bounds is None:
         return numbers
     return np.clip(np.where(np.isfinite(numbers), numbers, bounds[0]), *bounds)
 
 
 def members(value: Any) -> list[str]:
-    """Return the names of a message's fields, whichever library decoded it; none for others."""
+    """Return the names of a decoded message's fields, whatever library decoded it; else []."""
     if isinstance(value, Mapping):
         return [str(name) for name in value]
     descriptor = getattr(value, "DESCRIPTOR", None)

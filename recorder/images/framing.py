@@ -1,6 +1,6 @@
-"""How images, and numbers, become frames: size, crop, padding, colours.
+"""How images and numbers become frames: size, crop, padding, colours.
 
-`Framing` is for the images of a log or a camera; a `Recipe` repeats it for raw images of a caller.
+A `Framing` serves the images of a log or a camera; a `Recipe` repeats it for a user's raw images.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from cdmisfa.core.names import counted
 from recorder.images.compressed import compressed_image
 from recorder.images.fields import EXACT, bounded
 from recorder.images.options import Centre, Depth, Fit, Size
-from recorder.images.pixels import MalformedImage, Shown, raw_image, shrink
+from recorder.images.pixels import Content, MalformedImage, raw_image, shrink
 
-# Most pixels of a frame if no size is given: those of the paper's frames.
+# Largest number of pixels of a frame if no size is given, that of the paper's frames.
 FRAME_PIXELS: Final = 48 * 128
 
 
@@ -31,10 +31,10 @@ class Framing:
     """How the images, or the numbers, of one stream become frames.
 
     Attributes:
-        first: size of its first image; () for numbers, which stay as they are.
-        size: of a frame, (height, width); (count,) for numbers.
-        fit: see `fitted`.
-        color: whether a frame shows red, green and blue beside one another.
+        first: size of the stream's first image; () for numbers, which are not changed.
+        size: (height, width) of a frame; (count,) for numbers.
+        fit: how images of another aspect ratio become frames, see `fitted`.
+        color: True if a frame shows the red, green and blue images side by side.
     """
 
     first: tuple[int, ...]
@@ -42,20 +42,19 @@ class Framing:
     fit: Fit = "crop"
     color: bool = False
 
-    def frame(self, image: Shown) -> Shown:
-        """Turn an image, (height, width[, 3]), or the numbers of a message into a frame.
+    def frame(self, image: Content) -> Content:
+        """Convert an image, (height, width[, 3]), or the numbers of a message to a frame.
 
         Raises:
-            UsageError: the image is smaller than a frame, as the first one is. Images of
-                another size than the first may be smaller: they are enlarged. Or the message has
-                another count of numbers.
+            UsageError: the image is as small as the first one, and smaller than a frame (an image
+                that is smaller than the first one is enlarged); or the number of values changed.
         """
         if not self.first:
             if image.shape != self.size:
                 least = min(self.size[0], len(image))
                 raise UsageError(
-                    f"a message holds {len(image)} numbers, and the first {self.size[0]}: choose "
-                    f"a part of the field, as --field position[0:{least}]"
+                    f"a message has {len(image)} numbers, but the first had {self.size[0]}: choose "
+                    f"a part of the field, such as --field position[0:{least}]"
                 )
             return image
         height, width = self.size
@@ -66,16 +65,16 @@ class Framing:
             return frames[0]
         return np.hstack(frames if len(frames) == 3 else frames * 3)
 
-    def change(self, image: Shown) -> str:
+    def change(self, image: Content) -> str:
         """Return a warning about an image of another size, or about rounded numbers, or ""."""
         if not self.first:
             rounded = bool(len(image)) and np.abs(image).max() > EXACT
-            return "numbers beyond 2^53 may be rounded, to float64" if rounded else ""
+            return "numbers beyond 2^53 are rounded to float64" if rounded else ""
         size = size_of(image)
         if size == self.first:
             return ""
-        before, now, frame = map(_in_words, (self.first, size, self.size))
-        return f"images change from {before} to {now}; each is made a frame of {frame}"
+        before, now, frame = map(_size_text, (self.first, size, self.size))
+        return f"images change from {before} to {now}: each is resized to {frame}"
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -84,38 +83,38 @@ class Framing:
 
     @property
     def lossy(self) -> str:
-        """How images of another aspect ratio are fitted, in words; "" for the same ratio."""
+        """Description of how images of another aspect ratio are fitted; "" for the same ratio."""
         if not self.first:
             return ""
         if self.fit == "crop":
             inner = _largest_within(self.first, self.size)
-            return "" if inner == self.first else f"cropped to {_in_words(inner)}"
+            return "" if inner == self.first else f"cropped to {_size_text(inner)}"
         inner = _largest_within(self.size, self.first)
         if inner == self.size:
             return ""
-        return f"padded from {_in_words(inner)}" if self.fit == "pad" else "stretched"
+        return f"padded from {_size_text(inner)}" if self.fit == "pad" else "stretched"
 
     def __str__(self) -> str:
-        """How an image becomes a frame, in words."""
+        """Return a description of how an image becomes a frame."""
         if not self.first:
             return counted(self.size[0], "number")
-        resized = "" if self.first == self.size else f"shown as {_in_words(self.size)}"
-        return ", ".join(filter(None, [_in_words(self.first), self.lossy, resized]))
+        resized = "" if self.first == self.size else f"resized to {_size_text(self.size)}"
+        return ", ".join(filter(None, [_size_text(self.first), self.lossy, resized]))
 
 
 def framings(
-    firsts: Sequence[Shown], size: Size | None, fit: Fit, *, color: bool = False
+    firsts: Sequence[Content], size: Size | None, fit: Fit, *, color: bool = False
 ) -> Sequence[Framing]:
-    """Choose how the images or numbers of streams become frames, all of one shape.
+    """Choose how the images or numbers of streams become frames of one shape.
 
     Args:
-        firsts: the first image or numbers of each stream.
-        size: (height, width) of a frame; None for the `default_size` of the first image.
+        firsts: first image or numbers of each stream.
+        size: (height, width) of a frame; None: the `default_size` for the first image.
         fit: see `fitted`.
-        color: show red, green and blue beside one another.
+        color: True to show the red, green and blue images side by side.
 
     Raises:
-        UsageError: streams show images and numbers, or different counts of numbers.
+        UsageError: streams have both images and numbers, or different counts of numbers.
     """
     if all(first.ndim > 1 for first in firsts):
         size = size or default_size(size_of(firsts[0]))
@@ -123,23 +122,23 @@ def framings(
     kinds = ["images" if first.ndim > 1 else counted(len(first), "number") for first in firsts]
     if len(set(kinds)) > 1:
         raise UsageError(
-            "streams that are learned from together show frames of one shape, and these show "
-            + " and ".join(dict.fromkeys(kinds))
-            + ": take as many numbers of each, as with --field position[0:6], or each apart"
+            f"the streams have {' and '.join(dict.fromkeys(kinds))}, but frames must have one "
+            "shape: take equally many numbers of each, as with --field position[0:6], or learn "
+            "from each stream alone"
         )
-    given = {"--size": size is not None, "input.fit": fit != "crop", "--color": color}
-    if refused := [option for option, chosen in given.items() if chosen]:
-        raise UsageError(f"numbers are taken as they are: {are_for(refused, 'images')}")
+    image_options = {"--size": size is not None, "input.fit": fit != "crop", "--color": color}
+    if refused := [option for option, chosen in image_options.items() if chosen]:
+        raise UsageError(f"the frames are numbers: {are_for(refused, 'images')}")
     return [Framing((), first.shape) for first in firsts]
 
 
-def size_of(image: Shown) -> Size:
+def size_of(image: Content) -> Size:
     """Return the size of an image, (height, width)."""
     return image.shape[0], image.shape[1]
 
 
 def default_size(image: Size) -> Size:
-    """Divide a size by the least whole number that leaves `FRAME_PIXELS` or fewer."""
+    """Return a size divided by the smallest whole number that leaves at most `FRAME_PIXELS`."""
     height, width = image
     divisor = 1
     while max(height // divisor, 1) * max(width // divisor, 1) > FRAME_PIXELS:
@@ -148,17 +147,17 @@ def default_size(image: Size) -> Size:
 
 
 def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> ByteArray:
-    """Turn a gray image into a frame.
+    """Convert a gray image to a frame.
 
     Args:
         image: (height, width) uint8.
-        size: of the frame.
-        fit: for another aspect ratio: "crop" cuts two sides, as much of each, "pad" adds black
-            sides, "stretch" changes the ratio.
-        enlarge: accept a smaller image, too.
+        size: (height, width) of the frame.
+        fit: for another aspect ratio: "crop" cuts two opposite sides equally, "pad" adds black
+            borders, "stretch" changes the ratio.
+        enlarge: True to accept an image that is smaller than the frame.
 
     Raises:
-        UsageError: the image is smaller.
+        UsageError: the image is smaller than the frame.
     """
     if image.shape == size:
         return image
@@ -172,12 +171,12 @@ def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> 
     return frame
 
 
-def _in_words(size: Sequence[int]) -> str:
+def _size_text(size: Sequence[int]) -> str:
     return f"{size[1]}x{size[0]}"
 
 
 def _largest_within(outer: Sequence[int], ratio: Sequence[int]) -> Size:
-    """Return the largest size within `outer` that has the aspect ratio of another size."""
+    """Return the largest size within `outer` with the aspect ratio of `ratio`."""
     if outer[0] * ratio[1] > outer[1] * ratio[0]:
         return max(round(outer[1] * ratio[0] / ratio[1]), 1), outer[1]
     return outer[0], max(round(outer[0] * ratio[1] / ratio[0]), 1)
@@ -188,7 +187,7 @@ def _middle(image: ByteArray, size: Size) -> ByteArray:
     return image[top : top + size[0], left : left + size[1]]
 
 
-# Pixel formats of arrays, by the type and the number of a pixel's values.
+# Pixel formats of arrays, by element type and number of channels (0: gray).
 _FORMATS = {("u1", 0): "mono8", ("u2", 0): "mono16", ("u1", 3): "rgb8", ("u1", 4): "rgba8"}
 
 _DISTANCES = {"u2": "16UC1", "f4": "32FC1", "f8": "32FC1"}
@@ -245,18 +244,18 @@ class Recipe(Section):
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Return the recipe that `as_json` wrote.
+        """Return the recipe that `as_json` returned.
 
         Raises:
-            ValueError: the text is no recipe.
+            ValueError: the text is not a recipe.
         """
         values, names = json.loads(text), {field.name for field in fields(cls)}
         try:
             recipe = cls(**{name: value for name, value in values.items() if name in names})
         except (UsageError, AttributeError, TypeError) as error:
-            raise ValueError(f"it is no recipe: {error}") from None
+            raise ValueError(f"it is not a recipe: {error}") from None
         if not recipe.shape or len(recipe.raw) not in (0, 2):
-            raise ValueError("a recipe has a shape, and a size of raw images or none")
+            raise ValueError("it is not a recipe: its shape or the size of raw images is missing")
         return recipe
 
     def as_json(self) -> dict[str, Any]:
@@ -280,12 +279,12 @@ class Recipe(Section):
         """
         if self.size is None:
             return _numbers(images, self)
-        several = images if isinstance(images, Iterable) else [images]
-        frames = [make_frame(image, self) for image in several]
+        iterable = images if isinstance(images, Iterable) else [images]
+        frames = [make_frame(image, self) for image in iterable]
         return np.stack(frames) if frames else np.empty((0, *self.shape), np.uint8)
 
 
-def make_frame(image: Any, recipe: Recipe) -> Shown:
+def make_frame(image: Any, recipe: Recipe) -> Content:
     """Turn a raw image or numbers into a frame as the module saw it in learning.
 
     Colors become gray or are put side by side, 16-bit pixels are reduced to their high byte, a
@@ -299,7 +298,7 @@ def make_frame(image: Any, recipe: Recipe) -> Shown:
         recipe: recipe of the module.
 
     Returns:
-        The frame, of `recipe.shape`: uint8, or float64 for numbers.
+        The frame, of shape `recipe.shape`, uint8; float64 for numbers.
 
     Raises:
         UsageError: the image has another type, is smaller than a frame, or is upright although the
@@ -313,28 +312,28 @@ def make_frame(image: Any, recipe: Recipe) -> Shown:
         else:
             pixels = _image(np.asarray(image), recipe)
     except MalformedImage as error:
-        raise UsageError(f"an image cannot be taken: {error}") from None
+        raise UsageError(f"an image cannot be read: {error}") from None
     return Framing(size_of(pixels), recipe.size, recipe.fit, recipe.color).frame(pixels)
 
 
 def pixels_of(images: NDArray[Any]) -> NDArray[Any]:
     """Convert images to uint8 or uint16: booleans to 0 and 255, floats of 0 to 1 by round(255 x).
 
-    Whole numbers of 0 to 255 keep their values, and all others are returned unchanged.
+    Whole numbers of 0 to 255 keep their values; other images are returned unchanged.
     """
     if images.dtype == np.bool_:
         return np.where(images, np.uint8(255), np.uint8(0))
-    most = {"f": 1, "i": 255, "u": 255}.get(images.dtype.kind, 0)
+    limit = {"f": 1, "i": 255, "u": 255}.get(images.dtype.kind, 0)
     plain = images.dtype in (np.uint8, np.uint16) or not images.size
-    if plain or not most or not 0 <= images.min() <= images.max() <= most:
+    if plain or not limit or not 0 <= images.min() <= images.max() <= limit:
         return images
     if images.dtype.kind == "f":
         images = np.rint(images * images.dtype.type(255))
     return np.asarray(images, np.uint8)
 
 
-def _image(array: NDArray[Any], recipe: Recipe) -> Shown:
-    """Return an image of an array, gray (height, width), or (height, width, 3) in colours."""
+def _image(array: NDArray[Any], recipe: Recipe) -> Content:
+    """Return the image of an array, gray (height, width) or colour (height, width, 3)."""
     if recipe.range is None:
         array = pixels_of(array)
     if array.ndim == 3 and array.shape[2] == 1:
@@ -346,12 +345,12 @@ def _image(array: NDArray[Any], recipe: Recipe) -> Shown:
     elif recipe.pixels and known in ("mono8", "mono16"):
         known = f"{recipe.pixels.rstrip('0123456789')}{known.removeprefix('mono')}"
     if known is None or array.ndim not in (2, 3):
-        raise UsageError(f"images of {array.dtype} {array.shape} given: {_IMAGES}")
+        raise UsageError(f"images are {array.dtype} {array.shape}: {_IMAGES}")
     height, width = array.shape[:2]
     if recipe.raw and (height - width) * (recipe.raw[0] - recipe.raw[1]) < 0:
         raise UsageError(
-            f"an image of {width}x{height} given, and those learned from were of "
-            f"{recipe.raw[1]}x{recipe.raw[0]}: turn it, as by np.swapaxes(x, 0, 1), or crop it"
+            f"an image is {width}x{height}, but the module learned from images of "
+            f"{recipe.raw[1]}x{recipe.raw[0]}: turn it with np.swapaxes(x, 0, 1), or crop it"
         )
     little = "<f4" if known == "32FC1" else f"<{kind}"
     data = np.ascontiguousarray(array, little).tobytes()
@@ -370,7 +369,7 @@ def _numbers(rows: Any, recipe: Recipe) -> NDArray[np.float64]:
     if numbers.shape[1:] != recipe.shape or numbers.dtype.kind not in "biuf":
         names = f" ({', '.join(recipe.fields)})" if recipe.fields else ""
         raise UsageError(
-            f"{numbers.dtype} of shape {numbers.shape} given: give (n, {count}), rows of the "
-            f"{count} numbers that were learned from{names}"
+            f"the numbers are {numbers.dtype} {numbers.shape}: give (n, {count}), rows of the "
+            f"{count} numbers that the module learned from{names}"
         )
     return bounded(numbers.astype(np.float64), recipe.range)

@@ -1,7 +1,7 @@
-"""Messages of logs and robots: the images or the numbers in them, and the times in their headers.
+"""Messages of logs and robots: their images or numbers, and the times in their headers.
 
-Images of ROS and Foxglove are decoded here. Other messages are decoded by the definition that their
-channel states.
+This module decodes images of ROS and Foxglove. Other messages are decoded by the definition that
+their channel states.
 """
 
 from __future__ import annotations
@@ -27,28 +27,29 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.images.compressed import compressed_image, compressed_words
 from recorder.images.fields import Field, field_value, members, numbers_of
 from recorder.images.options import Depth, InputOptions
-from recorder.images.pixels import DISTANCES, MalformedImage, Shown, raw_image
+from recorder.images.pixels import DISTANCES, Content, MalformedImage, raw_image
 from recorder.images.videos import Packet, VideoPackets
 
-# The bytes of a message.
+# Bytes of a message.
 Data = bytes | memoryview
 
 # Decodes a message to an image or to numbers; raises MalformedImage.
 #
-# One that is `VideoPackets` has to be called with the messages in their order.
-Decoder = Callable[[Data], Shown]
+# A decoder of class `VideoPackets` must be called with the messages in their order.
+Decoder = Callable[[Data], Content]
 
 # Decodes a message to an object with its fields; raises MalformedImage.
-Opened = Callable[[bytes], Any]
+MessageDecoder = Callable[[bytes], Any]
 
-# Reads the time in a message's header, nanoseconds; raises MalformedImage.
+# Returns the time in a message's header (ns); raises MalformedImage.
 Stamp = Callable[[Data], int]
 
 # Header of compressed_depth_image_transport: the format, and two numbers that scale distances.
 _DEPTH_HEADER: Final = struct.Struct("<iff")
 
-# Most commas of an image in JSON, which has some ten: lists take 20 times the memory of text.
-_MOST_COMMAS: Final = 1000
+# Largest number of commas of an image in JSON, which has about ten: parsed lists take 20 times the
+# memory of their text.
+_MAX_COMMAS: Final = 1000
 
 _SECONDS: Final = ("sec", "secs", "seconds")
 _NANOS: Final = ("nsec", "nsecs", "nanosec", "nanos")
@@ -56,13 +57,13 @@ _HEADER: Final = re.compile(r"(?:std_msgs/)?(?:msg/)?Header\s+\w+")
 
 
 class MessageKind(NamedTuple):
-    """The type and the encoding of a channel's messages.
+    """Type and encoding of a channel's messages.
 
     Attributes:
-        schema: the name of their type.
+        schema: name of the type.
         encoding: "protobuf", "json", "cdr" or "ros1".
-        definition: of the type, as the channel states it.
-        language: of the definition: "protobuf", "ros2msg", "ros2idl", "ros1msg".
+        definition: definition of the type, as the channel states it.
+        language: language of the definition: "protobuf", "ros2msg", "ros2idl" or "ros1msg".
     """
 
     schema: str
@@ -72,7 +73,7 @@ class MessageKind(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """The content of a message with raw pixels; see `raw_image`."""
+    """Content of a message with raw pixels; see `raw_image`."""
 
     data: Data
     height: int
@@ -87,12 +88,12 @@ class Pixels(NamedTuple):
 
 
 class Compressed(NamedTuple):
-    """The content of a message with a JPEG or PNG.
+    """Content of a message with a JPEG or PNG.
 
     Attributes:
-        data: of the image; behind a header in messages of compressed_depth_image_transport.
+        data: the image; in messages of compressed_depth_image_transport it follows a header.
         encoding: pixel format before compression, if ROS states it.
-        packed_depth: whether the message is of compressed_depth_image_transport.
+        packed_depth: True for a message of compressed_depth_image_transport.
     """
 
     data: bytes
@@ -105,7 +106,7 @@ class Compressed(NamedTuple):
             return compressed_image(self.data, color=color)
         words = compressed_words(self.data[_DEPTH_HEADER.size if self.packed_depth else 0 :])
         distances: NDArray[Any] = words.astype("<u2")
-        if self.encoding == "32FC1":  # rounded inverses of distances; 0 means no measurement
+        if self.encoding == "32FC1":  # the words are inverse distances; 0 means no measurement
             _, scale, offset = _DEPTH_HEADER.unpack_from(self.data)
             inverse = words.astype(np.float32) - np.float32(offset)
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -115,7 +116,7 @@ class Compressed(NamedTuple):
 
 
 class _RosFields:
-    """Reads the fields of a ROS message behind its header, aligned (ROS 2) or packed (ROS 1)."""
+    """Reader of the fields of a ROS message after its header, aligned (ROS 2) or packed (ROS 1)."""
 
     def __init__(self, data: Data, *, ros1: bool) -> None:
         self._data = memoryview(data)
@@ -127,19 +128,19 @@ class _RosFields:
         else:
             head = bytes(self.take(4))
             if head[0] != 0 or head[1] not in (0, 1, 6, 7, 8, 9, 10, 11):
-                raise MalformedImage("a message is no CDR")
+                raise MalformedImage("a message is not CDR")
             self._order = "<" if head[1] & 1 else ">"
         self.stamp = self.u32() * NANOSECONDS + self.u32()
         self.text()  # frame id
 
     def take(self, count: int) -> memoryview:
         if count > len(self._data) - self.at:
-            raise MalformedImage("a ROS message is cut short or lies about a length")
+            raise MalformedImage("a ROS message is cut short or states a wrong length")
         self.at += count
         return self._data[self.at - count : self.at]
 
     def u32(self) -> int:
-        if not self._ros1:  # CDR's own header has 4 bytes, too
+        if not self._ros1:  # alignment counts from after CDR's own header, which has 4 bytes too
             self.take(-self.at % 4)
         return int(struct.unpack(self._order + "I", self.take(4))[0])
 
@@ -165,7 +166,7 @@ def _ros_compressed(data: Data, *, ros1: bool) -> Compressed:
     if depth and len(packed) <= _DEPTH_HEADER.size:
         raise MalformedImage("a compressed image of distances is cut short")
     if depth and "rvl" in transport:
-        raise MalformedImage("its distances are packed as rvl, which is not read: png is")
+        raise MalformedImage("its distances are packed as rvl, which is not supported: use png")
     plain = "32FC1" in encoding and not depth
     return Compressed(packed, "" if plain else encoding.strip(), depth)
 
@@ -183,7 +184,7 @@ def _ffmpeg_packet(data: Data) -> Packet:
     return Packet(bytes(fields.data()), codec)
 
 
-# Foxglove's messages with images: their class, and their content.
+# Foxglove's messages with images: their class, and a function that returns their content.
 _FOXGLOVE: Final[Mapping[str, tuple[Any, Callable[[Any, bytes], Any]]]] = {
     "foxglove.RawImage": (
         RawImage,
@@ -195,25 +196,25 @@ _FOXGLOVE: Final[Mapping[str, tuple[Any, Callable[[Any, bytes], Any]]]] = {
 
 
 def _foxglove(schema: str, encoding: str, data: Data) -> Any:
-    """Read the content of a message of Foxglove in protobuf or JSON."""
+    """Return the content of a Foxglove message in protobuf or JSON."""
     message_class, content = _FOXGLOVE[schema]
     try:
         if encoding == "protobuf":
             message = message_class.FromString(data)
             return content(message, message.data)
         text = bytes(data)
-        if text.count(b",") > _MOST_COMMAS:
+        if text.count(b",") > _MAX_COMMAS:
             raise ValueError("it has too many values")
         stated = parse_json(text, len(text))
         packed = base64.b64decode(stated.pop("data"), validate=True)
         names = set(message_class.DESCRIPTOR.fields_by_name) - {"timestamp"}
         message = message_class(**{name: stated[name] for name in names & stated.keys()})
         return content(message, packed)
-    except Exception as error:  # protobuf raises anything on broken messages
-        raise MalformedImage(f"a message is no {schema} ({one_line(error)})") from None
+    except Exception as error:  # protobuf raises various exceptions for damaged messages
+        raise MalformedImage(f"a message is not a {schema} ({one_line(error)})") from None
 
 
-# By schema and encoding, what reads the pixels, the compressed image or the packet.
+# Functions that return the pixels, compressed image or packet, by schema and encoding.
 _CONTENT: Final[Mapping[tuple[str, str], Callable[[Data], Any]]] = {
     ("sensor_msgs/msg/Image", "cdr"): partial(_ros_raw, ros1=False),
     ("sensor_msgs/Image", "ros1"): partial(_ros_raw, ros1=True),
@@ -232,7 +233,7 @@ _VIDEOS: Final = frozenset(
     kind for kind in _CONTENT if kind[0].endswith(("CompressedVideo", "FFMPEGPacket"))
 )
 
-# Kinds of messages that hold a JPEG or PNG, which takes long to decode.
+# Kinds of messages with a JPEG or PNG, which takes long to decode.
 PACKED: Final = frozenset(kind for kind in _CONTENT if kind[0].endswith("CompressedImage"))
 
 # Types of messages with images.
@@ -240,23 +241,23 @@ SCHEMAS: Final = tuple(sorted({schema for schema, _ in _CONTENT}))
 
 
 def decoder_of(kind: MessageKind, options: InputOptions) -> Decoder | None:
-    """Return the decoder for the images or the fields of a kind of messages, or None.
+    """Return the decoder of the images or the fields of messages, or None.
 
     Args:
-        kind: of the messages.
+        kind: kind of the messages.
         options: the fields to read, or else the range of distances and whether to keep colours.
 
     Returns:
-        A function that returns an image, or numbers (I,) float64; it raises MalformedImage, or
+        A function that returns an image, or numbers (I,) float64. It raises MalformedImage, or
         UsageError if a message has no such field.
     """
     depth, color = options.range, options.color is True
     if options.fields:
-        opened = message_decoder(kind)
-        if opened is None:
+        decode = message_decoder(kind)
+        if decode is None:
             return None
         fields = [Field(path) for path in options.fields]
-        return lambda data: numbers_of(fields, opened(bytes(data)), depth)
+        return lambda data: numbers_of(fields, decode(bytes(data)), depth)
     content = _CONTENT.get(kind[:2])
     if content is None:
         return None
@@ -266,37 +267,37 @@ def decoder_of(kind: MessageKind, options: InputOptions) -> Decoder | None:
 
 
 def stated_format(schema: str, encoding: str, data: Data) -> str:
-    """Return the pixel format that a message states, before compression; "" if it states none.
+    """Return the pixel format before compression that a message states, or "".
 
     Raises:
-        MalformedImage: the message is broken.
+        MalformedImage: the message is damaged.
     """
     if (schema, encoding) not in _CONTENT or (schema, encoding) in _VIDEOS:
         return ""
     return str(_CONTENT[schema, encoding](data).encoding)
 
 
-def packed_picture(schema: str, encoding: str, data: Data) -> bytes | None:
+def packed_image(schema: str, encoding: str, data: Data) -> bytes | None:
     """Return the JPEG or PNG in a message of a kind in `PACKED`; None for distances."""
     content = _CONTENT[schema, encoding](data)
     return None if content.encoding in DISTANCES else bytes(content.data)
 
 
-def message_decoder(kind: MessageKind) -> Opened | None:
+def message_decoder(kind: MessageKind) -> MessageDecoder | None:
     """Return the decoder of whole messages; None if their encoding or definition is unknown."""
-    decode: Opened | None = parse_json if kind.encoding == "json" else None
+    decode: MessageDecoder | None = parse_json if kind.encoding == "json" else None
     if kind.encoding in ("protobuf", "cdr", "ros1"):
         decode = _protobuf(kind) if kind.encoding == "protobuf" else _ros(kind)
     return decode and partial(_opened, kind.schema, decode)
 
 
-def _opened(schema: str, decode: Opened, data: bytes) -> Any:
+def _opened(schema: str, decode: MessageDecoder, data: bytes) -> Any:
     try:
         return decode(data)
     except CdmisfaError:
         raise
-    except Exception as error:  # protobuf and rosbags raise anything on broken messages
-        raise MalformedImage(f"a message is no {schema} ({one_line(error)})") from None
+    except Exception as error:  # protobuf and rosbags raise various exceptions for damaged data
+        raise MalformedImage(f"a message is not a {schema} ({one_line(error)})") from None
 
 
 def _protobuf(kind: MessageKind) -> Any:
@@ -308,12 +309,12 @@ def _protobuf(kind: MessageKind) -> Any:
             pool.Add(file)
         stated = pool.FindMessageTypeByName(kind.schema)
         return message_factory.GetMessageClass(stated).FromString
-    except Exception:  # protobuf raises anything on broken definitions
+    except Exception:  # protobuf raises various exceptions for damaged definitions
         return None
 
 
-def _ros(kind: MessageKind) -> Opened:
-    """Return the decoder of messages of ROS 1 or 2; the first one loads rosbags, which is slow."""
+def _ros(kind: MessageKind) -> MessageDecoder:
+    """Return the decoder of ROS 1 or 2 messages; its first call imports rosbags, which is slow."""
     package, _, rest = kind.schema.partition("/")
     # ROS 1's sensor_msgs/JointState is sensor_msgs/msg/JointState in ROS 2.
     name = kind.schema if "/" in rest or not rest else f"{package}/msg/{rest}"
@@ -324,11 +325,11 @@ def _ros(kind: MessageKind) -> Opened:
             from rosbags import typesys as ros
         except ImportError:
             raise CdmisfaError(
-                f"fields of {kind.schema} need rosbags: pip install rosbags (the extra [ros])"
+                f"fields of {kind.schema} need rosbags: pip install 'cdmisfa[ros]'"
             ) from None
         ros1 = kind.encoding == "ros1"
         text = kind.definition.decode("utf-8", "replace")
-        if not text.strip():  # without a definition, ROS's own
+        if not text.strip():  # without a definition, use ROS's own
             store = ros.get_typestore(ros.Stores.ROS1_NOETIC if ros1 else ros.Stores.LATEST)
         else:
             store = ros.get_typestore(ros.Stores.EMPTY)
@@ -341,7 +342,7 @@ def _ros(kind: MessageKind) -> Opened:
 
 
 def stamp_of(kind: MessageKind) -> Stamp | None:
-    """Return the reader of the times in messages of a kind; None if they have none."""
+    """Return the reader of the times in messages of a kind; None if they have no times."""
     if kind.encoding in ("cdr", "ros1"):
         lines = kind.definition.decode("utf-8", "replace").splitlines()
         stated = (line.partition("#")[0].strip() for line in lines)
@@ -349,8 +350,8 @@ def stamp_of(kind: MessageKind) -> Stamp | None:
         has_header = kind.schema in SCHEMAS or _HEADER.fullmatch(first) is not None
         ros1 = kind.encoding == "ros1"
         return (lambda data: _RosFields(data, ros1=ros1).stamp) if has_header else None
-    opened = message_decoder(kind)
-    return None if opened is None else lambda data: _stamp(opened(bytes(data)))
+    decode = message_decoder(kind)
+    return None if decode is None else lambda data: _stamp(decode(bytes(data)))
 
 
 def _stamp(message: Any) -> int:
@@ -359,10 +360,10 @@ def _stamp(message: Any) -> int:
         seconds, nanos = _member(value, *_SECONDS), _member(value, *_NANOS, default=0)
         if isinstance(seconds, int) and isinstance(nanos, int):
             return seconds * NANOSECONDS + nanos
-    raise MalformedImage("a message has no time of its own, as header.stamp or timestamp")
+    raise MalformedImage("a message has no time of its own, such as header.stamp or timestamp")
 
 
 def _member(message: Any, *names: str, default: Any = None) -> Any:
-    """Return the first of some fields that a message has."""
+    """Return the first of the named fields that a message has."""
     known = members(message)
     return next((field_value(message, name) for name in names if name in known), default)

@@ -8,56 +8,56 @@ from typing import Any, ClassVar, Final, Literal, cast
 
 from cdmisfa.core.config import Section, build, key
 
-# Recordings and runs state these texts: who reads one years later knows what its pixels are.
+# Recordings and runs store these texts, so that the meaning of pixels is known years later.
 
-# States how images become frames.
+# How images become frames.
 RECIPE: Final = (
     "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
     "size: area average (Pillow BOX); turned as the EXIF of a JPEG or PNG says"
 )
 
-# States how images of videos become frames.
+# How images of videos become frames.
 VIDEO_RECIPE: Final = (
     f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
     "((Y - 16) * 510 + 219) // 438 where its range is limited, by the nearest quarter turns of its "
     "display matrix"
 )
 
-# States how images become frames in colours.
+# How images become frames in colour.
 COLOR_RECIPE: Final = (
     "red, green and blue beside one another, each as gray is; of a Bayer pattern green is the mean "
     "of two; of a video by BT.709 or, where it states another or none, BT.601, in 16 bit whole "
     "numbers, with each chroma pixel repeated"
 )
 
-# States how numbers become frames.
+# How numbers become frames.
 NUMBERS_RECIPE: Final = "numbers as they are, float64"
 
 # (height, width) in pixels.
 Size = tuple[int, int]
 
-# Distances in metres that are shown black and white, or the range that numbers are kept in.
+# Range of distances (m) that are black and white, or range to which numbers are limited.
 Depth = tuple[float, float]
 
-# Whether frames show colours; "auto" looks at a log's first frames.
+# Whether frames are in colour; "auto" decides by the first frames of a log.
 Color = bool | Literal["auto"]
 
-# How an image of another ratio of the sides becomes a frame: see `fitted`.
+# How an image of another aspect ratio becomes a frame: see `fitted`.
 Fit = Literal["crop", "pad", "stretch"]
 
-# What frames are shown without before anything is learned: nothing, or each episode's mean.
+# What is subtracted from frames before learning: nothing, or the mean of each episode.
 Centre = Literal["run", "episode"]
 
-# Which time of a message counts: when it was logged, or that in its header.
+# Time of a message: when it was logged, or the time in its header.
 Clock = Literal["log", "header"]
 
-# What frames show where a camera paused: nothing, or its last image.
+# Frames while a camera paused: none, or its last image.
 Gaps = Literal["skip", "hold"]
 
-# How streams that differ are put on one clock: the i-th images, or the last ones at each time.
+# How streams with different times get one clock: by index, or by the last image at each time.
 Align = Literal["index", "time"]
 
-# Reaction to a live stream that stalls or goes away.
+# Reaction to a live stream that stalls or disconnects.
 OnLoss = Literal["reconnect", "wait", "end"]
 
 
@@ -98,7 +98,7 @@ class InputConfig(Section):
     stall: float = key(5.0, 0.1, 1e6)
 
 
-# Options of the command line for the settings that are no keys `input.*`.
+# Options of the command line for settings that are not keys `input.*`.
 OPTIONS: Final = {
     "topics": "--topic",
     "fields": "--field",
@@ -110,8 +110,8 @@ OPTIONS: Final = {
     "color": "--color",
 }
 
-# Keys that apply to our own recordings, too: these are not read as external logs for them.
-OF_EVERY_SOURCE: Final = ("centre", "holdout", "hold", "lost", "stall")
+# Keys that apply to recordings too: setting them does not make a source an external log.
+COMMON_KEYS: Final = ("centre", "holdout", "hold", "lost", "stall")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,14 +119,15 @@ class InputOptions(InputConfig):
     """How external logs and live streams become streams of frames.
 
     Attributes:
-        topics: topics of a log, a stream each, or patterns of them.
-        fields: numbers that are taken instead of images; see `Field`.
-        size: of frames; by default that with the images' ratio and at most 128x48 pixels.
-        rate: frames a second; by default those of the first stream.
-        start: seconds of a log before this time are left out.
-        end: seconds of a log from this time on are left out.
-        align: how streams that differ are put on one clock; without it they are refused.
-        color: whether frames show red, green and blue beside one another.
+        topics: topics of a log, one for each stream, or patterns of topics.
+        fields: fields of numbers to use instead of images; see `Field`.
+        size: (height, width) of frames; None: the aspect ratio of the images with at most as many
+            pixels as 128x48.
+        rate: frames a second; None: that of the first stream.
+        start: time of the log at which frames begin (s).
+        end: time of the log at which frames end (s); None: its end.
+        align: how streams with different times get one clock; None: refuse them.
+        color: True to show the red, green and blue images side by side.
     """
 
     topics: tuple[str, ...] = ()
@@ -140,7 +141,7 @@ class InputOptions(InputConfig):
 
     @classmethod
     def key_name(cls, name: str) -> str:
-        """Return how the command line calls a setting: its option, or its key."""
+        """Return the option of the command line for a setting, or its key."""
         return OPTIONS.get(name, f"{cls.prefix}.{name}")
 
     def chosen(self, names: Collection[str] | None = None) -> tuple[str, ...]:
@@ -152,13 +153,13 @@ class InputOptions(InputConfig):
         )
 
     def named(self, names: Collection[str] | None = None) -> list[str]:
-        """Return the options and keys of `chosen` settings, as errors name them."""
+        """Return the options and keys of the `chosen` settings, for errors."""
         return [self.key_name(name) for name in self.chosen(names)]
 
     @property
     def external(self) -> bool:
-        """Whether these settings have our own recordings read as external logs are."""
-        return any(name not in OF_EVERY_SOURCE for name in self.chosen())
+        """Whether a setting requires that recordings are read like external logs."""
+        return any(name not in COMMON_KEYS for name in self.chosen())
 
     @property
     def config(self) -> InputConfig:
@@ -168,10 +169,10 @@ class InputOptions(InputConfig):
         )
 
     def configured(self, *layers: Mapping[str, Any]) -> InputOptions:
-        """Return the same options with keys `input.*` of layers of values; the last one wins.
+        """Return the options with keys `input.*` from layers of values; later layers override.
 
         Raises:
-            UsageError: an unknown key, or a value that does not fit.
+            UsageError: a key is unknown, or a value does not fit.
         """
         return cast(InputOptions, build(InputConfig, "input", *layers, base=self))
 
@@ -184,7 +185,7 @@ class InputOptions(InputConfig):
         ]
 
     def words(self) -> list[str]:
-        """Return the words of a command line that give these settings; none for defaults."""
+        """Return the words of a command line for the settings that are not the defaults."""
         words: list[str] = []
         for name in self.chosen(OPTIONS):
             value = getattr(self, name)

@@ -1,4 +1,4 @@
-"""Raw pixels of all supported formats to gray or colours; images to fewer pixels."""
+"""Conversion of raw pixels in all supported formats to gray or colour, and shrinking of images."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import Depth
 
-# Content of one message: a gray image, (height, width) uint8, or one in colours, (height, width,
-# 3), or numbers, (I,) float64.
-Shown = NDArray[Any]
+# Content of a message: a gray image (height, width) uint8, a colour image (height, width, 3) uint8,
+# or numbers (I,) float64.
+Content = NDArray[Any]
 
-# Largest image that is decoded, more than one of 7680x4320.
+# Largest number of pixels of an image that is decoded, more than 7680x4320.
 MAX_PIXELS: Final = 36_000_000
 
-# Pixel formats that are read as they are, and what each byte of a pixel is.
+# Supported pixel formats, and the meaning of each byte of a pixel.
 ENCODINGS: Final[Mapping[str, str]] = {
     "mono8": "g",
     "8UC1": "g",
@@ -34,24 +34,24 @@ ENCODINGS: Final[Mapping[str, str]] = {
     "8UC4": "bgrX",
 }
 
-# Formats of one colour a pixel, and the colours of two by two of them, row by row.
+# Formats with one colour for each pixel, and the colours of two by two pixels, row by row.
 _BAYER: Final[Mapping[str, str]] = {
     f"bayer_{order}{bits}": order for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)
 }
 
-# Formats of distances: their numbers, and how many metres one is (REP 118).
+# Formats of distances: their numpy type, and the metres of one unit (REP 118).
 DISTANCES: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
 
-# Pixels that are converted at a time: the steps between take several bytes for each.
+# Pixels that are converted at a time, because intermediate arrays take several bytes for each.
 _BAND: Final = 1 << 20
 
 
 class MalformedImage(LogDamagedError):  # noqa: N818 - its text lacks the place
-    """An image cannot be read; the caller adds where it is."""
+    """Image that cannot be read; the caller adds its place to the error."""
 
 
 class UnknownPixels(MalformedImage):
-    """The pixels have a format that is not supported."""
+    """Pixels in a format that is not supported."""
 
 
 def raw_image(
@@ -67,28 +67,29 @@ def raw_image(
 ) -> ByteArray:
     """Convert pixels of any supported format to gray, (height, width) uint8.
 
-    Each two by two pixels of a Bayer pattern become one, (height // 2, width // 2).
+    Two by two pixels of a Bayer pattern become one, so that the result is (height // 2, width //
+    2).
 
     Args:
-        data: rows of `step` bytes, 0 for no more than the pixels take.
-        height: rows of pixels.
-        width: pixels of a row.
-        encoding: the pixel format, as ROS names it.
-        step: bytes from one row to the next.
-        big_endian: the byte order of 16 and 32 bits.
-        depth: show distances, 16UC1 in millimetres and 32FC1 in metres, from black to white;
-            no measurement is black, too. None takes 16UC1 as gray.
-        color: return colours as red, green and blue, (height, width, 3).
+        data: rows of `step` bytes.
+        height: height of the image (pixels).
+        width: width of the image (pixels).
+        encoding: name of the pixel format in ROS.
+        step: bytes from one row to the next; 0: as many as the pixels take.
+        big_endian: byte order of values of 16 and 32 bits.
+        depth: distances (m) that become black and white, for 16UC1 in millimetres and 32FC1 in
+            metres; pixels without a measurement become black. None: 16UC1 is gray.
+        color: True to return red, green and blue, (height, width, 3).
 
     Raises:
-        UsageError: 32FC1, and no `depth`.
-        UnknownPixels: an unsupported format.
-        MalformedImage: sizes that contradict the data.
+        UsageError: 32FC1 without `depth`.
+        UnknownPixels: the format is not supported.
+        MalformedImage: the sizes contradict the data.
     """
     number, metres = DISTANCES.get(encoding, ("", 0.0))
     if encoding == "32FC1" and depth is None:
         raise UsageError(
-            "its images are distances (32FC1): say which to show, as --set input.range=0.3,5"
+            "its images are distances (32FC1): set their range, such as --set input.range=0.3,5"
         )
     if number and depth is not None:
         size = int(number[1])
@@ -98,7 +99,9 @@ def raw_image(
         size = len(ENCODINGS[encoding])
     else:
         known = ", ".join([*ENCODINGS, "32FC1", *_BAYER])
-        raise UnknownPixels(f"its pixel format {encoding[:40]!r} is not read: use one of {known}")
+        raise UnknownPixels(
+            f"its pixel format {encoding[:40]!r} is not supported: use one of {known}"
+        )
     step = step or width * size
     fits = width * size <= step and step * (height - 1) + width * size <= len(data)
     if not 0 < height * width <= MAX_PIXELS or not fits:
@@ -139,10 +142,10 @@ def by_bands(pixels: NDArray[Any], convert: Callable[[NDArray[Any]], Any]) -> By
 
 
 def _bayer(pixels: ByteArray, order: str, *, color: bool) -> ByteArray:
-    """Return the gray or the colours of each two by two pixels; green is the mean of its two."""
+    """Return gray or colour of each two by two pixels; green is the mean of its two pixels."""
     height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
     if not height * width:
-        raise MalformedImage("a Bayer pattern has two rows and columns at least")
+        raise MalformedImage("its Bayer pattern has less than two rows or columns")
     squares = pixels[: 2 * height, : 2 * width].reshape(height, 2, width, 2).swapaxes(1, 2)
     cells = squares.reshape(height, width, 4)
     if color:
@@ -150,13 +153,13 @@ def _bayer(pixels: ByteArray, order: str, *, color: bool) -> ByteArray:
         total = cells[:, :, first].astype(np.uint16) + cells[:, :, second]
         green = ((total + 1) >> 1).astype(np.uint8)
         return np.stack([cells[:, :, order.index("r")], green, cells[:, :, order.index("b")]], 2)
-    # The weights of `RECIPE`, with green's on two pixels.
+    # The weights of `RECIPE`, with that of green divided among two pixels.
     weights = np.array([{"r": 19595, "g": 19235, "b": 7471}[name] for name in order], np.uint32)
     return by_bands(cells, lambda part: (part @ weights + 32768) >> 16)
 
 
 def _depth_gray(values: NDArray[Any], metres: float, depth: Depth) -> FloatArray:
-    """Map distances to gray; 0, infinity and NaN mean no measurement and are black."""
+    """Map distances to gray; 0, infinity and NaN mean no measurement and become black."""
     near, far = depth
     distances = values.astype(np.float64) * metres
     distances[~np.isfinite(distances) | (distances <= 0)] = near
@@ -164,23 +167,23 @@ def _depth_gray(values: NDArray[Any], metres: float, depth: Depth) -> FloatArray
 
 
 def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) -> ByteArray:
-    """Average the areas of a gray image into fewer pixels.
+    """Shrink a gray image by averaging areas.
 
     Args:
         image: (rows, columns) uint8.
-        height: rows of the result.
-        width: columns of the result.
-        enlarge: repeat the pixels of a smaller image instead of rejecting it.
+        height: height of the result.
+        width: width of the result.
+        enlarge: True to repeat the pixels of a smaller image instead of raising an error.
 
     Raises:
-        UsageError: the image is smaller.
+        UsageError: the image is smaller than the result.
     """
     if image.shape == (height, width):
         return image
     if not enlarge and (image.shape[0] < height or image.shape[1] < width):
         raise UsageError(
             f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
-            "choose larger images"
+            "choose a smaller --size, or larger images"
         )
     small = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
     return np.asarray(small, np.uint8)

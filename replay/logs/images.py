@@ -11,8 +11,8 @@ from typing import Final
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.processes import thread_count
-from recorder.images.compressed import AT_ONCE, compressed_image
-from recorder.images.pixels import Shown, UnknownPixels
+from recorder.images.compressed import MAX_THREAD_PIXELS, compressed_image
+from recorder.images.pixels import Content, UnknownPixels
 from replay.logs.stream import BROKEN, LogStream
 
 REMEDY: Final = "skip broken images with --skip-damaged"
@@ -41,7 +41,7 @@ class Images:
         self._threads = ThreadPoolExecutor(CORES)
         self._pending: dict[Place, Future[ByteArray] | None] = {}
         self._coming: Iterator[Place] = iter(())
-        self._whole: dict[int, tuple[int, Shown]] = {}
+        self._whole: dict[int, tuple[int, Content]] = {}
         self._broken: dict[int, dict[int, LogDamagedError]] = {}
 
     def expect(self, places: Iterable[Place]) -> None:
@@ -76,13 +76,15 @@ class Images:
                 data = stream.taken(row, stream.compressed)
         if data is None:
             return None
-        return self._threads.submit(compressed_image, data, color=self._color, most=AT_ONCE)
+        return self._threads.submit(
+            compressed_image, data, color=self._color, limit=MAX_THREAD_PIXELS
+        )
 
     def _forget(self, place: Place) -> None:
         if (coming := self._pending.pop(place)) is not None:
             coming.cancel()
 
-    def image(self, stream: int, row: int) -> Shown:
+    def image(self, stream: int, row: int) -> Content:
         """Read an image of a stream.
 
         Raises:
@@ -102,11 +104,11 @@ class Images:
         except UsageError as error:
             raise UsageError(f"{name(row)}: {error}") from None
 
-    def _decoded(self, stream: int, row: int) -> Shown:
+    def _decoded(self, stream: int, row: int) -> Content:
         image = self.pop((stream, row))
         return self._streams[stream].image(row) if image is None else image
 
-    def _whole_image(self, stream: int, row: int) -> Shown:
+    def _whole_image(self, stream: int, row: int) -> Content:
         """Return the last whole image up to a row, else the first behind it: of the log alone."""
         broken = self._broken.setdefault(stream, {})
         count = self._streams[stream].count

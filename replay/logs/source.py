@@ -18,7 +18,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.framing import Framing, framings
 from recorder.images.options import COLOR_RECIPE, InputOptions
-from recorder.images.pixels import Shown
+from recorder.images.pixels import Content
 from recorder.log.scenery import turns_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
@@ -86,7 +86,7 @@ class LoggedSource(StoredSource):
         if self.recorded:
             self.more = "record more frames, or "
         self.changes: dict[int, str] = {}
-        self._last_frames: dict[int, tuple[int, Shown]] = {}
+        self._last_frames: dict[int, tuple[int, Content]] = {}
         self._together = False
         self._images: Images | None = None
         try:
@@ -195,7 +195,7 @@ class LoggedSource(StoredSource):
         last = {(number, row) for number, (row, _) in self._last_frames.items()}
         self._images.expect(place for place in places if place not in last)
 
-    def _frame(self, stream: int, row: int, image: Shown | None = None) -> Shown:
+    def _frame(self, stream: int, row: int, image: Content | None = None) -> Content:
         """Return a stream's image as a frame; decoded once if it is repeated."""
         last = self._last_frames.get(stream)
         if last is not None and last[0] == row:

@@ -15,7 +15,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.options import RECIPE
-from recorder.images.pixels import MalformedImage, Shown
+from recorder.images.pixels import Content, MalformedImage
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord
 
@@ -80,7 +80,7 @@ class LogStream:
     times: IntArray | None = None
     begins: int = 0
     fetch: Callable[[int], Any] = int
-    decode: Callable[[Any], Shown] = np.asarray
+    decode: Callable[[Any], Content] = np.asarray
     compressed: Callable[[Any], bytes | None] | None = None
     read: Callable[[Rows], tuple[NDArray[Any], FloatArray]] | None = None
     memory_bytes: Callable[[], int] = int
@@ -110,7 +110,7 @@ class LogStream:
         if self.times is not None:
             check_times(f"{self.path}: {self.topic}", self.times)
 
-    def image(self, row: int) -> Shown:
+    def image(self, row: int) -> Content:
         """Decode a row.
 
         Raises:
@@ -118,7 +118,7 @@ class LogStream:
             LogDamagedError: the log is damaged there.
         """
         if self.read is not None:
-            image: Shown = self.read(range(row, row + 1))[0][0]
+            image: Content = self.read(range(row, row + 1))[0][0]
             return image
         return self.taken(row, self.decode)
 

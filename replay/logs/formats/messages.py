@@ -18,12 +18,12 @@ from recorder.images.messages import (
     SCHEMAS,
     MessageKind,
     decoder_of,
-    packed_picture,
+    packed_image,
     stamp_of,
     stated_format,
 )
 from recorder.images.options import NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, InputOptions
-from recorder.images.pixels import MalformedImage, Shown
+from recorder.images.pixels import Content, MalformedImage
 from recorder.images.videos import VideoPackets
 from recorder.mcap.records import MalformedRecord
 from replay.logs.stream import LogStream
@@ -140,7 +140,7 @@ def message_stream(
         times=times,
         fetch=fetch,
         decode=decode,
-        compressed=partial(packed_picture, *names) if is_packed else None,
+        compressed=partial(packed_image, *names) if is_packed else None,
         stamp=stamp_of(kind) if options.stamp == "header" else None,
         pixel_format=partial(stated_format, *names),
         recipe=NUMBERS_RECIPE if options.fields else RECIPE,
@@ -214,7 +214,7 @@ class _Video:
         assert messages.times is not None
         return video.part(np.arange(first, messages.count), messages.times[first:])
 
-    def _decode(self, row: int) -> Shown:
+    def _decode(self, row: int) -> Content:
         start = row
         while start not in (self._first, self._next) and not self._begins(start):
             start -= 1
