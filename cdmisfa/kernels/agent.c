@@ -1,12 +1,12 @@
-/* The curious agent: what it makes of a block, when it saves, what is rewarded, where it looks. */
+/* The curious agent: statistics of a block, saving, rewards, and the choice of the next stream. */
 
-static const double TIE = 1e-12;         /* share of a value below which a gain is rounding */
-static const double IDLE_EPSILON = 1e-3; /* below this the agent practically does not explore */
+static const double TIE = 1e-12;         /* relative gain up to which two values count as equal */
+static const double IDLE_EPSILON = 1e-3; /* epsilon below which the agent practically exploits */
 
-enum { MAX_SWEEPS = 100 }; /* of policy iteration, which takes a handful; bounds rounding cycles */
+enum { MAX_SWEEPS = 100 }; /* of policy iteration, which takes a few; rounding could make a cycle */
 
-/* Take output j on a block into its slowness, its change, and the gate's statistics; the block
- * counts among the novel ones already, its frames do not. */
+/* Update slowness, its change, and the gate's statistics with output j on a block; the block is
+ * counted among the novel ones already, its frames are not. */
 static void track_output(const agent *a, int64_t j, const double *y) {
   const rules *r = a->rules;
   int64_t blocks = a->memory->novel_blocks;
@@ -27,7 +27,7 @@ static void track_output(const agent *a, int64_t j, const double *y) {
   if (isnan(a->eta_dot[j])) a->eta_dot[j] = change;
   else a->eta_dot[j] += 2 / (r->eta_dot_window + 1) * (change - a->eta_dot[j]);
   a->eta_inst[j] = slowness(now.derivative, now.variance);
-  if (a->eta_inst[j] == INFINITY) return; /* what stands still has no slowness to average */
+  if (a->eta_inst[j] == INFINITY) return; /* a constant output has no slowness to average */
   double weight = window_rate(r->gate_window, blocks), step = a->eta_inst[j] - a->gate_mean[j];
   a->gate_mean[j] += weight * step;
   a->gate_variance[j] = (1 - weight) * (a->gate_variance[j] + weight * step * step);
@@ -43,7 +43,7 @@ static bool converged(const double *eta_dot, int64_t J, double delta) {
   return true;
 }
 
-/* Whether the abstraction has settled on something alive, while the agent stays with it. */
+/* Whether the output has settled and varies, and the agent stays with novel blocks of a stream. */
 static bool ready_to_save(const agent *a) {
   const memory *m = a->memory;
   const rules *r = a->rules;
@@ -53,7 +53,7 @@ static bool ready_to_save(const agent *a) {
   return r->tabular ? m->roc_error < r->roc_error : converged(a->eta_dot, a->outputs, r->delta);
 }
 
-/* Beta times the Gaussian Z of the mean weight change; sigma 0 means none.
+/* Beta times the Gaussian Z of the mean weight change; sigma 0 switches it off.
  *
  * Equation: 5
  */
@@ -61,7 +61,7 @@ static double expert_reward(double xi, double sigma, double beta) {
   return sigma <= 0 ? 0 : beta * exp_of(-xi * xi / (2 * sigma * sigma));
 }
 
-/* How much the mean weight change fell since the novel block before.
+/* Decrease of the mean weight change since the previous novel block.
  *
  * Equation: 5
  */
@@ -72,10 +72,11 @@ static double *last_entry(const agent *a, int64_t stream) {
   return a->dense + (2 * a->memory->last_stream + a->memory->last_action) * a->streams + stream;
 }
 
-/* Take the reward of the last transition into the sums whose quotient by their count t is R.
+/* Add the reward of the last transition to the sums; divided by their count t, these are R.
  *
- * R <- R~/t + (1 - 1/t) R, with R~ zero but for the entry (s, a, s'), is the mean over all rewarded
- * iterations: sum / t. Kept are the sums that the policy needs, and the tensor where it is small.
+ * R <- R~/t + (1 - 1/t) R, where R~ is zero except for the entry (s, a, s'), is the mean over all
+ * rewarded iterations: sum / t. The sums that the policy needs are stored, and the whole tensor if
+ * it is small.
  *
  * Equation: 6
  */
@@ -85,10 +86,10 @@ static void add_reward(const agent *a, int64_t stream, double reward) {
   if (a->tensor) *last_entry(a, stream) += reward;
 }
 
-/* CD-MISFA 1.0: move the entry (s, a, s') towards the reward; the norm of the tensor.
+/* CD-MISFA 1.0: move the entry (s, a, s') towards the reward; return the norm of the tensor.
  *
- * R~(s,a,s') <- alpha r + (1 - alpha) R~(s,a,s'), R = R~ / |R~|. No other entry changes, which is
- * what makes 1.0 unstable (paper, CD-MISFA 1.0 vs CD-MISFA 2.0 (b)).
+ * R~(s,a,s') <- alpha r + (1 - alpha) R~(s,a,s'), R = R~ / |R~|. The other entries do not change,
+ * which makes 1.0 unstable (paper, CD-MISFA 1.0 vs CD-MISFA 2.0 (b)).
  */
 static double add_reward_locally(const agent *a, int64_t stream, double reward) {
   int64_t S = a->streams, s = a->memory->last_stream;
@@ -102,10 +103,10 @@ static double add_reward_locally(const agent *a, int64_t stream, double reward) 
 
 /* Sum T of the values of all streams under the policy.
  *
- * Stay leads from s to s; switch to each other stream with probability 1/(n-1). Under a policy the
- * values then obey V(s) = r_stay(s) / (1 - gamma) where it stays, and where it switches
- * V(s) = r_switch(s) + gamma (T - V(s)) / (n-1): one unknown. A common factor of R changes no
- * policy, so its sums stand for it.
+ * Stay leads from s to s; switch leads to each other stream with probability 1/(n-1). The values of
+ * a policy obey V(s) = r_stay(s) / (1 - gamma) where it stays, and where it switches
+ * V(s) = r_switch(s) + gamma (T - V(s)) / (n-1), with one unknown T. A common factor of R does not
+ * change the policy, so its sums are used instead.
  */
 static double value_sum(const agent *a) {
   const double *stay = a->stay_sum, *leave = a->switch_sum;
@@ -128,14 +129,14 @@ static double value_sum(const agent *a) {
     total += policy[s] == 1 ? leave[s] : stay[s] * horizon;
     leavers += policy[s] == 1;
   }
-  /* Written so that nothing cancels when every stream is left and gamma is close to 1. */
+  /* This form has no cancellation if every stream is left and gamma is close to 1. */
   return total / (n - (double)leavers + (double)(leavers - 1) * (1 - gamma));
 }
 
-/* Make the policy greedy for the values it has; whether any stream changed its mind.
+/* Make the policy greedy for its values; return whether the action of any stream changed.
  *
- * With V(s) the value of s where it is left and where it stays, leaving is better under either
- * policy where the first is greater.
+ * With V(s) the values of s if it is left and if it stays, leaving is better under either policy if
+ * the first is greater.
  */
 static bool improve(const agent *a) {
   const double *stay = a->stay_sum, *leave = a->switch_sum;
@@ -161,10 +162,10 @@ static bool improve(const agent *a) {
   return changed != 0;
 }
 
-/* Values Q (S, 2) of both actions in every stream, under a policy that needs none to be chosen. */
+/* Values Q (S, 2) of both actions in every stream under the agent's policy. */
 void action_values(const agent *a, double *Q) {
   double gamma = a->rules->gamma, horizon = 1 / (1 - gamma), others = (double)(a->streams - 1);
-  double count = a->memory->scale > 0 ? a->memory->scale : 1; /* before, all sums are 0 */
+  double count = a->memory->scale > 0 ? a->memory->scale : 1; /* before any reward all sums are 0 */
   double share = others > 0 ? gamma / others : 0, damp = 1 / (1 + share);
   double arriving = others > 0 ? share * value_sum(a) / count : 0;
   const double *stay = a->stay_sum, *leave = a->switch_sum;
@@ -178,8 +179,8 @@ void action_values(const agent *a, double *Q) {
   if (a->streams == 1) Q[1] = Q[0];
 }
 
-/* Take the reward of the last transition into R, and improve the policy until it is optimal for R;
- * ties go to stay. */
+/* Update R with the reward of the last transition, and improve the policy until it is optimal for
+ * R; ties go to stay. */
 static void estimate_reward(const agent *a, double reward) {
   memory *m = a->memory;
   m->rewards++;
@@ -194,8 +195,9 @@ static void estimate_reward(const agent *a, double reward) {
     for (int k = 0; k < MAX_SWEEPS && improve(a); k++) continue;
 }
 
-/* Decaying epsilon-greedy: epsilon falls by one factor above the knee, by another below (paper,
- * Oscillatory Streams Environment); a switch leads to each of the other streams alike.
+/* Choose the next stream by decaying epsilon-greedy: epsilon shrinks by one factor above the knee
+ * and by another below (paper, Oscillatory Streams Environment); a switch leads to each other
+ * stream with the same probability.
  *
  * uniforms: three draws from [0, 1): whether to explore, the random action, the stream.
  */
@@ -219,7 +221,7 @@ static void act(const agent *a, const double *uniforms) {
   m->stream = o->next_stream;
 }
 
-/* Mean weight change over the frames of a block that have one: not the first after a gap. */
+/* Mean weight change over the frames of a block, without the first one after a gap. */
 static double mean_change(const double *xi, int64_t n) {
   double total = 0;
   int64_t count = 0;
@@ -230,7 +232,7 @@ static double mean_change(const double *xi, int64_t n) {
   return count ? total / (double)count : NAN;
 }
 
-/* What a novel block brings that ends before frame t: its reward, and whether to save. */
+/* Compute the reward of a novel block that ends before frame t, and whether to save. */
 static void judge(const agent *a, double xi, const double *y, int64_t t) {
   memory *m = a->memory;
   outcome *o = a->out;
@@ -251,11 +253,11 @@ static void judge(const agent *a, double xi, const double *y, int64_t t) {
   o->saved = ready_to_save(a);
 }
 
-/* One iteration after the gate's verdict and the abstraction's update.
+/* One iteration after the result of the gate and the update of the features.
  *
- * xi (n,): weight change at each frame of the block, which begins at frame t; y (n, J): outputs on
- * it; both are of no use unless it is novel. Where `saved` comes out true, the caller freezes the
- * abstraction and begins another; the statistics are still those of the saved one.
+ * xi (n,): weight change at each frame of the block, which begins at frame t; y (n, J): its
+ * outputs; both are unused unless the block is novel. If `saved` is true afterwards, the caller
+ * saves the features and begins new ones; the statistics are still those of the saved features.
  */
 int think(const agent *a, const double *xi, const double *y, int64_t t, const double *uniforms) {
   memory *m = a->memory;
@@ -277,7 +279,7 @@ int think(const agent *a, const double *xi, const double *y, int64_t t, const do
   return 0;
 }
 
-/* One iteration: known or novel, learn where it is novel, think; y is NaN where it is not. */
+/* One iteration: ask the gate, learn if the block is novel, think; y is NaN if it is not novel. */
 int iterate(const agent *a, const frozen *f, const incsfa *feature, const frames *shown,
             const frames *x, int64_t t, const double *uniforms, double *y, double *y_frozen,
             double *eta_inst, double *roc_error) {
@@ -298,13 +300,13 @@ int iterate(const agent *a, const frozen *f, const incsfa *feature, const frames
   return code;
 }
 
-/* Some frames of a table of them. */
+/* Frames [first, first + n) of a table. */
 static frames frames_from(const frames *x, int64_t first, int64_t n) {
   int64_t at = first * x->size;
   return (frames){n, x->size, x->pixels ? x->pixels + at : NULL, x->values ? x->values + at : NULL};
 }
 
-/* Keep iteration k in the curves of a trial. */
+/* Write iteration k into the curves of a trial. */
 static void keep_curves(const agent *a, const curves *kept, int64_t k) {
   int64_t S = a->streams, J = a->outputs;
   double scale = a->memory->scale > 0 ? a->memory->scale : 1;
@@ -315,11 +317,11 @@ static void keep_curves(const agent *a, const curves *kept, int64_t k) {
   action_values(a, kept->Q + 2 * k * S);
 }
 
-/* Up to n iterations on streams that repeat: until a module is to be saved, epsilon falls below
- * `swap_below` or patience ends; how many were done, or what went wrong.
+/* Do up to n iterations on periodic streams: until a module is ready to be saved, epsilon falls
+ * below `swap_below`, or patience ends. Returns the number of iterations, or an error.
  *
- * shown, x: of each stream a period of it and the tau frames that follow, x expanded. uniforms
- * (n, 3) as in `act`. kept: null, or what is kept of each iteration.
+ * shown, x: for each stream one period and the tau frames that follow, raw and expanded. uniforms
+ * (n, 3) as in `act`. kept: null, or the curves to write.
  */
 int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const frames *shown,
                    const frames *x, const double *uniforms, int64_t n, double swap_below,
@@ -343,8 +345,8 @@ int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const
   return code ? code : done;
 }
 
-/* The work of some blocks that only one of the two algorithms does, to be timed: y (phases, n, J)
- * and y_frozen (phases, M, n, J) are what abstraction and modules give out; told (M, J) scratch. */
+/* The work of some blocks that only one of the two algorithms does, for benchmarks: y (phases, n,
+ * J) and y_frozen (phases, M, n, J) are outputs of features and modules; told (M, J) is scratch. */
 void own_work(const agent *a, const frozen *f, int64_t blocks, int64_t phases, const double *y,
               const double *y_frozen, double *told) {
   memory *m = a->memory;

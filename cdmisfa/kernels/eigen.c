@@ -1,14 +1,14 @@
 /* Eigenvectors of small symmetric matrices: Householder reduction to a tridiagonal matrix, then the
- * implicit QL method. Reflectors and vectors lie in rows: every inner loop runs along memory.
+ * implicit QL method. Reflectors and vectors are rows, so that inner loops run along memory.
  *
  * Source: Golub and Van Loan, Matrix Computations, 8.3.
  */
 
-enum { QL_STEPS = 60 }; /* most for one eigenvalue; two or three are what it takes */
+enum { QL_STEPS = 60 }; /* limit for one eigenvalue, which takes two or three */
 
 static const double LAST_BIT = 2.3e-16;
 
-/* Householder reduction to a diagonal and what is beside it; reflectors replace the rows of a. */
+/* Householder reduction to diagonal and off-diagonal; reflectors replace the rows of a. */
 static void reduce(int64_t n, double *a, double *values, double *beside, double *factors,
                    double *q) {
   for (int64_t k = 0; k < n; k++) {
@@ -32,7 +32,7 @@ static void reduce(int64_t n, double *a, double *values, double *beside, double 
   }
 }
 
-/* One implicit QL step from `first` on; 0 where that eigenvalue stands alone already. */
+/* One implicit QL step from `first` on; 0 if that eigenvalue is separated already. */
 static int ql_step(int64_t n, int64_t first, double *values, double *beside, double *vectors) {
   int64_t last = first;
   while (last < n - 1 &&
@@ -70,8 +70,8 @@ static int ql_step(int64_t n, int64_t first, double *values, double *beside, dou
   return 1;
 }
 
-/* Eigenvalues (n,), the largest first, and eigenvectors (n, n), one a row, of a symmetric matrix,
- * which is overwritten; 3 n numbers are spare.
+/* Eigenvalues (n,), the largest first, and eigenvectors (n, n), one in each row, of a symmetric
+ * matrix, which is overwritten; `spare` has 3 n numbers.
  */
 void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare) {
   double *beside = take_zeros(&spare, n), *factors = take_zeros(&spare, n);

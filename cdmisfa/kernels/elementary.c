@@ -1,12 +1,12 @@
-/* exp, log, sine, cosine and normal draws by additions, multiplications and divisions alone.
+/* exp, log, sine, cosine and normal draws from additions, multiplications and divisions only.
  *
- * Those of C libraries are as exact, but their last bit depends on library and processor.
+ * Functions of C libraries are as exact, but their last bit depends on library and processor.
  */
 
 static const double LN_2 = 0.693147180559945309417;
-/* In two parts: the first of 33 bits, so that its products with exponents are exact. */
+/* ln 2 in two parts: the first has 33 bits, so that its products with exponents are exact. */
 static const double LN_2_HIGH = 6.93147180369123816490e-01, LN_2_LOW = 1.90821492927058770002e-10;
-/* In three parts: the first two of 33 bits. */
+/* pi / 2 in three parts: the first two have 33 bits. */
 static const double HALF_PI[3] = {1.57079632673412561417, 6.07710050630396597660e-11,
                                   2.02226624879595063154e-21};
 
@@ -25,7 +25,7 @@ static uint64_t to_bits(double x) {
 /* 2^k for -1022 <= k <= 1023. */
 static double power_of_two(int64_t k) { return from_bits((uint64_t)(k + 1023) << 52); }
 
-/* The series of exp about the nearest whole power of two; the next term is below half a bit. */
+/* Series of exp around the nearest power of two; the next term is below half a bit. */
 double exp_of(double x) {
   if (!(x >= -745.2)) return x < 0 ? 0.0 : NAN;
   if (x > 709.8) return INFINITY;
@@ -36,7 +36,7 @@ double exp_of(double x) {
   return total * power_of_two(halvings / 2) * power_of_two(halvings - halvings / 2);
 }
 
-/* The series of artanh: log m = 2 artanh((m - 1) / (m + 1)) for m between sqrt(1/2) and sqrt(2). */
+/* Series of artanh: log m = 2 artanh((m - 1) / (m + 1)) for m between sqrt(1/2) and sqrt(2). */
 double log_of(double x) {
   if (!(x > 0)) return x == 0 ? -INFINITY : NAN;
   if (x == INFINITY) return x;
@@ -58,7 +58,7 @@ double log_of(double x) {
   return fused((double)exponent, LN_2_HIGH, 2 * ratio + small);
 }
 
-/* Sine of x + `ahead` quarter turns, by the series of both within an eighth of a turn. */
+/* Sine of x + `ahead` quarter turns, by the series of sine or cosine within an eighth of a turn. */
 static double sine(double x, int ahead) {
   double turns = floor(fused(x, 1.0 / (HALF_PI[0] + HALF_PI[1]), 0.5));
   double rest = fused(-turns, HALF_PI[2], fused(-turns, HALF_PI[1], fused(-turns, HALF_PI[0], x)));
@@ -72,7 +72,7 @@ static double sine(double x, int ahead) {
   return quarter % 4 < 2 ? y : -y;
 }
 
-/* (n,) of numbers up to a million; of larger ones nothing is said. */
+/* Sines of n numbers of at most a million; the results for larger numbers are undefined. */
 void sines(const double *x, int64_t n, double *out) {
   for (int64_t i = 0; i < n; i++) out[i] = fabs(x[i]) < 1e9 ? sine(x[i], 0) : NAN;
 }
@@ -82,14 +82,14 @@ void cosines(const double *x, int64_t n, double *out) {
 }
 
 /* Standard normal draws from the words of a bit generator, by the ziggurat of Marsaglia and Tsang
- * (2000) with 256 layers, in the order in which numpy's Generator uses the words: the draws are
- * those of `standard_normal` but for the rounding of its tail.
+ * (2000) with 256 layers. Words are used in the order of numpy's Generator: the draws equal those
+ * of `standard_normal` up to the rounding of its tail.
  *
- * Returns how many words were used, or -1 where there are too few.
+ * Returns the number of words used, or -1 if there are too few.
  */
 int64_t normals(const uint64_t *words, int64_t n_words, double *out, int64_t n) {
   const double edge = 3.6541528853610088, area = 0.00492867323397465524494;
-  double right[256], height[256], inside[256]; /* of each layer; share of it under the next one */
+  double right[256], height[256], inside[256]; /* of each layer; its share under the next layer */
   right[255] = edge;
   height[0] = 1;
   height[255] = exp_of(-0.5 * edge * edge);

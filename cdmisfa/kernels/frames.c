@@ -1,12 +1,12 @@
-/* Chunks of logs: their messages found, and the values in them copied. */
+/* Chunks of logs: find their messages, and copy the values in them. */
 
-enum { /* of a log's records: an opcode, and bytes of what stands before something */
+enum { /* opcode of a message, and sizes of headers */
   MESSAGE = 5,
   BEFORE_RECORD = 9,  /* opcode and length */
-  BEFORE_PAYLOAD = 31 /* of a message, with the record's */
+  BEFORE_PAYLOAD = 31 /* header of a message, with that of its record */
 };
 
-/* The unsigned number of up to eight bytes, least first. */
+/* Unsigned number of up to eight bytes, the lowest first. */
 INLINE uint64_t number(const uint8_t *at, size_t width) {
   uint64_t value = 0;
   memcpy(&value, at, width);

@@ -1,12 +1,12 @@
-/* The gate: whether a frozen module knows a block, by slowness or (CD-MISFA 1.0) by clusters. */
+/* The gate: which saved module explains a block, by slowness or (CD-MISFA 1.0) by clusters. */
 
 static const double TWO_PI = 6.28318530717958647693;
-static const double CONSTANT_VARIANCE = 1e-12; /* up to which an input counts as constant */
-static const double BAND = 2;        /* half width of a band of known slowness, in SD (paper) */
-static const double FORGOTTEN = 0.5; /* count below which a centre is empty again */
+static const double CONSTANT_VARIANCE = 1e-12; /* variance up to which an input is constant */
+static const double BAND = 2;        /* half width of a module's slowness band, in SD (paper) */
+static const double FORGOTTEN = 0.5; /* count below which a cluster centre is empty again */
 
-/* Eta of a signal from E(ydot^2) and Var(y), in cycles per frame; smaller is slower, white noise
- * has 0.2251. A signal without variance has no slowness: infinity.
+/* Slowness of a signal from E(ydot^2) and Var(y), in cycles a frame; smaller is slower, white noise
+ * has 0.2251. A signal without variance has infinite slowness.
  *
  * Equation: 2
  */
@@ -14,7 +14,7 @@ double slowness(double derivative, double variance) {
   return variance <= 0 ? INFINITY : sqrt(derivative / variance) / TWO_PI;
 }
 
-/* Of one output over a block; `derivative` is the mean squared difference of frames. */
+/* Moments of one output over a block; `derivative` is the mean squared difference of frames. */
 typedef struct {
   double mean, variance, derivative;
 } moments;
@@ -23,8 +23,8 @@ INLINE lanes load_each(const double *y, int64_t step) {
   return (lanes){y[0], y[step], y[2 * step], y[3 * step]};
 }
 
-/* Those of n numbers, of which each is `step` after the one before; from the first one, so that
- * what stands still has no variance at all and no other loses digits to a large mean. */
+/* Moments of n numbers at a distance of `step`. They are computed relative to the first number, so
+ * that a constant has no variance, and no digits are lost to a large mean. */
 INLINE moments moments_by(const double *y, int64_t n, int64_t step) {
   lanes aparts = spread(0), squares = aparts, changes = aparts;
   int64_t k = 1;
@@ -51,7 +51,7 @@ static moments moments_of(const double *y, int64_t n, int64_t step) {
   return step == 1 ? moments_by(y, n, 1) : moments_by(y, n, step);
 }
 
-/* Eta of each output from the frames of one block only; y (n, J).
+/* Slowness of each output within one block; y (n, J).
  *
  * Equation: 4
  */
@@ -62,18 +62,18 @@ void instantaneous_slowness(int64_t n, int64_t J, const double *y, double *eta) 
   }
 }
 
-/* Rate of an exponential mean over `window` samples that starts as a plain mean. */
+/* Rate of an exponential mean over `window` samples that begins as a plain mean. */
 static double window_rate(double window, int64_t count) {
   return larger(2 / (window + 1), 1 / (double)count);
 }
 
-/* The centre of a node nearest to a block's output, and its root mean square distance; where there
- * is none yet, -1 and the size of the output itself.
+/* Centre of a node that is nearest to a block's output, and their root mean square distance; if the
+ * node has no centre, -1 and the size of the output itself.
  *
- * CD-MISFA 1.0 is gated by clusters in place of slowness: one node for each label, which is the
- * stream, holds centres of what the abstraction gives out there. Node, winner and error: Luciw,
- * Kompella, Kazerounian and Schmidhuber 2013; clusters with counts: Guedalia, London and Werman
- * 1999. Our choices are decision 0014.
+ * CD-MISFA 1.0 has a gate by clusters instead of slowness: a node for each label, that is for each
+ * stream, holds centres of the outputs there. Node, winner and error: Luciw, Kompella, Kazerounian
+ * and Schmidhuber 2013; clusters with counts: Guedalia, London and Werman 1999. Our choices are in
+ * decision 0014.
  */
 static int64_t nearest(const agent *a, const double *centres, const double *counts,
                        const double *y, double *distance) {
@@ -88,10 +88,11 @@ static int64_t nearest(const agent *a, const double *centres, const double *coun
   return best;
 }
 
-/* CD-MISFA 1.0: take a block's output into the node of its label; its error, also in the mean.
+/* CD-MISFA 1.0: update the node of a label with a block's output; return its error, and update the
+ * mean error.
  *
- * Every count of every label decays; the winner moves by 1/count where it lies within the radius,
- * else the block becomes a centre in place of the weakest one.
+ * All counts of all labels decay. The winner moves by 1/count if it is within the radius; else the
+ * block replaces the centre with the smallest count.
  */
 static double track_clusters(const agent *a, int64_t label, const double *y) {
   memory *m = a->memory;
@@ -117,8 +118,8 @@ static double track_clusters(const agent *a, int64_t label, const double *y) {
   return error;
 }
 
-/* First frozen module (from 1) whose error on a block is below the threshold, or NOVEL; `error`
- * (M,) is NaN where it has no centre under the label. */
+/* First module (from 1) whose error on a block is below the threshold, or NOVEL; `error` (M,) is
+ * NaN for modules that have no centre for the label. */
 static int64_t known_to(const agent *a, const frozen *f, int64_t label, const double *y_frozen,
                         double *error) {
   int64_t known_by = NOVEL, length = a->tau * a->outputs;
@@ -136,14 +137,14 @@ static bool is_constant(const frames *x) {
   const char *shown = x->pixels ? (const char *)x->pixels : (const char *)x->values;
   size_t row = (size_t)x->size * (x->pixels ? 1 : sizeof *x->values);
   bool same = memcmp(shown + row, shown, (size_t)(x->n - 1) * row) == 0;
-  if (same || x->pixels) return same; /* a pixel that changes at all varies by more */
+  if (same || x->pixels) return same; /* any change of a pixel exceeds the threshold */
   for (int64_t i = 0; i < x->size; i++)
     if (moments_of(x->values + i, x->n, x->size).variance > CONSTANT_VARIANCE) return false;
   return true;
 }
 
-/* The first frozen module (from 1) that knows a block, or NOVEL: one does where the slowness of
- * every output within the block, `eta_inst` (M, J), lies in its band. */
+/* First module (from 1) that explains a block, or NOVEL. A module does if the slowness of every
+ * output within the block, `eta_inst` (M, J), is in its band. */
 static int64_t verdict(const agent *a, const frozen *f, const double *y_frozen, double *eta_inst) {
   int64_t known_by = NOVEL, J = a->outputs;
   for (int64_t m = 0; m < f->modules; m++) {
@@ -158,7 +159,7 @@ static int64_t verdict(const agent *a, const frozen *f, const double *y_frozen, 
 
 static bool within(int64_t x, int64_t low, int64_t high) { return low <= x && x < high; }
 
-/* Whether the memory points to streams and actions that there are, and counts what can be. */
+/* Whether the indices of the memory are in range, and its counts possible. */
 static bool is_state(const agent *a) {
   const memory *m = a->memory;
   const int64_t most = (int64_t)1 << 44;
@@ -168,11 +169,11 @@ static bool is_state(const agent *a) {
          within(m->rewards, 0, most) && within(m->idle, 0, most) && within(*a->y_frames, 0, most);
 }
 
-/* What knows the block of the agent's stream: a module (from 1), NOVEL or CONSTANT.
+/* Find what explains the block of the agent's stream: a module (from 1), NOVEL or CONSTANT.
  *
- * x is the block as shown or, where the learner expands it, expanded. Written: the modules' outputs
- * y_frozen (M, n, J), all in one pass over the block, their slowness eta_inst (M, J) and clustering
- * error (M,), NaN but for 1.0.
+ * `shown` is the raw block, x the expanded one. Written: the modules' outputs y_frozen (M, n, J),
+ * all in one pass over the block, their slowness eta_inst (M, J), and their clustering error (M,),
+ * NaN except for 1.0.
  */
 int recognise(const agent *a, const frozen *f, const frames *shown, const frames *x,
               double *y_frozen, double *eta_inst, double *roc_error) {

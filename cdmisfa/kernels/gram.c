@@ -1,44 +1,43 @@
-/* IncSFA on the Gram matrix of the CCIPCA vectors: the fast way for images.
+/* IncSFA with the Gram matrix of the CCIPCA vectors, the fast way for images.
  *
- * The trajectory is that of `update_by_frame` up to rounding. All scalars of a frame come from
+ * The result equals that of `update_by_frame` up to rounding. All scalars of a frame follow from
  * inner products, in O(K^2); the vectors themselves are read and written once for every four
- * frames. Where all frames of a block show the same, they are read and written once a block
- * (`still`). xi has no cancellation. The bits depend on how frames are cut into calls; the learner
+ * frames. Columns in which all frames of a block are equal (`still`) are read and written once a
+ * block. xi has no cancellation. The bits depend on how frames are cut into calls; the learner
  * always cuts by tau.
  */
 
 enum {
   GROUP = 4,      /* frames applied in one pass */
-  TILE = 256,     /* columns of a tile: a group's frames in it are 8 KB, a quarter of L1 */
-  CELL = 8,       /* neighbouring columns that change or stand still together */
-  BATCH = 32,     /* cells that are settled together */
-  ROW = BATCH * CELL + CELL, /* their columns, and as many as keep rows apart in L1 */
+  TILE = 256,     /* columns of a tile: a group's frames in it take 8 KB, a quarter of L1 */
+  CELL = 8,       /* neighbouring columns that are treated alike, as changing or still */
+  BATCH = 32,     /* cells that are written together */
+  ROW = BATCH * CELL + CELL, /* their columns, and padding that keeps rows apart in L1 */
   REFRESH = 1000, /* frames after which the Gram matrix is computed from the vectors again */
-  WORTH = 4       /* still columns cost K^2 / 2 multiply-adds to write: too many where a block
-                     has fewer than K / WORTH frames */
+  WORTH = 4       /* still columns cost K^2 / 2 multiply-adds to write: too many if a block has
+                     fewer than K / WORTH frames */
 };
 
-static const double LEAST_SHRINK = 0.01; /* vectors that shrank by more are brought to length */
-static const double DENSE = 0.6;         /* share of changing cells above which all count so */
+static const double LEAST_SHRINK = 0.01; /* vectors that shrank more are scaled to their length */
+static const double DENSE = 0.6; /* share of changing cells above which all count as changing */
 
-/* The columns that change within a block: of the abstraction itself, or copies.
- * What is beyond the last whole cell belongs to none and counts as changing. */
+/* The columns that change within a block, in place or copied. Columns after the last complete cell
+ * belong to no cell and count as changing. */
 typedef struct {
   int64_t size, cells;
-  const int64_t *at; /* (cells,) where they are */
+  const int64_t *at; /* (cells,) offsets of the cells */
   double *mean, *v;  /* (size,) and (K, size) */
 } columns;
 
-/* Columns that stand still: all of them together cost what one column does.
+/* Columns that do not change in a block: all of them together take the time of one column.
  *
- * The centred frames there are a_t p with p = x - mean and numbers a_t, so the vectors stay
- * combinations of p and of what they were: v becomes beta p + L v. beta, L and the inner products
- * v.p obey the rule that columns obey, and go through the same passes. `taken` is the share of p
- * that the mean has taken in so far; its sum is far more exact than the product of what each
- * frame leaves.
+ * The centred frames there are a_t p with p = x - mean and numbers a_t, so that the vectors stay
+ * combinations of p and of their old values: v becomes beta p + L v. beta, L and the inner products
+ * v.p obey the rule of columns, and go through the same passes. `taken` is the share of p that has
+ * entered the mean; its sum is far more exact than the product of the remaining shares.
  */
 typedef struct {
-  int64_t cells, width; /* width K + 2 of the table; 0 where nothing stands still */
+  int64_t cells, width; /* width K + 2 of the table; 0 if no cell is still */
   const int64_t *at;    /* (cells,) */
   double *p;            /* (CELL cells,) */
   double *table;        /* (K, width) beta, then L, then v.p */
@@ -46,14 +45,14 @@ typedef struct {
   double energy, taken, a[GROUP];
 } still;
 
-/* Up to GROUP consecutive frames, and what is to be done to the vectors. In memory these lack
- * their factors `shrink`, which one pass in many multiplies in. */
+/* Up to GROUP consecutive frames, and the changes to apply to the vectors. The vectors in memory
+ * lack their factors `shrink`, which only one pass in many applies. */
 typedef struct {
-  double *u;              /* (tiles, GROUP, TILE) centred frames; 0 where there are none */
+  double *u;              /* (tiles, GROUP, TILE) centred frames; 0 for missing frames */
   double g[GROUP][GROUP]; /* their inner products */
   double *e;              /* (K, GROUP) with the vectors */
   double *steps;          /* (K, 2 GROUP) gain and take of each frame */
-  double *shrink;         /* (K,) product of what the steps keep of each vector */
+  double *shrink;         /* (K,) product of the factors of each vector */
   double *keep, *gain, *take;                /* (GROUP, K) coefficients of the steps */
   double *m, *m_before;                      /* (J, K) phi = m v; before the group's change */
   double *gram_before, *e_before, *products; /* (K, K), (GROUP, K), (K,) */
@@ -63,10 +62,10 @@ typedef struct {
 
 /* One CCIPCA step on inner products: v_j' = keep_j v_j + gain_j r_j, r -= take_j v_j'.
  *
- * gram and d are brought up to date. energy is |u|^2 of the centred frame, e (K,) its inner
- * products u.v_j, overwritten. Afterwards v_j'.v_i (j < i, upper triangle) is turned into
- * v_j'.v_i' and mirrored: along a row each product waits for the one before, so four rows at a
- * time fill the wait.
+ * gram and d are updated. energy is |u|^2 of the centred frame; e (K,) are its inner products
+ * u.v_j, which are overwritten. Then v_j'.v_i (j < i, upper triangle) becomes v_j'.v_i' and is
+ * mirrored. Along a row each product depends on the previous one, so four rows are computed at a
+ * time.
  */
 static void ccipca_coefficients(const incsfa *s, double weight, double energy, double *restrict e,
                                 double *keep, double *gain, double *take) {
@@ -104,7 +103,7 @@ static void ccipca_coefficients(const incsfa *s, double weight, double energy, d
   for (int64_t i = 0; i < K; i++) s->d[i] = sqrt(gram[i * K + i]);
 }
 
-/* Bring the group's inner products with the vectors over one step: any linear functional obeys
+/* Update the inner products of a group with the vectors after one step. Any linear functional obeys
  * f_j' = keep_j f_j + gain_j rho; rho -= take_j f_j'. rho are those with the step's frame. */
 static void follow(int64_t K, double *e, lanes rho, const double *keep, const double *gain,
                    const double *take) {
@@ -142,9 +141,9 @@ static double change_of_features(const incsfa *s, const group *w, int64_t first,
   return sqrt(larger(xi, 0));
 }
 
-/* Learn from a group's inner products: everything but `v` and `phi`.
+/* Learn from a group's inner products: everything except `v` and `phi`.
  *
- * `pending` says that phi is older than the vectors, so that phi itself is to tell its change.
+ * With `pending`, phi is older than the vectors, so that its change is computed from phi itself.
  */
 static void learn_group(const incsfa *s, group *w, int64_t count, int gap, int pending,
                         double *xi) {
@@ -184,9 +183,9 @@ static void learn_group(const incsfa *s, group *w, int64_t count, int gap, int p
   }
 }
 
-/* Centre `count` frames in the columns of a tile, see `centre`; 0 where there are none.
+/* Centre `count` frames in the columns of a tile, see `centre`; 0 for missing frames.
  *
- * `rate` are the rates of the mean, 0 beyond the frames that there are.
+ * `rate` are the rates of the mean, 0 for missing frames.
  */
 INLINE void centre_tile(const frames *x, int pixels, int64_t first, int64_t count,
                         const columns *c, int64_t start, const double *rate, double *u) {
@@ -213,7 +212,7 @@ INLINE void centre_tile(const frames *x, int pixels, int64_t first, int64_t coun
   for (int64_t s = count; s < GROUP; s++) memset(u + s * TILE, 0, TILE * sizeof *u);
 }
 
-/* Take back that the very first frame was centred in a tile of all columns. */
+/* Undo the centring of the very first frame in a tile of all columns. */
 static void first_frame(const frames *x, const columns *c, int64_t start, double *u) {
   int64_t width = smaller(TILE, c->size - start);
   for (int64_t i = 0; i < width; i++) {
@@ -273,7 +272,7 @@ static void scale_tile(int64_t K, double *v, int64_t v_row, int64_t width, const
     for (int64_t i = 0; i < width; i++) v[j * v_row + i] *= shrink[j];
 }
 
-/* Centre the next group where it stands still, and add its share to the inner products. */
+/* Centre the next group in the still columns, and add their share to the inner products. */
 static void measure_still(const incsfa *s, still *t, group *w, int64_t count) {
   int64_t K = s->components, seen = s->counts[0];
   memset(t->r, 0, (size_t)(GROUP * t->width) * sizeof(double));
@@ -292,9 +291,9 @@ static void measure_still(const incsfa *s, still *t, group *w, int64_t count) {
   }
 }
 
-/* Apply a group of `applied` frames to the vectors, and centre and measure the next one.
+/* Apply a group of `applied` frames to the vectors, and centre and measure the next group.
  *
- * `settle` multiplies `shrink` in; `shown` brings phi up to date. The next group is `count` frames
+ * `settle` applies `shrink`; with `shown`, phi is updated too. The next group has `count` frames
  * from `first` on. Returns the square of the change of phi.
  */
 static double run_pass(const incsfa *s, const columns *c, still *t, group *w, int64_t applied,
@@ -330,7 +329,7 @@ static double run_pass(const incsfa *s, const columns *c, still *t, group *w, in
   return square;
 }
 
-/* Note which cells, of some words of eight bytes each, are not the same in two frames. */
+/* Note the cells, of some words of eight bytes each, in which two frames differ. */
 INLINE void note_changes(int64_t cells, int words, const char *one, const char *other,
                          uint64_t *restrict changed) {
   for (int64_t c = 0; c < cells; c++)
@@ -342,8 +341,8 @@ INLINE void note_changes(int64_t cells, int words, const char *one, const char *
     }
 }
 
-/* Write which cells change within a block, in order, and behind them those that stand still;
- * return how many change: all, where too few stand still. `changed` has a word for each cell. */
+/* Write the cells that change within a block, in order, and after them the still cells; return the
+ * number of changing cells: all of them if too few are still. `changed` has one word a cell. */
 static int64_t find_changing(const incsfa *s, const frames *x, uint64_t *restrict changed,
                              int64_t *cells) {
   int64_t every = s->inputs / CELL, count = 0;
@@ -351,7 +350,7 @@ static int64_t find_changing(const incsfa *s, const frames *x, uint64_t *restric
   const char *data = x->pixels ? (const char *)x->pixels : (const char *)x->values;
   int worth = x->n * WORTH >= s->components;
   memset(changed, 0, (size_t)every * sizeof *changed);
-  for (int64_t t = x->n - 1; worth && t > 0; t--) { /* the last frame most often tells */
+  for (int64_t t = x->n - 1; worth && t > 0; t--) { /* the last frame differs most often */
     const char *row = data + (size_t)(t * x->size) * item;
     if (x->pixels) note_changes(every, 1, data, row, changed);
     else note_changes(every, CELL, data, row, changed);
@@ -365,10 +364,10 @@ static int64_t find_changing(const incsfa *s, const frames *x, uint64_t *restric
   return moving;
 }
 
-/* Copy the columns of a cell; as many bytes as the compiler knows of. */
+/* Copy the columns of a cell; the size is a constant for the compiler. */
 INLINE void copy_cell(const double *from, double *to) { memcpy(to, from, CELL * sizeof *to); }
 
-/* Copy the columns of some cells, and what is beyond the last whole cell, out of rows or back. */
+/* Copy the columns of some cells, and those after the last complete cell, out of rows or back. */
 static void copy_columns(int64_t rows, double *all, int64_t size, const columns *c, double *few,
                          int back) {
   int64_t beyond = size % CELL;
@@ -384,7 +383,7 @@ static void copy_columns(int64_t rows, double *all, int64_t size, const columns 
   }
 }
 
-/* Inner products of some vectors with p; their number is a constant where this is called. */
+/* Inner products of some vectors with p; their number is a constant at each call. */
 INLINE void products_with_still(int vectors, const double *v, int64_t v_row, const still *t,
                                 double *out, int64_t out_row) {
   lanes s[4][2];
@@ -403,7 +402,7 @@ INLINE void products_with_still(int vectors, const double *v, int64_t v_row, con
   for (int j = 0; j < vectors; j++) out[j * out_row] = sum(s[j][0] + s[j][1]);
 }
 
-/* Set p, its energy and the table, before the block's first frame. */
+/* Set p, its energy and the table before the first frame of a block. */
 static void begin_still(const incsfa *s, const frames *x, still *t) {
   int64_t K = s->components, j = 0;
   for (int64_t n = 0; n < t->cells; n++)
@@ -420,8 +419,8 @@ static void begin_still(const incsfa *s, const frames *x, still *t) {
                         t->width);
 }
 
-/* Bring mean and vectors to the end of the block where it stands still. `before` has
- * (K + 1 + 3, ROW). L is lower triangular: three rows need the columns up to the last. */
+/* Write mean and vectors at the end of a block in the still columns. `before` has (K + 1 + 3, ROW).
+ * L is lower triangular: three rows need the columns up to the last of them. */
 static void settle_still(const incsfa *s, const still *t, double *before) {
   int64_t K = s->components, row = ROW;
   double *after = before + (K + 1) * row;
@@ -447,13 +446,13 @@ static void settle_still(const incsfa *s, const still *t, double *before) {
   }
 }
 
-/* Frames of the next group: up to GROUP, but fewer where phi is older than the vectors; then the
- * group ends with the frame whose change is taken from phi itself. */
+/* Number of frames of the next group: up to GROUP, but fewer if phi is older than the vectors; the
+ * group then ends with the frame whose change is computed from phi itself. */
 static int64_t group_length(int64_t left, int pending, int gap) {
   return smaller(left, pending ? (gap ? 2 : 1) : GROUP);
 }
 
-/* All groups of a block, one after the other; returns whether phi is to be brought up to date. */
+/* Learn all groups of a block, one after the other; return whether phi must be updated. */
 static int learn_groups(const incsfa *s, const frames *x, int gap, int pending, const columns *c,
                         still *t, group *w, double *xi) {
   for (int64_t start = 0, count = 0;;) {
@@ -550,8 +549,8 @@ int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
 
 /* Learn from consecutive frames (n, I).
  *
- * The first frame after a gap, and the very first, update mean and whitening only. xi (n,)
- * receives the change of phi at each frame, NaN at such ones.
+ * The first frame after a gap, and the very first, update mean and whitening only. xi (n,) receives
+ * the change of phi at each frame, NaN at these frames.
  */
 int incsfa_update(const incsfa *s, const frames *x, int gap, double *xi) {
   return s->inputs < MANY_INPUTS ? incsfa_by_frame(s, x, gap, xi) : incsfa_by_gram(s, x, gap, xi);

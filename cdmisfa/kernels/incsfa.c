@@ -1,16 +1,16 @@
-/* Incremental slow feature analysis: the small equations, and learning frame by frame.
+/* Incremental slow feature analysis: its equations, and learning frame by frame.
  *
  * Sources: candid covariance-free incremental PCA (CCIPCA): Weng, Zhang and Hwang 2003; minor
- * component analysis (MCA) by sequential addition: Peng and Yi 2006; the two joined as IncSFA:
+ * component analysis (MCA) by sequential addition: Peng and Yi 2006; both combined as IncSFA:
  * Kompella, Luciw and Schmidhuber 2012.
  */
 
-/* Share of the largest whitening variance below which a component is rounding noise. The Gram
- * recursion knows a residual's energy to about 1e-15 of the frame's, so above this share it is
- * right to five digits or more; learning frame by frame follows the same rule. */
+/* Share of the largest whitening variance below which a component is rounding noise (decision
+ * 0024). The Gram recursion has the energy of a residual to about 1e-15 of the frame's, so above
+ * this share it is right to five digits or more; learning frame by frame uses the same rule. */
 static const double RANK_TOLERANCE = 1e-10;
 
-/* Variance below which a component is rounding noise whatever the others are. */
+/* Variance below which a component is rounding noise, whatever the other variances are. */
 static const double LEAST_VARIANCE = 1e-30;
 
 /* Rate of the running mean at the n-th frame (from 1): 1/n, then 2/(window + 1). */
@@ -30,16 +30,16 @@ INLINE double amnesic_weight(int64_t n) {
   return (1.0 + amnesia) / k;
 }
 
-/* Variance at or below which a component is rounding noise. It is whitened to 0, contributes
- * nothing to phi (see `mca_step`) and does not shrink any further; it comes back as soon as the
- * input varies along it. */
+/* Variance up to which a component is rounding noise. Such a component is whitened to 0, does not
+ * contribute to phi (see `mca_step`) and does not shrink further; it returns as soon as the input
+ * varies along it. */
 INLINE double rank_floor(int64_t K, const double *d) {
   double largest = 0;
   for (int64_t k = 0; k < K; k++) largest = larger(largest, d[k]);
   return larger(RANK_TOLERANCE * largest, LEAST_VARIANCE);
 }
 
-/* scale_k = d_k^-3/2, which turns u.v_k into a component of unit variance; 0 for noise. */
+/* scale_k = d_k^-3/2, which makes u.v_k a component of unit variance; 0 for rounding noise. */
 INLINE void whitening_scales(int64_t K, const double *d, double *scale) {
   double floor = rank_floor(K, d);
   for (int64_t k = 0; k < K; k++) scale[k] = d[k] > floor ? 1.0 / (d[k] * sqrt(d[k])) : 0;
@@ -47,10 +47,10 @@ INLINE void whitening_scales(int64_t K, const double *d, double *scale) {
 
 /* Turn each row of w towards the next slowest direction.
  *
- * Source: Peng and Yi 2006 with sequential addition, as in the authors' IncSFA: gamma = .24 / nu,
- * rate nu / (1 + 1.2 j) for output j from 0. A component that is rounding noise would look
- * perfectly slow: it counts as unchanged, and its share of a row is halved, so that rows turn to
- * the components that live. z_dot (K,) is the change of the whitened frame, step (K,) scratch.
+ * Source: Peng and Yi 2006 with sequential addition, as in the authors' IncSFA: gamma = 0.24 / nu,
+ * rate nu / (1 + 1.2 j) for output j from 0. A component of rounding noise would look perfectly
+ * slow: it counts as unchanged, and its share of a row is halved, so that rows turn to the other
+ * components. z_dot (K,) is the change of the whitened frame, step (K,) scratch.
  */
 INLINE void mca_step(const incsfa *s, double *z_dot, const double *scale, double *step) {
   int64_t K = s->components;
@@ -72,7 +72,7 @@ INLINE void mca_step(const incsfa *s, double *z_dot, const double *scale, double
   }
 }
 
-/* Take the n-th frame (from 1) into the mean and subtract it; the very first is not centred. */
+/* Update the mean with the n-th frame (from 1), and subtract it; the first frame is not centred. */
 INLINE void centre(const incsfa *s, int64_t n, double *u) {
   double rate = mean_rate(n, s->window);
   for (int64_t i = 0; i < s->inputs; i++) {
@@ -81,7 +81,7 @@ INLINE void centre(const incsfa *s, int64_t n, double *u) {
   }
 }
 
-/* Turn the vectors towards the principal components; r is left with what none explains.
+/* Turn the vectors towards the principal components; r becomes the unexplained rest of the frame.
  *
  * v_j <- (1-w) v_j + w (r.v_j)/|v_j| r, then r <- r - (r.v_j) v_j / |v_j|^2.
  */
@@ -99,10 +99,10 @@ INLINE void ccipca_step(const incsfa *s, double weight, double *restrict r) {
   }
 }
 
-enum { VECTORS = 4 }; /* that are read together: rows of images are multiples of 4 KB, so more of
-                         them would fall on the same lines of L1 */
+enum { VECTORS = 4 }; /* vectors that are read together: rows of images are multiples of 4 KB, so
+                         that more of them would use the same lines of L1 */
 
-/* Express phi on the vectors: m = w diag(scale). */
+/* Weights m of the vectors with phi = m v: m = w diag(scale). */
 INLINE void features_in_vectors(const incsfa *s, double *scale, double *m) {
   whitening_scales(s->components, s->d, scale);
   for (int64_t j = 0; j < s->outputs; j++)
@@ -128,7 +128,7 @@ INLINE double slow_features(const incsfa *s, const double *m, int64_t start, int
   return square;
 }
 
-/* Learn frame by frame; however frames are cut into calls, the bits are the same. */
+/* Learn frame by frame; the bits do not depend on how frames are cut into calls. */
 INLINE int update_by_frame(const incsfa *s, const frames *x, int gap, double *xi) {
   int64_t size = s->inputs, K = s->components, J = s->outputs;
   double *u = malloc((size_t)((2 + J) * size + (3 + J) * K) * sizeof *u);
@@ -161,7 +161,7 @@ INLINE int update_by_frame(const incsfa *s, const frames *x, int gap, double *xi
 int incsfa_by_frame(const incsfa *s, const frames *x, int gap, double *xi) {
   if (s->counts[0] < 0) return NOT_A_STATE;
   if (s->inputs == 5 && s->components == 5 && s->outputs == 1) {
-    incsfa paper = *s; /* its loops are unrolled where the compiler knows how long they are */
+    incsfa paper = *s; /* with constant sizes the compiler unrolls the loops */
     paper.inputs = paper.components = 5, paper.outputs = 1;
     return update_by_frame(&paper, x, gap, xi);
   }

@@ -1,13 +1,13 @@
-/* Everything that Python calls, and the records that it fills in; `build.py` reads this file, too.
+/* Declarations of everything that Python calls, and of its records; `build.py` reads this file too.
  *
- * Arrays are of doubles, in C order, and do not overlap; (n, I) says n rows of I numbers. Their
- * sizes and types are checked in `__init__.py`, and nowhere else. A function that returns an int
- * returns 0, or one of these:
+ * Arrays are of doubles, in C order, and do not overlap; (n, I) means n rows of I numbers.
+ * `__init__.py` checks their sizes and types; C does not. A function that returns an int returns 0,
+ * or one of these:
  */
 enum {
-  NO_MEMORY = -1, /* there is not enough memory for what is in between */
-  NOT_A_STATE = -2, /* an index in the state lies outside of what it points to */
-  OUT_OF_ORDER = -3 /* a chunk is not as its index says, or as its messages are laid out */
+  NO_MEMORY = -1, /* memory for intermediate results could not be allocated */
+  NOT_A_STATE = -2, /* an index in the state is out of range */
+  OUT_OF_ORDER = -3 /* a chunk contradicts its index, or the layout of its messages */
 };
 
 /* Frames as rows: pixels, which count 1/255 each, or values; the other pointer is null. */
@@ -17,7 +17,7 @@ typedef struct {
   const double *values;
 } frames;
 
-/* Whether this processor has AVX2 and FMA, which one of the two modules is compiled for. */
+/* Whether this processor has AVX2 and FMA, for which one of the two modules is compiled. */
 int has_wide_lanes(void);
 
 /* lanes.h */
@@ -36,23 +36,24 @@ int outputs(int64_t rows, const double *phi, const double *offset, const frames 
 void mean_output(int64_t rows, int64_t size, const double *phi, const double *mean, double *offset);
 
 /* incsfa.c: I inputs, K components, J outputs */
-enum { MANY_INPUTS = 200 }; /* from so many on the Gram matrix is faster; nothing else decides */
+enum { MANY_INPUTS = 200 }; /* number of inputs from which `incsfa_update` uses the Gram matrix,
+                               which is then faster; both ways differ in the last bits */
 typedef struct {
   int64_t inputs, components, outputs;
-  double nu, window;  /* learning rate of MCA, frames of the running mean */
+  double nu, window;  /* learning rate of MCA, window of the running mean (frames) */
   double *mean;       /* (I,) */
   double *v, *d;      /* (K, I) CCIPCA vectors, (K,) their lengths */
-  double *gram;       /* (K, K) inner products of v; kept for many inputs only */
-  double *w, *z_prev; /* (J, K) MCA rows, (K,) whitened frame before */
+  double *gram;       /* (K, K) inner products of v; stored for many inputs only */
+  double *w, *z_prev; /* (J, K) MCA rows, (K,) previous frame, whitened */
   double *phi;        /* (J, I) slow features */
-  int64_t *counts;    /* (3,) frames seen; 1 after a gap; frames since `gram` is new */
+  int64_t *counts;    /* (3,) frames; 1 after a gap; frames since `gram` was computed */
 } incsfa;
 int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi);
 int incsfa_by_frame(const incsfa *state, const frames *x, int gap, double *xi);
 int incsfa_by_gram(const incsfa *state, const frames *x, int gap, double *xi);
 
-/* The agent: S streams, J outputs, M frozen modules; what each field is, agents/agent.py tells. */
-enum { NOVEL = 0, CONSTANT = -1 }; /* what knows a block that no module does */
+/* The agent: S streams, J outputs, M saved modules; agents/agent.py describes the fields. */
+enum { NOVEL = 0, CONSTANT = -1 }; /* results of the gate if no module explains a block */
 
 typedef struct {
   int64_t iteration, module, stream, last_stream, last_action, fed_stream, fed_until;
@@ -81,8 +82,8 @@ typedef struct {
 } rules;
 
 typedef struct {
-  int64_t streams, outputs, tau; /* S, J, frames of a block */
-  int64_t tensor, places;        /* whether `dense` is kept; centres of each stream, or 0 */
+  int64_t streams, outputs, tau; /* S, J, frames in a block */
+  int64_t tensor, places;        /* S if `dense` is stored, else 0; centres of each stream, or 0 */
   const rules *rules;
   outcome *out;
   memory *memory;
@@ -102,7 +103,7 @@ typedef struct {
   double *centres, *counts;    /* (M, S, places, tau, J), (M, S, places) */
 } frozen;
 
-/* What is kept of each iteration of a trial. */
+/* Signals of each iteration of a trial. */
 typedef struct {
   outcome *outcome;        /* (N,) */
   double *eta_dot, *R, *Q; /* (N, J), (N, S) of the stay entries, (N, S, 2) */
@@ -127,51 +128,52 @@ int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const
 void own_work(const agent *a, const frozen *f, int64_t blocks, int64_t phases, const double *y,
               const double *y_frozen, double *told);
 
-/* frames.c: a message of a chunk, and where its payload stands there */
+/* frames.c: a message of a chunk, and offset and size of its payload */
 typedef struct {
   uint64_t log_time, publish_time; /* ns */
   int64_t at, size;
   uint32_t sequence;
   uint16_t channel, unused;
 } message;
-/* What a walk over records found: how many, where it ended, and the range of the log times. */
+/* Result of a walk over records: their numbers, its end, and the range of log times. */
 typedef struct {
   int64_t messages, others, end;
-  uint64_t earliest, latest; /* of no message 2^64 - 1 and 0 */
+  uint64_t earliest, latest; /* 2^64 - 1 and 0 without messages */
 } walked;
-/* Walk over the records of a chunk as far as they are sound. Out messages (found->messages,),
- * others (found->others, 2) first byte and end of other records, each unless NULL. */
+/* Walk over the records of a chunk up to the first invalid one. Written: messages
+ * (found->messages,), and others (found->others, 2) first byte and end of other records, each
+ * unless NULL. */
 int walk_records(const uint8_t *data, int64_t size, message *messages, int64_t *others,
                  walked *found);
 
-/* Where payloads of at least so many bytes hold R values of a width, and M bytes that are always
- * the same: distances from a payload's end. */
+/* Layout of payloads with at least `least` bytes: the distances from the payload's end of R values
+ * of a width, and of M bytes that are equal in all messages. */
 typedef struct {
   int64_t least, values, width, marks;
   const int64_t *distances, *places; /* (R,), (M,) */
   const uint8_t *bytes;              /* (M,) */
 } layout;
-/* Of the messages (n,) of a chunk those of a channel: check the layout of those of its rows
- * [start, stop), and copy their values to out (stop - start, R, width) unless that is NULL. How
- * many the channel has, or OUT_OF_ORDER. */
+/* Check the layout of messages [start, stop) of a channel among the messages (n,) of a chunk, and
+ * copy their values to out (stop - start, R, width) unless that is NULL. Returns the number of
+ * messages of the channel, or OUT_OF_ORDER. */
 int64_t gather(const uint8_t *data, int64_t size, const message *messages, int64_t n,
                uint16_t channel, int64_t start, int64_t stop, const layout *l, uint8_t *out);
 
-/* eigen.c: matrix and vectors (n, n), values (n,), spare (3 n,) */
+/* eigen.c: matrix and vectors (n, n), values (n,), scratch (3 n,) */
 void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare);
 
 /* recursive.c: I inputs, L directions, K whitened components, J outputs */
-enum { PIECE = 64 }; /* frames taken in at once; longer blocks are cut into pieces of so many */
+enum { PIECE = 64 }; /* frames in one update of the basis; longer blocks are cut into such pieces */
 typedef struct {
   int64_t inputs, size, components, outputs; /* I, L, K, J */
-  int64_t window;      /* frames of the exponential window */
+  int64_t window;      /* exponential window (frames) */
   double *mean;        /* (I,) */
-  double *basis;       /* (L, I) orthonormal directions, those of the largest variance first */
-  double *variance;    /* (L,) along them */
-  double *differences; /* (L, L) mean square of the differences of consecutive frames along them */
+  double *basis;       /* (L, I) orthonormal directions, in order of falling variance */
+  double *variance;    /* (L,) variance of the frames along each direction */
+  double *differences; /* (L, L) mean products of the differences of frames along the directions */
   double *weights;     /* (J, L) slow features as weights of the directions */
-  double *spectrum;    /* (K,) slowness of all slow features */
+  double *spectrum;    /* (K,) slowness of all slow features, the slowest first */
   double *last;        /* (I,) the last frame */
-  int64_t *counts;     /* (3,) directions in use, frames seen, differences seen */
+  int64_t *counts;     /* (3,) directions in use, frames, differences */
 } recursive;
 int recursive_update(const recursive *sfa, const frames *x, int gap, double *change);

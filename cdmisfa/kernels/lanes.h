@@ -1,9 +1,8 @@
-/* Four numbers at a time: the words that every kernel is written in.
+/* Vectors of four doubles ("lanes"), in which all kernels are written.
  *
- * Sums run over fixed lanes and are added up in a fixed order, and every multiply-add is a fused
- * one, which IEEE 754 rounds once. So the bits are the same whichever compiler, level of
- * optimisation and instruction set made them. Compile with -ffp-contract=off: what is not
- * written as a fused multiply-add must not become one.
+ * Sums run over fixed lanes and are added in a fixed order, and every multiply-add is a fused one,
+ * which IEEE 754 rounds once. Therefore the bits do not depend on compiler, optimisation or
+ * instruction set. Compile with -ffp-contract=off: other products and sums must not be fused.
  */
 #ifndef LANES_H
 #define LANES_H
@@ -29,7 +28,7 @@ enum { LANES = 4 };
 
 typedef double lanes __attribute__((vector_size(32), aligned(8), may_alias));
 
-/* As many whole numbers, or what a comparison of lanes gives: all bits or none. */
+/* Four whole numbers, or the result of a comparison of lanes: all bits or none. */
 typedef int64_t whole_lanes __attribute__((vector_size(32), aligned(8), may_alias));
 
 INLINE lanes load(const double *p) { return *(const lanes *)p; }
@@ -40,7 +39,7 @@ INLINE lanes spread(double x) { return (lanes){x, x, x, x}; }
 
 INLINE whole_lanes load_whole(const int64_t *p) { return *(const whole_lanes *)p; }
 
-/* x where a comparison holds, else y. */
+/* x where a comparison is true, else y. */
 INLINE lanes choose(whole_lanes holds, lanes x, lanes y) {
   return (lanes)(((whole_lanes)x & holds) | ((whole_lanes)y & ~holds));
 }
@@ -52,14 +51,14 @@ INLINE lanes absolute(lanes x) { return (lanes)((whole_lanes)x & INT64_MAX); }
 typedef double pair __attribute__((vector_size(16)));
 typedef int64_t bits __attribute__((vector_size(16)));
 
-/* x + y, and what rounding took away. */
+/* x + y; `lost` receives the rounding error. */
 INLINE pair two_sum(pair x, pair y, pair *lost) {
   pair total = x + y, rest = total - x;
   *lost = (x - (total - rest)) + (y - rest);
   return total;
 }
 
-/* The first 26 bits of x; what is left are the others. */
+/* The first 26 bits of x. */
 INLINE pair upper_half(pair x) {
   pair shifted = x * 134217729.0;
   return shifted - (shifted - x);
@@ -70,11 +69,11 @@ INLINE bits between(pair x, double low, double high) {
   return (bits)(size >= low) & (bits)(size <= high);
 }
 
-/* x y + z, rounded once, where the processor has no instruction for it.
+/* x y + z, rounded once, for processors without an instruction for it.
  *
- * Product and sums are split into what is rounded and what rounding took away, and that is added up
- * rounded to odd, so that the last addition rounds as the exact sum would: Boldo and Melquiond
- * (2008). The C library has what is too large or too small for it.
+ * Product and sums are split into rounded values and rounding errors, whose sum is rounded to odd,
+ * so that the last addition rounds as the exact sum would: Boldo and Melquiond (2008). The C
+ * library's fma computes values that are too large or too small for this.
  */
 INLINE pair add_product_of_pair(pair x, pair y, pair z) {
   bits zero = (bits)(x == 0) | (bits)(y == 0);
@@ -105,7 +104,7 @@ INLINE lanes add_product(lanes x, lanes y, lanes z) {
 #endif
 }
 
-/* The same of single numbers. */
+/* x y + z of single numbers, rounded once. */
 INLINE double fused(double x, double y, double z) {
 #if defined(__FMA__) || defined(__aarch64__)
   return __builtin_fma(x, y, z);
@@ -120,7 +119,7 @@ INLINE int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
 
 INLINE double larger(double a, double b) { return a > b ? a : b; }
 
-/* Without __builtin_cpu_supports, which is 0 where clang's run-time library is that of zig. */
+/* __builtin_cpu_supports returns 0 with zig's run-time library for clang, so it is not used. */
 int has_wide_lanes(void) {
 #if defined(__x86_64__)
   const unsigned needed = bit_FMA | bit_AVX | bit_OSXSAVE, kept_by_system = 6;
@@ -134,7 +133,7 @@ int has_wide_lanes(void) {
 #endif
 }
 
-/* x . y over many numbers: sixteen lanes, then four, then what is left in order. */
+/* x . y over many numbers: sixteen lanes, then four, then the rest in order. */
 static double long_dot(const double *x, const double *y, int64_t n) {
   lanes a = spread(0), b = a, c = a, d = a;
   int64_t i = 0;
@@ -150,7 +149,7 @@ static double long_dot(const double *x, const double *y, int64_t n) {
   return total;
 }
 
-/* x . y; of a few numbers in order, where adding lanes up would take longer. */
+/* x . y; a few numbers are added in order, which is faster than adding lanes. */
 INLINE double dot(const double *x, const double *y, int64_t n) {
   if (n >= 2 * LANES) return long_dot(x, y, n);
   double even = 0, odd = 0;
@@ -195,7 +194,7 @@ INLINE lanes read_pixels(const uint8_t *p) {
 #endif
 }
 
-/* Four values of frames, or one, from the `at`-th on; `pixels` is a constant where it is called. */
+/* Four values of frames from index `at` on; `pixels` is a constant at each call. */
 INLINE lanes read_lanes(const frames *x, int pixels, int64_t at) {
   return pixels ? read_pixels(x->pixels + at) : load(x->values + at);
 }
@@ -204,7 +203,7 @@ INLINE double read_value(const frames *x, int64_t at) {
   return x->pixels ? x->pixels[at] * PIXEL : x->values[at];
 }
 
-/* Values of a frame in columns [start, start + width). */
+/* Write columns [start, start + width) of frame t as values. */
 static void read_columns(const frames *x, int64_t t, int64_t start, int64_t width, double *out) {
   int64_t at = t * x->size + start, i = 0;
   if (x->values) {
@@ -215,8 +214,8 @@ static void read_columns(const frames *x, int64_t t, int64_t start, int64_t widt
   for (; i < width; i++) out[i] = x->pixels[at + i] * PIXEL;
 }
 
-/* Some rows of v times some rows of u, or of pixels; both counts are constants where it is called,
- * and one of the two pointers is null. */
+/* Add products of some rows of v with some rows of u, or with pixels; both counts are constants at
+ * each call, and one of the two pointers is null. */
 INLINE void add_products_of(int rows, int frames, const double *v, int64_t v_row, const double *u,
                             const uint8_t *pixels, int64_t u_row, int64_t width, double *e,
                             int64_t e_row) {
@@ -247,10 +246,10 @@ INLINE void add_products_of(int rows, int frames, const double *v, int64_t v_row
     }
 }
 
-/* e[r][t] += v[r] . u[t] for all rows of v and of u: what every kernel spends most on.
+/* e[r][t] += v[r] . u[t] for all rows of v and of u. The kernels spend most of their time here.
  *
- * Each sum has four lanes of its own, whichever rows are taken together to keep both in
- * registers: it does not depend on what it is stacked with.
+ * Each sum has four lanes of its own, whatever rows are computed together to keep both in
+ * registers, so that a sum does not depend on the other rows.
  */
 static void add_products(int64_t rows, int64_t frames, const double *v, int64_t v_row,
                          const double *u, int64_t u_row, int64_t width, double *e, int64_t e_row) {
@@ -283,7 +282,7 @@ static void add_products(int64_t rows, int64_t frames, const double *v, int64_t 
   }
 }
 
-/* Some rows of `add_multiplied`, over `blocks` times four columns; both constants where called. */
+/* Some rows of `add_multiplied` over 4 `blocks` columns; both are constants at each call. */
 INLINE void multiply_block(int rows, int blocks, int64_t parts, const double *a, int64_t a_row,
                            const double *b, int64_t b_row, double *c, int64_t c_row) {
   lanes s[3][4];
@@ -304,7 +303,7 @@ INLINE void multiply_block(int rows, int blocks, int64_t parts, const double *a,
     for (int i = 0; i < blocks; i++) store(c + r * c_row + i * LANES, s[r][i]);
 }
 
-/* All rows of it over `blocks` times four columns. */
+/* All rows of `add_multiplied` over 4 `blocks` columns. */
 INLINE void multiply_columns(int blocks, int64_t rows, int64_t parts, const double *a,
                              int64_t a_row, const double *b, int64_t b_row, double *c,
                              int64_t c_row) {
@@ -317,7 +316,7 @@ INLINE void multiply_columns(int blocks, int64_t rows, int64_t parts, const doub
     multiply_block(1, blocks, parts, a + r * a_row, a_row, b, b_row, c + r * c_row, c_row);
 }
 
-/* c += a b, see `multiply`. */
+/* c += a b; see `multiply`. */
 static void add_multiplied(int64_t rows, int64_t parts, int64_t width, const double *a,
                            int64_t a_row, const double *b, int64_t b_row, double *c,
                            int64_t c_row) {
@@ -334,21 +333,21 @@ static void add_multiplied(int64_t rows, int64_t parts, int64_t width, const dou
     }
 }
 
-/* c = a b, of (rows, parts) and (parts, width): every number is a sum in the order of the parts. */
+/* c = a b, of (rows, parts) and (parts, width); sums are in the order of the parts. */
 void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64_t a_row,
               const double *b, int64_t b_row, double *c, int64_t c_row) {
   for (int64_t r = 0; r < rows; r++) memset(c + r * c_row, 0, (size_t)width * sizeof *c);
   add_multiplied(rows, parts, width, a, a_row, b, b_row, c, c_row);
 }
 
-/* The first n of spare numbers, which are then no longer spare. */
+/* Take n numbers from the scratch memory. */
 static double *take(double **spare, int64_t n) {
   double *taken = *spare;
   *spare += n;
   return taken;
 }
 
-/* The same, set to 0. */
+/* Take n numbers from the scratch memory, set to 0. */
 static double *take_zeros(double **spare, int64_t n) {
   double *taken = take(spare, n);
   return memset(taken, 0, (size_t)n * sizeof *taken);

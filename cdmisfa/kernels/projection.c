@@ -1,12 +1,12 @@
 /* Outputs of slow features on whole blocks of frames, equation (1): y = phi (x - mean). */
 
 enum {
-  CHUNK = 256,   /* columns scaled at a time */
-  TOGETHER = 64, /* frames scaled at a time: so many chunks stay in L2 while all rows pass */
-  PANEL = 12     /* rows whose chunks stay in L1 while all frames pass */
+  CHUNK = 256,   /* columns that are scaled at a time */
+  TOGETHER = 64, /* frames that are scaled at a time: their chunks stay in L2 for all rows */
+  PANEL = 12     /* rows whose chunks stay in L1 for all frames */
 };
 
-/* `add_products` of a single row, for which frames need no copy. */
+/* `add_products` for a single row, for which frames need not be copied. */
 static void add_products_once(const frames *x, int64_t first, int64_t count, const double *phi,
                               int64_t start, int64_t width, double *e) {
   int64_t t = 0, size = x->size, at = first * size + start;
@@ -23,7 +23,7 @@ static void add_products_once(const frames *x, int64_t first, int64_t count, con
 
 /* y = phi x - offset.
  *
- * A row's output does not depend on which rows it is stacked with, nor a frame's on its block.
+ * The output of a row does not depend on the other rows, nor that of a frame on the other frames.
  */
 int outputs(int64_t rows, const double *phi, const double *offset, const frames *x, double *y) {
   int64_t size = x->size, together = smaller(TOGETHER, x->n);
@@ -53,7 +53,7 @@ int outputs(int64_t rows, const double *phi, const double *offset, const frames 
   return 0;
 }
 
-/* What phi gives out on the mean input: the offset of a centred projection. */
+/* Output of phi on the mean input: the offset of a centred projection. */
 void mean_output(int64_t rows, int64_t size, const double *phi, const double *mean,
                  double *offset) {
   for (int64_t r = 0; r < rows; r++) offset[r] = dot(phi + r * size, mean, size);

@@ -1,37 +1,37 @@
-/* Recursive SFA: the largest principal components of all frames so far, block by block, and the
- * slowest directions among them.
+/* Recursive SFA: the largest principal components of all frames so far, updated block by block, and
+ * the slowest directions among them.
  *
  * Sources: incremental PCA with a moving mean: Ross et al. 2008; SFA as an eigenvalue problem:
  * Wiskott and Sejnowski 2002; recursive forms: Kompella et al. 2012, Liwicki et al. 2015.
  */
 
-/* From row to row of chunks: rows a power of two apart fall on each other in L1. */
+/* Distance of the rows of chunks: rows at powers of two would use the same lines of L1. */
 enum { APART = CHUNK + 8 };
 
 /* Share of a value below which its differences are rounding noise. */
 static const double VALUE_NOISE = 1e-14;
-/* Share of the largest variance below which a direction is left out as rounding noise. */
+/* Share of the largest variance below which a direction is rounding noise and is dropped. */
 static const double VARIANCE_NOISE = 1e-8;
 
-/* What a piece of a block does to the basis, in inner products alone.
+/* Update of the basis by a piece of a block, in inner products only.
  *
- * Its rows are the old basis, its frames, the frame before them, and the mean of its frames; all
- * frames are less the mean of those before. P rows are chosen, k directions come out.
+ * Its rows are the old basis, the frames, the previous frame, and the mean of the frames; the mean
+ * of all earlier frames is subtracted from every frame. P rows are chosen, and give k directions.
  */
 typedef struct {
   const frames *x;
-  int64_t first, m;     /* its first frame in x, and frames */
-  int64_t rank, n, row; /* old directions, rows but for the last; numbers in a row of `inner` */
-  double seen, moved;   /* frames before; share of their mean that the frames are less, too */
+  int64_t first, m;     /* its first frame in x, and number of frames */
+  int64_t rank, n, row; /* old directions, rows without the last, numbers in a row of `inner` */
+  double seen, moved;   /* earlier frames; share of the frames' mean to subtract from them too */
   double *slice;        /* (row, APART) chunks of some rows */
   double *shift;        /* (I,) the last row */
   double *inner;        /* (n + 1, row) inner products of all rows */
-  double *scale;        /* (n,) by how much the rows count: sqrt(seen variance), or 1 */
+  double *scale;        /* (n,) weights of the rows: sqrt(seen variance), or 1 */
   int64_t p, k;
-  int64_t *chosen;      /* (P + 1,) the rows chosen, and the last row */
-  double *weights;      /* (k, P + 1) new directions as weights of these */
-  double *variance;     /* (L,) along them, then 0 */
-  double *turn;         /* (k, row) their inner products with all rows */
+  int64_t *chosen;      /* (P + 1,) indices of the chosen rows, and of the last row */
+  double *weights;      /* (k, P + 1) new directions as weights of these rows */
+  double *variance;     /* (L,) variance along the new directions, then 0 */
+  double *turn;         /* (k, row) inner products of the new directions with all rows */
 } piece;
 
 /* Columns [start, start + width) of a row. */
@@ -74,8 +74,8 @@ static void measure_rows(const recursive *sfa, const piece *b) {
 }
 
 /* Inner products of the rows whose largest principal components are the new basis: the old basis
- * weighted by the variance along it, and the frames less the part of their mean that the old mean
- * explains, so that their scatter about the new mean comes out.
+ * weighted by the variance along it, and the frames minus a share of their mean, chosen so that the
+ * result has the scatter around the new mean.
  */
 static void weigh_rows(const piece *b, double *gram, double *spare) {
   int64_t r = b->rank + b->m;
@@ -94,7 +94,7 @@ static void weigh_rows(const piece *b, double *gram, double *spare) {
   }
 }
 
-/* Index of the first of the largest numbers, and of the first NaN where there is one. */
+/* Index of the first of the largest numbers, or of the first NaN if there is one. */
 static int64_t largest_of(int64_t n, const double *x) {
   int64_t largest = 0;
   for (int64_t i = 1; i < n; i++)
@@ -102,9 +102,9 @@ static int64_t largest_of(int64_t n, const double *x) {
   return largest;
 }
 
-/* How many and which rows differ most, and what they explain of all others: Cholesky decomposition
- * of gram (r, r) with pivots, as factor (P, r) with factor' factor equal to gram on their span.
- * The rows left out have at most `least` left to explain.
+/* Choose the rows that differ most, and return their number: Cholesky decomposition of gram (r, r)
+ * with pivots. factor (P, r) satisfies factor' factor = gram on the span of the chosen rows. At
+ * most `least` of each other row remains unexplained.
  */
 static int64_t choose_rows(int64_t r, int64_t most, const double *gram, double least,
                            int64_t *chosen, double *factor, double *spare) {
@@ -128,7 +128,7 @@ static int64_t choose_rows(int64_t r, int64_t most, const double *gram, double l
   return most;
 }
 
-/* The weights of the chosen rows: weights' factor[:, chosen]' = vectors, from the last row on. */
+/* Weights of the chosen rows: weights' factor[:, chosen]' = vectors, from the last row on. */
 static void solve_weights(const piece *b, const double *factor, const double *vectors,
                           double *spare) {
   int64_t p = b->p, k = b->k, r = b->rank + b->m;
@@ -149,8 +149,10 @@ static void solve_weights(const piece *b, const double *factor, const double *ve
   }
 }
 
-/* The new basis. On the span of the rows chosen, half as many again as it has, its components are
- * exact, and what is left out is smaller than the least of them.
+/* Compute the new basis. On the span of the chosen rows, 1.5 L of them, its components are exact;
+ * the rest is smaller than the smallest of these rows. The factor 1.5 is measured (decision 0021):
+ * with 1.25 the outputs have a correlation of 0.91 with the exact ones on the hardest of seven
+ * streams, with 1.5 0.96, with 2 0.999; more rows take more time.
  */
 static void merge_rows(const recursive *sfa, piece *b, double *spare) {
   int64_t r = b->rank + b->m, size = sfa->size, p, most = smaller(size + size / 2, r);
@@ -175,7 +177,7 @@ static void merge_rows(const recursive *sfa, piece *b, double *spare) {
   multiply(b->k, p + 1, b->row, b->weights, p + 1, rows, b->row, b->turn, b->row);
 }
 
-/* Write the new basis, and move the mean. */
+/* Write the new basis, and update the mean. */
 static void write_basis(const recursive *sfa, const piece *b) {
   for (int64_t start = 0; start < sfa->inputs; start += CHUNK) {
     int64_t width = smaller(CHUNK, sfa->inputs - start);
@@ -187,13 +189,13 @@ static void write_basis(const recursive *sfa, const piece *b) {
   add_multiple((double)b->m / (b->seen + (double)b->m), b->shift, sfa->mean, sfa->inputs);
 }
 
-/* Mean square of the differences of consecutive frames, along the new directions. */
+/* Update the mean products of the differences of consecutive frames, in the new directions. */
 static void update_differences(const recursive *sfa, const piece *b, int skipped, double *spare) {
   int64_t size = sfa->size, k = b->k, rank = b->rank, m = b->m, count = m - skipped;
   double *steps = take_zeros(&spare, k * m), *half = take_zeros(&spare, k * rank);
   double *turned = take_zeros(&spare, k * k), *new = take_zeros(&spare, k * k);
   double pairs = (double)sfa->counts[2], share = 1 / larger(pairs + (double)count, 1);
-  const double *shown = b->turn + rank; /* the frame before is behind the others */
+  const double *shown = b->turn + rank; /* the previous frame is after the others */
   for (int64_t i = 0; i < k; i++, shown += b->row)
     for (int64_t t = skipped; t < m; t++) steps[i * m + t] = shown[t] - shown[t > 0 ? t - 1 : m];
   multiply(k, rank, rank, b->turn, b->row, sfa->differences, size, half, rank);
@@ -201,13 +203,13 @@ static void update_differences(const recursive *sfa, const piece *b, int skipped
   add_products(k, k, steps, m, steps, m, m, new, k);
   memset(sfa->differences, 0, (size_t)(size * size) * sizeof(double));
   for (int64_t i = 0; i < k; i++)
-    for (int64_t j = 0; j < k; j++) { /* symmetric whatever rounding does */
+    for (int64_t j = 0; j < k; j++) { /* made symmetric in spite of rounding */
       double both = 0.5 * (turned[i * k + j] + turned[j * k + i]);
       sfa->differences[i * size + j] = share * fused(pairs, both, new[i * k + j]);
     }
 }
 
-/* The slow features: least difference among the whitened components. */
+/* Compute the slow features: the directions of least difference among the whitened components. */
 static void solve_slowest(const recursive *sfa, int64_t rank, double *spare) {
   int64_t size = sfa->size, k = smaller(sfa->components, rank);
   double *scale = take_zeros(&spare, k), *matrix = take_zeros(&spare, k * k);
@@ -225,8 +227,8 @@ static void solve_slowest(const recursive *sfa, int64_t rank, double *spare) {
       sfa->weights[o * size + i] = vectors[(k - 1 - o) * k + i] * scale[i];
 }
 
-/* Keep the signs that the outputs had, and say how much the slowest changed: equation P1. They had
- * the weights `before` (J, k) of the new directions; NaN where there was none.
+/* Keep the signs of the outputs, and return the change of the slowest one: equation P1. `before`
+ * (J, k) are the old weights of the new directions; the change is NaN if there were none.
  */
 static double align_outputs(const recursive *sfa, int64_t k, const double *before, double *spare) {
   double *old = take_zeros(&spare, k), change = NAN;
@@ -241,8 +243,8 @@ static double align_outputs(const recursive *sfa, int64_t k, const double *befor
   return change;
 }
 
-/* Learn from m frames of a block, from the one at `first` on, and return how much the outputs
- * changed; `gap` where they do not follow the frames before.
+/* Learn from m frames of a block from index `first` on, and return the change of the slowest
+ * output; `gap` if they do not follow the previous frames.
  */
 static double learn_piece(const recursive *sfa, const frames *x, int64_t first, int64_t m, int gap,
                           double *spare) {
@@ -260,7 +262,7 @@ static double learn_piece(const recursive *sfa, const frames *x, int64_t first, 
   b.variance = take_zeros(&spare, size);
   b.turn = take_zeros(&spare, size * b.row);
   double *before = take_zeros(&spare, sfa->outputs * size);
-  int skipped = gap || seen == 0; /* differences to the frame before */
+  int skipped = gap || seen == 0; /* 1: no difference to the previous frame */
   for (int64_t i = 0; i < b.n; i++) b.scale[i] = i < b.rank ? sqrt(b.seen * sfa->variance[i]) : 1;
 
   if (seen == 0) read_columns(x, first, 0, sfa->inputs, sfa->mean);
@@ -278,9 +280,10 @@ static double learn_piece(const recursive *sfa, const frames *x, int64_t first, 
   return align_outputs(sfa, b.k, before, spare);
 }
 
-/* Learn from consecutive frames, of which the first does not follow those before where there is a
- * `gap`. `change` (n,) is how much the outputs changed with each piece, at its last frame, and NaN
- * elsewhere. After a frame that is not finite there is no direction, and the mean is not finite.
+/* Learn from consecutive frames; `gap` if the first one does not follow the previous frames.
+ * `change` (n,) receives the change of the slowest output by each piece, at its last frame, and
+ * NaN elsewhere. After a frame that is not finite there are no directions, and the mean is not
+ * finite.
  */
 int recursive_update(const recursive *sfa, const frames *x, int gap, double *change) {
   const int64_t *counts = sfa->counts;
