@@ -164,6 +164,6 @@ def test_large_pictures_are_left_to_one_thread(
     monkeypatch.setattr(compressed, "budget", lambda: limits.append(1) or budget())
     frames = shown(log)[0]
     assert len(limits) < 10
-    monkeypatch.setattr(ahead, "AT_ONCE", 20)
+    monkeypatch.setattr(ahead, "MAX_THREAD_PIXELS", 20)
     assert all(map(np.array_equal, shown(log)[0], frames))
     assert len(limits) > COUNT

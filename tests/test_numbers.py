@@ -237,7 +237,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
         ({"time": "s:h"}, r"no column s:h; .* a unit \(s, ms, us, ns\)"),
         ({"time": "big"}, r"big \(int64\) has no times .* or in s: state the unit"),
         ({"time": "us"}, r"state the unit \(s, ms, us, ns\), as in --set input.time=us:ns"),
-        ({"rate": 5, "size": (4, 4)}, "as they are: --size is for images"),
+        ({"rate": 5, "size": (4, 4)}, "are numbers: --size is for images"),
     ],
 )
 def test_what_a_table_lacks_is_said(options: Any, why: str, tmp_path: Path) -> None:
