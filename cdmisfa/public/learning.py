@@ -50,6 +50,8 @@ def learn(
 ) -> Run:
     """Learn slow feature modules, and return the run.
 
+    The returned run has the signals and the modules:
+
         run = cdmisfa.learn(array)
         run.signals.to_pandas()
         run.modules[0].transform(array)
