@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -78,16 +79,10 @@ _DTYPES: Mapping[str, str] = {
 
 
 def _signal(
-    symbol: str,
-    about: str,
-    dims: str = "",
-    unit: str = "1",
-    *,
-    equation: str = "",
-    show: Show | None = None,
+    symbol: str, dims: str = "", unit: str = "1", *, equation: str = "", show: Show | None = None
 ) -> Any:
     """Return a field; floats are shown as lines and others as lanes, by default."""
-    facts = {"symbol": symbol, "about": about, "dims": dims, "unit": unit, "equation": equation}
+    facts = {"symbol": symbol, "dims": dims, "unit": unit, "equation": equation}
     return dataclasses.field(metadata={**facts, "show": show})
 
 
@@ -97,133 +92,111 @@ class BlockSignals:
 
     A signal that does not exist in an iteration (y of a block that was not novel, a
     reward in the warm-up) is NaN. `R` has shape (0, 2, 0) when there are more than
-    `DENSE_STREAMS` streams.
+    `DENSE_STREAMS` streams. `SIGNALS` takes the descriptions from this text.
+
+    Attributes:
+        iteration: Number of the iteration, from 0.
+        t: Frame number of the first frame of the block.
+        log_time: Log time of the first frame of the block.
+        stream: Attended stream, from 0.
+        module: Number of the module being learned, from 1.
+        novel: Whether the block is novel, so that the learner learns from it.
+        known_by: Module that explains the block, from 1; 0 if none does, -1 if the block is
+            constant.
+        saved: Whether a module was saved at the end of the block.
+        share: Recent share of blocks that were novel and of the same stream as the block before.
+        novel_blocks: Number of novel blocks since the last module was saved.
+        y: Output of the features being learned, on the block.
+        y_frozen: Output of each saved module on the block.
+        eta: Slowness of each output.
+        eta_dot: Running mean of the change of slowness; a module is saved when it is below δ.
+        variance: Recent variance of each output.
+        eta_inst: Slowness of each output within the block.
+        gate_mean: Running mean of η^inst.
+        gate_sd: Running standard deviation of η^inst.
+        eta_inst_frozen: Slowness of the outputs of each saved module within the block.
+        band_mean: Mean of η^inst when the module was saved, for each module.
+        band_sd: Standard deviation of η^inst when the module was saved; the module explains a block
+            whose η^inst is within m_i ± 2 SD_i.
+        roc_error_inst: Clustering error of the block: distance of the output from the nearest
+            cluster centre (CD-MISFA 1.0 only).
+        roc_error: Running mean of the clustering error; a module is saved when it is below a
+            threshold (CD-MISFA 1.0 only).
+        roc_error_frozen: Clustering error of each saved module; below the threshold the module
+            explains the block (CD-MISFA 1.0 only).
+        xi: Mean change of the weights over the block.
+        xi_dot: Change of ⟨ξ⟩ since the last novel block.
+        curiosity: Curiosity reward.
+        expert: Expert reward.
+        reward: Reward of the last transition.
+        R: Running reward function.
+        Q: Action value function.
+        policy: Policy for each stream: 0 stay, 1 switch.
+        epsilon: Probability of a random action; above 1 counts as 1.
+        explored: Whether the action was chosen at random.
+        action: Action after the block: 0 stay, 1 switch.
+        next_stream: Stream attended next.
+        change: Mean change of the candidate's outputs in a block, 0 to 1.41 (progress learner
+            only).
+        tested: Slowness of the candidate on frames before it learned from them (progress learner
+            only).
+        fitted: Slowness of the candidate on frames that it learned from (progress learner only).
+        learning_error: Learning error of the candidate: c + |ln(η_test / η_fit)| (progress learner
+            only).
+        interest: Recent fall of the learning error of each stream, relative to the error; 0 if the
+            stream is not being learned (progress learner only).
+        state: State of each stream: 0 being learned, 1 learned, 2 explained by a module of another
+            stream, 3 rejected; -1 if the learner has no states.
+        typical: Median slowness of all features of the stream, with which the candidate is compared
+            (progress learner only).
+        regret: Recent improvement: logarithm of the slowness that an older candidate would have
+            now, divided by that of the candidate (progress learner only).
     """
 
-    iteration: int = _signal("k", "Number of the iteration, from 0.", show="hidden")
-    t: int = _signal(
-        "t", "Frame number of the first frame of the block.", "", "frames", show="hidden"
-    )
-    log_time: int = _signal(
-        "", "Log time of the first frame of the block.", "", "ns", show="hidden"
-    )
-    stream: int = _signal("s", "Attended stream, from 0.")
-    module: int = _signal("i", "Number of the module being learned, from 1.")
-    novel: bool = _signal("", "Whether the block is novel, so that the learner learns from it.")
-    known_by: int = _signal(
-        "", "Module that explains the block, from 1; 0 if none does, -1 if the block is constant."
-    )
-    saved: bool = _signal("", "Whether a module was saved at the end of the block.")
-    share: float = _signal(
-        "", "Recent share of blocks that were novel and of the same stream as the block before."
-    )
-    novel_blocks: int = _signal(
-        "", "Number of novel blocks since the last module was saved.", "", "blocks", show="line"
-    )
-    y: FloatArray = _signal(
-        "y", "Output of the features being learned, on the block.", "TJ", equation="1"
-    )
-    y_frozen: FloatArray = _signal(
-        "y_i", "Output of each saved module on the block.", "MTJ", equation="1"
-    )
-    eta: FloatArray = _signal("η", "Slowness of each output.", "J", "1/frame", equation="2")
-    eta_dot: FloatArray = _signal(
-        "η̇",
-        "Running mean of the change of slowness; a module is saved when it is below δ.",
-        "J",
-        "1/frame",
-        equation="3",
-    )
-    variance: FloatArray = _signal("v_r", "Recent variance of each output.", "J")
-    eta_inst: FloatArray = _signal(
-        "η^inst", "Slowness of each output within the block.", "J", "1/frame", equation="4"
-    )
-    gate_mean: FloatArray = _signal("m", "Running mean of η^inst.", "J", "1/frame")
-    gate_sd: FloatArray = _signal("SD", "Running standard deviation of η^inst.", "J", "1/frame")
-    eta_inst_frozen: FloatArray = _signal(
-        "η_i^inst",
-        "Slowness of the outputs of each saved module within the block.",
-        "MJ",
-        "1/frame",
-        equation="4",
-    )
-    band_mean: FloatArray = _signal(
-        "m_i", "Mean of η^inst when the module was saved, for each module.", "MJ", "1/frame"
-    )
-    band_sd: FloatArray = _signal(
-        "SD_i",
-        "Standard deviation of η^inst when the module was saved; the module explains a block whose "
-        "η^inst is within m_i ± 2 SD_i.",
-        "MJ",
-        "1/frame",
-    )
-    roc_error_inst: float = _signal(
-        "",
-        "Clustering error of the block: distance of the output from the nearest cluster centre "
-        "(CD-MISFA 1.0 only).",
-    )
-    roc_error: float = _signal(
-        "",
-        "Running mean of the clustering error; a module is saved when it is below a threshold "
-        "(CD-MISFA 1.0 only).",
-    )
-    roc_error_frozen: FloatArray = _signal(
-        "",
-        "Clustering error of each saved module; below the threshold the module explains the block "
-        "(CD-MISFA 1.0 only).",
-        "M",
-    )
-    xi: float = _signal("⟨ξ⟩", "Mean change of the weights over the block.", equation="5")
-    xi_dot: float = _signal("⟨ξ̇⟩", "Change of ⟨ξ⟩ since the last novel block.", equation="5")
-    curiosity: float = _signal("-⟨ξ̇⟩", "Curiosity reward.", equation="5")
-    expert: float = _signal("βZ(⟨ξ⟩)", "Expert reward.", equation="5")
-    reward: float = _signal("r", "Reward of the last transition.", equation="5")
-    R: FloatArray = _signal("R", "Running reward function.", "SAS", equation="6", show="heat")
-    Q: FloatArray = _signal("Q", "Action value function.", "SA", show="heat")
-    policy: IntArray = _signal("π", "Policy for each stream: 0 stay, 1 switch.", "S")
-    epsilon: float = _signal("ε", "Probability of a random action; above 1 counts as 1.")
-    explored: bool = _signal("", "Whether the action was chosen at random.")
-    action: int = _signal("a", "Action after the block: 0 stay, 1 switch.")
-    next_stream: int = _signal("s'", "Stream attended next.")
-    change: float = _signal(
-        "c", "Mean change of the candidate's outputs in a block, 0 to 1.41 (progress learner only)."
-    )
-    tested: float = _signal(
-        "η_test",
-        "Slowness of the candidate on frames before it learned from them (progress learner only).",
-        unit="1/frame",
-    )
-    fitted: float = _signal(
-        "η_fit",
-        "Slowness of the candidate on frames that it learned from (progress learner only).",
-        unit="1/frame",
-    )
-    learning_error: float = _signal(
-        "e", "Learning error of the candidate: c + |ln(η_test / η_fit)| (progress learner only)."
-    )
-    interest: FloatArray = _signal(
-        "",
-        "Recent fall of the learning error of each stream, relative to the error; 0 if the stream "
-        "is not being learned (progress learner only).",
-        "S",
-    )
-    state: IntArray = _signal(
-        "",
-        "State of each stream: 0 being learned, 1 learned, 2 explained by a module of another "
-        "stream, 3 rejected; -1 if the learner has no states.",
-        "S",
-    )
-    typical: float = _signal(
-        "η_typ",
-        "Median slowness of all features of the stream, with which the candidate is compared "
-        "(progress learner only).",
-        unit="1/frame",
-    )
-    regret: float = _signal(
-        "",
-        "Recent improvement: logarithm of the slowness that an older candidate would have now, "
-        "divided by that of the candidate (progress learner only).",
-    )
+    iteration: int = _signal("k", show="hidden")
+    t: int = _signal("t", unit="frames", show="hidden")
+    log_time: int = _signal("", unit="ns", show="hidden")
+    stream: int = _signal("s")
+    module: int = _signal("i")
+    novel: bool = _signal("")
+    known_by: int = _signal("")
+    saved: bool = _signal("")
+    share: float = _signal("")
+    novel_blocks: int = _signal("", unit="blocks", show="line")
+    y: FloatArray = _signal("y", "TJ", equation="1")
+    y_frozen: FloatArray = _signal("y_i", "MTJ", equation="1")
+    eta: FloatArray = _signal("η", "J", "1/frame", equation="2")
+    eta_dot: FloatArray = _signal("η̇", "J", "1/frame", equation="3")
+    variance: FloatArray = _signal("v_r", "J")
+    eta_inst: FloatArray = _signal("η^inst", "J", "1/frame", equation="4")
+    gate_mean: FloatArray = _signal("m", "J", "1/frame")
+    gate_sd: FloatArray = _signal("SD", "J", "1/frame")
+    eta_inst_frozen: FloatArray = _signal("η_i^inst", "MJ", "1/frame", equation="4")
+    band_mean: FloatArray = _signal("m_i", "MJ", "1/frame")
+    band_sd: FloatArray = _signal("SD_i", "MJ", "1/frame")
+    roc_error_inst: float = _signal("")
+    roc_error: float = _signal("")
+    roc_error_frozen: FloatArray = _signal("", "M")
+    xi: float = _signal("⟨ξ⟩", equation="5")
+    xi_dot: float = _signal("⟨ξ̇⟩", equation="5")
+    curiosity: float = _signal("-⟨ξ̇⟩", equation="5")
+    expert: float = _signal("βZ(⟨ξ⟩)", equation="5")
+    reward: float = _signal("r", equation="5")
+    R: FloatArray = _signal("R", "SAS", equation="6", show="heat")
+    Q: FloatArray = _signal("Q", "SA", show="heat")
+    policy: IntArray = _signal("π", "S")
+    epsilon: float = _signal("ε")
+    explored: bool = _signal("")
+    action: int = _signal("a")
+    next_stream: int = _signal("s'")
+    change: float = _signal("c")
+    tested: float = _signal("η_test", unit="1/frame")
+    fitted: float = _signal("η_fit", unit="1/frame")
+    learning_error: float = _signal("e")
+    interest: FloatArray = _signal("", "S")
+    state: IntArray = _signal("", "S")
+    typical: float = _signal("η_typ", unit="1/frame")
+    regret: float = _signal("")
 
 
 # Number of streams above which the signal R is left out, because its size grows with their square.
@@ -233,7 +206,9 @@ DENSE_STREAMS = 64
 def _described(field: dataclasses.Field[Any]) -> Signal:
     dtype = _DTYPES[str(field.type)]
     show = field.metadata["show"] or ("line" if dtype == "float64" else "lane")
-    return Signal(name=field.name, dtype=dtype, **{**field.metadata, "show": show})
+    found = re.search(rf"\n +{field.name}: (.+(?:\n {{12}}.+)*)", BlockSignals.__doc__ or "")
+    about = " ".join(found[1].split()) if found else ""  # python -OO removes the text
+    return Signal(name=field.name, dtype=dtype, about=about, **{**field.metadata, "show": show})
 
 
 # The description of every signal, in the record's order.
