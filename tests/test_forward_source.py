@@ -98,7 +98,7 @@ def test_a_resumed_recording_is_the_same_bytes(split: float | None, tmp_path: Pa
         )  # fmt: skip
     late = Webcams()
     late.take_all(700)
-    with pytest.raises(UsageError, match=r"at frame 700 and cannot go back to \d+: open it a"):
+    with pytest.raises(UsageError, match=r"at frame 700, after frame \d+: open it a"):
         record(late, folder, resume=True)
     record(Webcams(), folder, resume=True)
     assert contents(folder) == contents(whole)

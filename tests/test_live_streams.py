@@ -212,7 +212,7 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
         with open_live(words, InputOptions(range=(1, 3))) as source:
             assert source.take(0, 2).frames[1, 0].tolist() == [0, 0, 128, 255, 255]
             assert source.describe()["range_metres"] == [1, 3]
-        with pytest.raises(UsageError, match=r"set their range, such as --set input\.range"):
+        with pytest.raises(UsageError, match=r"add --set input\.range"):
             open_live(words, InputOptions())
 
 

@@ -100,5 +100,5 @@ def test_what_a_file_states_is_read_as_it_was_written(
     assert list(values)[:4] == ["schema", "scene", "view", "stream_index"]
     assert ViewMetadata.parse("x.mcap", values) == facts
     for key in ("view", "stream_index", "frame_shape", "dtype", "fps", "start_ns"):
-        with pytest.raises(LogDamagedError, match=rf"x\.mcap: its recording metadata .*{key}"):
+        with pytest.raises(LogDamagedError, match=rf"x\.mcap: its metadata .*{key}"):
             ViewMetadata.parse("x.mcap", {k: v for k, v in values.items() if k != key})

@@ -76,7 +76,7 @@ def test_a_video_is_taken_from_its_first_whole_picture(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="/cam: the video has no key frame"):
         opened(path).__enter__()
     path = write(tmp_path / "c.mcap", video("h264"), "theora")
-    with pytest.raises(UsageError, match="its codec 'theora' is not supported: encode it"):
+    with pytest.raises(UsageError, match="its codec 'theora' is not supported: use h264"):
         opened(path).__enter__()
 
 

@@ -105,10 +105,7 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
     if n_streams > DENSE_STREAMS:
         dense = 0
         if tabular:
-            raise UsageError(
-                f"learner.algorithm 1.0 cannot learn from {n_streams} streams: give at most "
-                f"{DENSE_STREAMS}"
-            )
+            raise UsageError(f"learner.algorithm 1.0: give at most {DENSE_STREAMS} streams")
     clusters = (n_streams, config.roc_centres) if tabular else (0, 0)
     arrays: dict[str, Any] = {
         "memory": np.zeros(1, MEMORY),

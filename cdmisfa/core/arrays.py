@@ -62,9 +62,7 @@ def without_table(data: Any, name: str = "frames") -> Any:
                 column = column.cast("float64")
         values: NDArray[Any] = column.to_numpy()
         if values.dtype.kind not in "biuf":
-            raise UsageError(
-                f"{name}: column {key} has the type {kind}, which is not numeric: leave it out"
-            )
+            raise UsageError(f"{name}: column {key} has type {kind}, which is not numeric: drop it")
         columns.append(values)
     return np.column_stack(columns) if columns else np.empty((len(table), 0))
 

@@ -250,9 +250,7 @@ def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
         path, equals, value = word.partition("=")
         section, dot, name = path.strip().partition(".")
         if not (equals and section and dot and name):
-            raise UsageError(
-                f"--set {short_text(word)}: write section.key=value, as learner.nu=0.02"
-            )
+            raise UsageError(f"--set {short_text(word)}: write section.key=value (learner.nu=0.02)")
         sections.setdefault(section, {})[name] = value.strip()
     return sections
 

@@ -120,9 +120,7 @@ def workers(jobs: int) -> Iterator[Submit]:
         try:
             yield submit
         except BrokenProcessPool as error:
-            raise WorkersError(
-                "a worker process was killed: repeat the command; finished results are kept"
-            ) from error
+            raise WorkersError("a worker process was killed: run the command again") from error
         finally:
             pool.shutdown(kill_workers=True)
 
@@ -201,9 +199,7 @@ def _dask_workers(scheduler: str) -> Iterator[Submit]:
     try:
         distributed: Any = importlib.import_module("distributed")
     except ImportError as error:
-        raise UsageError(
-            "--scheduler needs a package that is missing: pip install 'cdmisfa[dask]'"
-        ) from error
+        raise UsageError("--scheduler needs dask: pip install 'cdmisfa[dask]'") from error
     # Otherwise it logs a traceback for every lost connection; errors that matter are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
@@ -213,9 +209,7 @@ def _dask_workers(scheduler: str) -> Iterator[Submit]:
             stack.enter_context(contextlib.closing(client))
             client.wait_for_workers(1, timeout=CONNECT_SECONDS)
         except (OSError, TimeoutError, ValueError) as error:
-            raise WorkersError(
-                f"no dask scheduler with workers answers at {scheduler}: {one_line(error)}"
-            ) from error
+            raise WorkersError(f"no dask cluster at {scheduler}: {one_line(error)}") from error
         try:
             yield client.get_executor(pure=False).submit
         except (distributed.KilledWorker, CancelledError) as error:

@@ -89,9 +89,7 @@ def fork_span(
     }
     fixed = [f"{section}.*" for section in words if section != "learner"]
     if fixed := [*fixed, *(key for key in FIXED if key in changed)]:
-        raise UsageError(
-            f"{fixed[0]} cannot change in a fork: set other keys learner.*, or start another run"
-        )
+        raise UsageError(f"{fixed[0]} cannot change in a fork: set other keys learner.*")
     if seed is not None and seed != manifest["seed"]:
         changed["seed"] = [manifest["seed"], seed]
     seed = int(manifest["seed"] if seed is None else seed)

@@ -238,9 +238,7 @@ def _read(path: Path) -> tuple[dict[str, Row], int]:
                     rows.pop(row["id"], None)  # so that the order is that of the last rows
                     rows[row["id"]] = row
                 except (ValueError, KeyError, TypeError) as error:
-                    raise LogDamagedError(
-                        f"{path} line {number} is not the row of a trial: remove the line"
-                    ) from error
+                    raise LogDamagedError(f"{path} line {number} is damaged: remove it") from error
                 size += len(line)
     except MemoryError:
         rows.clear()

@@ -70,9 +70,7 @@ class Recording(Described):
         self.loop, self.skip_damaged, self.episodes = loop, skip_damaged, episodes
         self.words = as_words(sources)
         if not self.words and len(sources) != 1:
-            raise UsageError(
-                f"{len(sources)} arrays have no names: give {{'left': array, 'right': array}}"
-            )
+            raise UsageError(f"{len(sources)} arrays have no names: give {{'left': array, ...}}")
         self._arrays = sources[0]
         with self.source() as source:
             self.spec: SourceSpec = source.spec

@@ -145,9 +145,7 @@ class Run(Described, replay.runs.run.Run):
         count = len(self.signals["iteration"])
         stop = count if stop is None else stop
         if not 0 <= start < stop <= count:
-            raise ValueError(
-                f"{self.path} has no iterations [{start}, {stop}): it has [0, {count})"
-            )
+            raise ValueError(f"no iterations [{start}, {stop}): {self.path} has [0, {count})")
         starts, tau = self.signals["t"], self.signals["y"].shape[1]
         first, last = int(starts[start]), int(starts[stop - 1]) + tau
         parts = [np.empty((0, *self.header.spec.frame_shape), self.header.spec.dtype)]

@@ -90,9 +90,7 @@ class FoxgloveCamera:
                 proxy=None,
             )
         except Exception as error:  # various exceptions of network, address and protocol
-            raise CdmisfaError(
-                f"{self._public_address} does not answer: {one_line(error)}"
-            ) from None
+            raise CdmisfaError(f"{self._public_address}: no answer: {one_line(error)}") from None
         with connection:
             number, decode = self._find(connection)
             subscriptions = [{"id": _SUBSCRIPTION, "channelId": number}]

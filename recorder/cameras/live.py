@@ -254,9 +254,7 @@ class LiveSource(ForwardSource):
                 while len(stamps) < needed and (stamped := readers.take(state)):
                     stamps.append(stamped)
                 if not stamps and (reason or now >= deadline):
-                    raise UsageError(
-                        reason or f"{name} delivers no image: check the camera and its name"
-                    )
+                    raise UsageError(reason or f"{name} delivers no image: check the camera")
                 if not reason and len(stamps) < needed:
                     missing.append(name)
             if not missing or now >= deadline:

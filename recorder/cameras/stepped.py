@@ -55,9 +55,7 @@ class SteppedSource(ForwardSource):
         check_request(self._spec, 0, n)
         self._ahead += islice(self._steps, max(n - len(self._ahead), 0))
         if len(self._ahead) < n:
-            raise LogExhaustedError(
-                f"{len(self._ahead)} frames are left at frame {self._t}, but {n} are needed"
-            )
+            raise LogExhaustedError(f"{len(self._ahead)} of {n} frames are left at frame {self._t}")
         steps, self._ahead = self._ahead[:n], self._ahead[n:]
         truth = freeze(np.stack([values for _, values in steps]))
         blocks = [

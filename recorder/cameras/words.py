@@ -68,9 +68,7 @@ def open_live(
         from recorder.cameras.stepped import GymSource
 
         if set(schemes) != {"gym"}:
-            raise UsageError(
-                "gym: is simulated and cannot be combined with cameras: record each separately"
-            )
+            raise UsageError("gym: streams cannot be combined with cameras: record each separately")
         tasks = [word.partition(":")[2] for word in words]
         framing: dict[str, Any] = {"size": options.size, "fit": options.fit, "fps": options.rate}
         return GymSource(tasks, names=names, seed=seed, color=color, **framing)

@@ -106,9 +106,7 @@ def _decoded(data: bytes, limit: int = MAX_PIXELS) -> Iterator[ImageFile]:
     except MalformedImage:
         raise
     except MemoryError:
-        raise MalformedImage(
-            f"its JPEG or PNG takes more than {BUDGET >> 20} MiB of memory, the limit"
-        ) from None
+        raise MalformedImage(f"its image takes more than {BUDGET >> 20} MiB of memory") from None
     except Exception as error:  # Pillow raises whatever its codecs raise
         raise MalformedImage(f"its JPEG or PNG is damaged ({type(error).__name__})") from None
 

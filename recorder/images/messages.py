@@ -324,9 +324,7 @@ def _ros(kind: MessageKind) -> MessageDecoder:
         try:
             from rosbags import typesys as ros
         except ImportError:
-            raise CdmisfaError(
-                f"fields of {kind.schema} need rosbags: pip install 'cdmisfa[ros]'"
-            ) from None
+            raise CdmisfaError(f"{kind.schema} needs rosbags: pip install 'cdmisfa[ros]'") from None
         ros1 = kind.encoding == "ros1"
         text = kind.definition.decode("utf-8", "replace")
         if not text.strip():  # without a definition, use ROS's own

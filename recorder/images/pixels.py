@@ -88,9 +88,7 @@ def raw_image(
     """
     number, metres = DISTANCES.get(encoding, ("", 0.0))
     if encoding == "32FC1" and depth is None:
-        raise UsageError(
-            "its images are distances (32FC1): set their range, such as --set input.range=0.3,5"
-        )
+        raise UsageError("its images are distances (32FC1): add --set input.range=0.3,5")
     if number and depth is not None:
         size = int(number[1])
     elif encoding in _BAYER:

@@ -220,9 +220,7 @@ def _codec(stated: str) -> str:
     for part, name in _CODECS.items():
         if part in stated.partition(";")[0].lower():
             return name
-    raise MalformedImage(
-        f"its codec {stated!r} is not supported: encode it as h264, h265, vp9 or av1"
-    )
+    raise MalformedImage(f"its codec {stated!r} is not supported: use h264, h265, vp9 or av1")
 
 
 def _begins_vp9(data: bytes) -> bool:

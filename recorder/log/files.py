@@ -86,9 +86,7 @@ def refuse_existing(folder: Path, *, force: bool, resumable: bool = True) -> Non
     refuse_named_as_file(folder)
     if folder.exists() and not force and any(folder.iterdir()):
         resume = ", continue with --resume," if resumable else ""
-        raise UsageError(
-            f"{folder} exists: choose another folder{resume} or overwrite with --force"
-        )
+        raise UsageError(f"{folder} exists: choose another folder{resume} or add --force")
 
 
 def local_folder(place: str | Path) -> Path:
@@ -209,9 +207,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(handle)
-        raise UsageError(
-            f"{folder} is in use by another process: wait for it, or choose another folder"
-        ) from error
+        raise UsageError(f"{folder} is in use by another process: wait for it") from error
     except OSError:
         pass  # this file system has no locks
     try:
@@ -297,7 +293,5 @@ def prepared_folder(
             for path in sorted(old, reverse=True):  # last parts first: a kill leaves a beginning
                 path.unlink(missing_ok=True)
         except OSError as error:
-            raise LogWriteError(
-                f"{folder} cannot be written: {error.strerror}: check its rights and free space"
-            ) from error
+            raise LogWriteError(f"{folder} cannot be written: {error.strerror}") from error
         yield

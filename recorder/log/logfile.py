@@ -134,10 +134,7 @@ class AppendOnlyFile:
         except OSError:
             mine = True  # this file system has no locks
         if not mine:
-            raise UsageError(
-                f"{self._path} is being written by another process: wait for it, or choose another "
-                "name"
-            )
+            raise UsageError(f"{self._path} is being written by another process: wait for it")
 
 
 _STAY_OPEN: Final[WeakSet[AppendOnlyFile]] = WeakSet()

@@ -214,9 +214,7 @@ class ViewMetadata:
             if wrong := [key for key, right in possible.items() if not right]:
                 raise ValueError(f"{wrong[0]} is {values[wrong[0]][:60]!r}")
         except (KeyError, ValueError) as error:
-            raise LogDamagedError(
-                f"{path}: its recording metadata is damaged ({error}): record it again"
-            ) from None
+            raise LogDamagedError(f"{path}: its metadata is damaged ({error})") from None
         return stated
 
 

@@ -319,9 +319,7 @@ def set_log_aside(place: ViewResume) -> Path | None:
         for shorter in (path, partial_path(path)):
             shorter.unlink(missing_ok=True)
     except OSError as error:
-        raise LogWriteError(
-            f"{path} cannot be resumed: {error.strerror}: check the rights of its folder"
-        ) from error
+        raise LogWriteError(f"{path} cannot be resumed: {error.strerror}") from error
     return aside
 
 

@@ -171,9 +171,7 @@ def scenery_of(config: Mapping[str, Any], neck: Place | None = None) -> Scenery 
             arms=arms if config.get("arms") else {},
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise LogDamagedError(
-            f"the configuration of the scene is damaged ({error}): record it again"
-        ) from error
+        raise LogDamagedError(f"the scene's configuration is damaged ({error})") from error
 
 
 def turns_of(config: Mapping[str, Any], streams: Sequence[int]) -> tuple[tuple[int, ...], ...]:

@@ -125,9 +125,7 @@ class OscillatorySource(ClockedSource):
         check_request(self._spec, stream, n)
         length = self._spec.length
         if length is not None and self._t + n > length:
-            raise LogExhaustedError(
-                f"the streams have {length} frames: {n} more at frame {self._t} do not exist"
-            )
+            raise LogExhaustedError(f"the streams end at frame {length}, before {self._t + n}")
         index = (self._t + np.arange(n)) % PERIOD
         frames = self._tables[stream][index]
         block = Block(stream, self._t, freeze(frames), freeze(2 * np.pi * index[:, None] / PERIOD))

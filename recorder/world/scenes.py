@@ -150,9 +150,7 @@ def blocks_in_process(
     if first >= frames:
         return
     if source.t > first:
-        raise UsageError(
-            f"the source is at frame {source.t} and cannot go back to {first}: open it again"
-        )
+        raise UsageError(f"the source is at frame {source.t}, after frame {first}: open it again")
     step = max(1, min(BLOCK, int(source.spec.fps / 2)))  # so that files grow at least every second
     while source.t < frames:
         for block in source.take_all(min(step, frames - source.t)):
