@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Rgb = tuple[int, int, int]
 Rgba = tuple[int, int, int, int]
-Colour = Rgb | Rgba
+RgbOrRgba = Rgb | Rgba
 
 ORANGE: Rgb = (230, 159, 0)
 SKY: Rgb = (86, 180, 233)
@@ -43,7 +43,7 @@ BRICK: Rgb = (190, 95, 90)
 BROWN: Rgb = (140, 115, 95)
 
 # Colours of the states of streams: not decided, learned, explained, rejected; no stream has one.
-STATES: tuple[Rgb, ...] = (SAND, PLUM, MIST, DARK)
+STATE_COLOURS: tuple[Rgb, ...] = (SAND, PLUM, MIST, DARK)
 
 # Colours of lines that belong to no stream: a full colour is a stream's, and its module's. They are
 # seen on black, and on the white on which browsers show the viewer.
@@ -68,13 +68,13 @@ def faint(rgb: Rgb) -> Rgba:
     return (*rgb, 0x80)
 
 
-def packed(rgb: Colour) -> int:
+def packed(rgb: RgbOrRgba) -> int:
     """Return a colour as 0xRRGGBBAA."""
     red, green, blue, *opacity = rgb
     return red << 24 | green << 16 | blue << 8 | (opacity[0] if opacity else 0xFF)
 
 
-def packed_all(colours: Sequence[Colour]) -> NDArray[np.uint32]:
+def packed_all(colours: Sequence[RgbOrRgba]) -> NDArray[np.uint32]:
     """Return colours as an (n,) array, the form that the viewer accepts for any n."""
     return np.array([packed(rgb) for rgb in colours], dtype=np.uint32)
 

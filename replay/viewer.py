@@ -39,7 +39,7 @@ SECONDS = 120.0
 # Installs a Vulkan driver that needs no graphics card.
 INSTALL = "apt-get install mesa-vulkan-drivers libvulkan1"
 
-ITERATION = re.compile(r"iteration\s*(\d+)", re.IGNORECASE)
+ITERATION_PATTERN = re.compile(r"iteration\s*(\d+)", re.IGNORECASE)
 
 
 class Program(subprocess.Popen[bytes]):
@@ -234,7 +234,7 @@ def frame_at(path: Path, at: str) -> int:
     if at.isdecimal():
         return int(at)
     if path.suffix != ".rrd" and holds_run(path):
-        if match := ITERATION.fullmatch(at.strip()):
+        if match := ITERATION_PATTERN.fullmatch(at.strip()):
             for columns in read_columns(path):
                 for frame in columns.frames[columns.iterations == int(match[1])]:
                     return int(frame)

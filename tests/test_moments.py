@@ -202,7 +202,7 @@ def test_a_keyframe_that_lies_is_found_out(
     assert cdmisfa("learn", "oscillatory", *told, "-o", tmp_path / "run").code == 0
     checked = cdmisfa("check", tmp_path / "run")
     assert checked.code == 4
-    assert checked.out.startswith("iteration 19: keyframe abstraction.v[3, 1] is ")
+    assert checked.out.startswith("iteration 19: keyframe abstraction.v[3, 1] differs: ")
     assert cdmisfa("check", tmp_path / "run", "--iterations", ":15").code == 0
     assert cdmisfa("check", tmp_path / "run", "--iterations", "10:", "--json").code == 4
 

@@ -36,7 +36,7 @@ from replay.logs.formats.views import SeveralRecordingsError
 from replay.logs.open_logs import is_external_format
 from replay.open_sources import locations, open_recording, with_every_topic
 from replay.runs.folders import MODULES_FILE
-from replay.runs.run import Run
+from replay.runs.run import StoredRun
 from replay.storage.identity import file_sha256
 from replay.stored_source import StoredSource, centre_as
 
@@ -73,7 +73,7 @@ class Application:
     """
 
     def __init__(self, path: str | Path) -> None:
-        run = Run(path)
+        run = StoredRun(path)
         self._path = str(path)
         self.modules = run.modules
         if not self.modules:

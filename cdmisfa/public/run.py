@@ -92,7 +92,7 @@ def _refuse_unknown(name: str) -> None:
         raise UnknownSignalError(f"no signal {name!r}: {did_you_mean(str(name), SIGNALS)}")
 
 
-class Run(Described, replay.runs.run.Run):
+class Run(Described, replay.runs.run.StoredRun):
     """A run on disk; each part is read when it is first used.
 
     Args:

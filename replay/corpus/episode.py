@@ -117,7 +117,7 @@ def _digest(logs: Sequence[Mapping[str, Any]]) -> str:
     return hashlib.sha256(json.dumps(logs, sort_keys=True).encode()).hexdigest()
 
 
-def names_of(logs: Sequence[Log]) -> tuple[str, list[str]]:
+def relative_names(logs: Sequence[Log]) -> tuple[str, list[str]]:
     """Return the folder of all logs, "" for URLs, and the path of each log relative to it."""
     paths = [os.path.abspath(log[0]) for log in logs]
     paths = [os.path.dirname(p) if len(log) > 1 else p for p, log in zip(paths, logs, strict=True)]
@@ -134,7 +134,7 @@ def episode_of(
     log: Log, name: str, source: LoggedSource, reopen: Callable[[Log], LoggedSource]
 ) -> Episode:
     spec, format = source.spec, log_format(log[0])
-    if len(spec.streams) == 1 and format in ("video", "table", "pictures", "arrays"):
+    if len(spec.streams) == 1 and format in ("video", "table", "images", "arrays"):
         spec = replace(spec, streams=("stream",))  # else each file would be another stream
     stated = source.origin() if source.recorded else source.described([])
     streams, fields = {}, stated.get("fields") or []

@@ -12,7 +12,15 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.names import counted
 from recorder.images.options import InputOptions
-from replay.corpus.episode import Episode, Log, are_alike, by_numbers, episode_of, names_of, sampled
+from replay.corpus.episode import (
+    Episode,
+    Log,
+    are_alike,
+    by_numbers,
+    episode_of,
+    relative_names,
+    sampled,
+)
 from replay.logs.formats.lerobot import PAUSE
 from replay.logs.source import LoggedSource
 from replay.open_sources import open_log
@@ -88,7 +96,7 @@ class EpisodeSource(StoredSource):
         episodes: list[Episode] = []
         errors: list[CdmisfaError] = []
         warnings: list[str] = []
-        self._folder, names = names_of(logs)
+        self._folder, names = relative_names(logs)
         order = sorted(zip(names, logs, strict=True), key=lambda named: by_numbers(named[0]))
         for done, (name, log) in enumerate(order, 1):
             try:

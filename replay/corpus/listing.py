@@ -86,7 +86,7 @@ def _below(root: str, listed: set[tuple[int, int]]) -> Iterator[ListedLog]:
         state = os.stat(folder)
         names = {*folders, *files}
         format = _format_of_folder(folder, names)
-        if format in ("bag", "dataset", "pictures"):
+        if format in ("bag", "dataset", "images"):
             yield _log_file(folder)
         if (state.st_dev, state.st_ino) in listed or format in ("bag", "dataset"):
             folders.clear()

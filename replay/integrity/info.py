@@ -33,7 +33,7 @@ from replay.storage.paths import log_files
 CHECK_BYTES: Final = 1024 * 1024 * 1024
 
 Times = NDArray[np.uint64]
-Result = TypeVar("Result")
+Outcome = TypeVar("Outcome")
 
 
 def describe(*words: str | Path) -> LogReport:
@@ -112,7 +112,7 @@ def describe_log(log: Path, *, decode: bool | None = None) -> LogReport:
         return describe_reader(reader, decode=False)
 
 
-def read_once(path: Path, work: Callable[[LogReader], Result]) -> Result:
+def read_once(path: Path, work: Callable[[LogReader], Outcome]) -> Outcome:
     """Apply a function to the reader of a log and read each byte once if the log is whole.
 
     Args:
@@ -136,7 +136,7 @@ def _describe_external(place: Path, most: int) -> LogReport:
     channels = channels_of(place)
     missing = tuple(Problem(str(place), c.missing) for c in channels if c.missing)
     kind, broken = log_format(place), None
-    if most and kind == "pictures":
+    if most and kind == "images":
         broken = broken_images(image_files(place), most)
     crc: Crc = "absent" if broken is None else "bad" if broken else "ok"
     unchecked = broken is None and kind != "arrays"  # arrays are whole if they can be loaded

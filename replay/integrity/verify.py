@@ -323,7 +323,7 @@ def _check_external(path: Path) -> LogReport:
     except LogDamagedError as error:
         return replace(failed(path, error), crc="absent")
     report = _check_topics(path, [c.info.topic for c in channels if c.images and c.info.messages])
-    if kind == "pictures" and channels[0].info.encoding == "png":  # PNG has checksums of its own
+    if kind == "images" and channels[0].info.encoding == "png":  # PNG has checksums of its own
         report = replace(report, crc="ok" if report.ok else "bad")
     notes = dict.fromkeys(line for channel in channels for line in channel.remarks)
     return replace(report, notes=tuple(notes | dict.fromkeys(report.notes)))

@@ -16,7 +16,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import stream_name, stream_names
 from recorder.images.options import InputOptions
 from replay.logs import clock as clocks
-from replay.logs.clock import Clock
+from replay.logs.clock import FrameClock
 from replay.logs.formats.arrays import FPS
 from replay.logs.stream import LogStream, joined
 
@@ -27,7 +27,7 @@ class UnequalError(UsageError):
 
 def align(
     streams: Sequence[LogStream], options: InputOptions
-) -> tuple[list[LogStream], float, Clock]:
+) -> tuple[list[LogStream], float, FrameClock]:
     """Put streams on one clock; arrays always by index.
 
     Args:
@@ -131,7 +131,7 @@ def join_parts(streams: Sequence[LogStream]) -> list[LogStream]:
     return result if len(result) < len(streams) else list(streams)
 
 
-def names_of(streams: Sequence[LogStream]) -> tuple[str, ...]:
+def unique_stream_names(streams: Sequence[LogStream]) -> tuple[str, ...]:
     """Name streams by their topics, and by files and folders where they share a topic.
 
     Raises:

@@ -34,7 +34,7 @@ Rows = range | IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class FrameClock:
     """Frames of all streams on one clock.
 
     Attributes:
@@ -50,7 +50,7 @@ class Clock:
     first: int = 0
 
 
-def by_time(streams: Sequence[IntArray], fps: float) -> Clock:
+def by_time(streams: Sequence[IntArray], fps: float) -> FrameClock:
     """Show in each frame the last row at or before its time, while every stream has rows.
 
     Raises:
@@ -72,10 +72,10 @@ def by_time(streams: Sequence[IntArray], fps: float) -> Clock:
             if begins < ends:
                 spans.append((begins, ends))
         gaps.append(spans)
-    return Clock(start, rows, gaps)
+    return FrameClock(start, rows, gaps)
 
 
-def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> Clock:
+def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> FrameClock:
     """Show the i-th row of every stream together, up to the end of the shortest.
 
     Args:
@@ -89,7 +89,7 @@ def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> Clock:
     first, count = streams[0], min(map(len, streams))
     begins = [int(i) for i in pauses(first) if i < count] if gaps else []
     if not begins:
-        return Clock(int(first[0]), [range(count)] * len(streams), [[]] * len(streams))
+        return FrameClock(int(first[0]), [range(count)] * len(streams), [[]] * len(streams))
     ticks = np.ones(count, np.int64)
     for i in begins:
         ticks[i] = max(round(int(first[i] - first[i - 1]) * fps / NANOSECONDS), 2)
@@ -97,7 +97,7 @@ def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> Clock:
     spans = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
     _refuse_many(frame[-1])
     rows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
-    return Clock(int(first[0]), [rows] * len(streams), [spans] * len(streams))
+    return FrameClock(int(first[0]), [rows] * len(streams), [spans] * len(streams))
 
 
 def _refuse_many(frames: float) -> None:
@@ -108,7 +108,7 @@ def _refuse_many(frames: float) -> None:
         )
 
 
-def by_number(views: Iterable[Sequence[Span]], facts: ViewMetadata, name: str) -> Clock:
+def by_number(views: Iterable[Sequence[Span]], facts: ViewMetadata, name: str) -> FrameClock:
     """Show each frame of a recording at its number; rows are numbers of frames.
 
     Args:
@@ -134,7 +134,7 @@ def by_number(views: Iterable[Sequence[Span]], facts: ViewMetadata, name: str) -
     parts = [np.arange(low, high) for low, high in common] if len(common) > 1 else []
     rows: Rows = np.concatenate(parts) if parts else range(begins, end)
     absent = [outside(covered, begins, end) if facts.gaps else [] for covered in streams]
-    return Clock(facts.start_ns, [rows] * len(streams), absent, begins)
+    return FrameClock(facts.start_ns, [rows] * len(streams), absent, begins)
 
 
 def intersection(one: Sequence[Span], two: Sequence[Span]) -> list[Span]:

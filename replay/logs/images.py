@@ -21,7 +21,7 @@ REMEDY: Final = "skip broken images with --skip-damaged"
 CORES: Final = thread_count()
 
 # The number of a stream, and a row of it.
-Place = tuple[int, int]
+StreamRow = tuple[int, int]
 
 
 class Images:
@@ -39,12 +39,12 @@ class Images:
     def __init__(self, streams: Sequence[LogStream], *, color: bool, skip_damaged: bool) -> None:
         self._streams, self._color, self._skip_damaged = streams, color, skip_damaged
         self._threads = ThreadPoolExecutor(CORES)
-        self._pending: dict[Place, Future[ByteArray] | None] = {}
-        self._coming: Iterator[Place] = iter(())
+        self._pending: dict[StreamRow, Future[ByteArray] | None] = {}
+        self._coming: Iterator[StreamRow] = iter(())
         self._whole: dict[int, tuple[int, Content]] = {}
         self._broken: dict[int, dict[int, LogDamagedError]] = {}
 
-    def expect(self, places: Iterable[Place]) -> None:
+    def expect(self, places: Iterable[StreamRow]) -> None:
         """Announce the rows that are asked for next, in this order; others are forgotten."""
         wanted = dict.fromkeys(places if CORES > 1 else ())
         for place in self._pending.keys() - wanted:
@@ -52,7 +52,7 @@ class Images:
         self._coming = iter([place for place in wanted if place not in self._pending])
         self._begin()
 
-    def pop(self, place: Place) -> ByteArray | None:
+    def pop(self, place: StreamRow) -> ByteArray | None:
         """Return an image; None if no thread has decoded it, or the caller shall see the error."""
         coming = self._pending.pop(place, None)
         self._begin()
@@ -80,7 +80,7 @@ class Images:
             compressed_image, data, color=self._color, limit=MAX_THREAD_PIXELS
         )
 
-    def _forget(self, place: Place) -> None:
+    def _forget(self, place: StreamRow) -> None:
         if (coming := self._pending.pop(place)) is not None:
             coming.cancel()
 

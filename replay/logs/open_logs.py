@@ -19,7 +19,7 @@ from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import location
 from replay.storage.paths import log_files
 
-Format = Literal["mcap", "split", "bag", "dataset", "pictures", "video", "table", "arrays"]
+Format = Literal["mcap", "split", "bag", "dataset", "images", "video", "table", "arrays"]
 
 
 # Functions that open the streams of a log; the ExitStack that they are given closes what they open.
@@ -28,7 +28,7 @@ FORMATS: Final[Mapping[Format, Callable[..., list[LogStream]]]] = {
     "split": mcap_log.streams,
     "bag": bag.streams,
     "dataset": lerobot.streams,
-    "pictures": images.streams,
+    "images": images.streams,
     "video": video.streams,
     "table": table.streams,
     "arrays": arrays.streams,
@@ -59,8 +59,8 @@ def log_format(path: Path) -> Format:
             return "bag"
         if metadata.is_file():
             return "split"
-        pictures = any(file.suffix.lower() in images.ENDINGS for file in path.iterdir())
-        return "pictures" if pictures and not any(path.glob("*.mcap*")) else "mcap"
+        has_images = any(file.suffix.lower() in images.ENDINGS for file in path.iterdir())
+        return "images" if has_images and not any(path.glob("*.mcap*")) else "mcap"
     known = _BY_ENDING.get(path.suffix.lower(), "mcap")
     return known if known == "bag" or path.is_file() else "mcap"
 
@@ -205,6 +205,6 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
         return arrays.array_channels(path)
     with open_stream(path) as stream:
         first, last = (None, None) if stream.times is None else map(int, stream.times[[0, -1]])
-        schema = "picture" if kind == "pictures" else "video"
+        schema = "image" if kind == "images" else "video"
         info = ChannelInfo(stream.topic, stream.encoding, schema, stream.count, first, last)
         return [ExternalChannel(info, True, stream.missing, tuple(stream.remarks))]

@@ -23,8 +23,8 @@ from recorder.log.scenery import turns_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
 from replay.logs import clock as clocks
-from replay.logs.aligning import align, names_of
-from replay.logs.formats.views import SCENE
+from replay.logs.aligning import align, unique_stream_names
+from replay.logs.formats.views import SCENE_KEYS
 from replay.logs.images import Images
 from replay.logs.open_logs import identity_of
 from replay.logs.stream import BROKEN, LogStream, Rows
@@ -113,7 +113,7 @@ class LoggedSource(StoredSource):
             names = tuple(stream.topic for stream in self.streams)
             self._spec = replace(facts.spec, streams=names, length=length)
         else:
-            names = names_of(self.streams)
+            names = unique_stream_names(self.streams)
             self._images = images = Images(
                 self.streams, color=self.color, skip_damaged=self._skip_damaged
             )
@@ -278,7 +278,7 @@ class LoggedSource(StoredSource):
         if not self.recorded:
             return {}
         facts = self.streams[0].views[0].facts
-        return {name: getattr(facts, name) for name in SCENE if name in facts.values}
+        return {name: getattr(facts, name) for name in SCENE_KEYS if name in facts.values}
 
     def origin(self) -> Mapping[str, Any]:
         """See `StoredSource`."""

@@ -22,7 +22,7 @@ from recorder.mcap.records import MalformedRecord
 # Log times from here on count as damage, in nanoseconds: the year 2116.
 LAST_NS: Final = 2**62
 
-Result = TypeVar("Result")
+Value = TypeVar("Value")
 
 # Rows of a stream: one a message, image or row of a table, from 0.
 Rows = range | IntArray
@@ -122,7 +122,7 @@ class LogStream:
             return image
         return self.taken(row, self.decode)
 
-    def taken(self, row: int, function: Callable[[Any], Result]) -> Result:
+    def taken(self, row: int, function: Callable[[Any], Value]) -> Value:
         """Apply a function to the stored bytes of a row; raises as `image`."""
         with limited(self.path, self.program, memory_bytes=self.memory_bytes()):
             return function(self.fetch(row))

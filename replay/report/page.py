@@ -12,10 +12,10 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from replay.palette import CYCLE, STATES
+from replay.palette import CYCLE, STATE_COLOURS
 from replay.report.figures import colour_class, curves, timeline
 from replay.report.run_data import RunData
-from replay.report.run_page import command, run_content
+from replay.report.run_page import cli_command, run_content
 from replay.report.svg_plot import number
 from replay.runs.compare import side_by_side
 
@@ -76,12 +76,14 @@ def report_of_runs(paths: Sequence[Path], title: str) -> str:
             "explained": [line for row in rows for line in row.explanation().splitlines()],
             "curves": [plot for plot in plots if plot is not None],
             "timelines": [
-                (row.name, timeline(row.outline), command("report", path))
+                (row.name, timeline(row.outline), cli_command("report", path))
                 # More timelines would make the page too large.
                 for path, row in zip(paths[:24], rows, strict=False)
                 if row.outline.iterations
             ],
-            "compare": command("compare", *paths, "--save", "both.rrd") if len(paths) < 5 else "",
+            "compare": cli_command("compare", *paths, "--save", "both.rrd")
+            if len(paths) < 5
+            else "",
             "frames": {},
         }
     )
@@ -111,9 +113,9 @@ def _templates() -> tuple[Environment, str, str]:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "command": command, "thousands": "{:,}".format}
+    environment.filters |= {"number": number, "command": cli_command, "thousands": "{:,}".format}
     style, script = (loader.get_source(environment, name)[0] for name in ("page.css", "page.js"))
-    for kind, variable, colours in (("c", "--c", CYCLE), ("state", "--s", STATES)):
+    for kind, variable, colours in (("c", "--c", CYCLE), ("state", "--s", STATE_COLOURS)):
         style += "".join(
             f".{kind}{i}{{{variable}:#{r:02x}{g:02x}{b:02x}}}"
             for i, (r, g, b) in enumerate(colours)

@@ -23,7 +23,7 @@ from replay.runs.log import (
     Event,
     read_batches,
 )
-from replay.runs.run import Run, Tally
+from replay.runs.run import StoredRun, Tally
 from replay.truth_fits import TruthFit, truth_fits
 
 TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
@@ -116,7 +116,7 @@ class RunData:
     """
 
     def __init__(self, path: Path, frames: int) -> None:
-        run = Run(path)
+        run = StoredRun(path)
         self.path, self.header, self.spec = run.log.parent, run.header, run.header.spec
         self.document: Mapping[str, Any] = read_run_json(self.path)
         self.problems: list[str] = []

@@ -43,7 +43,7 @@ SECTIONS = 12
 MOST_FILES = 100
 
 
-def command(*words: object) -> str:
+def cli_command(*words: object) -> str:
     """Return a command of cdmisfa to copy into a shell."""
     return shlex.join(["cdmisfa", *map(str, words)])
 
@@ -87,7 +87,7 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         "sections": SECTIONS,
         "held_out": run.result.get("held_out"),
         "origin": _origin(run, again),
-        "view": command("view", run.path),
+        "view": cli_command("view", run.path),
         "frames": frames,
     }
 
@@ -192,7 +192,7 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
         "quantity": run.spec.truth[truth_fits[0].column] if truth_fits else "",
         "truth": truth_plot(module, truth_fits[0]) if truth_fits else None,
         "recent": recent_plots(module),
-        "view": command("view", run.path, "--at", f"iteration {frozen.iteration}"),
+        "view": cli_command("view", run.path, "--at", f"iteration {frozen.iteration}"),
         **_weights(module, images=images),
         "extremes": [],
     }
@@ -249,11 +249,14 @@ def _origin(run: RunData, again: str) -> list[tuple[str, Any]]:
     document, manifest = run.document, run.header.manifest
     source = document.get("source") or manifest.get("source")
     source = source if isinstance(source, Mapping) else {}
-    rows: list[tuple[str, Any]] = [("check", command("check", run.path)), ("learn again", again)]
+    rows: list[tuple[str, Any]] = [
+        ("check", cli_command("check", run.path)),
+        ("learn again", again),
+    ]
     fork = manifest.get("fork")
     if isinstance(fork, Mapping):
         parent = os.path.normpath(run.path / str(fork.get("parent")))
-        rows.append(("compare with the parent run", command("compare", parent, run.path)))
+        rows.append(("compare with the parent run", cli_command("compare", parent, run.path)))
     rows += [
         ("algorithm", run.header.setting("learner", "algorithm")),
         ("seed", manifest.get("seed")),

@@ -26,7 +26,7 @@ MAX_LETTERS = 60
 
 IDENTICAL = "identical, bit for bit"
 
-HEAD = ("run", "seed", "iterations", "modules", "against the first run")
+HEAD = ("run", "seed", "iterations", "modules", "compared with the first run")
 
 # Key of the number of iterations among the outcomes of streams.
 ITERATIONS = "iterations"
@@ -58,7 +58,7 @@ class Difference:
             return f"iteration {self.iteration}: the first {self.first}, the second {self.second}"
         place = f"[{', '.join(map(str, self.place))}]" if self.place else ""
         where = f"iteration {self.iteration}: {self.signal}{place}"
-        return f"{where} is {self.first} against {self.second}"
+        return f"{where} differs: {self.first} and {self.second}"
 
     def as_json(self) -> dict[str, Any]:
         """Return the place and both values as JSON values."""
@@ -159,11 +159,11 @@ def different_versions(first: Path, second: Path) -> tuple[str, ...]:
     """
     a, b = (read_run_json(run_log(run).parent) for run in (first, second))
     one, two = read_header(first).arithmetic, read_header(second).arithmetic
-    lines = [] if one == two else [f"{ARITHMETIC} {one} against {two}"]
+    lines = [] if one == two else [f"{ARITHMETIC} {one} -> {two}"]
     for x, y in ((a.get(table), b.get(table)) for table in ("versions", "platform")):
         if isinstance(x, Mapping) and isinstance(y, Mapping):
             shared = sorted(x.keys() & y.keys())
-            lines += [f"{k} {x[k]} against {y[k]}" for k in shared if x[k] != y[k]]
+            lines += [f"{k} {x[k]} -> {y[k]}" for k in shared if x[k] != y[k]]
     return tuple(lines)
 
 
@@ -264,11 +264,11 @@ class ComparedRun:
         """Return the settings and versions that may explain the difference, a line each."""
         lines = []
         if self.settings:
-            settings = (f"{k} {_short(a)} against {_short(b)}" for k, a, b in self.settings)
-            lines.append(f"{self.name} has other settings: {'; '.join(settings)}")
+            settings = (f"{k} {_short(a)} -> {_short(b)}" for k, a, b in self.settings)
+            lines.append(f"settings changed in {self.name}: {'; '.join(settings)}")
         if self.versions:
             versions = "; ".join(self.versions)
-            lines.append(f"{self.name} has other versions, which may explain it: {versions}")
+            lines.append(f"versions changed in {self.name}, a possible reason: {versions}")
         return "\n".join(lines)
 
 

@@ -28,7 +28,7 @@ LINES = (
 )
 
 
-class Run:
+class StoredRun:
     """A run on disk; each part is read when it is asked for.
 
     Args:

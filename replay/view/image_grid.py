@@ -13,7 +13,7 @@ from replay.module_outputs import SAMPLE_FRAMES
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
-from replay.view.writer import Range, ViewWriter, changes, drawable, part
+from replay.view.writer import Interval, ViewWriter, changes, drawable, part
 
 GRID = "latest_frames"
 
@@ -42,7 +42,7 @@ def grid_positions(
 
 def grid_bounds(
     count: int, height: int, width: int, columns: int | None = None
-) -> tuple[Range, Range]:
+) -> tuple[Interval, Interval]:
     """Return ranges of x and y that hold a wall of images of a size; see `grid_positions`."""
     x, y = map(max, zip(*grid_positions(count, width, height, columns), strict=True))
     margin = SPACE * height

@@ -13,7 +13,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cdmisfa.core.errors import UsageError
-from replay.view.writer import FRAME, ITERATION, Range
+from replay.view.writer import FRAME, ITERATION, Interval
 
 Views = list[rrb.View | rrb.Container]
 
@@ -143,7 +143,7 @@ def curve_view(
     *,
     start: int = 0,
     recent: int = 0,
-    span: Range | None = None,
+    span: Interval | None = None,
     legend: bool = True,
 ) -> rrb.TimeSeriesView:
     """Return a plot of curves over time.
@@ -194,7 +194,7 @@ def _axis(
     return rrb.archetypes.TimeAxis(view_range=visible)
 
 
-def images(origin: str, name: str, bounds: tuple[Range, Range] | None = None) -> rrb.View:
+def images(origin: str, name: str, bounds: tuple[Interval, Interval] | None = None) -> rrb.View:
     """Return a view of images; with `bounds`, of the part within ranges of x and y."""
     across, down = bounds or (None, None)
     visible = rrb.VisualBounds2D(x_range=across, y_range=down) if across and down else None

@@ -17,7 +17,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.modules import Module
 from replay.module_outputs import ModuleOutputs, SampledFrame
-from replay.palette import BRICK, DARK, GREY, MIST, Colour, Rgb, colour, faint, packed, shade
+from replay.palette import BRICK, DARK, GREY, MIST, Rgb, RgbOrRgba, colour, faint, packed, shade
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, Frames
 from replay.runs.run import Outline
@@ -217,7 +217,7 @@ class ModulesView:
         slow = np.zeros(0) if module is None else module.slow
         visible = np.flatnonzero(slow) if slow.any() else np.arange(y.shape[1])
         names = [f"output {j + 1}" for j in visible.tolist()]
-        rgbs: list[Colour] = [colour(stream), *(faint(colour(stream)) for _ in visible[1:])]
+        rgbs: list[RgbOrRgba] = [colour(stream), *(faint(colour(stream)) for _ in visible[1:])]
         path = f"modules/{number}/output"
         self._writer.lines(path, names, (t, iterations), y[:, visible], rgbs, gap=self._tau)
 

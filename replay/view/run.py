@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SIGNALS, Signal
 from cdmisfa.modules import Module
-from replay.palette import GREY, Colour, colour, faint, packed_all, pale
+from replay.palette import GREY, RgbOrRgba, colour, faint, packed_all, pale
 from replay.runs.columns import SignalColumns, has_values
 from replay.runs.log import Batch, RunHeader
 from replay.runs.run import Outline, rules_of
@@ -152,7 +152,7 @@ class Curve(NamedTuple):
     path: str
     names: Sequence[str]
     values: NDArray[Any]
-    rgbs: Sequence[Colour] = ()
+    rgbs: Sequence[RgbOrRgba] = ()
     of: Any = slice(None)
     per_frame: bool = False
     width: float = WIDTH
@@ -211,7 +211,7 @@ class SignalCurves:
                 continue
             if value.dtype.kind == "i" and not has_values(signal.name, value):
                 continue
-            per_frame, rgbs = "T" in signal.dims, list[Colour]()
+            per_frame, rgbs = "T" in signal.dims, list[RgbOrRgba]()
             if signal.dims.startswith("M"):
                 for i in range(1, value.shape[1] + 1):
                     names = line_names(signal, i, outputs)

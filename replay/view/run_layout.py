@@ -11,7 +11,7 @@ from replay.runs.run import Outline
 from replay.view import layouts
 from replay.view.image_grid import GRID, grid_bounds, sheet_size
 from replay.view.layouts import RECENT, Panel, Tab, Views, beside, curve_view, images
-from replay.view.writer import MOST_STREAMS, Range, ViewWriter, drawable
+from replay.view.writer import MOST_STREAMS, Interval, ViewWriter, drawable
 
 # Modules that have a page each; of more, those that stand on one page.
 PAGES, MOST_MODULES = 12, 6
@@ -153,7 +153,7 @@ class RunLayout:
             legend=panel.legend and several,
         )
 
-    def _span(self, panel: Panel, entities: Sequence[str]) -> Range | None:
+    def _span(self, panel: Panel, entities: Sequence[str]) -> Interval | None:
         """Return the range of a panel's axis; None leaves it to the viewer."""
         if panel.low is not None and panel.high is not None:
             return panel.low, panel.high

@@ -215,5 +215,5 @@ def _state(code: int) -> tuple[str, Rgb]:
     if code >= len(STATES):
         module = code - len(STATES)
         text = STATE_WORDS[_KNOWN]
-        return f"{text} by module {module}" if module else text, palette.STATES[_KNOWN]
-    return STATE_WORDS[code], palette.STATES[code]
+        return f"{text} by module {module}" if module else text, palette.STATE_COLOURS[_KNOWN]
+    return STATE_WORDS[code], palette.STATE_COLOURS[code]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import times_of
-from replay.palette import Colour, packed_all, pale
+from replay.palette import RgbOrRgba, packed_all, pale
 
 # Timeline of the global frame counter t.
 FRAME = "frame"
@@ -51,7 +51,7 @@ MAX_BYTES = 4 * 1024 * 1024
 WIDTH = 1.5
 
 # Least and greatest value.
-Range = tuple[float, float]
+Interval = tuple[float, float]
 
 # Frames of n rows, and their iterations where the source has any, (n,) each.
 At = tuple[IntArray, IntArray | None]
@@ -136,7 +136,7 @@ class ViewWriter:
 
     def __init__(self, recording: rr.RecordingStream, spec: SourceSpec) -> None:
         self.recording, self.spec = recording, spec
-        self.spans: dict[str, Range] = {}
+        self.spans: dict[str, Interval] = {}
         self._buffers: dict[str, _Buffer] = {}
 
     def log(self, path: str, value: Any) -> None:
@@ -175,7 +175,7 @@ class ViewWriter:
         names: Sequence[str],
         at: At,
         values: NDArray[Any],
-        rgbs: Sequence[Colour] = (),
+        rgbs: Sequence[RgbOrRgba] = (),
         *,
         width: float = WIDTH,
         gap: int = 0,
@@ -243,7 +243,7 @@ class ViewWriter:
         for path, waiting in self._buffers.items():
             self._send_buffer(path, waiting)
 
-    def covered(self, entity: str) -> Range | None:
+    def covered(self, entity: str) -> Interval | None:
         """Return the least and the greatest value of an entity that is written, or of many (**)."""
         spans = [self.spans[path] for path in self.matching(entity)]
         return (min(low for low, _ in spans), max(high for _, high in spans)) if spans else None

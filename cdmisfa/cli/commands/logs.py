@@ -63,8 +63,8 @@ def _print_info(info: LogReport) -> None:
     for part in [info] if together else info.files:
         words: list[str] = [part.state]
         if part.state != "not read":
-            words = [part.kind, part.state.replace("unchecked", "contents unchecked")]
-            words += [f"checksums {part.crc}"]
+            state = part.state.replace("unchecked", "contents unchecked")
+            words = [part.kind.replace("foreign", "external"), state, f"checksums {part.crc}"]
             words += [] if part.seed is None else [f"seed {part.seed}"]
         printing.line(f"{part.path}: {', '.join(words)}")
     for line in (*(f"{p.where}: {p.what}" for p in info.problems), *info.notes):
@@ -351,9 +351,10 @@ def _print_index(indexed: Indexed) -> None:
     )
     if indexed.kinds:
         head = "kind", "logs", "files", "streams", "length", "size"
-        counts = [[row[name] for name in head[:4]] for row in indexed.kinds]
+        kinds = [row["kind"].replace("foreign", "external") for row in indexed.kinds]
+        counts = [[row[name] for name in head[1:4]] for row in indexed.kinds]
         sizes = [[duration_text(row["seconds"]), decimal(row["bytes"])] for row in indexed.kinds]
-        printing.table(head, [[*a, *b] for a, b in zip(counts, sizes, strict=True)])
+        printing.table(head, [[k, *a, *b] for k, a, b in zip(kinds, counts, sizes, strict=True)])
     for row in indexed.problems:
         printing.line(f"{row['path']}: {row['problem']}")
     if (more := indexed.broken - len(indexed.problems)) > 0:

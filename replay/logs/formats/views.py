@@ -28,10 +28,10 @@ _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)
 _SMALLEST: Final = 64
 
 # Keys of a view's metadata that say what was recorded.
-SCENE: Final = ("scene", "seed", "config_sha256")
+SCENE_KEYS: Final = ("scene", "seed", "config_sha256")
 
 # Keys that are the same in all files of a recording.
-_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", "gaps", *SCENE)
+_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", "gaps", *SCENE_KEYS)
 
 
 class SeveralRecordingsError(UsageError):
