@@ -82,9 +82,12 @@ def signals() -> str:
 def constants() -> str:
     """Return the table of the learner's constants, with the results at half and twice the value."""
     document = json.loads((RESULTS / "constants.json").read_text("utf-8"))
-    table = document["tables"][0]
-    rows = [[f"`{name.rpartition('.')[2]}`", *cells] for name, *cells in table["rows"]]
-    return markdown(table["header"], rows)
+    rows = []
+    for name, value, about, origin, *results in document["tables"][0]["rows"]:
+        short = f"`{name.rpartition('.')[2]}`" if value else name
+        meaning = f"{about}; {origin}" if about else ""
+        rows.append([short, value, meaning, *(result.replace(": ", ":<br>") for result in results)])
+    return markdown(["constant", "value", "meaning; origin", "half", "twice"], rows)
 
 
 def commands() -> str:
