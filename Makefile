@@ -1,4 +1,4 @@
-# demo and test create .venv and use it; the command is then .venv/bin/cdmisfa.
+# demo and test create .venv and use it. The command is then .venv/bin/cdmisfa.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/.installed
@@ -17,7 +17,7 @@ demo: $(INSTALLED)
 
 test: lint suite
 
-# Of three processes one waits as a rule: for cameras, viewers and what it has killed.
+# Three processes on two cores: one of them usually waits for a camera, a viewer or a killed process.
 suite: $(TESTED)
 	$(BIN)/pytest -n 3 --dist loadgroup
 
@@ -29,7 +29,7 @@ lint: $(TESTED)
 bench: .venv/.with-bench
 	$(BIN)/python -m benchmarks
 
-# The site, in build/site; nothing is fetched.
+# Build the site in build/site, without network access.
 docs: .venv/.with-docs
 	$(BIN)/sphinx-build -W -b html docs build/site
 
@@ -43,11 +43,11 @@ fuzz: $(TESTED)
 torture: $(TESTED)
 	$(BIN)/python -m tools.torture --seed $(or $(SEED),0) --minutes $(or $(MINUTES),30)
 
-# The tests of tools/, with some cases of each kind of attack, and of the benchmarks.
+# Run the tests of tools/, with some cases of each kind of attack, and of the benchmarks.
 attacks: $(TESTED)
 	$(BIN)/pytest -n 3 --dist loadgroup tools
 
-# The tests of the kernels, which then end where they leave an array or the range of a number.
+# Run the tests of the kernels with sanitizers: they stop at an access outside an array or an overflow.
 sanitized: $(TESTED)
 	CFLAGS="$(SANITIZERS)" LDFLAGS="$(SANITIZERS)" $(BIN)/python setup.py -q \
 	    build --build-base $(SANITIZED) --build-lib $(SANITIZED)/lib
@@ -55,7 +55,7 @@ sanitized: $(TESTED)
 	    $(BIN)/pytest -q -o "pythonpath=$(SANITIZED)/lib ." $(wildcard tests/test_kernels*.py) \
 	    tests/test_incsfa.py tests/test_recursive_sfa.py tests/test_chunks.py
 
-# Wheel and source archive of the commit, in dist/.
+# Build the wheel and the source archive of the commit in dist/.
 release: .venv/.with-release
 	rm -rf dist build/release
 	git clone --quiet . build/release
@@ -64,7 +64,7 @@ release: .venv/.with-release
 
 install: $(INSTALLED)
 
-# What the product needs; .with-EXTRA is the product with an extra of pyproject.toml.
+# Install the product; .with-EXTRA adds an extra of pyproject.toml.
 $(INSTALLED): $(SOURCES)
 	@echo "installing cdmisfa and what it needs into .venv, once (about a minute)"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
