@@ -19,7 +19,7 @@ from benchmarks.live_streams import FPS
 from benchmarks.report import SAMPLE, interleaved, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.apply import Application, Totals, follow
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from cdmisfa.modules import Module
 from recorder.images.framing import Recipe
 from recorder.images.options import InputOptions
@@ -44,7 +44,9 @@ FRAMES, FILMED, READ = 4000, 200, 640
 def make_run(folder: Path, outputs: int) -> Path:
     """A run with ten modules of random weights."""
     with open_log([SAMPLE], loop=True) as source:
-        run(source, LearnerConfig(tau=TAU, expansion="none"), folder, max_iterations=3, rerun=False)
+        run_session(
+            source, LearnerConfig(tau=TAU, expansion="none"), folder, max_iterations=3, rerun=False
+        )
     rng = np.random.default_rng(1)
     band = np.full(outputs, 0.01)
     save_modules(

@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.report import SAMPLE, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig, load_preset
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from replay.open_sources import open_recording
 
 CONFIGS = {
@@ -31,7 +31,7 @@ def learning(config: LearnerConfig, out: Path | None, *, rerun: bool) -> Callabl
 
     def call(iterations: int) -> None:
         source.seek(0)
-        run(source, config, out, max_iterations=iterations, force=True, rerun=rerun)
+        run_session(source, config, out, max_iterations=iterations, force=True, rerun=rerun)
 
     return call
 

@@ -19,7 +19,7 @@ from PIL import Image
 from benchmarks import foreign
 from benchmarks.report import save
 from cdmisfa.agents.progress.config import ProgressConfig
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from recorder.cameras.live import LiveSource
 from recorder.cameras.words import open_live
 from recorder.images.options import InputOptions
@@ -82,7 +82,7 @@ def watch(folder: Path, seconds: float, streams: int = STREAMS) -> list[object]:
         cpu, wall = time.process_time(), time.perf_counter()
         end = wall + seconds
         with LiveRecorder(source, folder) as live:
-            run(live, ProgressConfig(), stop=lambda: time.perf_counter() > end)
+            run_session(live, ProgressConfig(), stop=lambda: time.perf_counter() > end)
             counts = source.alignment
         wall = time.perf_counter() - wall
         cpu = time.process_time() - cpu

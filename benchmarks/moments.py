@@ -72,7 +72,7 @@ def learning(word: str, out: Path, keyframes: int | None, frames: int) -> Callab
         how = SOURCES[word]
         source, told = open_source([word], **how)
         iterations = frames // told.learner.tau
-        session.run(
+        session.run_session(
             source,
             told.learner,
             out,

@@ -18,7 +18,7 @@ from benchmarks.report import middle, save
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import open_source
 from replay.open_sources import open_external
 
@@ -76,7 +76,7 @@ def first_block(path: Path) -> int:
         source, configuration = open_source([path])
         with contextlib.closing(source):
             try:
-                run(
+                run_session(
                     source,
                     configuration.learner,
                     Path(folder) / "run",

@@ -11,7 +11,7 @@ import pytest
 from folders import flip
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from recorder.log.logfile import LogFile
 from recorder.mcap.reader import LogReader
 from recorder.world.oscillatory import OscillatorySource
@@ -24,7 +24,7 @@ EASY = LearnerConfig(delta=1.0, eta_dot_window=3, min_variance=0.0, warm_up=0, t
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("final") / "run"
-    found = run(OscillatorySource(), EASY, folder, max_iterations=400, max_modules=1)
+    found = run_session(OscillatorySource(), EASY, folder, max_iterations=400, max_modules=1)
     assert found.modules
     return folder
 

@@ -15,7 +15,7 @@ from run_data import IMAGE, VECTOR, having, read_signals, run_of
 from test_viewer import addresses
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from recorder.world.oscillatory import OscillatorySource
 from replay.view import live
 from replay.view.live import LiveView
@@ -89,9 +89,9 @@ def test_a_viewer_shows_the_run_as_it_grows_and_keeps_it():
 
 def test_a_run_gives_the_same_with_and_without(tmp_path):
     said, folder = [], tmp_path / "run"
-    quiet = run(OscillatorySource(), LearnerConfig(), None, max_iterations=60)
+    quiet = run_session(OscillatorySource(), LearnerConfig(), None, max_iterations=60)
     how = {"max_iterations": 60, "live": lambda address: said.append(address) or nullcontext()}
-    shown = run(OscillatorySource(), LearnerConfig(), folder, **how)
+    shown = run_session(OscillatorySource(), LearnerConfig(), folder, **how)
     assert shown.signals_sha256 == quiet.signals_sha256
     assert (folder / "run.rrd").is_file()
     assert len(said) == 1
@@ -100,9 +100,9 @@ def test_a_run_gives_the_same_with_and_without(tmp_path):
 def test_a_resumed_run_shows_what_went_before(tmp_path, sent):
     """All of a resumed run is handed over, each record once, and in order."""
     folder, how = tmp_path / "run", {"rerun": False}
-    run(OscillatorySource(), LearnerConfig(), folder, max_iterations=30, **how)
+    run_session(OscillatorySource(), LearnerConfig(), folder, max_iterations=30, **how)
     how |= {"resume": True, "live": lambda address: nullcontext()}
-    run(OscillatorySource(), LearnerConfig(), folder, max_iterations=50, **how)
+    run_session(OscillatorySource(), LearnerConfig(), folder, max_iterations=50, **how)
     expected = [s.epsilon for s in read_signals(folder)]
     assert len(expected) == 50
     np.testing.assert_array_equal(np.concatenate(sent["signals/epsilon"]), expected)

@@ -20,7 +20,7 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.experiments.run_folder import RunResult
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from recorder.cameras.live import LiveSource, Steady
 from recorder.cameras.readers import Readers
 from recorder.live import COUNTS, LiveRecorder, record_live
@@ -167,7 +167,7 @@ CONFIGS = [
 
 
 def learned(source: FrameSource, config: Any) -> RunResult:
-    result = run(source, config, max_modules=99)
+    result = run_session(source, config, max_modules=99)
     assert result.ended == "log_exhausted"
     return result
 
@@ -207,7 +207,9 @@ def test_a_live_run_that_ends_within_a_block_is_checked_by_its_recording(
 ) -> None:
     script = [*steady(0, 0, 100), *steady(0, 5, 30)]  # a gap, and less than a block behind it
     with LiveRecorder(opened(script), tmp_path / "rec") as live:
-        run(live, ProgressConfig(tau=40, components=3, outputs=1), tmp_path / "run", rerun=False)
+        run_session(
+            live, ProgressConfig(tau=40, components=3, outputs=1), tmp_path / "run", rerun=False
+        )
     assert live.t > 100
     checked = cdmisfa("check", tmp_path / "run", "--source", tmp_path / "rec")
     assert (checked.code, checked.out) == (

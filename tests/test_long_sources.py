@@ -21,7 +21,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.run_folder import RunResult
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from replay import stored_source
 from replay.open_sources import open_recording
 from replay.runs.compare import different_settings
@@ -65,7 +65,7 @@ def learn(path: Path, out: Path, *sinks: Sink, **how: Any) -> RunResult:
     with_end = {"max_iterations": ITERATIONS, "rerun": False, **how}
     source = open_recording(path)
     try:
-        return run(source, CONFIG, out, sinks=sinks, **with_end)
+        return run_session(source, CONFIG, out, sinks=sinks, **with_end)
     finally:
         source.close()
 

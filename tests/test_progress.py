@@ -28,7 +28,7 @@ from cdmisfa.agents.progress.learner import ProgressLearner
 from cdmisfa.core.blocks import Block, freeze
 from cdmisfa.core.signals import canonical_bytes
 from cdmisfa.experiments.loop import learn_blocks
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from recorder.recording import record
 from replay.open_sources import open_recording
 
@@ -104,13 +104,17 @@ def test_what_changes_is_learned_anew_or_known(attention: str) -> None:
 
 def test_live_recorded_and_resumed_are_the_same_bit_for_bit(tmp_path: Path) -> None:
     names = ("noise", "swing", "constant", "stroll")
-    live = run(MovingPictures(*names), CONFIG, tmp_path / "live", rerun=False)
+    live = run_session(MovingPictures(*names), CONFIG, tmp_path / "live", rerun=False)
     record(MovingPictures(*names), tmp_path / "log", frames=live.frames)
-    recorded = run(open_recording([tmp_path / "log"]), CONFIG, tmp_path / "recorded", rerun=False)
+    recorded = run_session(
+        open_recording([tmp_path / "log"]), CONFIG, tmp_path / "recorded", rerun=False
+    )
     assert recorded.signals_sha256 == live.signals_sha256
-    stopped = run(MovingPictures(*names), CONFIG, tmp_path / "run", max_iterations=37, keyframes=10)
+    stopped = run_session(
+        MovingPictures(*names), CONFIG, tmp_path / "run", max_iterations=37, keyframes=10
+    )
     assert stopped.iterations == 37
-    resumed = run(MovingPictures(*names), CONFIG, tmp_path / "run", resume=True)
+    resumed = run_session(MovingPictures(*names), CONFIG, tmp_path / "run", resume=True)
     assert (resumed.signals_sha256, resumed.iterations) == (live.signals_sha256, live.iterations)
     assert resumed.summary == live.summary
     opened = Run(tmp_path / "run")
@@ -256,8 +260,10 @@ def test_rules_choose_what_they_are_for(
 
 def test_eight_outputs_are_decided_as_one_and_marked(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     names, told = ("noise", "swing", "stroll"), ProgressConfig(components=8)
-    one = run(MovingPictures(*names), ProgressConfig(components=8, outputs=1), tmp_path / "one")
-    eight = run(MovingPictures(*names), told, tmp_path / "run", rerun=False)
+    one = run_session(
+        MovingPictures(*names), ProgressConfig(components=8, outputs=1), tmp_path / "one"
+    )
+    eight = run_session(MovingPictures(*names), told, tmp_path / "run", rerun=False)
     assert told.outputs == 8
     assert [(m.stream, m.iteration) for m in eight.modules] == [
         (m.stream, m.iteration) for m in one.modules

@@ -12,7 +12,7 @@ import pytest
 from cdmisfa.core.config import LearnerConfig, section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.resume import check_run
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from recorder.config import RecordConfig
 from recorder.log.scenery import scenery_of, turned
 from recorder.recording import record_scene
@@ -75,9 +75,9 @@ def test_a_switch_costs_the_same_frames_live_and_from_the_log(scene, tmp_path):
     recording = tmp_path / "recording"
     record_scene("icub", recording, SMALL, frames=500)
     scene.seek(0)
-    live = run(scene, LEARNER, tmp_path / "live", max_iterations=25, rerun=False)
+    live = run_session(scene, LEARNER, tmp_path / "live", max_iterations=25, rerun=False)
     with contextlib.closing(open_recording(recording)) as source:
-        logged = run(source, LEARNER, tmp_path / "log", max_iterations=25, rerun=False)
+        logged = run_session(source, LEARNER, tmp_path / "log", max_iterations=25, rerun=False)
     assert live.signals_sha256 == logged.signals_sha256
     blocks = read_outline(tmp_path / "log" / "run.mcap").blocks
     lost = np.diff(blocks.starts) - LEARNER.tau
@@ -87,7 +87,7 @@ def test_a_switch_costs_the_same_frames_live_and_from_the_log(scene, tmp_path):
     with contextlib.closing(open_recording(recording)) as source:
         assert check_run(tmp_path / "log", (str(recording),), start=11).holds
         for stop in (7, 25):  # stopped, and resumed
-            again = run(
+            again = run_session(
                 source,
                 LEARNER,
                 tmp_path / "again",

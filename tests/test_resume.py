@@ -23,7 +23,7 @@ from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import Keyframes
 from cdmisfa.experiments.run_folder import SET_ASIDE, RunResult
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from recorder.config import RecordConfig
 from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
@@ -72,7 +72,7 @@ def go(
     source: FrameSource, out: Path | None, iterations: int, config: LearnerConfig = CONFIG, **more
 ) -> RunResult:
     more = {"max_modules": 99, "seed": 3, "rerun": False, "keyframes": EVERY} | more
-    return run(source, config, out, max_iterations=iterations, **more)
+    return run_session(source, config, out, max_iterations=iterations, **more)
 
 
 @pytest.fixture(scope="module")

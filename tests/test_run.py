@@ -17,7 +17,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.outcomes import END_REASONS
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.experiments.run_folder import RunResult
-from cdmisfa.experiments.session import run as run_it
+from cdmisfa.experiments.session import run_session
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import load_modules
 
@@ -28,7 +28,7 @@ IMPATIENT = dataclasses.replace(CONFIG, epsilon_start=1e-4, patience=3)
 def run(out: Path | None = None, source: OscillatorySource | None = None, **how: Any) -> RunResult:
     how = {"max_iterations": 12, "rerun": False, **how}
     config = how.pop("config", CONFIG)
-    return run_it(source or OscillatorySource(), config, out, **how)
+    return run_session(source or OscillatorySource(), config, out, **how)
 
 
 def logged(out: Path) -> SignalsHash:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import Layers, configure, open_source
 
 ROOT = Path(__file__).parents[1]
@@ -50,7 +50,7 @@ def learned() -> dict[str, str]:
     for algorithm in ("2.0", "1.0", "progress"):
         told = configure("oscillatory", Layers.read(words=[f"learner.algorithm={algorithm}"]))
         source = told.open_scene()
-        result = run(source, told.learner, seed=3, max_iterations=20)
+        result = run_session(source, told.learner, seed=3, max_iterations=20)
         found[algorithm] = result.signals_sha256
         if algorithm == "1.0":
             continue
@@ -61,7 +61,7 @@ def learned() -> dict[str, str]:
             loop=True,
         )
         with contextlib.closing(images):
-            result = run(images, told.learner, seed=3, max_iterations=2)
+            result = run_session(images, told.learner, seed=3, max_iterations=2)
         found[f"{algorithm} of images"] = result.signals_sha256
     return found
 

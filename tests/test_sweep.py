@@ -24,7 +24,7 @@ from cdmisfa.core.processes import WorkersError
 from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import store
 from cdmisfa.experiments import sweep as sweeping
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.store import ROWS, read_trial_rows
 from cdmisfa.experiments.sweep import DROPPED_KEYS, plan, sweep
 from recorder.recording import record_scene
@@ -88,7 +88,7 @@ def test_a_recording_is_named_by_its_bytes_and_swept_as_its_scene_is(tmp_path: P
 def test_a_trial_is_a_run(tmp_path: Path) -> None:
     sweep("oscillatory", tmp_path, seeds=[5], max_iterations=600)
     (row,) = read_trial_rows(tmp_path)
-    result = run(OscillatorySource(), LearnerConfig(), seed=5, max_iterations=600).as_json()
+    result = run_session(OscillatorySource(), LearnerConfig(), seed=5, max_iterations=600).as_json()
     assert row["result"] == {key: result[key] for key in row["result"]}
 
 

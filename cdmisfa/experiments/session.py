@@ -343,7 +343,7 @@ class Session:
             before.unlink()
 
 
-def run(
+def run_session(
     source: FrameSource, config: Any, folder: str | Path | None = None, **options: Any
 ) -> RunResult:
     """Start a run, or resume the one in `folder`, and learn to its end.

@@ -21,7 +21,7 @@ from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.run_folder import module_table, with_recipes
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import (
     Configuration,
     Layers,
@@ -186,5 +186,5 @@ def compute_trial(
                 "ended": result.ended,
             }
         options: dict[str, Any] = {"seed": seed, "sections": configuration.tables()}
-        learned = run(opened, configuration.learner, rerun=False, **options, **limits)
+        learned = run_session(opened, configuration.learner, rerun=False, **options, **limits)
     return {key: value for key, value in learned.as_json().items() if key not in DROPPED_KEYS}

@@ -14,7 +14,7 @@ from cdmisfa.core.blocks import FrameSource, description
 from cdmisfa.core.learning import Sink
 from cdmisfa.experiments.holdout import hold_out
 from cdmisfa.experiments.run_folder import command_of
-from cdmisfa.experiments.session import run as run_to_its_end
+from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import (
     Configuration,
     Layers,
@@ -96,7 +96,7 @@ def learn(
         hold_out(frames, configuration)
         if command is not None:
             command = command_of(command[0], {**how, **limits, **command[1]}, folder)
-        run_to_its_end(
+        run_session(
             frames,
             configuration.learner,
             folder,

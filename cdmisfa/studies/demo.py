@@ -17,7 +17,7 @@ from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.reports import write_report
 from cdmisfa.experiments.run_folder import RunResult
-from cdmisfa.experiments.session import run
+from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import Layers, configure, open_source
 from cdmisfa.modules import Module
 from replay.truth_fits import truth_fits
@@ -67,7 +67,7 @@ def demo(
 
     def learn(bar: Any, word: str | Path, out: Path | None, most: int | None) -> RunResult:
         with _opened(word, preset, seed) as source:
-            return run(
+            return run_session(
                 source,
                 configuration.learner,
                 out,

@@ -230,7 +230,7 @@ def _layout(outputs: int) -> Layout:
     )
 
 
-def line(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> str:
+def json_line(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> str:
     """Return the outputs on a block as a line of JSON; a number that is not finite is null."""
     block = applied.block
 

@@ -202,7 +202,7 @@ def _apply(
     """Apply modules to an open source; write the outputs to a file, and to stdout as lines."""
     from cdmisfa.experiments.apply import Totals, follow
     from cdmisfa.experiments.apply_logs import written_to
-    from replay.export.applied import line
+    from replay.export.applied import json_line
 
     if hasattr(source, "stop"):
         source.stop = stop  # so that a signal also ends waiting for frames
@@ -214,7 +214,7 @@ def _apply(
         if output is not None:
             sinks.append(stack.enter_context(written_to(output, spec, modules, force=True)))
         if as_lines:
-            sinks.append(lambda block: printing.line(line(block, spec, modules)))
+            sinks.append(lambda block: printing.line(json_line(block, spec, modules)))
         blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))
         total = None if spec.length is None else spec.length * len(spec.streams)
         follow(blocks, sinks, totals, lambda: shown.update(totals.frames, total))
