@@ -243,7 +243,10 @@ def frame_at(path: Path, at: str) -> int:
             for event in batch.events:
                 if words.search(event.text):
                     return int(event.t)
-    raise UsageError(f"--at {at!r} is not a frame, iteration or event of {path}")
+    raise UsageError(
+        f"--at {at!r} is not a frame, iteration or event of {path}: write it as 2000, "
+        "'iteration 50' or 'module 2'"
+    )
 
 
 def free_port(port: int = 0) -> int:

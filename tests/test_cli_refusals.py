@@ -19,7 +19,7 @@ TAKEN = "taken exists: choose another folder"
 
 CASES: dict[str, tuple[str, ...]] = {
     # words: what the line says. RUN, REC and LOGS are a run, a recording, and logs.
-    "learn no/such.mcap": ("no/such.mcap", "icub, oscillatory"),
+    "learn no/such.mcap": ("no/such.mcap", "icub and oscillatory"),
     **{f"{command} no/such": ("no/such",) for command in ("info", "verify", "view")},
     "compare no/such neither": ("no/such",),
     "export no/such -o x.csv": ("no/such: no such file or folder",),
@@ -43,7 +43,7 @@ CASES: dict[str, tuple[str, ...]] = {
         "was made with learner.algorithm = 2.0, not progress",
     ),
     # what is written has the name of its kind
-    "view RUN --save x.mp4": ("x.mp4: the view is a file of Rerun: name it x.rrd",),
+    "view RUN --save x.mp4": ("x.mp4: a view is a Rerun file: name it x.rrd",),
     "export REC --to images -o z.csv": ("z.csv: the output is a folder: name it without .csv",),
     # a file of another kind is a wrong word and no damage
     **{f"{command} numbers.h5": (NO_MCAP,) for command in ("info", "verify", "check")},

@@ -53,7 +53,11 @@ def learner(**values: Any) -> LearnerConfig:
 
 
 WRONG = {
-    "far from all": (Outer, {"zzzz": 1}, "unknown key scene.zzzz: there are inner, on, seed, kind"),
+    "far from all": (
+        Outer,
+        {"zzzz": 1},
+        "unknown key scene.zzzz: choose from inner, on, seed, kind",
+    ),
     "near": (LearnerConfig, {"epsilon_dekay": 1}, "did you mean learner.epsilon_decay?"),
     "number": (LearnerConfig, {"nu": "fast"}, "learner.nu is 'fast': it must be a number"),
     "nan": (LearnerConfig, {"nu": "nan"}, "learner.nu is 'nan': it must be a number"),

@@ -35,5 +35,5 @@ def test_pixels_count_a_255th():
 
 def test_no_expansion_keeps_the_size_and_an_unknown_one_is_refused():
     assert expanded_size("none", 6144) == 6144
-    with pytest.raises(UsageError, match="'cubic': there are none, quadratic"):
+    with pytest.raises(UsageError, match="'cubic': choose from none, quadratic"):
         expanded_size("cubic", 2)

@@ -174,6 +174,7 @@ def _explain(error: Exception) -> int:
         case click.UsageError():
             command = error.ctx.command_path if error.ctx else "cdmisfa"
             message = error.format_message().rstrip(".")
+            message = message[:1].lower() + message[1:]
             return _fail(f"{message} (see {command} --help)", error.exit_code)
         case OSError():
             where = f"{error.filename}: " if error.filename else ""

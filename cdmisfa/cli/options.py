@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +28,7 @@ class LocalPath(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """See `click.ParamType`."""
         if not str(value):
-            self.fail("it is empty: name a path", param, ctx)
+            self.fail("the path is empty: name a file or folder", param, ctx)
         if "://" in str(value):
             self.fail(f"{value} is a URL: name a path on this machine", param, ctx)
         return super().convert(value, param, ctx)
@@ -68,7 +69,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """Parse WIDTHxHEIGHT as (height, width)."""
     match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text, re.ASCII)
     if match is None:
-        raise click.BadParameter(f"{text!r} is no size: write WIDTHxHEIGHT, as 128x48")
+        raise click.BadParameter(f"{text!r} is no size: write WIDTHxHEIGHT, such as 128x48")
     return int(match[2]), int(match[1])
 
 
@@ -77,80 +78,110 @@ def parse_seconds(text: str) -> float:
     pattern = r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d{1,9})?)"
     match = re.fullmatch(pattern, text, re.ASCII)
     if match is None:
-        raise click.BadParameter(f"{text!r} is no time: write seconds, or MINUTES:SECONDS, as 1:30")
+        raise click.BadParameter(
+            f"{text!r} is no time: write seconds or MINUTES:SECONDS, such as 1:30"
+        )
     hours, minutes, seconds = (float(part or 0) for part in match.groups())
     return hours * 3600 + minutes * 60 + seconds
 
 
-class WholeNumber(click.IntRange):
-    """A whole number whose limits the help does not print."""
+class Number(click.ParamType[Any]):
+    """A number within limits, which only errors print.
+
+    Args:
+        low: smallest value.
+        high: largest value.
+        kind: type of the number.
+    """
 
     name = "n"
 
-    def _describe_range(self) -> str:
-        return ""
+    def __init__(self, low: float, high: float = math.inf, kind: type = int) -> None:
+        self.low, self.high, self.kind = low, high, kind
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """See `click.ParamType`."""
+        try:
+            number = self.kind(value)
+        except ValueError:
+            number = math.nan
+        if not self.low <= number <= self.high:
+            least = f"of at least {self.low:g}"
+            limits = least if self.high > 1e9 else f"from {self.low:g} to {self.high:.9g}"
+            kind = "whole number" if self.kind is int else "number"
+            self.fail(f"{value} is wrong: give a {kind} {limits}", param, ctx)
+        return number
 
 
-class Rate(click.FloatRange):
-    """A number whose limits the help does not print."""
+COUNT = Number(1)
+SEED = Number(0, 2**63 - 1)
+PROCESSES = Number(1, 1024)
 
-    def _describe_range(self) -> str:
-        return ""
+
+def option(spec: str, help: str, *, name: str | None = None, **about: Any) -> Decorator:
+    """Return an option of a command.
+
+    Args:
+        spec: its name and the word for its value, as "--frames N"; without a word it is a flag.
+        help: its help text.
+        name: name of the parameter, if it is not that of the option.
+        about: see `click.option`; the type of a value N is by default a whole number from 1.
+    """
+    flag, _, value = spec.partition(" ")
+    if value:
+        about |= {"metavar": value, "type": about.get("type", COUNT if value == "N" else None)}
+    elif "type" not in about:
+        about["is_flag"] = True
+    return click.option(flag, *filter(None, (name,)), help=help, **about)
 
 
 # Options by the names of `InputOptions`; `settings` are the keys `input.*` of commands that have
 # no other keys.
-INPUTS = {
-    "topics": click.option(
-        "--topic",
-        "topics",
+INPUTS: dict[str, Decorator] = {
+    "topics": option(
+        "--topic TOPIC",
+        "Read this topic of a log, or all that match a pattern such as '/cam*'; each becomes a "
+        "stream. Repeatable. [default: the only one with images; apply, view and export: all]",
+        name="topics",
         multiple=True,
-        metavar="TOPIC",
-        help="Read this topic of a log, or all that match a pattern such as '/cam*'; each becomes "
-        "a stream. Repeatable. [default: the only one with images; apply, view and export: all]",
     ),
-    "fields": click.option(
-        "--field",
-        "fields",
+    "fields": option(
+        "--field FIELD",
+        "Read these numbers: a field of the messages, such as pose.position.x or ranges[0:100], or "
+        "a column of a table. Repeatable; several form one vector. [default: images, or all "
+        "columns of a table]",
+        name="fields",
         multiple=True,
-        metavar="FIELD",
-        help="Read these numbers: a field of the messages, such as pose.position.x or "
-        "ranges[0:100], or a column of a table. Repeatable; several form one vector. [default: "
-        "images, or all columns of a table]",
     ),
-    "size": click.option(
-        "--size",
+    "size": option(
+        "--size WxH",
+        "Shrink images to frames of this width and height in pixels. [default: same aspect ratio, "
+        "at most as many pixels as 128x48]",
         type=parse_size,
-        metavar="WxH",
-        help="Shrink images to frames of this width and height in pixels. [default: same aspect "
-        "ratio, at most as many pixels as 128x48]",
     ),
-    "rate": click.option(
-        "--rate",
-        type=Rate(1e-3, 1e6),
-        metavar="HZ",
-        help="Frames per second. [default: rate of the first stream]",
+    "rate": option(
+        "--rate HZ",
+        "Frames per second. [default: rate of the first stream]",
+        type=Number(1e-3, 1e6, float),
     ),
-    "start": click.option(
-        "--start",
+    "start": option(
+        "--start TIME",
+        "Skip the part of a log before this time, in seconds or as MINUTES:SECONDS.",
         type=parse_seconds,
-        metavar="TIME",
         default="0",
         show_default=True,
-        help="Skip the part of a log before this time, in seconds or as MINUTES:SECONDS.",
     ),
-    "end": click.option(
-        "--end",
+    "end": option(
+        "--end TIME",
+        "Skip the part of a log from this time on, in seconds or as MINUTES:SECONDS. [default: end "
+        "of the log]",
         type=parse_seconds,
-        metavar="TIME",
-        help="Skip the part of a log from this time on, in seconds or as MINUTES:SECONDS. "
-        "[default: end of the log]",
     ),
-    "align": click.option(
+    "align": option(
         "--align",
+        "Combine streams of different rates: by message number (index), or by the newest message "
+        "at each time (time). [default: stop with an error]",
         type=click.Choice(["index", "time"]),
-        help="Combine streams of different rates: by message number (index), or by the newest "
-        "message at each time (time). [default: stop with an error]",
     ),
     "color": click.option(
         "--color",
@@ -162,12 +193,11 @@ INPUTS = {
         help="Put red, green and blue side by side in frames of three times the width. auto does "
         "so if the hue varies in the first 2,000 frames, independently of brightness.",
     ),
-    "settings": click.option(
-        "--set",
-        "input_settings",
+    "settings": option(
+        "--set KEY=VALUE",
+        "Set a configuration key input.*, such as input.fit=pad. Repeatable.",
+        name="input_settings",
         multiple=True,
-        metavar="KEY=VALUE",
-        help="Set a configuration key input.*, such as input.fit=pad. Repeatable.",
     ),
 }
 
@@ -202,15 +232,6 @@ def inputs(*names: str) -> Decorator:
 
 # Options of several commands
 
-COUNT = WholeNumber(1)
-SEED = WholeNumber(0, 2**63 - 1)
-PROCESSES = WholeNumber(1, 1024)
-
-
-def count(name: str, help: str) -> Decorator:
-    """Return an option whose value is a whole number from 1."""
-    return click.option(name, type=COUNT, help=help)
-
 
 def settings(
     help: str = "Set a configuration key, such as learner.nu=0.02. Repeatable.",
@@ -219,52 +240,40 @@ def settings(
     return click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help=help)
 
 
-max_iterations = count(
-    "--max-iterations", "Stop after this number of iterations. [default: no limit; fork: as RUN]"
+max_iterations = option(
+    "--max-iterations N", "Stop after this number of iterations. [default: no limit; fork: as RUN]"
 )
-max_modules = count(
-    "--max-modules",
+max_modules = option(
+    "--max-modules N",
     "Stop after this number of modules. [default: no limit; learners 2.0 and 1.0: number of "
     "streams; fork: as RUN]",
 )
-seed = click.option(
-    "--seed", type=SEED, default=0, show_default=True, help="Seed of every random choice."
+seed = option("--seed N", "Seed of every random choice.", type=SEED, default=0, show_default=True)
+preset = option(
+    "--preset NAME",
+    "Use the configuration values of a preset (icub, icub-real, oscillatory or cameras) or of your "
+    ".toml file. [default: the preset for SOURCE]",
 )
-preset = click.option(
-    "--preset",
-    metavar="NAME",
-    help="Use the configuration values of a preset (icub, icub-real, oscillatory or cameras) or "
-    "of your .toml file. [default: the preset for SOURCE]",
-)
-source = click.option(
-    "--source",
-    metavar="SOURCE",
+source = option(
+    "--source SOURCE",
+    "Read the source of the run here, if it was moved. Repeatable. [default: as the run states]",
     multiple=True,
-    help="Read the source of the run here, if it was moved. Repeatable. [default: as the run "
-    "states]",
 )
 
-loop = click.option("--loop", is_flag=True, help="Start a recording or log again when it ends.")
-skip_damaged = click.option(
-    "--skip-damaged",
-    is_flag=True,
-    help="Skip damaged parts and images of a log, instead of stopping with an error.",
+loop = option("--loop", "Start a recording or log again when it ends.")
+skip_damaged = option(
+    "--skip-damaged", "Skip damaged parts and images of a log, instead of stopping with an error."
 )
-force = click.option("--force", is_flag=True, help="Overwrite existing files.")
-no_rerun = click.option("--no-rerun", is_flag=True, help="Do not write the Rerun view run.rrd.")
-retry_failed = click.option(
-    "--retry-failed", is_flag=True, help="Compute failed trials or logs again."
+force = option("--force", "Overwrite existing files.")
+no_rerun = option("--no-rerun", "Do not write the Rerun view run.rrd.")
+retry_failed = option("--retry-failed", "Compute failed trials or logs again.")
+as_json = option("--json", "Print the results as one JSON document.", name="as_json")
+jobs = option(
+    "--jobs N", "Number of parallel processes.", type=PROCESSES, default=1, show_default=True
 )
-as_json = click.option(
-    "--json", "as_json", is_flag=True, help="Print the results as one JSON document."
-)
-jobs = click.option(
-    "--jobs", type=PROCESSES, default=1, show_default=True, help="Number of parallel processes."
-)
-scheduler = click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Compute on the dask cluster with this scheduler, instead of in --jobs processes.",
+scheduler = option(
+    "--scheduler ADDRESS",
+    "Compute on the dask cluster with this scheduler, instead of in --jobs processes.",
 )
 
 

@@ -91,4 +91,4 @@ def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     if nearest:
         return f"did you mean {prefix}{nearest[0]}?"
-    return f"there are {', '.join(names)}"
+    return f"choose from {', '.join(names)}"

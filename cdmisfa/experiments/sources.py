@@ -296,7 +296,7 @@ def open_logs(
             known = [*SCENES, *(f"{kind}:{address}" for kind in CAMERAS if colon)]
             if str(path) in SCENES:
                 raise no_such(path, [], "a scene must be the only source")
-            raise no_such(path, known, f"the scenes are {', '.join(SCENES)}")
+            raise no_such(path, known, f"scenes are {' and '.join(SCENES)}")
     options: Any = {"loop": loop, "skip_damaged": skip_damaged}
     source: StoredSource | None = None
     if episodes or may_be_corpus(words):

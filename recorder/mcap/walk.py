@@ -115,8 +115,8 @@ class LogStructure:
         """Raise an error for damage or, with `skip_damaged`, note it."""
         if not self.skip_damaged:
             raise LogDamagedError(
-                f"{self.path}: {place}: {problem}; save the rest with cdmisfa recover (from a "
-                "recording, cdmisfa learn --skip-damaged leaves it out)"
+                f"{self.path}: {place}: {problem}; repair the file with cdmisfa recover, or "
+                "skip the damage with cdmisfa learn --skip-damaged"
             )
         self.note(place, problem)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import opened_regular
-from recorder.mcap.records import KINDS, MAGIC
+from recorder.mcap.records import MAGIC
 from recorder.mcap.store import PARTIAL
 from replay.storage.location import location
 
@@ -32,7 +32,7 @@ def log_files(path: str | Path) -> list[Path]:
     logs = whole + [p for p in cut if p.with_suffix("") not in whole]
     if not logs:
         raise UsageError(
-            f"{path}: no log in this folder; {KINDS}; record or learn first, or give each video, "
+            f"{path}: no MCAP file in this folder: give each video, "
             "bag, table or folder of images by its path, or index all with cdmisfa index"
         )
     return logs

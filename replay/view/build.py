@@ -125,7 +125,7 @@ def recording_to(
         UsageError: it exists and `force` is not set.
         CdmisfaError: the file cannot be written.
     """
-    refuse_unless(out, "the view is a file of Rerun", ".rrd", "")
+    refuse_unless(out, "a view is a Rerun file", ".rrd", "")
     refuse_taken(out, force=force)
     place = hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:12]
     recording = rr.RecordingStream(APPLICATION, recording_id=f"{name}-{place}")

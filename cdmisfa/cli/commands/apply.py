@@ -34,14 +34,13 @@ STDOUT = "stdout"
     "File to write for one log: .parquet, .csv, .mcap or .rrd (a view). Or the folder to write "
     "into, one file for each log. [default: print a summary only]",
 )
-@click.option(
-    "--to",
+@options.option(
+    "--to FORMAT",
+    "Format of the files in the folder -o: parquet, csv, mcap or rrd. stdout writes no file: it "
+    "prints a JSON line for each block as soon as the block is complete. [default: parquet]",
     type=click.Choice([*FILE_FORMS, STDOUT]),
-    metavar="FORMAT",
-    help="Format of the files in the folder -o: parquet, csv, mcap or rrd. stdout writes no file: "
-    "it prints a JSON line for each block as soon as the block is complete. [default: parquet]",
 )
-@options.count("--frames", "Stop after this number of frames of each stream. [default: all]")
+@options.option("--frames N", "Stop after this number of frames of each stream. [default: all]")
 @options.loop
 @options.skip_damaged
 @options.inputs("topics", "fields", "rate", "start", "end", "align", "settings")
@@ -118,16 +117,17 @@ def apply_command(
         _print_applied_logs(run, applied, as_json)
         return applied.exit_code
     logs = _logs(source)
-    if output is None:
-        fits = to in (None, STDOUT)
-    else:
-        fits = ending in FILE_FORMS and to in (None, STDOUT, ending) and len(logs) == 1
+    if output is None and to not in (None, STDOUT):
+        raise UsageError(f"--to {to} needs a folder or file to write: name it with -o")
+    if output is not None:
+        if ending not in FILE_FORMS:
+            endings = ", ".join(f".{form}" for form in FILE_FORMS)
+            raise UsageError(f"-o {output} is no supported file: choose one of {endings}")
+        if to not in (None, STDOUT, ending):
+            raise UsageError(f"-o {output} is no {to} file: leave out --to, or change the ending")
+        if len(logs) > 1:
+            raise UsageError(f"-o {output} is one file, for {len(logs)} logs: name a folder")
         refuse_taken(output, force=force)
-    if not fits:
-        raise UsageError(
-            f"-o is a file {', '.join(f'.{form}' for form in FILE_FORMS)} for one log or live "
-            "stream, or a folder for several logs; --to names the format of files in a folder"
-        )
     return _apply_to_each(run, logs, output, frames, to == STDOUT, as_json, **how)
 
 

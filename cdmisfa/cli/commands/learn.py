@@ -29,34 +29,28 @@ if TYPE_CHECKING:
 @options.seed
 @options.preset
 @options.settings()
-@click.option(
-    "--algorithm",
-    metavar="NAME",
-    help="Use this learner: progress, 2.0 or 1.0 (of the paper), or your package.module:Class. "
+@options.option(
+    "--algorithm NAME",
+    "Use this learner: progress, 2.0 or 1.0 (of the paper), or your package.module:Class. "
     "[default: 2.0 for scenes and their recordings, else progress]",
 )
 @options.max_iterations
 @options.max_modules
 @options.loop
-@click.option(
-    "--resume",
-    is_flag=True,
-    help="Continue the interrupted run in the folder -o; SOURCE and options may be left out.",
+@options.option(
+    "--resume", "Continue the interrupted run in the folder -o; SOURCE and options may be left out."
 )
 @options.skip_damaged
-@click.option("--live-view", is_flag=True, help="Show the run in the Rerun viewer while it learns.")
+@options.option("--live-view", "Show the run in the Rerun viewer while it learns.")
 @options.no_rerun
-@click.option(
-    "--episodes",
-    is_flag=True,
-    help="Learn from the logs one after the other; no block crosses from one to the next.",
+@options.option(
+    "--episodes", "Learn from the logs one after the other; no block crosses from one to the next."
 )
-@click.option(
-    "--record",
-    "record_to",
+@options.option(
+    "--record DIR",
+    "Also record all live streams into this folder, to learn from them again.",
+    name="record_to",
     type=options.LOCAL,
-    metavar="DIR",
-    help="Also record all live streams into this folder, to learn from them again.",
 )
 @options.inputs(*options.ALL_INPUTS)
 @options.force
@@ -114,7 +108,7 @@ def learn_command(
     from recorder.cameras.words import is_live
 
     if resume and (output is None or force):
-        raise click.UsageError("--resume needs -o RUN, the run to resume, and no --force")
+        raise click.UsageError("--resume needs -o RUN, the run to resume, without --force")
     if not source:
         return _learn_as_started(ctx, output if resume else None)
     if algorithm is not None:
@@ -149,8 +143,7 @@ def _learn_as_started(ctx: click.Context, run: Path | None) -> int:
     from cdmisfa.experiments.run_folder import read_command
 
     if run is None:
-        source = next(param for param in ctx.command.params if param.name == "source")
-        raise click.MissingParameter(ctx=ctx, param=source)
+        raise click.UsageError("name a SOURCE: a scene, a recording, logs or live streams")
     words, stored = read_command(run)
     kept = {
         name: value
@@ -244,19 +237,18 @@ def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool
 
 @options.command("fork")
 @click.argument("run", type=options.LOCAL)
-@click.option(
-    "--iteration",
-    type=options.WholeNumber(0),
+@options.option(
+    "--iteration K",
+    "Begin with the first K iterations of RUN.",
+    type=options.Number(0),
     required=True,
-    metavar="K",
-    help="Begin with the first K iterations of RUN.",
 )
 @options.output("Folder of the new run to write.", required=True)
 @options.settings("Set a configuration key learner.* from iteration K on. Repeatable.")
-@click.option(
-    "--seed",
+@options.option(
+    "--seed N",
+    "Seed of every random choice from iteration K on. [default: the seed of RUN]",
     type=options.SEED,
-    help="Seed of every random choice from iteration K on. [default: the seed of RUN]",
 )
 @options.max_iterations
 @options.max_modules

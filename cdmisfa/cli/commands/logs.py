@@ -223,20 +223,16 @@ def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
 
 @options.command("export")
 @options.log_argument("path")
-@click.option(
-    "--to",
-    "form",
-    metavar="FORMAT",
-    help="Format to write: parquet, csv, npz, images, mp4 or lerobot. [default: the ending of -o]",
+@options.option(
+    "--to FORMAT",
+    "Format to write: parquet, csv, npz, images, mp4 or lerobot. [default: the ending of -o]",
+    name="form",
 )
 @options.output("File or folder to write.", required=True)
-@click.option(
-    "--lossless", is_flag=True, help="Encode videos without changing any pixel; they become larger."
-)
-@click.option(
-    "--task",
-    metavar="TEXT",
-    help="Task that a LeRobot dataset names for its episodes. [default: as the log states]",
+@options.option("--lossless", "Encode videos without changing any pixel; they become larger.")
+@options.option(
+    "--task TEXT",
+    "Task that a LeRobot dataset names for its episodes. [default: as the log states]",
 )
 @options.inputs("topics", "fields", "rate", "settings")
 @options.force
@@ -287,15 +283,14 @@ def export_command(
 @options.command("index")
 @click.argument("corpus", nargs=-1, required=True, type=options.WORD, metavar="PATH...")
 @options.output("Parquet file to write. [default: corpus.parquet in the folder PATH]")
-@click.option(
+@options.option(
     "--deep",
-    is_flag=True,
-    help="Decode every message, to find image sizes, gaps, and damage that summaries do not show.",
+    "Decode every message, to find image sizes, gaps, and damage that summaries do not show.",
 )
-@click.option(
-    "--jobs",
+@options.option(
+    "--jobs N",
+    "Number of parallel processes. [default: number of processors]",
     type=options.PROCESSES,
-    help="Number of parallel processes. [default: number of processors]",
 )
 @options.as_json
 @options.quiet

@@ -23,32 +23,30 @@ if TYPE_CHECKING:
 @options.command("record")
 @click.argument("source", nargs=-1, type=options.WORD)
 @options.output("Folder of the recording to write.", required=True)
-@options.count(
-    "--frames",
-    "Stop after this number of frames of each stream. [default: 1000; cameras: until Ctrl-C; "
-    "with --resume: as before]",
+@options.option(
+    "--frames N",
+    "Stop after this number of frames of each stream. [default: 1000; cameras: until Ctrl-C; with "
+    "--resume: as before]",
 )
-@click.option(
-    "--seed",
+@options.option(
+    "--seed N",
+    "Seed of every random choice. [default: 0; with --resume: as before]",
     type=options.SEED,
-    help="Seed of every random choice. [default: 0; with --resume: as before]",
 )
-@click.option(
-    "--view",
-    "views",
+@options.option(
+    "--view NAME",
+    "Record only this view (stream) of the scene. Repeatable. [default: all]",
+    name="views",
     multiple=True,
-    metavar="NAME",
-    help="Record only this view (stream) of the scene. Repeatable. [default: all]",
 )
 @options.jobs
 @options.preset
 @options.settings()
-@click.option("--resume", is_flag=True, help="Continue the interrupted recording in the folder -o.")
-@click.option(
-    "--split",
-    metavar="TIME",
-    help="Begin a new file for each stream after this time, such as 90s or 10min. [default: one "
-    "file; with --resume: as before]",
+@options.option("--resume", "Continue the interrupted recording in the folder -o.")
+@options.option(
+    "--split TIME",
+    "Begin a new file for each stream after this time, such as 90s or 10min. [default: one file; "
+    "with --resume: as before]",
 )
 @options.inputs("fields", "size", "rate", "color")
 @options.force
@@ -179,7 +177,7 @@ def _record_live(
 @options.output("Folder of the recording to write.", required=True)
 @options.inputs(*options.ALL_INPUTS, "settings")
 @options.skip_damaged
-@click.option("--resume", is_flag=True, help="Continue the interrupted recording in the folder -o.")
+@options.option("--resume", "Continue the interrupted recording in the folder -o.")
 @options.force
 @options.as_json
 @options.quiet

@@ -19,11 +19,8 @@ if TYPE_CHECKING:
 
 @options.command("compare")
 @options.log_argument("runs", "RUN...")
-@click.option(
-    "--save",
-    type=options.LOCAL,
-    metavar="F.rrd",
-    help="Also write a Rerun view with the curves of all runs.",
+@options.option(
+    "--save F.rrd", "Also write a Rerun view with the curves of all runs.", type=options.LOCAL
 )
 @options.force
 @options.as_json
@@ -46,7 +43,7 @@ def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_j
     from replay.runs.compare import side_by_side
 
     if len(runs) < 2:
-        raise click.UsageError("name two runs, or more")
+        raise click.UsageError("compare needs two runs or more")
     rows = side_by_side(runs)
     if save is not None:
         from replay.view.comparison import build_overlay  # takes half a second
@@ -96,18 +93,17 @@ def _iterations(
     """Parse FIRST:END; without END as (FIRST, None)."""
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", value or ":", re.ASCII)
     if match is None:
-        raise click.BadParameter(f"{value!r} is no range: write FIRST:END, as 100:200")
+        raise click.BadParameter(f"{value!r} is no range: write FIRST:END, such as 100:200")
     first, end = match.groups()
     return int(first or 0), int(end) if end else None
 
 
 @options.command("check")
 @click.argument("run", type=options.LOCAL)
-@click.option(
-    "--iterations",
-    metavar="FIRST:END",
+@options.option(
+    "--iterations FIRST:END",
+    "Check only the iterations from FIRST to before END. [default: all]",
     callback=_iterations,
-    help="Check only the iterations from FIRST to before END. [default: all]",
 )
 @options.source
 @options.as_json
@@ -139,13 +135,12 @@ def check_command(
 
 @options.command("inspect")
 @click.argument("run", type=options.LOCAL)
-@click.option(
-    "--iteration",
-    "iterations",
-    type=options.WholeNumber(0),
+@options.option(
+    "--iteration K",
+    "Print the state after the first K iterations.",
+    name="iterations",
+    type=options.Number(0),
     required=True,
-    metavar="K",
-    help="Print the state after the first K iterations.",
 )
 @options.source
 @options.as_json

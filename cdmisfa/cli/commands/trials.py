@@ -25,18 +25,16 @@ MOST_SEEDS = 1_000_000
 @options.output(
     "Folder of the sweep to write, required without --summary. Finished trials in it are skipped."
 )
-@click.option(
-    "--grid",
-    metavar="KEY=V1,V2,...",
+@options.option(
+    "--grid KEY=V1,V2,...",
+    "Try these values of a configuration key. Repeatable: every combination is tried.",
     multiple=True,
-    help="Try these values of a configuration key. Repeatable: every combination is tried.",
 )
-@click.option(
-    "--seeds",
-    metavar="FIRST:END",
+@options.option(
+    "--seeds FIRST:END",
+    "Use each of these seeds: from FIRST to before END, or a list such as 1,5,9.",
     default="0:20",
     show_default=True,
-    help="Use each of these seeds: from FIRST to before END, or a list such as 1,5,9.",
 )
 @options.preset
 @options.settings()
@@ -47,13 +45,12 @@ MOST_SEEDS = 1_000_000
 @options.jobs
 @options.scheduler
 @options.retry_failed
-@click.option(
+@options.option(
     "--summary",
-    is_flag=True,
-    help="Learn nothing; print mean and standard deviation over the seeds of the sweep in the "
-    "folder SOURCE.",
+    "Learn nothing; print mean and standard deviation over the seeds of the sweep in the folder "
+    "SOURCE.",
 )
-@click.option("--csv", is_flag=True, help="Print the summary as comma-separated values.")
+@options.option("--csv", "Print the summary as comma-separated values.")
 @options.as_json
 @options.quiet
 @click.pass_context
@@ -127,7 +124,7 @@ def parse_grid(words: tuple[str, ...]) -> dict[str, list[str]]:
         key, _, values = word.partition("=")
         grid[key.strip()] = [value.strip() for value in values.split(",") if value.strip()]
         if not key.strip() or not grid[key.strip()]:
-            raise click.UsageError(f"--grid {word}: write it as section.key=value,value")
+            raise click.UsageError(f"--grid {word}: write KEY=V1,V2, such as learner.nu=0.02,0.05")
     return grid
 
 
@@ -144,7 +141,7 @@ def parse_seeds(text: str) -> list[int]:
         if max(Counter(seeds).values()) > 1:
             raise ValueError
     except ValueError:
-        raise click.UsageError(f"--seeds {text}: write each seed once, as 0:20 or 1,5,9") from None
+        raise click.UsageError(f"--seeds {text}: list each seed once, as 0:20 or 1,5,9") from None
     return seeds
 
 
@@ -180,16 +177,15 @@ def _print_summary(folder: Path, *, as_csv: bool, as_json: bool) -> None:
 @options.command("reproduce")
 @click.argument("name", metavar="EXPERIMENT")
 @options.output("Folder of the results to write. [default: reproduction]")
-@options.count("--trials", "Number of trials of each condition. [default: as in the paper]")
+@options.option("--trials N", "Number of trials of each condition. [default: as in the paper]")
 @options.jobs
 @options.scheduler
-@click.option(
-    "--recording",
+@options.option(
+    "--recording DIR",
+    "Folder of a recording of the scene icub to use. [default: record it now]",
     type=options.LOCAL,
-    metavar="DIR",
-    help="Folder of a recording of the scene icub to use. [default: record it now]",
 )
-@click.option("--quick", is_flag=True, help="Run only a few trials, enough to test the claims.")
+@options.option("--quick", "Run only a few trials, enough to test the claims.")
 @options.as_json
 @options.quiet
 def reproduce_command(
@@ -250,12 +246,12 @@ def reproduce_command(
 @options.command("demo")
 @options.output("Folder to write recordings/ and runs/ into. [default: current folder]")
 @options.seed
-@click.option(
-    "--frames",
-    type=options.WholeNumber(400),
+@options.option(
+    "--frames N",
+    "Number of frames to record of each view, at least 400.",
+    type=options.Number(400),
     show_default=True,
     default=8000,
-    help="Number of frames to record of each view, at least 400.",
 )
 @options.jobs
 @options.as_json

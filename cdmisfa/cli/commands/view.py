@@ -13,32 +13,24 @@ from cdmisfa.core.errors import UsageError
 
 @options.command("view")
 @options.log_argument("run", "PATH...")
-@click.option("--save", type=options.LOCAL, metavar="F.rrd", help="Write the view to this file.")
-@click.option("--web", is_flag=True, help="Show the view in a browser on this machine.")
-@click.option(
-    "--screenshot",
-    type=options.LOCAL,
-    metavar="F.png",
-    help="Draw the view into this image file; needs no screen.",
+@options.option("--save F.rrd", "Write the view to this file.", type=options.LOCAL)
+@options.option("--web", "Show the view in a browser on this machine.")
+@options.option(
+    "--screenshot F.png", "Draw the view into this image file; needs no screen.", type=options.LOCAL
 )
-@click.option(
-    "--at",
-    metavar="WHEN",
-    help='Open the view at this frame, at "iteration 500", or at an event, such as "module 2". '
+@options.option(
+    "--at WHEN",
+    'Open the view at this frame, at "iteration 500", or at an event, such as "module 2". '
     "[default: end of the run]",
 )
-@click.option("--tab", metavar="NAME", help="Open this tab of the view. [default: the first]")
-@click.option(
-    "--port",
-    type=options.WholeNumber(1, 65535),
-    help="Port of --web on this machine. [default: a free one]",
+@options.option("--tab NAME", "Open this tab of the view. [default: the first]")
+@options.option(
+    "--port N",
+    "Port of --web on this machine. [default: a free one]",
+    type=options.Number(1, 65535),
 )
-@click.option(
-    "--every",
-    type=options.COUNT,
-    show_default=True,
-    default=10,
-    help="Show every Nth image; curves show every value.",
+@options.option(
+    "--every N", "Show every Nth image; curves show every value.", show_default=True, default=10
 )
 @options.inputs("topics", "fields", "rate", "settings")
 @options.force
