@@ -1,4 +1,4 @@
-"""Ten modules applied to logs, against reading these alone, and how late live blocks are told."""
+"""Ten modules applied to logs, against reading these alone, and the delay of live outputs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OUTPUTS = (1, 8)
 """Outputs of a module: of CD-MISFA 2.0, and of the progress learner."""
 
 FORMS = ("", "parquet", "mcap", "rrd")
-"""What is written; "" is nothing."""
+"""Output formats; "" writes nothing."""
 
 SHAPE = (48, 128)
 FRAMES, FILMED, READ = 4000, 200, 640
@@ -107,8 +107,8 @@ def throughput(folder: Path, rounds: int) -> tuple[Rows, Rows]:
         clock, and the shares of them that are left.
     """
     film = folder / "film.mp4"
-    shown = open_arrays({"cam": np.stack(pictures(FILMED, *VGA))}, InputOptions(size=VGA))
-    write_video(shown, 0, film, lossless=False)
+    film_source = open_arrays({"cam": np.stack(pictures(FILMED, *VGA))}, InputOptions(size=VGA))
+    write_video(film_source, 0, film, lossless=False)
     cpu: Rows = []
     wall: Rows = []
     for outputs in OUTPUTS:
@@ -130,7 +130,7 @@ def throughput(folder: Path, rounds: int) -> tuple[Rows, Rows]:
 
 
 def latency(folder: Path, blocks: int) -> list[object]:
-    """Return how much later than its own duration after its first frame a block is told, ms."""
+    """Return the delay of outputs after the end of their block, in milliseconds."""
     words = [sys.executable, "-m", "benchmarks.live_streams"]
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     late = []
@@ -139,8 +139,8 @@ def latency(folder: Path, blocks: int) -> list[object]:
         named = [str(folder / f"run{OUTPUTS[-1]}"), f"http://127.0.0.1:{port}/0.mjpg"]
         options = ["--rate", str(FPS), "--frames", str(blocks * TAU), "--to", "stdout"]
         command = [sys.executable, "-m", "cdmisfa", "apply", *named, *options]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, **pipes) as told:
-            for line in told.stdout:
+        with subprocess.Popen(command, stderr=subprocess.PIPE, **pipes) as process:
+            for line in process.stdout:
                 now, block = time.time_ns(), json.loads(line)
                 late.append((now - block["log_time"] - block["frames"] * 1e9 / FPS) / 1e6)
         sender.stdin.close()

@@ -1,4 +1,4 @@
-"""Converting logs of others into recordings, against decoding the same frames alone."""
+"""Converting external logs into recordings, against decoding the same frames alone."""
 
 from __future__ import annotations
 

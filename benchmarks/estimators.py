@@ -21,11 +21,11 @@ CASES = ((20_000, 20), (20_000, 300), (2000, 2000))
 """Samples, and values of each."""
 
 LARGEST = 300
-"""Values of which methods are asked that look at all of them sample by sample, or copy X often."""
+"""Most values for methods that process all of them sample by sample, or copy X often."""
 
 
 def samples(n: int, size: int) -> FloatArray:
-    """As many sines of speeds from .002 to .4 cycles a sample, mixed, and noise, (n, size)."""
+    """Return mixed sines of 0.002 to 0.4 cycles a sample, with noise, (n, size)."""
     rng = np.random.default_rng(0)
     turns = np.outer(np.arange(n), np.geomspace(0.002, 0.4, size)) + rng.random(size)
     mixed = np.sin(2 * np.pi * turns) @ (rng.standard_normal((size, size)) / np.sqrt(size))
@@ -33,7 +33,7 @@ def samples(n: int, size: int) -> FloatArray:
 
 
 def candidates(X: FloatArray) -> dict[str, Callable[[], Any]]:
-    """What is compared, as far as it is installed: each learns anew, and is what transforms."""
+    """Return the installed estimators by name; each call fits a new one."""
     size = X.shape[1]
 
     def by_batches(model: Any, learn: Callable[[Any, FloatArray], Any]) -> Any:
@@ -41,7 +41,7 @@ def candidates(X: FloatArray) -> dict[str, Callable[[], Any]]:
             learn(model, X[start : start + BATCH])
         return model
 
-    found: dict[str, Callable[[], Any]] = {
+    estimators: dict[str, Callable[[], Any]] = {
         "RecursiveSFA": lambda: RecursiveSFA(FEATURES, n_whitened=WHITENED).fit(X),
         "IncSFA": lambda: IncSFA(FEATURES, n_whitened=WHITENED).fit(X),
         "IncrementalPCA": lambda: by_batches(
@@ -54,25 +54,25 @@ def candidates(X: FloatArray) -> dict[str, Callable[[], Any]]:
         def tica(*, batches: bool) -> Any:
             model = TICA(lagtime=1, dim=FEATURES)
             if batches:
-                by_batches(model, lambda own, x: own.partial_fit((x[:-1], x[1:])))
+                by_batches(model, lambda tica, x: tica.partial_fit((x[:-1], x[1:])))
             else:
                 model.fit(X)
             return model.fetch_model()
 
-        found["TICA"] = lambda: tica(batches=False)
-        found["TICA, batches"] = lambda: tica(batches=True)
+        estimators["TICA"] = lambda: tica(batches=False)
+        estimators["TICA, batches"] = lambda: tica(batches=True)
     if WHITENED < size <= LARGEST:
-        found["RecursiveSFA, all"] = lambda: RecursiveSFA(FEATURES, n_whitened=size).fit(X)
+        estimators["RecursiveSFA, all"] = lambda: RecursiveSFA(FEATURES, n_whitened=size).fit(X)
     if size <= LARGEST:
         with contextlib.suppress(ImportError):
             from sksfa import SFA
 
-            found["sklearn-sfa"] = lambda: SFA(FEATURES).fit(X)
-    return found
+            estimators["sklearn-sfa"] = lambda: SFA(FEATURES).fit(X)
+    return estimators
 
 
 def allocated(call: Callable[[], Any]) -> float:
-    """The most that is allocated by numpy and Python while it runs, in MB."""
+    """Return the peak memory of numpy and Python during a call, in MB."""
     gc.collect()
     tracemalloc.start()
     call()
@@ -82,7 +82,7 @@ def allocated(call: Callable[[], Any]) -> float:
 
 
 def slowness(y: FloatArray) -> float:
-    """Of the slowest output, (n, J), in cycles a sample."""
+    """Return the slowness of the slowest output, (n, J), in cycles a sample."""
     moves = (np.diff(y, axis=0) ** 2).mean(axis=0)
     return float(np.sqrt(moves / y.var(axis=0)).min() / (2 * np.pi))
 
@@ -93,10 +93,10 @@ def main(*, quick: bool = False) -> None:
     with threadpool_limits(1):
         for n, size in CASES[: 1 if quick else None]:
             X, following = np.split(samples(2 * n, size), 2)
-            found = candidates(X)
-            work = {name: lambda c=call: bool(c()) or 1 for name, call in found.items()}
+            estimators = candidates(X)
+            work = {name: lambda c=call: bool(c()) or 1 for name, call in estimators.items()}
             times = interleaved(work, 1 if quick or size >= LARGEST else 3)
-            for name, call in found.items():
+            for name, call in estimators.items():
                 took = f"{middle(times[name]) / 1e6:.3g}"
                 against = f"{ratio(times[name], times['RecursiveSFA']):.3g}x"
                 slowest = f"{slowness(np.asarray(call().transform(following))):.2g}"

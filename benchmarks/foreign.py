@@ -42,12 +42,12 @@ def pictures(n: int, height: int, width: int) -> list[Picture]:
     """Slow waves with some noise, (height, width) each."""
     rng = np.random.default_rng(3)
     y, x = np.mgrid[0:height, 0:width]
-    found = []
+    images = []
     for t in range(n):
         wave = 128 + 90 * np.sin(x / 17 + t / 40) * np.cos(y / 11 - t / 70)
         noise = rng.random((height, width)) < 0.08
-        found.append((wave // 8 * 8 + noise * 4).astype(np.uint8))
-    return found
+        images.append((wave // 8 * 8 + noise * 4).astype(np.uint8))
+    return images
 
 
 def _fields(image: Picture, encoding: str) -> dict[str, Any]:
@@ -130,14 +130,14 @@ READ_ONLY = {
     "200 bytes, zstd": Case("Numbers", "json", numbers, SMALL, "zstd", number=100),
     "JPEG among 20 x 200 bytes, zstd": Case(JPEG, "protobuf", foxglove_jpeg, VGA, "zstd", 20, 2),
 }
-"""Of which messages are read, and no frames."""
+"""Cases in which only messages are read, no frames."""
 PICTURES = 60
 """Pictures that follow one another, again and again."""
 
 
 def write(path: Path, case: Case, n: int) -> Path:
     """Write n messages, or as many times more as the case says, with mcap's own writer."""
-    shown = [case.encode(image) for image in pictures(min(n, PICTURES), *case.size)]
+    payloads = [case.encode(image) for image in pictures(min(n, PICTURES), *case.size)]
     other = numbers(np.arange(8, dtype=np.uint8))
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType[case.compression.upper()])
@@ -145,7 +145,7 @@ def write(path: Path, case: Case, n: int) -> Path:
         schema = writer.register_schema(case.schema, case.encoding, b"")
         channel = writer.register_channel(TOPIC, case.encoding, schema)
         beside = writer.register_channel("/beside", "json", 0)
-        for i, data in zip(range(n * case.number), itertools.cycle(shown), strict=False):
+        for i, data in zip(range(n * case.number), itertools.cycle(payloads), strict=False):
             at = i * STEP_NS
             writer.add_message(channel, at, data, at)
             for k in range(1, case.beside + 1):
@@ -187,20 +187,20 @@ def messages(path: Path) -> int:
 
 def views(path: Path) -> int:
     """As `messages`, each payload where it lies in its chunk."""
-    found = 0
+    count = 0
     with LogReader(path) as reader:
         (number,) = (n for n, channel in reader.channels.items() if channel.topic == TOPIC)
         for _, table in reader.tables(topics=[TOPIC]):
-            own = np.flatnonzero(table.channel == number).tolist()
-            found += sum(1 for row in own if table.view(row))
-    return found
+            rows = np.flatnonzero(table.channel == number).tolist()
+            count += sum(1 for row in rows if table.view(row))
+    return count
 
 
 def mcap_messages(path: Path, *, crc: bool = True) -> int:
     """Do as `messages` with mcap's reader; how many."""
     with path.open("rb") as file:
-        found = make_reader(file, validate_crcs=crc).iter_messages(topics=[TOPIC])
-        return sum(1 for _, _, message in found if message.data)
+        records = make_reader(file, validate_crcs=crc).iter_messages(topics=[TOPIC])
+        return sum(1 for _, _, message in records if message.data)
 
 
 CLOCKS = {"CPU": time.process_time_ns, "wall": time.perf_counter_ns}
@@ -221,8 +221,8 @@ def measured(
     rows: dict[str, list[object]] = {}
     for name, clock in CLOCKS.items():
         times = interleaved(calls, rounds, clock)
-        others = [f"{ratio(times['mcap'], times[k]):.2f}x" for k in work if k != "mcap"]
-        rows[name] = [middle(times["mcap"], 1), *others]
+        ratios = [f"{ratio(times['mcap'], times[k]):.2f}x" for k in work if k != "mcap"]
+        rows[name] = [middle(times["mcap"], 1), *ratios]
     return rows
 
 
@@ -230,7 +230,7 @@ def main(*, quick: bool = False) -> None:
     """Measure, and write results/foreign.json."""
     rounds, n = (2, 300) if quick else (7, 400)
     read: dict[str, list[list[object]]] = {clock: [] for clock in CLOCKS}
-    shown: dict[str, list[list[object]]] = {clock: [] for clock in CLOCKS}
+    decoded: dict[str, list[list[object]]] = {clock: [] for clock in CLOCKS}
     with tempfile.TemporaryDirectory() as folder:
         for name, case in (CASES | READ_ONLY).items():
             path = write(Path(folder) / "log.mcap", case, n)
@@ -238,7 +238,7 @@ def main(*, quick: bool = False) -> None:
                 read[clock].append([name, *row])
             if name in CASES:
                 for clock, row in measured(path, FRAMES, rounds).items():
-                    shown[clock].append([name, *row])
+                    decoded[clock].append([name, *row])
     reading = ["mcap, µs a message", "cdmisfa", "cdmisfa, no copy", "mcap without CRCs"]
     save(
         "foreign",
@@ -252,7 +252,7 @@ def main(*, quick: bool = False) -> None:
             *((["reader alone, " + clock, *reading], rows) for clock, rows in read.items()),
             *(
                 (["frames, " + clock, "mcap, µs a frame", "cdmisfa, times as fast"], rows)
-                for clock, rows in shown.items()
+                for clock, rows in decoded.items()
             ),
         ],
     )

@@ -48,10 +48,10 @@ def learning(by: str, config: LearnerConfig, frames: NDArray[Any], n: int) -> Ca
 def plain_numpy(config: LearnerConfig, frames: NDArray[Any], n: int) -> Callable[[], int]:
     """A call that learns n more frames by the equations, in numpy."""
     state = new_state(np.random.default_rng(1), frames.shape[1], config)
-    plain, shown = PlainIncSFA(state, config), itertools.cycle(frames)
+    plain, endless = PlainIncSFA(state, config), itertools.cycle(frames)
 
     def call() -> int:
-        for x in itertools.islice(shown, n):
+        for x in itertools.islice(endless, n):
             plain.learn(x)
         return n
 
@@ -140,16 +140,16 @@ def measure_still(rounds: int) -> list[list[Any]]:
     """Rows of the Gram kernel: the sample log, and its frames with noise in every pixel."""
     source = open_recording(SAMPLE, loop=True)
     views = range(len(source.spec.streams))
-    shown = [source.take(stream, 40).frames.reshape(40, PIXELS) for stream in (*views, *views)]
+    blocks = [source.take(stream, 40).frames.reshape(40, PIXELS) for stream in (*views, *views)]
     rng = np.random.default_rng(3)
-    noise = [rng.integers(-2, 3, b.shape) for b in shown]
+    noise = [rng.integers(-2, 3, b.shape) for b in blocks]
     noisy = [
-        freeze(np.clip(b + n, 0, 255).astype(np.uint8)) for b, n in zip(shown, noise, strict=True)
+        freeze(np.clip(b + n, 0, 255).astype(np.uint8)) for b, n in zip(blocks, noise, strict=True)
     ]
     rows = []
     for components, outputs in ((8, 1), (16, 5), (32, 5), (64, 5)):
         config = LearnerConfig(components=components, outputs=outputs, nu=0.01, tau=40)
-        work = {"still": learning_blocks(config, shown), "noise": learning_blocks(config, noisy)}
+        work = {"still": learning_blocks(config, blocks), "noise": learning_blocks(config, noisy)}
         times = interleaved(work, 3 * rounds)
         gain = f"{ratio(times['noise'], times['still']):.2f}x"
         still, all_of_it = middle(times["still"], 3), middle(times["noise"], 3)
@@ -208,8 +208,8 @@ def measure_errors(n: int) -> list[list[Any]]:
         for x in frames:
             reference.learn(x)
         for name, (by, way, _) in runs.items():
-            shown = freeze(np.ascontiguousarray(frames[:, ::way]))
-            kernels.incsfa_update(abstractions[name], shown, False, by)
+            part = freeze(np.ascontiguousarray(frames[:, ::way]))
+            kernels.incsfa_update(abstractions[name], part, False, by)
         if start + config.tau in noted:
             for name, (by, way, state) in runs.items():
                 drift = np.abs((state.gram - state.v @ state.v.T) / np.outer(state.d, state.d))
@@ -238,13 +238,16 @@ def main(*, quick: bool = False) -> None:
         limits = {name: round(x, 1) for name, x in machine_limits(rounds).items()}
         cases = [*measure_vectors(rounds), *measure_images(rounds)]
         still = measure_still(rounds)
-    others = ("plain numpy", "by frame", "IncrementalPCA")
+    competitors = ("plain numpy", "by frame", "IncrementalPCA")
     rows = [
         [c["inputs"], c["K"], c["J"], c["tau"], c["ours"], c["us_per_frame"][c["ours"]]]
-        + [f"{c['times_faster_than'][o]}x" if o in c["times_faster_than"] else "" for o in others]
+        + [
+            f"{c['times_faster_than'][o]}x" if o in c["times_faster_than"] else ""
+            for o in competitors
+        ]
         for c in cases
     ]
-    header = ["inputs", "K", "J", "tau", "kernel", "µs a frame", *(f"vs {o}" for o in others)]
+    header = ["inputs", "K", "J", "tau", "kernel", "µs a frame", *(f"vs {o}" for o in competitors)]
     save(
         "kernels",
         "IncSFA kernels",

@@ -90,8 +90,8 @@ def watch(folder: Path, seconds: float, streams: int = STREAMS) -> list[object]:
         sender.stdin.close()
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     theirs = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    found: list[object] = [streams, f"{wall:.0f}", round(cpu / wall, 2), round(theirs / wall, 2)]
-    return found + [sum(count[name] for count in counts.values()) for name in _LOST]
+    row: list[object] = [streams, f"{wall:.0f}", round(cpu / wall, 2), round(theirs / wall, 2)]
+    return row + [sum(count[name] for count in counts.values()) for name in _LOST]
 
 
 def main(*, quick: bool = False) -> None:

@@ -29,7 +29,7 @@ FRAMES = 60_000
 MOMENTS = 15
 
 SOURCES: Mapping[str, dict[str, Any]] = {str(SAMPLE): {"loop": True}, "oscillatory": {}}
-"""What is learned from, and how it is opened."""
+"""Sources, and how each is opened."""
 
 NAMES = {str(SAMPLE): "sample log", "oscillatory": "oscillatory streams"}
 
@@ -70,13 +70,13 @@ def learning(word: str, out: Path, keyframes: int | None, frames: int) -> Callab
 
     def call() -> int:
         how = SOURCES[word]
-        source, told = open_source([word], **how)
-        iterations = frames // told.learner.tau
+        source, configuration = open_source([word], **how)
+        iterations = frames // configuration.learner.tau
         session.run_session(
             source,
-            told.learner,
+            configuration.learner,
             out,
-            sections=told.tables(),
+            sections=configuration.tables(),
             command=command_of((word,), how, out),
             max_iterations=iterations,
             max_modules=iterations,
@@ -100,13 +100,13 @@ def timed(call: Callable[[], int]) -> tuple[float, float]:
 
 
 def share(out: Path) -> tuple[int, float]:
-    """How many keyframes a log has, and its part, as stored, that they are."""
+    """Return the number of keyframes of a log, and their share of its bytes."""
     log = run_log(out)
     with LogReader(log) as reader:
-        own = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
-        counts = [(s.stored, own & (s.channel_counts() or {}).keys()) for s in reader.segments]
-    found = [stored for stored, kept in counts if kept]
-    return len(found), sum(found) / log.stat().st_size
+        numbers = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
+        counts = [(s.stored, numbers & (s.channel_counts() or {}).keys()) for s in reader.segments]
+    sizes = [stored for stored, keyframes in counts if keyframes]
+    return len(sizes), sum(sizes) / log.stat().st_size
 
 
 def moments(out: Path, iterations: int) -> list[float]:
@@ -139,11 +139,11 @@ def main(*, quick: bool = False) -> None:
             for case, count in iterations.items():
                 out = Path(folder) / name / case
                 many, part = share(out)
-                took = statistics.median(found[case][0] for found in rounds)
-                spent = statistics.median(found[case][1] for found in rounds)
+                took = statistics.median(times[case][0] for times in rounds)
+                spent = statistics.median(times[case][1] for times in rounds)
                 percent = [f"{100 * value:.1f} %" for value in (spent, part)]
-                there = moments(out, count)
-                seconds = f"{statistics.median(there):.3f} ({max(there):.3f})"
+                durations = moments(out, count)
+                seconds = f"{statistics.median(durations):.3f} ({max(durations):.3f})"
                 rows.append([name, case, many, round(took), *percent, seconds])
     head = ["run", "keyframes", "how many", "µs an iteration", "of that", "of run.mcap"]
     save(

@@ -51,7 +51,7 @@ def first_picture(path: Path) -> None:
 class FirstBlock(BaseException):
     """A block was learned: bytes that the learning thread had read by then.
 
-    No `Exception`, because learning goes on where a sink raises one.
+    No `Exception`, because learning continues if a sink raises one.
     """
 
 
@@ -89,7 +89,7 @@ def first_block(path: Path) -> int:
 
 
 def forget(path: Path) -> None:
-    """Let the system forget what it has of a file in memory, where it can."""
+    """Drop the system's cache of a file, if the system supports it."""
     if hasattr(os, "posix_fadvise"):
         with path.open("rb") as file:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -99,14 +99,14 @@ def seconds(
     path: Path, rounds: int, *, cold: bool, work: Callable[[Path], object] = first_picture
 ) -> float:
     """The median of how long some work on a log takes, by the wall's clock."""
-    found = []
+    durations = []
     for _ in range(rounds):
         if cold:
             forget(path)
         start = time.perf_counter()
         work(path)
-        found.append(time.perf_counter() - start)
-    return middle(found, 3)
+        durations.append(time.perf_counter() - start)
+    return middle(durations, 3)
 
 
 def main(*, quick: bool = False) -> None:

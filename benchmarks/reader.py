@@ -73,10 +73,10 @@ def decompression(path: Path, frames: int, *, in_memory: bool) -> Callable[[], i
                 if isinstance(record, Chunk):
                     yield record.data, record.uncompressed_size
 
-    kept = list(chunks()) if in_memory else None
+    stored_chunks = list(chunks()) if in_memory else None
 
     def call() -> int:
-        for stored, size in kept or list(chunks()):
+        for stored, size in stored_chunks or list(chunks()):
             zstd.decompress(stored, max_output_size=size)
         return frames
 

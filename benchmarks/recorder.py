@@ -37,21 +37,21 @@ def recording(scene: str, frames: int, folder: Path, jobs: int) -> Callable[[], 
 def steady_and_start(
     scene: str, frames: int, folder: Path, jobs: int, rounds: int
 ) -> tuple[float, float]:
-    """What a frame takes once the recorder runs, in microseconds, and its start in seconds.
+    """Return microseconds per frame of a running recorder, and seconds of its start.
 
-    By the wall's clock: five times as many frames take so much longer; the rest is the start.
+    Wall time: from the difference between n and 5 n frames; the rest is the start.
     """
     short, long = recording(scene, frames, folder, jobs), recording(scene, 5 * frames, folder, jobs)
-    found = []
+    times = []
     for _ in range(rounds):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         few = short()
         between = time.perf_counter()
         many = long()
         ended = time.perf_counter()
-        frame = ((ended - between) - (between - begun)) / (many - few)
-        found.append((1e6 * frame, between - begun - few * frame))
-    return min(found)
+        frame = ((ended - between) - (between - start)) / (many - few)
+        times.append((1e6 * frame, between - start - few * frame))
+    return min(times)
 
 
 def main(*, quick: bool = False, scene: str = "icub") -> None:

@@ -38,11 +38,11 @@ def cluster(workers: int) -> Iterator[tuple[str, list[psutil.Process]]]:
     commands += [["worker", address, "--nthreads", "1", "--no-nanny"]] * workers
     how: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     how["env"] = {**os.environ, "OMP_NUM_THREADS": "1"}
-    begun = [subprocess.Popen([*dask, *words, "--no-dashboard"], **how) for words in commands]
+    processes = [subprocess.Popen([*dask, *words, "--no-dashboard"], **how) for words in commands]
     try:
-        yield address, [psutil.Process(one.pid) for one in begun[1:]]
+        yield address, [psutil.Process(one.pid) for one in processes[1:]]
     finally:
-        for process in begun:
+        for process in processes:
             process.kill()
             process.wait()
 
@@ -50,7 +50,7 @@ def cluster(workers: int) -> Iterator[tuple[str, list[psutil.Process]]]:
 def seconds(
     run: Path, logs: Path, address: str, workers: list[psutil.Process]
 ) -> tuple[float, ...]:
-    """Seconds by the wall's clock, and of the processors in workers, that all logs take."""
+    """Return wall seconds, and CPU seconds of the workers, for all logs."""
 
     def used() -> float:
         return sum(sum(worker.cpu_times()[:2]) for worker in workers)
@@ -68,8 +68,8 @@ def main(*, quick: bool = False) -> None:
     with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as stack:
         run, logs = make_run(Path(place) / "run", OUTPUTS[-1]), Path(place) / "logs"
         logs.mkdir()
-        shown = open_arrays({"cam": np.stack(pictures(FRAMES, *VGA))}, InputOptions(size=VGA))
-        write_video(shown, 0, logs / "0.mp4", lossless=False)
+        source = open_arrays({"cam": np.stack(pictures(FRAMES, *VGA))}, InputOptions(size=VGA))
+        write_video(source, 0, logs / "0.mp4", lossless=False)
         for number in range(1, LOGS):
             shutil.copyfile(logs / "0.mp4", logs / f"{number}.mp4")
         clusters = {n: stack.enter_context(cluster(n)) for n in (1, 2)}
@@ -77,9 +77,9 @@ def main(*, quick: bool = False) -> None:
         took: dict[int, list[tuple[float, float]]] = {1: [], 2: []}
         for turn in range(3 if quick else 8):
             for workers, about in clusters.items():
-                found = seconds(run, logs, *about)
+                duration = seconds(run, logs, *about)
                 if turn:
-                    took[workers].append(found)
+                    took[workers].append(duration)
     load = os.getloadavg()[1]
     faster = [one[0] / two[0] for one, two in zip(took[1], took[2], strict=True)]
     rows = [

@@ -51,8 +51,8 @@ def run_trials(name: str, learners: list[str], seed: int, settings: list[str]) -
         else:
             course = run_learner(open_learner(config, source.spec, seed), source, name)
         expansion = config.expansion or ("none" if images else "quadratic")
-        found = judge(course, source, config.components, expansion)
-        rows.append({"set": name, "learner": learner, "seed": seed, **found})
+        scores = judge(course, source, config.components, expansion)
+        rows.append({"set": name, "learner": learner, "seed": seed, **scores})
     return rows
 
 

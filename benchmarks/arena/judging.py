@@ -45,13 +45,13 @@ class Course:
     Attributes:
         saved: the modules, in order.
         watched: of every block its first frame and its stream.
-        given_up: blocks that each stream was watched until it was first rejected.
+        rejected: blocks that each stream was watched until it was first rejected.
         ended: whether the learner ended by itself.
     """
 
     saved: list[Saved] = field(default_factory=list)
     watched: list[tuple[int, int]] = field(default_factory=list)
-    given_up: dict[int, int] = field(default_factory=dict)
+    rejected: dict[int, int] = field(default_factory=dict)
     ended: bool = False
 
 
@@ -64,38 +64,38 @@ def run_learner(learner: Learner, source: ArenaSource, name: str) -> Course:
             break
         block = source.take(learner.stream, learner.tau)
         learner.step(block)
-        stream, shown = block.stream, source.shown(block.stream, source.t - 1)
+        stream, showing = block.stream, source.showing(block.stream, source.t - 1)
         course.watched.append((block.t, stream))
-        about = stream, shown.name, shown.learnable, len(course.watched)
+        about = stream, showing.name, showing.learnable, len(course.watched)
         course.saved += [Saved(module, *about) for module in learner.modules[len(course.saved) :]]
         if any(f"{source.spec.streams[stream]} is rejected" in text for text in learner.events):
             visits = sum(watched == stream for _, watched in course.watched)
-            course.given_up.setdefault(stream, visits)
+            course.rejected.setdefault(stream, visits)
     return course
 
 
 def judge(course: Course, source: ArenaSource, components: int, expansion: str) -> dict[str, Any]:
-    """Return what a run came to, as JSON values; None where a measure does not apply.
+    """Return the scores of a run as JSON values; None where a measure does not apply.
 
     Args:
-        course: of the run.
-        source: what it learned from.
+        course: course of the run.
+        source: the streams that it learned from.
         components: K of the batch SFA that modules are compared with.
-        expansion: of that.
+        expansion: expansion of the batch SFA.
     """
     targets = _targets(course, source, (components, expansion))
     at = list(targets.values())
-    never = [not any(shown.learnable for shown in phases) for phases in source.phases]
+    never = [not any(showing.learnable for showing in phases) for phases in source.phases]
     right = [one.name for one in course.saved if one.learnable]
     wrong = [one.name for one in course.saved if not one.learnable]
-    vain = [not source.shown(stream, t).learnable for t, stream in course.watched]
+    vain = [not source.showing(stream, t).learnable for t, stream in course.watched]
     return {
         "targets": targets,
         "noise": wrong,
         "learned": float(np.mean([block is not None for block in at])),
         "noise learned": len(wrong),
         "twice": len(right) - len(set(right)),
-        "noise told": max((n for s, n in course.given_up.items() if never[s]), default=None),
+        "noise told": max((n for s, n in course.rejected.items() if never[s]), default=None),
         "in vain": float(np.mean(vain)),
         "ends": float(course.ended),
         "blocks": len(course.watched) if course.ended else None,
@@ -119,16 +119,16 @@ def _targets(course: Course, source: ArenaSource, terms: tuple[int, str]) -> dic
                 slow.append((k, name))
                 knows += [(k, name)] if correlation(y, answer) > KNOWS else []
     sound = [k for k, one in enumerate(course.saved) if (k, one.name) in slow]
-    found = {}
+    targets: dict[str, int | None] = {}
     for stream, phases in enumerate(source.phases):
-        for phase, shown in enumerate(phases):
-            own = [k for k in sound if course.saved[k].name == shown.name]
-            by = own or [k for k in sound if (k, shown.name) in knows]
-            if shown.learnable:
+        for phase, showing in enumerate(phases):
+            learned = [k for k in sound if course.saved[k].name == showing.name]
+            by = learned or [k for k in sound if (k, showing.name) in knows]
+            if showing.learnable:
                 begins = sum(t < phase * CHANGE for t, _ in course.watched)
                 name = f"{source.spec.streams[stream]} {phase}"
-                found[name] = max(begins, course.saved[by[0]].block) if by else None
-    return found
+                targets[name] = max(begins, course.saved[by[0]].block) if by else None
+    return targets
 
 
 def _is_learnable(name: str) -> bool:
@@ -137,24 +137,24 @@ def _is_learnable(name: str) -> bool:
 
 def _probes(course: Course, source: ArenaSource, terms: tuple[int, str]) -> dict[str, float | None]:
     """Return R^2 of the state by the modules of each stream, and by principal components."""
-    found = []
+    r_squared = []
     for name, footage in source.footage.items():
         modules = [one.module for one in course.saved if one.name == name and one.learnable]
         if modules and footage.state.shape[1]:
-            own = np.concatenate([m.transform(footage.frames) for m in modules], axis=1)
+            features = np.concatenate([m.transform(footage.frames) for m in modules], axis=1)
             leading = source.reference(name, *terms)[1].transform(footage.frames)
-            n = min(own.shape[1], leading.shape[1])
-            found.append([probe(y[:, :n], footage.state) for y in (own, leading)])
-    means = np.mean(found, axis=0).tolist() if found else (None, None)
+            n = min(features.shape[1], leading.shape[1])
+            r_squared.append([probe(y[:, :n], footage.state) for y in (features, leading)])
+    means = np.mean(r_squared, axis=0).tolist() if r_squared else (None, None)
     return dict(zip(("R2", "R2 of components"), means, strict=True))
 
 
 def probe(features: FloatArray, state: FloatArray) -> float:
-    """Return how well a linear map tells the state of the world from features, mean R^2.
+    """Return how well a linear map predicts the state of the world from features, mean R^2.
 
     Ridge regression is fitted on the first three quarters of the frames and judged on the last.
-    A part of the state that stands still in either is left out, and one that is told worse than
-    by its mean counts 0.
+    A constant part of the state is skipped, and one that is predicted worse than by its mean
+    counts 0.
 
     Args:
         features: (n, J).

@@ -45,14 +45,14 @@ class Footage:
     state: FloatArray
 
     @property
-    def shown(self) -> NDArray[Any]:
+    def training(self) -> NDArray[Any]:
         """The frames that a learner sees, again and again: the first three quarters."""
         return self.frames[: len(self.frames) * 3 // 4]
 
     @property
     def following(self) -> NDArray[Any]:
         """The frames that modules are judged on: the last quarter."""
-        return self.frames[len(self.shown) :]
+        return self.frames[len(self.training) :]
 
 
 def stateless(frames: NDArray[Any]) -> Footage:
@@ -102,21 +102,21 @@ def wandering(rng: Rng, n: int, memory: float) -> FloatArray:
 
 def light(rng: Rng, n: int) -> Footage:
     """An image whose brightness drifts, with a sensor's noise."""
-    shown = soft_image(rng)
+    image = soft_image(rng)
     brightness = 30 * np.sin(np.cumsum(rng.normal(0, 0.5, n)) / 10)
-    return _lit(rng, shown, brightness, np.ones(WIDTH))
+    return _lit(rng, image, brightness, np.ones(WIDTH))
 
 
 def drifting(rng: Rng, n: int) -> Footage:
     """An image lit from one side, then from the other, in `DRIFT` frames."""
-    shown = soft_image(rng)
+    image = soft_image(rng)
     drift = np.sin(2 * np.pi * (np.arange(n) / DRIFT + rng.random()))
-    return _lit(rng, shown, drift, np.linspace(-30, 30, WIDTH))
+    return _lit(rng, image, drift, np.linspace(-30, 30, WIDTH))
 
 
-def _lit(rng: Rng, shown: FloatArray, course: FloatArray, side: FloatArray) -> Footage:
+def _lit(rng: Rng, image: FloatArray, course: FloatArray, side: FloatArray) -> Footage:
     def seen(at: int, m: int) -> NDArray[Any]:
-        return shown + course[at : at + m, None, None] * side + SENSOR_SD * gaussian(rng, m)
+        return image + course[at : at + m, None, None] * side + SENSOR_SD * gaussian(rng, m)
 
     return Footage(in_pieces(len(course), seen), course[:, None])
 
@@ -171,8 +171,8 @@ def vector_noise(rng: Rng, n: int) -> Footage:
 
 def jumping(rng: Rng, n: int) -> Footage:
     """Another image every 10 frames."""
-    shown = np.stack([soft_image(rng) for _ in range(-(-n // 10))])
-    return stateless(np.repeat(pixels(shown), 10, axis=0)[:n])
+    images = np.stack([soft_image(rng) for _ in range(-(-n // 10))])
+    return stateless(np.repeat(pixels(images), 10, axis=0)[:n])
 
 
 def constant(rng: Rng, n: int) -> Footage:
@@ -193,32 +193,32 @@ def pink(rng: Rng, n: int) -> Footage:
 
 def noisy(rng: Rng, n: int, noise: str) -> Footage:
     """A still image under one of `NOISES`."""
-    shown = soft_image(rng)
-    return stateless(in_pieces(n, lambda at, m: NOISES[noise](rng, shown, m)))
+    image = soft_image(rng)
+    return stateless(in_pieces(n, lambda at, m: NOISES[noise](rng, image, m)))
 
 
-def _salted(rng: Rng, shown: FloatArray, m: int) -> NDArray[Any]:
+def _salted(rng: Rng, image: FloatArray, m: int) -> NDArray[Any]:
     drawn = rng.random((m, HEIGHT, WIDTH), np.float32)
-    return np.where(drawn < 0.05, 0.0, np.where(drawn > 0.95, 255.0, shown))
+    return np.where(drawn < 0.05, 0.0, np.where(drawn > 0.95, 255.0, image))
 
 
 NOISES: dict[str, Callable[[Rng, FloatArray, int], NDArray[Any]]] = {
-    "sensor": lambda rng, shown, m: shown + SENSOR_SD * gaussian(rng, m),
+    "sensor": lambda rng, image, m: image + SENSOR_SD * gaussian(rng, m),
     "salt": _salted,  # a tenth of the pixels are black or white
-    "speckle": lambda rng, shown, m: shown * (1 + 0.3 * gaussian(rng, m)),  # of a laser, a radar
-    "shot": lambda rng, shown, m: 25.5 * rng.poisson(shown / 25.5, (m, HEIGHT, WIDTH)),
+    "speckle": lambda rng, image, m: image * (1 + 0.3 * gaussian(rng, m)),  # of a laser, a radar
+    "shot": lambda rng, image, m: 25.5 * rng.poisson(image / 25.5, (m, HEIGHT, WIDTH)),
 }
 
 
 def bands(rng: Rng, n: int) -> Footage:
     """A still image with the rolling bands of a lamp that is not in step with the shutter."""
-    shown = soft_image(rng)
+    image = soft_image(rng)
     phase = np.cumsum(rng.normal(2.4, 0.4, n))
     rows = 2 * np.pi * np.arange(HEIGHT) / 24
 
     def seen(at: int, m: int) -> NDArray[Any]:
         rolling = 20 * np.cos(rows - phase[at : at + m, None])[:, :, None]
-        return NOISES["sensor"](rng, shown + rolling, m)
+        return NOISES["sensor"](rng, image + rolling, m)
 
     return stateless(in_pieces(n, seen))
 
@@ -274,12 +274,12 @@ def _caused(plain: Footage, cause: FloatArray, seen: Callable[[int, int], Any]) 
 
 
 def pausing(rng: Rng, plain: Footage) -> Footage:
-    """Frames that stand still half of the time, 300 at once on average."""
+    """Return frames that are constant half of the time, 300 at once on average."""
     n = len(plain.frames)
     lengths = rng.exponential(300, 4 * n // 300 + 100).astype(int) + 1
     moving = np.repeat(np.arange(len(lengths)) % 2 == 0, lengths)[:n]
-    shown = np.cumsum(moving) - 1
-    return replace(plain, frames=plain.frames[shown], state=plain.state[shown])
+    rows = np.cumsum(moving) - 1
+    return replace(plain, frames=plain.frames[rows], state=plain.state[rows])
 
 
 CAMERAS: dict[str, Callable[[Rng, Footage], Footage]] = {

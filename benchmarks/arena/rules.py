@@ -50,7 +50,7 @@ def prediction_error(frames: NDArray[Any], candidate: Candidate) -> float:
     """Return the mean square error of outputs on a block, each predicted from the one before.
 
     The prediction is y(t + 1) = rho y(t), with the rho that the slowness fitted so far implies:
-    1 for white noise, which nothing predicts, and 0 for what stands still.
+    1 for white noise, which nothing predicts, and 0 for a constant.
     """
     y = candidate.y[np.isfinite(candidate.y).all(axis=1)]
     fitted = candidate.sfa.state.spectrum[: y.shape[1]]
@@ -76,23 +76,23 @@ class Distillation:
 
     def __call__(self, frames: NDArray[Any], candidate: Candidate) -> float:
         """Return the imitation's mean square error on a block, before it is learned from."""
-        shown = frames @ self._projection.T
+        features = frames @ self._projection.T
         self._blocks += 1
-        now = np.stack([shown.mean(axis=0), (shown * shown).mean(axis=0)])
+        now = np.stack([features.mean(axis=0), (features * features).mean(axis=0)])
         self._moments += (now - self._moments) / self._blocks
         mean, square = self._moments
         scatter = np.sqrt(np.maximum(square - mean * mean, 1e-12))
-        inputs = np.clip((shown - mean) / scatter, -5.0, 5.0)
-        own = np.maximum(inputs @ self._imitator.T, 0.0)
+        inputs = np.clip((features - mean) / scatter, -5.0, 5.0)
+        hidden = np.maximum(inputs @ self._imitator.T, 0.0)
         wanted = np.maximum(inputs @ self._hidden.T, 0.0) @ self._target.T
-        missing = wanted - own @ self._learned.T
-        step = missing.T @ own / len(own)
-        self._learned += 0.5 * step / max(float((own * own).sum(axis=1).mean()), 1e-12)
+        missing = wanted - hidden @ self._learned.T
+        step = missing.T @ hidden / len(hidden)
+        self._learned += 0.5 * step / max(float((hidden * hidden).sum(axis=1).mean()), 1e-12)
         return float((missing * missing).mean())
 
 
 def _largest(s: Situation, values: FloatArray) -> tuple[int, bool]:
-    """Take the largest value of what is learned, first what was watched too little for one."""
+    """Take the stream with the largest value, streams without a value first."""
     known = np.where(np.isfinite(values), values, np.inf)
     return exploring(lambda s: np.where(s.learning, known, -np.inf))(s)
 

@@ -44,7 +44,7 @@ GROUPS = {"all": list(SETS), "reported": REPORTED, "tuning": TUNING}
 
 
 class Showing(NamedTuple):
-    """What a stream shows for a while; `apart` is how many times `BEGIN_APART` later it begins."""
+    """A phase of a stream; `apart` is how many times `BEGIN_APART` later it begins."""
 
     kind: str
     camera: str = ""
@@ -63,11 +63,11 @@ _WORD = re.compile(r"(?:(\w+):)?([\w.-]+?)(?:#(\d+))?")
 
 
 def parse(word: str) -> tuple[Showing, ...]:
-    """Return what a stream shows, one thing after the other.
+    """Return the phases of a stream in order.
 
     Args:
-        word: `CAMERA:NAME#APART`, of which only the name is required; a stream that changes has
-            two of them with a `>` between.
+        word: `CAMERA:NAME#APART`, where only the name is required; a stream that changes has
+            two of them, separated by `>`.
 
     Example:
         >>> parse("lit:pong#1")
@@ -95,7 +95,7 @@ def make_footage(name: str, seed: int) -> Footage:
 
 
 def refer(footage: Footage, components: int, expansion: str) -> tuple[Module, Module]:
-    """Return what batch SFA finds in the frames that a learner sees.
+    """Return the results of batch SFA on the frames that a learner sees.
 
     Args:
         footage: of the stream.
@@ -105,9 +105,9 @@ def refer(footage: Footage, components: int, expansion: str) -> tuple[Module, Mo
     Returns:
         The slowest output, and the K leading principal components.
     """
-    shown = footage.shown
-    x = expand(expansion, shown.reshape(len(shown), -1))
-    scale = PIXEL if shown.dtype == UINT8 else 1.0
+    frames = footage.training
+    x = expand(expansion, frames.reshape(len(frames), -1))
+    scale = PIXEL if frames.dtype == UINT8 else 1.0
     phi, mean, directions = batch_outputs([(x, False)], len(x), components, outputs=1)
     return linear(phi, mean, expansion, scale), linear(directions, mean, expansion, scale)
 
@@ -145,8 +145,8 @@ class ArenaSource:
         self.reference = cache(lambda name, *terms: refer(self.footage[name], *terms))
         self.t = 0
 
-    def shown(self, stream: int, t: int) -> Showing:
-        """Return what a stream shows at frame t."""
+    def showing(self, stream: int, t: int) -> Showing:
+        """Return the phase of a stream at frame t."""
         phases = self.phases[stream]
         return phases[min(t // CHANGE, len(phases) - 1)]
 
@@ -154,8 +154,8 @@ class ArenaSource:
         """Return the next n frames of a stream."""
         frames = np.empty((n, *self.spec.frame_shape), self.spec.dtype)
         for k, t in enumerate(range(self.t, self.t + n)):
-            showing = self.shown(stream, t)
-            source = self.footage[showing.name].shown
+            showing = self.showing(stream, t)
+            source = self.footage[showing.name].training
             frames[k] = source[(t + showing.apart * BEGIN_APART) % len(source)]
         frames.flags.writeable = False
         block = Block(stream, self.t, frames, np.zeros((n, 0)))

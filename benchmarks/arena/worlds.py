@@ -100,8 +100,8 @@ def robot(rng: Rng, n: int, model: str, distance: float) -> Footage:
     path = str(Path(pybullet_data.getDataPath(), model))
     with silenced():
         world = bullet_client.BulletClient(pybullet.DIRECT)
-        found = (world.loadURDF(path),) if model.endswith(".urdf") else world.loadMJCF(path)
-    body = max(found, key=world.getNumJoints)  # others are the ground
+        bodies = (world.loadURDF(path),) if model.endswith(".urdf") else world.loadMJCF(path)
+    body = max(bodies, key=world.getNumJoints)  # others are the ground
     about = [world.getJointInfo(body, joint) for joint in range(world.getNumJoints(body))]
     turning = [each for each in about if each[2] == world.JOINT_REVOLUTE]
     sliding = [each[0] for each in about if each[2] == world.JOINT_PRISMATIC]

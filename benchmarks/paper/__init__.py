@@ -53,9 +53,9 @@ def study(
         settings = [{**each, "recording": str(recording)} for each in settings]
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
         rows = list(pool.map(run, settings))
-    found = tables([Trial(s, row, {}) for s, row in zip(settings, rows, strict=True)])
-    print("\n\n".join(markdown(*table) for table in found))
-    document = {"tables": found, "trials": [*zip(settings, rows, strict=True)]}
+    results = tables([Trial(s, row, {}) for s, row in zip(settings, rows, strict=True)])
+    print("\n\n".join(markdown(*table) for table in results))
+    document = {"tables": results, "trials": [*zip(settings, rows, strict=True)]}
     given.out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(plain({**document, "versions": versions()}), indent=1)
     (given.out / f"{name}.json").write_text(text + "\n", "utf-8")

@@ -80,17 +80,17 @@ def run(settings: Settings) -> dict[str, Any]:
 
 def tables(trials: Sequence[Trial]) -> list[Table]:
     """Tabulate how many trials come out right: order and policies as the paper's."""
-    found = groups(trials, "scene", "case")
+    trials_by_case = groups(trials, "scene", "case")
 
     def of_icub(case: str) -> list[str]:
-        group = found.get(("icub", case), [])
+        group = trials_by_case.get(("icub", case), [])
         third = sum(len(t.row["streams"]) > 2 for t in group)
         counts = (icub.in_order(group), icub.follow_both(group))
         return [*(of_all(count, len(group)) for count in counts), f"{third} of {len(group)}"]
 
     rows = []
     for case, keys in CASES.items():
-        group = found["oscillatory", case]
+        group = trials_by_case["oscillatory", case]
         right = sum(learned_order(t.row) == oscillatory.Oscillatory.optimal for t in group)
         changed = ", ".join(f"{key} {value:g}" for key, value in keys.items())
         rows.append([case, changed or "-", of_all(right, len(group)), *of_icub(case)])

@@ -36,7 +36,7 @@ OWN_KEYS = {
 def run(settings: Settings) -> dict[str, Any]:
     """Time an iteration of 2.0, and the work that only 2.0 and only 1.0 does in it.
 
-    Whole iterations are timed where nothing is frozen. 1.0 is told by its parts: its iterations
+    Whole iterations are timed where nothing is frozen. 1.0 is timed by its parts: its iterations
     here keep 2.0's statistics for the record, too, which is no cost of 1.0.
     """
     streams, modules, seed = (settings[key] for key in ("streams", "modules", "seed"))

@@ -246,7 +246,7 @@ class RunLayout:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
-        values = curve_view(name, ["/world/watched"], recent=RECENT)
+        values = curve_view("Input values", ["/world/watched"], recent=RECENT)
         whose = layouts.state_rows("Attended stream", ["/attended/each_block"], recent=RECENT)
         return rrb.Vertical(values, whose, row_shares=[3, 2])
 
