@@ -29,9 +29,10 @@ lint: $(TESTED)
 bench: .venv/.with-bench
 	$(BIN)/python -m benchmarks
 
-# Build the site in build/site, without network access.
+# Build the site in build/site, without network access. All of it is built again: tables are made
+# from the code, and Sphinx forgets the index entries of unchanged pages, which the search needs.
 docs: .venv/.with-docs
-	$(BIN)/sphinx-build -W -b html docs build/site
+	$(BIN)/sphinx-build -W -E -a -b html docs build/site
 
 images: .venv/.with-docs
 	$(BIN)/python docs/images/draw.py

@@ -70,12 +70,6 @@ def replace_tables(app: Any, name: str, text: list[str]) -> None:
     text[0] = generated.replaced(text[0]).replace("../README.md)", "index.md)")
 
 
-def find_generated(app: Any, env: Any, *changes: Any) -> list[str]:
-    """Return the pages with tables that are made from the code, to be read in every build."""
-    pages = {name: Path(env.doc2path(name)) for name in env.found_docs}
-    return [name for name, path in pages.items() if "\n{{ " in path.read_text("utf-8")]
-
-
 def add_search_words(app: Any, name: str, text: list[str]) -> None:
     """Put index entries, which the search rates highest, below the title of a page."""
     if words := SEARCH_WORDS.get(name):
@@ -124,7 +118,6 @@ def add_demonstrations(app: Any, failure: Exception | None) -> None:
 
 def setup(app: Any) -> None:
     app.connect("builder-inited", make_runs)
-    app.connect("env-get-outdated", find_generated)
     app.connect("source-read", replace_tables)
     app.connect("source-read", add_search_words)
     app.connect("include-read", link_within_the_site)
