@@ -37,11 +37,12 @@ WIDTH = 76
 # Width of the names of the inputs.
 NAMES = 22
 
-EXAMPLES = "\n\nExamples:\n"
+# Headings in the docstrings of commands.
+OPTIONS, EXAMPLES = "\n\nOptions:\n", "\n\nExamples:\n"
 
 
 class Command(click.Command):
-    """A command whose docstring ends with "Examples:", printed at the end of its help page.
+    """A command whose docstring is its help page: what it does, its own options, and examples.
 
     Attributes:
         examples: the example commands.
@@ -49,6 +50,10 @@ class Command(click.Command):
 
     def __init__(self, name: str | None, *, help: str, **settings: Any) -> None:
         text, _, examples = inspect.cleandoc(help).partition(EXAMPLES)
+        text, _, entries = text.partition(OPTIONS)
+        for spec, about in re.findall(r"^ {4}(--\S+).*?: (.*(?:\n {8}.*)*)", entries, re.MULTILINE):
+            option = next(param for param in settings["params"] if spec in param.opts)
+            option.help = " ".join(about.split())
         self.examples = [line.strip() for line in examples.splitlines()]
         lines = "".join(f"  {line}\n" for line in self.examples)
         super().__init__(name, help=laid_out(text), epilog=f"\b\nExamples:\n{lines}", **settings)

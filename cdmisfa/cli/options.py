@@ -118,12 +118,12 @@ SEED = Number(0, 2**63 - 1)
 PROCESSES = Number(1, 1024)
 
 
-def option(spec: str, help: str, *, name: str | None = None, **about: Any) -> Decorator:
+def option(spec: str, help: str = "", *, name: str | None = None, **about: Any) -> Decorator:
     """Return an option of a command.
 
     Args:
         spec: its name and the word for its value, as "--frames N"; without a word it is a flag.
-        help: its help text.
+        help: its help text; by default that below "Options:" in the docstring of the command.
         name: name of the parameter, if it is not that of the option.
         about: see `click.option`; the type of a value N is by default a whole number from 1.
     """

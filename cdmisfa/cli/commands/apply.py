@@ -34,13 +34,8 @@ STDOUT = "stdout"
     "File to write for one log: .parquet, .csv, .mcap or .rrd (a view). Or the folder to write "
     "into, one file for each log. [default: print a summary only]",
 )
-@options.option(
-    "--to FORMAT",
-    "Format of the files in the folder -o: parquet, csv, mcap or rrd. stdout writes no file: it "
-    "prints a JSON line for each block as soon as the block is complete. [default: parquet]",
-    type=click.Choice([*FILE_FORMS, STDOUT]),
-)
-@options.option("--frames N", "Stop after this number of frames of each stream. [default: all]")
+@options.option("--to FORMAT", type=click.Choice([*FILE_FORMS, STDOUT]))
+@options.option("--frames N")
 @options.loop
 @options.skip_damaged
 @options.inputs("topics", "fields", "rate", "start", "end", "align", "settings")
@@ -84,6 +79,12 @@ def apply_command(
         {url}
         {index}
         {live}
+
+    Options:
+        --to FORMAT: Format of the files in the folder -o: parquet, csv, mcap or rrd. stdout writes
+            no file: it prints a JSON line for each block as soon as the block is complete.
+            [default: parquet]
+        --frames N: Stop after this number of frames of each stream. [default: all]
 
     Examples:
         cdmisfa apply runs/kitchen today.mcap -o features.parquet

@@ -29,29 +29,16 @@ if TYPE_CHECKING:
 @options.seed
 @options.preset
 @options.settings()
-@options.option(
-    "--algorithm NAME",
-    "Use this learner: progress, 2.0 or 1.0 (of the paper), or your package.module:Class. "
-    "[default: 2.0 for scenes and their recordings, else progress]",
-)
+@options.option("--algorithm NAME")
 @options.max_iterations
 @options.max_modules
 @options.loop
-@options.option(
-    "--resume", "Continue the interrupted run in the folder -o; SOURCE and options may be left out."
-)
+@options.option("--resume")
 @options.skip_damaged
-@options.option("--live-view", "Show the run in the Rerun viewer while it learns.")
+@options.option("--live-view")
 @options.no_rerun
-@options.option(
-    "--episodes", "Learn from the logs one after the other; no block crosses from one to the next."
-)
-@options.option(
-    "--record DIR",
-    "Also record all live streams into this folder, to learn from them again.",
-    name="record_to",
-    type=options.LOCAL,
-)
+@options.option("--episodes")
+@options.option("--record DIR", name="record_to", type=options.LOCAL)
 @options.inputs(*options.ALL_INPUTS)
 @options.force
 @options.as_json
@@ -97,6 +84,14 @@ def learn_command(
         module     a slow feature that is learned and no longer changes
         gap        a pause of a stream of more than ten frames; no block crosses it
         preset     a named set of configuration values
+
+    Options:
+        --algorithm NAME: Use this learner: progress, 2.0 or 1.0 (of the paper), or your
+            package.module:Class. [default: 2.0 for scenes and their recordings, else progress]
+        --resume: Continue the interrupted run in the folder -o; SOURCE and options may be left out.
+        --live-view: Show the run in the Rerun viewer while it learns.
+        --episodes: Learn from the logs one after the other; no block crosses from one to the next.
+        --record DIR: Also record all live streams into this folder, to learn from them again.
 
     Examples:
         cdmisfa learn left.mcap right.mcap -o runs/kitchen
@@ -237,19 +232,10 @@ def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool
 
 @options.command("fork")
 @click.argument("run", type=options.LOCAL)
-@options.option(
-    "--iteration K",
-    "Begin with the first K iterations of RUN.",
-    type=options.Number(0),
-    required=True,
-)
+@options.option("--iteration K", type=options.Number(0), required=True)
 @options.output("Folder of the new run to write.", required=True)
 @options.settings("Set a configuration key learner.* from iteration K on. Repeatable.")
-@options.option(
-    "--seed N",
-    "Seed of every random choice from iteration K on. [default: the seed of RUN]",
-    type=options.SEED,
-)
+@options.option("--seed N", type=options.SEED)
 @options.max_iterations
 @options.max_modules
 @options.source
@@ -274,6 +260,10 @@ def fork_command(
 
     RUN is:
         {run}
+
+    Options:
+        --iteration K: Begin with the first K iterations of RUN.
+        --seed N: Seed of every random choice from iteration K on. [default: the seed of RUN]
 
     Examples:
         cdmisfa fork runs/kitchen --iteration 100 --set learner.visit=9 -o runs/slower

@@ -223,17 +223,10 @@ def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
 
 @options.command("export")
 @options.log_argument("path")
-@options.option(
-    "--to FORMAT",
-    "Format to write: parquet, csv, npz, images, mp4 or lerobot. [default: the ending of -o]",
-    name="form",
-)
+@options.option("--to FORMAT", name="form")
 @options.output("File or folder to write.", required=True)
-@options.option("--lossless", "Encode videos without changing any pixel; they become larger.")
-@options.option(
-    "--task TEXT",
-    "Task that a LeRobot dataset names for its episodes. [default: as the log states]",
-)
+@options.option("--lossless")
+@options.option("--task TEXT")
 @options.inputs("topics", "fields", "rate", "settings")
 @options.force
 @options.as_json
@@ -257,6 +250,13 @@ def export_command(
         {recording}
         {logs}
         {url}
+
+    Options:
+        --to FORMAT: Format to write: parquet, csv, npz, images, mp4 or lerobot. [default: the
+            ending of -o]
+        --lossless: Encode videos without changing any pixel; they become larger.
+        --task TEXT: Task that a LeRobot dataset names for its episodes. [default: as the log
+            states]
 
     Examples:
         cdmisfa export runs/kitchen -o signals.parquet
@@ -283,15 +283,8 @@ def export_command(
 @options.command("index")
 @click.argument("corpus", nargs=-1, required=True, type=options.WORD, metavar="PATH...")
 @options.output("Parquet file to write. [default: corpus.parquet in the folder PATH]")
-@options.option(
-    "--deep",
-    "Decode every message, to find image sizes, gaps, and damage that summaries do not show.",
-)
-@options.option(
-    "--jobs N",
-    "Number of parallel processes. [default: number of processors]",
-    type=options.PROCESSES,
-)
+@options.option("--deep")
+@options.option("--jobs N", type=options.PROCESSES)
 @options.as_json
 @options.quiet
 def index_command(
@@ -306,6 +299,11 @@ def index_command(
         logs                  a folder with logs in it or in folders below
         'logs/**/*.mcap'      a file, or a pattern that names several
         s3://lab/logs/        a folder or file at an s3:// address
+
+    Options:
+        --deep: Decode every message, to find image sizes, gaps, and damage that summaries do not
+            show.
+        --jobs N: Number of parallel processes. [default: number of processors]
 
     Examples:
         cdmisfa index logs

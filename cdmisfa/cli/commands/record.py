@@ -23,31 +23,14 @@ if TYPE_CHECKING:
 @options.command("record")
 @click.argument("source", nargs=-1, type=options.WORD)
 @options.output("Folder of the recording to write.", required=True)
-@options.option(
-    "--frames N",
-    "Stop after this number of frames of each stream. [default: 1000; cameras: until Ctrl-C; with "
-    "--resume: as before]",
-)
-@options.option(
-    "--seed N",
-    "Seed of every random choice. [default: 0; with --resume: as before]",
-    type=options.SEED,
-)
-@options.option(
-    "--view NAME",
-    "Record only this view (stream) of the scene. Repeatable. [default: all]",
-    name="views",
-    multiple=True,
-)
+@options.option("--frames N")
+@options.option("--seed N", type=options.SEED)
+@options.option("--view NAME", name="views", multiple=True)
 @options.jobs
 @options.preset
 @options.settings()
-@options.option("--resume", "Continue the interrupted recording in the folder -o.")
-@options.option(
-    "--split TIME",
-    "Begin a new file for each stream after this time, such as 90s or 10min. [default: one file; "
-    "with --resume: as before]",
-)
+@options.option("--resume")
+@options.option("--split TIME")
 @options.inputs("fields", "size", "rate", "color")
 @options.force
 @options.as_json
@@ -75,6 +58,15 @@ def record_command(
     SOURCE is one of:
         {scene}
         {live}
+
+    Options:
+        --frames N: Stop after this number of frames of each stream. [default: 1000; cameras: until
+            Ctrl-C; with --resume: as before]
+        --seed N: Seed of every random choice. [default: 0; with --resume: as before]
+        --view NAME: Record only this view (stream) of the scene. Repeatable. [default: all]
+        --resume: Continue the interrupted recording in the folder -o.
+        --split TIME: Begin a new file for each stream after this time, such as 90s or 10min.
+            [default: one file; with --resume: as before]
 
     Examples:
         cdmisfa record icub -o recordings/table --frames 2000 --seed 3
@@ -177,7 +169,7 @@ def _record_live(
 @options.output("Folder of the recording to write.", required=True)
 @options.inputs(*options.ALL_INPUTS, "settings")
 @options.skip_damaged
-@options.option("--resume", "Continue the interrupted recording in the folder -o.")
+@options.option("--resume")
 @options.force
 @options.as_json
 @options.quiet
@@ -200,6 +192,9 @@ def convert_command(
         {recording}
         {logs}
         {url}
+
+    Options:
+        --resume: Continue the interrupted recording in the folder -o.
 
     Examples:
         cdmisfa convert left.mp4 right.mp4 -o recordings/kitchen

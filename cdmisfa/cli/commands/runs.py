@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 @options.command("compare")
 @options.log_argument("runs", "RUN...")
-@options.option(
-    "--save F.rrd", "Also write a Rerun view with the curves of all runs.", type=options.LOCAL
-)
+@options.option("--save F.rrd", type=options.LOCAL)
 @options.force
 @options.as_json
 def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_json: bool) -> int:
@@ -34,6 +32,9 @@ def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_j
     RUN is one of:
         {run}
         {log of run}
+
+    Options:
+        --save F.rrd: Also write a Rerun view with the curves of all runs.
 
     Examples:
         cdmisfa compare runs/kitchen runs/again
@@ -100,11 +101,7 @@ def _iterations(
 
 @options.command("check")
 @click.argument("run", type=options.LOCAL)
-@options.option(
-    "--iterations FIRST:END",
-    "Check only the iterations from FIRST to before END. [default: all]",
-    callback=_iterations,
-)
+@options.option("--iterations FIRST:END", callback=_iterations)
 @options.source
 @options.as_json
 def check_command(
@@ -117,6 +114,9 @@ def check_command(
 
     RUN is:
         {run}
+
+    Options:
+        --iterations FIRST:END: Check only the iterations from FIRST to before END. [default: all]
 
     Examples:
         cdmisfa check runs/kitchen
@@ -135,13 +135,7 @@ def check_command(
 
 @options.command("inspect")
 @click.argument("run", type=options.LOCAL)
-@options.option(
-    "--iteration K",
-    "Print the state after the first K iterations.",
-    name="iterations",
-    type=options.Number(0),
-    required=True,
-)
+@options.option("--iteration K", name="iterations", type=options.Number(0), required=True)
 @options.source
 @options.as_json
 def inspect_command(run: Path, iterations: int, source: tuple[str, ...], as_json: bool) -> None:
@@ -153,6 +147,9 @@ def inspect_command(run: Path, iterations: int, source: tuple[str, ...], as_json
 
     RUN is:
         {run}
+
+    Options:
+        --iteration K: Print the state after the first K iterations.
 
     Examples:
         cdmisfa inspect runs/kitchen --iteration 100

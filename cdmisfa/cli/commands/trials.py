@@ -25,17 +25,8 @@ MOST_SEEDS = 1_000_000
 @options.output(
     "Folder of the sweep to write, required without --summary. Finished trials in it are skipped."
 )
-@options.option(
-    "--grid KEY=V1,V2,...",
-    "Try these values of a configuration key. Repeatable: every combination is tried.",
-    multiple=True,
-)
-@options.option(
-    "--seeds FIRST:END",
-    "Use each of these seeds: from FIRST to before END, or a list such as 1,5,9.",
-    default="0:20",
-    show_default=True,
-)
+@options.option("--grid KEY=V1,V2,...", multiple=True)
+@options.option("--seeds FIRST:END", default="0:20", show_default=True)
 @options.preset
 @options.settings()
 @options.max_iterations
@@ -45,12 +36,8 @@ MOST_SEEDS = 1_000_000
 @options.jobs
 @options.scheduler
 @options.retry_failed
-@options.option(
-    "--summary",
-    "Learn nothing; print mean and standard deviation over the seeds of the sweep in the folder "
-    "SOURCE.",
-)
-@options.option("--csv", "Print the summary as comma-separated values.")
+@options.option("--summary")
+@options.option("--csv")
 @options.as_json
 @options.quiet
 @click.pass_context
@@ -78,6 +65,15 @@ def sweep_command(
         {logs}
         {url}
         {index}
+
+    Options:
+        --grid KEY=V1,V2,...: Try these values of a configuration key. Repeatable: every combination
+            is tried.
+        --seeds FIRST:END: Use each of these seeds: from FIRST to before END, or a list such as
+            1,5,9.
+        --summary: Learn nothing; print mean and standard deviation over the seeds of the sweep in
+            the folder SOURCE.
+        --csv: Print the summary as comma-separated values.
 
     Examples:
         cdmisfa sweep oscillatory --grid learner.nu=0.02,0.05 --jobs 4 -o sweeps/nu
@@ -177,15 +173,11 @@ def _print_summary(folder: Path, *, as_csv: bool, as_json: bool) -> None:
 @options.command("reproduce")
 @click.argument("name", metavar="EXPERIMENT")
 @options.output("Folder of the results to write. [default: reproduction]")
-@options.option("--trials N", "Number of trials of each condition. [default: as in the paper]")
+@options.option("--trials N")
 @options.jobs
 @options.scheduler
-@options.option(
-    "--recording DIR",
-    "Folder of a recording of the scene icub to use. [default: record it now]",
-    type=options.LOCAL,
-)
-@options.option("--quick", "Run only a few trials, enough to test the claims.")
+@options.option("--recording DIR", type=options.LOCAL)
+@options.option("--quick")
 @options.as_json
 @options.quiet
 def reproduce_command(
@@ -207,6 +199,11 @@ def reproduce_command(
         nonstationary         whether the learner follows a changing stream
         icub                  order in which the robot's three views are learned
         all                   all of them
+
+    Options:
+        --trials N: Number of trials of each condition. [default: as in the paper]
+        --recording DIR: Folder of a recording of the scene icub to use. [default: record it now]
+        --quick: Run only a few trials, enough to test the claims.
 
     Examples:
         cdmisfa reproduce oscillatory --quick
@@ -246,13 +243,7 @@ def reproduce_command(
 @options.command("demo")
 @options.output("Folder to write recordings/ and runs/ into. [default: current folder]")
 @options.seed
-@options.option(
-    "--frames N",
-    "Number of frames to record of each view, at least 400.",
-    type=options.Number(400),
-    show_default=True,
-    default=8000,
-)
+@options.option("--frames N", type=options.Number(400), show_default=True, default=8000)
 @options.jobs
 @options.as_json
 @options.quiet
@@ -262,6 +253,9 @@ def demo_command(output: Path | None, seed: int, frames: int, jobs: int, as_json
     The command simulates the iCub robot at a table, learns from its three views, and writes a
     report. It overwrites the results of an earlier demo in the same folder. Without PyBullet, which
     needs Python 3.11 or older, it uses the scene oscillatory instead.
+
+    Options:
+        --frames N: Number of frames to record of each view, at least 400.
 
     Examples:
         cdmisfa demo

@@ -13,25 +13,13 @@ from cdmisfa.core.errors import UsageError
 
 @options.command("view")
 @options.log_argument("run", "PATH...")
-@options.option("--save F.rrd", "Write the view to this file.", type=options.LOCAL)
-@options.option("--web", "Show the view in a browser on this machine.")
-@options.option(
-    "--screenshot F.png", "Draw the view into this image file; needs no screen.", type=options.LOCAL
-)
-@options.option(
-    "--at WHEN",
-    'Open the view at this frame, at "iteration 500", or at an event, such as "module 2". '
-    "[default: end of the run]",
-)
-@options.option("--tab NAME", "Open this tab of the view. [default: the first]")
-@options.option(
-    "--port N",
-    "Port of --web on this machine. [default: a free one]",
-    type=options.Number(1, 65535),
-)
-@options.option(
-    "--every N", "Show every Nth image; curves show every value.", show_default=True, default=10
-)
+@options.option("--save F.rrd", type=options.LOCAL)
+@options.option("--web")
+@options.option("--screenshot F.png", type=options.LOCAL)
+@options.option("--at WHEN")
+@options.option("--tab NAME")
+@options.option("--port N", type=options.Number(1, 65535))
+@options.option("--every N", show_default=True, default=10)
 @options.inputs("topics", "fields", "rate", "settings")
 @options.force
 def view_command(
@@ -55,6 +43,16 @@ def view_command(
         {logs}
         {url}
         {view}
+
+    Options:
+        --save F.rrd: Write the view to this file.
+        --web: Show the view in a browser on this machine.
+        --screenshot F.png: Draw the view into this image file; needs no screen.
+        --at WHEN: Open the view at this frame, at "iteration 500", or at an event, such as "module
+            2". [default: end of the run]
+        --tab NAME: Open this tab of the view. [default: the first]
+        --port N: Port of --web on this machine. [default: a free one]
+        --every N: Show every Nth image; curves show every value.
 
     Examples:
         cdmisfa view runs/kitchen
