@@ -89,6 +89,6 @@ def drawn(driver: Any, lanes: Collection[str] = tuple(LANES)) -> None:
 
 def errors(driver: Any) -> list[str]:
     """What the browser calls errors, but for what the policy refuses."""
-    found = [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
+    result = [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
     expected = ("Content Security Policy", "TypeError: Failed to fetch")
-    return [error for error in found if not any(word in error for word in expected)]
+    return [error for error in result if not any(word in error for word in expected)]

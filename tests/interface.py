@@ -65,7 +65,7 @@ def documents() -> dict[str, list[str]]:
     """The keys of what commands print with --json, in a folder of their own."""
     from cdmisfa.cli import run
 
-    found = {}
+    result = {}
     logs = Path(__file__).parents[1] / "sample_logs"
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         Path("sample_logs").symlink_to(logs)
@@ -78,8 +78,8 @@ def documents() -> dict[str, list[str]]:
                 code = run([name.partition(" ")[0], *map(str, words), "--json"])
             if code:
                 raise AssertionError(f"{name}: {said.getvalue()}")
-            found[name] = sorted(set(keys(json.loads(out.getvalue()))))
-    return found
+            result[name] = sorted(set(keys(json.loads(out.getvalue()))))
+    return result
 
 
 def commands() -> dict[str, list[str]]:
@@ -87,23 +87,23 @@ def commands() -> dict[str, list[str]]:
     from cdmisfa.cli.app import COMMANDS, cli
 
     context = click.Context(cli)
-    found = {}
+    result = {}
     for name in COMMANDS:
         command = cli.get_command(context, name)
         assert command is not None
-        found[name] = [
+        result[name] = [
             p.human_readable_name for p in command.params if isinstance(p, click.Argument)
         ]
         options = [p for p in command.params if isinstance(p, click.Option)]
-        found[name] += sorted(word for p in options for word in (*p.opts, *p.secondary_opts))
-    return found
+        result[name] += sorted(word for p in options for word in (*p.opts, *p.secondary_opts))
+    return result
 
 
 def names() -> dict[str, list[str]]:
     """What `cdmisfa` has: members of classes, arguments of functions."""
     import cdmisfa
 
-    found = {}
+    result = {}
     for name in dir(cdmisfa):
         if name.startswith("__"):
             continue
@@ -112,14 +112,14 @@ def names() -> dict[str, list[str]]:
             ours = [kind for kind in thing.__mro__ if kind.__module__.split(".")[0] in OURS]
             members = {member for kind in ours for member in vars(kind)}
             members |= {member for kind in ours for member in getattr(kind, "__annotations__", ())}
-            found[name] = sorted(
+            result[name] = sorted(
                 member for member in members if not member.startswith(("_", "set_"))
             )
         elif callable(thing):
-            found[name] = list(inspect.signature(thing).parameters)
+            result[name] = list(inspect.signature(thing).parameters)
         else:
-            found[name] = []
-    return found
+            result[name] = []
+    return result
 
 
 OURS = ("cdmisfa", "recorder", "replay")
@@ -161,8 +161,8 @@ def codes() -> dict[str, int]:
     from cdmisfa.core import errors
 
     kinds = vars(errors).values()
-    found = [k for k in kinds if inspect.isclass(k) and issubclass(k, errors.CdmisfaError)]
-    return {kind.__name__: kind.exit_code for kind in found}
+    result = [k for k in kinds if inspect.isclass(k) and issubclass(k, errors.CdmisfaError)]
+    return {kind.__name__: kind.exit_code for kind in result}
 
 
 def interface() -> dict[str, Any]:

@@ -75,9 +75,9 @@ class Page:
         parser.feed(self.source)
         self.tags = parser.tags
         self.text = re.sub(r"\s+", " ", " ".join(parser.text))
-        found = re.search(r'<script type="application/json"[^>]*>(.*?)</script>', self.source)
-        assert found is not None
-        self.frames: dict[str, Any] = json.loads(found[1])
+        result = re.search(r'<script type="application/json"[^>]*>(.*?)</script>', self.source)
+        assert result is not None
+        self.frames: dict[str, Any] = json.loads(result[1])
 
     def count(self, tag: str) -> int:
         return sum(name == tag for name, _ in self.tags)

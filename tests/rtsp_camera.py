@@ -59,23 +59,23 @@ class Connection(socketserver.StreamRequestHandler):
         return lines
 
     def _answer(self, method: str, address: str, head: str) -> None:
-        told = {
+        headers = {
             "OPTIONS": "Public: OPTIONS, DESCRIBE, SETUP, PLAY, TEARDOWN\r\n\r\n",
             "DESCRIBE": f"Content-Base: {address}/\r\nContent-Type: application/sdp\r\n"
             f"Content-Length: {len(_OFFER)}\r\n\r\n{_OFFER}",
             "SETUP": f"Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\n{_SESSION}\r\n",
         }
-        self.wfile.write((head + told.get(method, f"{_SESSION}\r\n")).encode())
+        self.wfile.write((head + headers.get(method, f"{_SESSION}\r\n")).encode())
 
     def _show(self) -> None:
-        sequence, begun = 0, time.monotonic()
+        sequence, started = 0, time.monotonic()
         for k, units in enumerate(pictures(self.server.shown)):
             for unit in units:
                 marker = 0x80 if unit is units[-1] else 0
                 head = struct.pack(">BBHII", 0x80, marker | 96, sequence, k * _TICKS, 7)
                 sequence += 1
                 self.wfile.write(b"$\0" + struct.pack(">H", len(head + unit)) + head + unit)
-            time.sleep(max(begun + (k + 1) / RATE - time.monotonic(), 0))
+            time.sleep(max(started + (k + 1) / RATE - time.monotonic(), 0))
 
 
 class RtspCamera(socketserver.ThreadingTCPServer):

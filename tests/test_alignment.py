@@ -39,8 +39,8 @@ def test_every_frame_shows_the_last_image_at_or_before_it(
             assert stream[row] <= at
             assert row + 1 == len(stream) or stream[row + 1] > at
         shown = len(set(rows))
-        found = counts(len(stream), rows)
-        assert (found["repeated"], found["dropped"]) == (len(clock) - shown, len(stream) - shown)
+        result = counts(len(stream), rows)
+        assert (result["repeated"], result["dropped"]) == (len(clock) - shown, len(stream) - shown)
 
 
 def test_no_rate_makes_frames_without_end() -> None:

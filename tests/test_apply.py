@@ -87,17 +87,17 @@ def test_a_view_has_the_outputs_beside_the_pictures(
     y = np.concatenate([a.y for a in applied])
     for i, own in enumerate((slice(0, 3), slice(3, 6)), 1):
         rows = view.rows[f"/outputs/1_cam/{i}"]
-        found = scalars(rows)
-        there = ~np.isnan(found[:, 0])  # a row of NaN ends lines where a gap begins
-        np.testing.assert_array_equal(found[there], y[:, own])
+        result = scalars(rows)
+        there = ~np.isnan(result[:, 0])  # a row of NaN ends lines where a gap begins
+        np.testing.assert_array_equal(result[there], y[:, own])
         assert np.count_nonzero(~there) == bool(gap)
         assert (
             np.array(view.rows[f"/outputs/1_cam/{i}"]["frame"])[there].tolist() == frames.tolist()
         )
     begins = [a.block.t for a in applied]
     for name in ("slowness", "novelty"):
-        told = view.rows[f"/{name}/1_cam"]
-        values = dict(zip(told["frame"], scalars(told).tolist(), strict=True))
+        reported = view.rows[f"/{name}/1_cam"]
+        values = dict(zip(reported["frame"], scalars(reported).tolist(), strict=True))
         columns = [0, 3] if name == "slowness" else [0, 1]
         assert [values[t] for t in begins] == [getattr(a, name)[columns].tolist() for a in applied]
     assert view.rows["/views/1_cam"]["frame"] == [t for t in frames.tolist() if t % 10 == 0]
@@ -115,9 +115,9 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
         application.open([str(tmp_path / "rec")]),
         external(tmp_path / "rec" / "cam.mcap", ["/view/cam"]),
     ]
-    found = [list(application.to(source)) for source in sources]
-    assert [len(one.block) for one in found[0]] == [TAU] * 7 + [10]
-    for each in zip(*found, strict=True):
+    result = [list(application.to(source)) for source in sources]
+    assert [len(one.block) for one in result[0]] == [TAU] * 7 + [10]
+    for each in zip(*result, strict=True):
         for one in each[1:]:
             for name in ("y", "slowness", "alive", "novelty"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(each[0], name))

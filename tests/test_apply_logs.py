@@ -87,10 +87,10 @@ def test_a_folder_of_logs_becomes_one_table(
     rows = zip(table["log"].to_pylist(), table["stream"].to_pylist(), strict=True)
     recorded = {("rec", "cam"): 50, ("rec", "other"): 50}
     assert Counter(rows) == {(name, "cam"): 90 for name in NAMES} | recorded
-    told = cdmisfa("apply", run, logs, "-o", out)
-    assert told.code == 3
-    assert "7 logs: 0 processed now, 7 processed before, 2 failed or incomplete" in told.out
-    assert "failed: broken.mcap: " in told.out
+    reported = cdmisfa("apply", run, logs, "-o", out)
+    assert reported.code == 3
+    assert "7 logs: 0 processed now, 7 processed before, 2 failed or incomplete" in reported.out
+    assert "failed: broken.mcap: " in reported.out
 
 
 def test_the_same_bytes_come_of_processes_and_of_dask_though_a_worker_is_killed(
@@ -147,11 +147,11 @@ def test_only_what_is_missing_or_has_changed_is_done(
     assert again() == (1, 4)
 
     before = (logs / "a.mcap").stat()
-    kept = shutil.copy2(logs / "a.mcap", tmp_path / "kept.mcap")
+    remaining = shutil.copy2(logs / "a.mcap", tmp_path / "kept.mcap")
     camera(logs / "a.mcap", 60, 5)
     assert again() == (1, 4)
     assert files(out)["a.mcap.parquet"] != whole["a.mcap.parquet"]
-    shutil.copy2(kept, logs / "a.mcap")
+    shutil.copy2(remaining, logs / "a.mcap")
     assert (logs / "a.mcap").stat().st_mtime_ns == before.st_mtime_ns
     assert again() == (1, 4)
     assert files(out)["a.mcap.parquet"] == whole["a.mcap.parquet"]
@@ -205,8 +205,8 @@ def test_what_is_finished_is_kept_when_it_is_stopped(run: Path, logs: Path, tmp_
     done = len(files(out))
     assert pq.read_table(out).num_rows == 90 * done
     assert not (out / STORE / "parts").exists()
-    found = apply_to_logs(run, [str(logs)], out)
-    assert done - 2 <= found.skipped <= done < 64 == len(files(out))
+    result = apply_to_logs(run, [str(logs)], out)
+    assert done - 2 <= result.skipped <= done < 64 == len(files(out))
 
 
 def test_a_full_disk_is_a_line_and_the_files_before_are_kept(

@@ -14,11 +14,11 @@ from replay.storage.arrays import read_arrays
 def test_what_was_written_is_read(tmp_path: Path) -> None:
     written = {"a.b": np.arange(6.0).reshape(2, 3), "none": np.zeros((0, 2)), "text": np.array("x")}
     np.savez(tmp_path / "file.npz", **written)
-    found = read_arrays(tmp_path / "file.npz")
-    assert sorted(found) == sorted(written)
+    result = read_arrays(tmp_path / "file.npz")
+    assert sorted(result) == sorted(written)
     for name, array in written.items():
-        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
-        assert found[name].tobytes() == array.tobytes()
+        assert (result[name].dtype, result[name].shape) == (array.dtype, array.shape)
+        assert result[name].tobytes() == array.tobytes()
     with pytest.raises(FileNotFoundError):
         read_arrays(tmp_path / "other.npz")
 

@@ -136,9 +136,9 @@ def test_values_are_copied_from_within_the_payloads_only(data: st.DataObject) ->
     laid_out = data.draw(place), list(marks), list(marks.values()), distances, width
     out = np.zeros((stop - start, len(distances) * width), np.uint8)
     chunk = np.frombuffer(raw, np.uint8), messages, 1, (start, stop)
-    found = kernels.gather(*chunk, kernels.layout(*laid_out), out)
+    result = kernels.gather(*chunk, kernels.layout(*laid_out), out)
     true = reference.gather(raw, own[start:stop], *laid_out)
-    assert found == (None if true is None else len(own))
+    assert result == (None if true is None else len(own))
     assert true is None or out.tobytes() == true
 
 

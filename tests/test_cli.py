@@ -82,10 +82,10 @@ class TestJson:
             sum(getattr(index, name) for index in summary.chunk_indexes)
             for name in ("compressed_size", "uncompressed_size")
         )
-        found = cdmisfa("info", log, "--json").json
+        result = cdmisfa("info", log, "--json").json
         chunks = {"zstd": len(summary.chunk_indexes)}
         expected = {"file": log.stat().st_size, "stored": stored, "decompressed": whole}
-        assert found["size"] == {**expected, "compression": chunks}
+        assert result["size"] == {**expected, "compression": chunks}
         said = cdmisfa("info", log).out
         statistics = summary.statistics
         seconds = (statistics.message_end_time - statistics.message_start_time) / 1e9

@@ -126,7 +126,7 @@ def test_a_shell_completes_commands_options_choices_and_files(
         monkeypatch.setenv("COMP_WORDS", f"cdmisfa {line}")
         monkeypatch.setenv("COMP_CWORD", str(len(line.split(" "))))
         monkeypatch.setenv("_CDMISFA_COMPLETE", "bash_complete")
-        pairs = [found.split(",", 1) for found in cdmisfa().out.splitlines()]
+        pairs = [result.split(",", 1) for result in cdmisfa().out.splitlines()]
         return [value if kind == "plain" else None for kind, value in pairs]
 
     assert completed("") == COMMANDS

@@ -174,8 +174,8 @@ def test_the_defaults_and_the_papers_constants() -> None:
     oscillatory = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
     icub = build(LearnerConfig, "learner", load_preset("icub")["learner"])
     assert oscillatory == learner() == LearnerConfig()
-    told = [(c.nu, c.tau, c.sigma, c.delta, c.epsilon_start) for c in (oscillatory, icub)]
-    assert told == [(0.05, 100, 0.0009, 0.0006, 1.2), (0.01, 40, 0.01, 0.0008, 1.2)]
+    reported = [(c.nu, c.tau, c.sigma, c.delta, c.epsilon_start) for c in (oscillatory, icub)]
+    assert reported == [(0.05, 100, 0.0009, 0.0006, 1.2), (0.01, 40, 0.01, 0.0008, 1.2)]
     assert (oscillatory.expansion, icub.expansion) == ("quadratic", "none")
 
 
@@ -219,10 +219,10 @@ def test_any_text_is_a_value_or_a_plain_error(text: str, key: str) -> None:
     try:
         value = getattr(learner(**{key: text}), key)
     except UsageError as error:
-        told = str(error)
+        reported = str(error)
     else:
-        told = f"learner.{key} is {value}"
-    assert told.startswith(f"learner.{key} is")
+        reported = f"learner.{key} is {value}"
+    assert reported.startswith(f"learner.{key} is")
 
 
 @pytest.mark.parametrize(
@@ -231,9 +231,9 @@ def test_any_text_is_a_value_or_a_plain_error(text: str, key: str) -> None:
 )
 def test_docstrings_tell_every_key(section: type) -> None:
     """The page of keys is made of them."""
-    told = "".join(inspect.getdoc(each) or "" for each in section.__mro__)
+    reported = "".join(inspect.getdoc(each) or "" for each in section.__mro__)
     for key in dataclasses.fields(section):
         if isinstance(key.default_factory, type):
             test_docstrings_tell_every_key(key.default_factory)
         else:
-            assert f"\n    {key.name}: " in told, key.name
+            assert f"\n    {key.name}: " in reported, key.name

@@ -49,9 +49,9 @@ def rows_of(folder: Path) -> Rows:
 
 
 def row(folder: Path, path: str, topic: str | None = None) -> dict[str, Any]:
-    found = [r for r in rows_of(folder) if r["path"] == path and topic in (None, r["topic"])]
-    assert len(found) == 1 or topic is None, found
-    return found[0]
+    result = [r for r in rows_of(folder) if r["path"] == path and topic in (None, r["topic"])]
+    assert len(result) == 1 or topic is None, result
+    return result[0]
 
 
 class TestRows:

@@ -78,10 +78,10 @@ def accepted(kind: dict[str, Any], damage: Damage, tries: int = 30) -> int:
         whole = packed(scene(random), **kind)
         damaged = damage(whole, random)
         try:
-            found = compressed_image(damaged, color=True)
+            result = compressed_image(damaged, color=True)
         except MalformedImage:
             continue
-        wrong += not np.array_equal(found, compressed_image(whole, color=True))
+        wrong += not np.array_equal(result, compressed_image(whole, color=True))
     return wrong
 
 

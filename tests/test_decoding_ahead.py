@@ -23,12 +23,12 @@ BROKEN = (0, 17, 18, 21, 60)
 
 
 def messages(*broken: int) -> list[bytes]:
-    found = []
+    result = []
     for i, image in enumerate(pictures(COUNT)):
         data = encoded(image, "PNG" if i % 3 else "JPEG")
         data = data[: len(data) // 2] if i in broken else data
-        found.append(CompressedImage(data=data, format="png").SerializeToString())
-    return found
+        result.append(CompressedImage(data=data, format="png").SerializeToString())
+    return result
 
 
 def write(path: Path, *broken: int) -> Path:
@@ -69,16 +69,16 @@ def test_threads_change_no_frame_and_no_error(
     skip_damaged: bool,
 ) -> None:
     log = write(tmp_path / "log.mcap" if write.__name__ == "write" else tmp_path / "log", *broken)
-    found = {}
+    result = {}
     for cores in (1, 2, 5):
         monkeypatch.setattr(ahead, "CORES", cores)
-        found[cores] = shown(log, skip_damaged=skip_damaged)
-    frames, said, error = found[1]
+        result[cores] = shown(log, skip_damaged=skip_damaged)
+    frames, said, error = result[1]
     assert (len(frames) == -(-COUNT // 7)) == (skip_damaged or not broken)
     for cores in (2, 5):
-        assert found[cores][1:] == (said, error)
-        assert len(found[cores][0]) == len(frames)
-        assert all(map(np.array_equal, found[cores][0], frames))
+        assert result[cores][1:] == (said, error)
+        assert len(result[cores][0]) == len(frames)
+        assert all(map(np.array_equal, result[cores][0], frames))
 
 
 def test_few_pictures_are_held_and_each_is_decoded_once(
@@ -114,7 +114,7 @@ def two(path: Path, *broken: int) -> Path:
 
 def anyhow(path: Path) -> list[np.ndarray | str]:
     """What is asked for without a plan: either stream, both at once, other places."""
-    found: list[np.ndarray | str] = []
+    result: list[np.ndarray | str] = []
     order = np.random.default_rng(0)
     with contextlib.closing(external(path, ["/a", "/b"], loop=True, rate=25)) as source:
         for what in order.integers(0, 6, 60).tolist():
@@ -123,13 +123,13 @@ def anyhow(path: Path) -> list[np.ndarray | str]:
                 if what == 0:
                     source.seek(int(order.integers(0, 3 * COUNT)))
                 elif what < 3:
-                    found += [block.frames for block in source.take_all(n)]
+                    result += [block.frames for block in source.take_all(n)]
                 else:
-                    found.append(source.take(what % 2, n).frames)
+                    result.append(source.take(what % 2, n).frames)
             except LogDamagedError as error:
-                found.append(str(error))
+                result.append(str(error))
                 source.seek(source.t + n)
-    return found
+    return result
 
 
 @pytest.mark.parametrize("broken", [(), (5, 30, 31)])

@@ -21,6 +21,6 @@ WITH_EXAMPLES = [
 def test_examples_give_what_they_say(name: str) -> None:
     if name == "cdmisfa.watching":
         pytest.importorskip("gymnasium")
-    found = doctest.testmod(importlib.import_module(name))
-    assert found.attempted > 0
-    assert found.failed == 0
+    result = doctest.testmod(importlib.import_module(name))
+    assert result.attempted > 0
+    assert result.failed == 0

@@ -29,7 +29,7 @@ QUICK = ("--set", "learner.tau=10", "--no-rerun")
 def scenes(count: int, frames: int, seed: int = 0) -> list[np.ndarray]:
     """Episodes of a square that moves before a background, in each another one, and noise."""
     rng, t = np.random.default_rng(seed), np.arange(frames)
-    found = []
+    result = []
     for _ in range(count):
         background = rng.uniform(20, 200, (SIZE[0] // 2, SIZE[1] // 2))
         shown = np.repeat(np.kron(background, np.ones((2, 2)))[None], frames, axis=0)
@@ -37,8 +37,8 @@ def scenes(count: int, frames: int, seed: int = 0) -> list[np.ndarray]:
         for i, at in enumerate(left):
             shown[i, 5:11, at : at + 6] += 70
         shown += rng.normal(0, 6, shown.shape)
-        found.append(np.clip(shown, 0, 255).astype(np.uint8))
-    return found
+        result.append(np.clip(shown, 0, 255).astype(np.uint8))
+    return result
 
 
 def write_log(path: Path, images: np.ndarray, first: int = 0, topic: str = "/cam") -> Path:
@@ -84,8 +84,8 @@ def test_episodes_are_learned_as_one_log_with_pauses_is(cdmisfa: Cdmisfa, tmp_pa
     assert named.json["signals_sha256"] == learned.json["signals_sha256"]
     by_index = cdmisfa("learn", folder / "corpus.parquet", *QUICK, "--json")
     assert by_index.json["signals_sha256"] == learned.json["signals_sha256"]
-    found = package.learn(str(folder), tau=10)
-    assert found.result["signals_sha256"] == learned.json["signals_sha256"]
+    result = package.learn(str(folder), tau=10)
+    assert result.result["signals_sha256"] == learned.json["signals_sha256"]
     (folder / "ep2.mcap").unlink()
     without = cdmisfa("check", run, "--json")
     assert (without.code, without.json["other_files"]) == (4, ["ep2.mcap"])

@@ -46,5 +46,7 @@ def test_tensorboard_has_the_curves_and_events_of_a_run(tmp_path: Path) -> None:
         known = np.flatnonzero(np.isfinite(signal))
         assert [step for step, _ in points] == known.tolist()
         np.testing.assert_allclose([y for _, y in points], signal[known], rtol=1e-6)
-    told = [value.tensor.string_val[0] for _, value in written if value.tag.startswith("events")]
-    assert any(b"module 1 saved" in text for text in told)
+    reported = [
+        value.tensor.string_val[0] for _, value in written if value.tag.startswith("events")
+    ]
+    assert any(b"module 1 saved" in text for text in reported)

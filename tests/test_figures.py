@@ -64,14 +64,14 @@ def missed(*names: str) -> tuple[int, int]:
 
 def mean(measure: str, learner: str, *sets: str) -> float:
     """Return the mean of a measure over sets of streams."""
-    found = [entry["measures"][measure]["mean"] for entry in arena(learner, *sets)]
-    return statistics.fmean(value for value in found if value is not None)
+    result = [entry["measures"][measure]["mean"] for entry in arena(learner, *sets)]
+    return statistics.fmean(value for value in result if value is not None)
 
 
 def noise_modules(learner: str, *sets: str) -> int:
     """Return how many modules were saved on streams of noise, over all seeds."""
-    found = [entry["measures"]["wrong"] for entry in arena(learner, *sets)]
-    return round(sum(each["mean"] * each["n"] for each in found))
+    result = [entry["measures"]["wrong"] for entry in arena(learner, *sets)]
+    return round(sum(each["mean"] * each["n"] for each in result))
 
 
 def claims(experiment: str) -> list[Any]:
@@ -282,11 +282,11 @@ def test_claims_of_the_paper_have_figures_of_their_data() -> None:
 def test_tables_of_the_learners_are_those_of_their_data() -> None:
     page = (EVIDENCE / "learners.md").read_text("utf-8")
     for entry in arena("progress"):
-        found, of = entry["measures"], learned("progress", entry["point"]["set"])
-        state = [f"{found[name]['mean']:.2f}" for name in ("probe", "probe_components")]
+        result, of = entry["measures"], learned("progress", entry["point"]["set"])
+        state = [f"{result[name]['mean']:.2f}" for name in ("probe", "probe_components")]
         blocks = (
-            "{mean:.0f} [{low:.0f}, {high:.0f}]".format(**found["blocks"])
-            if found["blocks"]["n"]
+            "{mean:.0f} [{low:.0f}, {high:.0f}]".format(**result["blocks"])
+            if result["blocks"]["n"]
             else "-"
         )
         assert f"| {of[0]} of {of[1]} | 0 | {blocks} | {' | '.join(state)} |" in page

@@ -24,8 +24,8 @@ EASY = LearnerConfig(delta=1.0, eta_dot_window=3, min_variance=0.0, warm_up=0, t
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("final") / "run"
-    found = run_session(OscillatorySource(), EASY, folder, max_iterations=400, max_modules=1)
-    assert found.modules
+    result = run_session(OscillatorySource(), EASY, folder, max_iterations=400, max_modules=1)
+    assert result.modules
     return folder
 
 
@@ -67,9 +67,9 @@ def copied_log(folder: Path, *, drop: int = -1, final: bool = True) -> None:
 
 
 def test_a_run_is_whole_wherever_it_lies(copy: Path) -> None:
-    found = check_log(copy)
-    assert found.ok, found.problems
-    (note,) = found.notes
+    result = check_log(copy)
+    assert result.ok, result.problems
+    (note,) = result.notes
     assert note.startswith(f"{copy / 'run.rrd'} is not verified: write it again with cdmisfa view")
     assert check_log(copy / "run.mcap").ok
 
@@ -91,15 +91,15 @@ def test_a_run_is_whole_wherever_it_lies(copy: Path) -> None:
 )
 def test_what_was_changed_is_named(copy: Path, change: Callable[[Path], None], named: str) -> None:
     change(copy)
-    found = check_log(copy)
-    assert {Path(problem.where).name for problem in found.problems} == {named}
+    result = check_log(copy)
+    assert {Path(problem.where).name for problem in result.problems} == {named}
 
 
 def test_a_run_from_before_is_whole_and_said_to_prove_nothing(copy: Path) -> None:
     copied_log(copy, final=False)
-    found = check_log(copy)
-    assert found.ok
-    assert "no final record" in found.notes[-1]
+    result = check_log(copy)
+    assert result.ok
+    assert "no final record" in result.notes[-1]
     copied_log(copy, drop=17, final=False)
     problems = check_log(copy).problems
     assert {Path(problem.where).name for problem in problems} == {"run.mcap"}

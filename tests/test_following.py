@@ -23,10 +23,10 @@ def test_an_output_finds_the_truth_it_follows():
     rng = np.random.default_rng(0)
     truth = rng.standard_normal((500, 3))
     y = -2 * truth[:, 1] + 0.01 * rng.standard_normal(500)
-    found = best_fit(("a", "b", "c", "constant"), y, truth, np.ones(500))
-    assert (found.column, found.function) == (1, "b")
-    assert found.r > 0.99
-    np.testing.assert_allclose(found(truth[:, 1]), -2 * truth[:, 1], atol=0.01)
+    result = best_fit(("a", "b", "c", "constant"), y, truth, np.ones(500))
+    assert (result.column, result.function) == (1, "b")
+    assert result.r > 0.99
+    np.testing.assert_allclose(result(truth[:, 1]), -2 * truth[:, 1], atol=0.01)
     assert best_fit(("constant",), y, np.ones(500)) is None
 
 
@@ -43,10 +43,10 @@ def test_the_simplest_function_of_a_truth_is_named(function, said):
     """The oscillatory streams' slow features are sines of a phase, which itself they follow not."""
     phase = 2 * np.pi * np.arange(1000) / 500 % (2 * np.pi)
     noise = 0.05 * np.random.default_rng(0).standard_normal(1000)
-    found = best_fit(("angle",), function(phase) + noise, phase)
-    assert found.function == said
-    assert found.r > 0.99
-    np.testing.assert_allclose(found(phase), function(phase), atol=0.05)
+    result = best_fit(("angle",), function(phase) + noise, phase)
+    assert result.function == said
+    assert result.r > 0.99
+    np.testing.assert_allclose(result(phase), function(phase), atol=0.05)
 
 
 def heard(run: Path, module, spec) -> tuple[ModuleOutputs, np.ndarray, np.ndarray]:
@@ -98,8 +98,8 @@ def test_rows_kept_do_not_depend_on_how_they_came(sizes: list[int], most: int) -
     one.add(numbers, -numbers)
     for part in np.split(numbers, np.cumsum(sizes))[:-1]:
         parts.add(part, -part)
-    kept = parts.columns[0].tolist() if sizes else []
-    assert kept == one.columns[0].tolist() == (-one.columns[1]).tolist()
-    assert len(kept) == one.count if one.step == 1 else most // 4 <= len(kept) <= most
-    if len(kept) > 1:
-        assert max(np.diff([*kept, len(numbers)])) <= 3 * one.step
+    remaining = parts.columns[0].tolist() if sizes else []
+    assert remaining == one.columns[0].tolist() == (-one.columns[1]).tolist()
+    assert len(remaining) == one.count if one.step == 1 else most // 4 <= len(remaining) <= most
+    if len(remaining) > 1:
+        assert max(np.diff([*remaining, len(numbers)])) <= 3 * one.step

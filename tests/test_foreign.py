@@ -111,8 +111,8 @@ def test_a_bayer_pattern_becomes_gray(order: str, bits: int, big: bool) -> None:
     data = mosaic.tobytes()
     if bits == 16:
         data = (mosaic.astype(np.uint16) << 8 | 55).astype(">u2" if big else "<u2").tobytes()
-    found = raw_image(data, 7, 9, f"bayer_{order}{bits}", big_endian=big)
-    np.testing.assert_array_equal(found, np.asarray(Image.fromarray(COLOUR).convert("L"))[:3, :4])
+    result = raw_image(data, 7, 9, f"bayer_{order}{bits}", big_endian=big)
+    np.testing.assert_array_equal(result, np.asarray(Image.fromarray(COLOUR).convert("L"))[:3, :4])
 
 
 @pytest.mark.parametrize("kind", RAW)

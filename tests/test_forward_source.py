@@ -90,11 +90,11 @@ def test_a_resumed_recording_is_the_same_bytes(split: float | None, tmp_path: Pa
     """A source that has not come to the missing frames yet passes over those that are there."""
     whole, folder = tmp_path / "whole", tmp_path / "rec"
     record(Webcams(), whole, frames=FRAMES, split=split)
-    told: list[float] = []
+    reported: list[float] = []
     with pytest.raises(RecordingStoppedError):
         record(
-            Webcams(), folder, frames=FRAMES, split=split, progress=told.append,
-            stop=lambda: len(told) > 24,
+            Webcams(), folder, frames=FRAMES, split=split, progress=reported.append,
+            stop=lambda: len(reported) > 24,
         )  # fmt: skip
     late = Webcams()
     late.take_all(700)

@@ -98,9 +98,11 @@ def test_images_at_other_times_than_their_frames_are_said(
     assert line.startswith(f"{path}: /cam is read one image a frame, at an uneven rate ")
     assert said in line
     remedy = line.split("--align time --rate ")[1].split()[0]
-    kept = external(path, align="time", rate=float(remedy))
-    assert not kept.warnings
-    assert kept.frames / kept.spec.fps == pytest.approx((times[-1] - times[0]) / 1000, abs=0.05)
+    remaining = external(path, align="time", rate=float(remedy))
+    assert not remaining.warnings
+    assert remaining.frames / remaining.spec.fps == pytest.approx(
+        (times[-1] - times[0]) / 1000, abs=0.05
+    )
     assert not external(path, align="index").warnings
 
 
@@ -187,8 +189,8 @@ def test_a_conversion_with_gaps_is_resumed(tmp_path: Path, split: float | None) 
     right = write_log(tmp_path / "right.mcap", [400, *range(3000, 8000, STEP_MS), 12000])
 
     def converted(name: str, after: int, *, resume: bool = False) -> Path:
-        told: list[float] = []
-        how = {"stop": lambda: len(told) > after, "progress": told.append}
+        reported: list[float] = []
+        how = {"stop": lambda: len(reported) > after, "progress": reported.append}
         source = external([left, right], align="time", rate=50, start=0.4)
         with contextlib.closing(source), contextlib.suppress(RecordingStoppedError):
             record(source, tmp_path / name, split=split, resume=resume, **how)

@@ -54,23 +54,25 @@ def test_frames_held_out_are_not_learned_from_and_judged_as_batch_sfa_is(
     cdmisfa: Cdmisfa, log: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    found = cdmisfa("learn", log, *LEARN, "-o", run, "--no-rerun").json
+    result = cdmisfa("learn", log, *LEARN, "-o", run, "--no-rerun").json
     changed = values()
     changed[5400:] = changed[5400:][::-1, ::-1]
     other = cdmisfa("learn", table(tmp_path / "other.csv", changed), *LEARN).json
-    assert found["signals_sha256"] == other["signals_sha256"]
-    assert found["held_out"]["modules"] != other["held_out"]["modules"]
-    assert found["held_out"]["frames"] == [5400, 6000]
-    assert found["held_out"]["fitted"] == [0, found["frames"]]
-    (module,), (told,) = load_modules(run), found["held_out"]["modules"]
+    assert result["signals_sha256"] == other["signals_sha256"]
+    assert result["held_out"]["modules"] != other["held_out"]["modules"]
+    assert result["held_out"]["frames"] == [5400, 6000]
+    assert result["held_out"]["fitted"] == [0, result["frames"]]
+    (module,), (reported,) = load_modules(run), result["held_out"]["modules"]
     x = values()
-    weights = batch_sfa(x[: found["frames"]], 2)
-    batch = slowness((x[5400:] - x[: found["frames"]].mean(axis=0)) @ weights.T)
-    np.testing.assert_allclose(told["slowness"], slowness(module.transform(x[5400:])), rtol=1e-9)
-    np.testing.assert_allclose(told["of_batch"], batch, rtol=1e-6)
-    assert cdmisfa("info", run, "--json").json["held_out"] == found["held_out"]
+    weights = batch_sfa(x[: result["frames"]], 2)
+    batch = slowness((x[5400:] - x[: result["frames"]].mean(axis=0)) @ weights.T)
+    np.testing.assert_allclose(
+        reported["slowness"], slowness(module.transform(x[5400:])), rtol=1e-9
+    )
+    np.testing.assert_allclose(reported["of_batch"], batch, rtol=1e-6)
+    assert cdmisfa("info", run, "--json").json["held_out"] == result["held_out"]
     lines = cdmisfa("info", run).out.splitlines()
-    own, theirs = (", ".join(f"{v:.4f}" for v in told[k]) for k in ("slowness", "of_batch"))
+    own, theirs = (", ".join(f"{v:.4f}" for v in reported[k]) for k in ("slowness", "of_batch"))
     at = lines.index("slowness on the held-out frames 5400 to 5999:")
     assert lines[at + 1] == f"module 1 of log: {own}; batch SFA: {theirs}"
 
@@ -123,8 +125,8 @@ def test_slowness_in_pieces_is_that_of_all_frames(size: int) -> None:
     phi, mean, _ = batch_outputs(in_pieces(x, size), len(x), components=6, outputs=2)
     exact = slowness((x - x.mean(axis=0)) @ batch_sfa(x, 2).T)
     np.testing.assert_allclose(mean, x.mean(axis=0), rtol=1e-9, atol=1e-12)
-    (found,) = following_slowness(in_pieces(x, size), [(phi, mean)])
-    np.testing.assert_allclose(found, exact, rtol=1e-6)
+    (result,) = following_slowness(in_pieces(x, size), [(phi, mean)])
+    np.testing.assert_allclose(result, exact, rtol=1e-6)
 
 
 def test_no_step_leads_across_what_is_missing() -> None:
@@ -153,9 +155,9 @@ def test_damage_among_what_is_held_out_is_named_or_passed_over(tmp_path: Path) -
             with pytest.raises(LogExhaustedError, match="before 20 held-out"):
                 source.take(0, 1)
             if skip_damaged:
-                found = evaluate(source, [replace(learned, expansion="none")], components=2)
-                assert found is not None
-                assert found["frames"] == [100, 120]
+                result = evaluate(source, [replace(learned, expansion="none")], components=2)
+                assert result is not None
+                assert result["frames"] == [100, 120]
             else:
                 with pytest.raises(LogDamagedError, match=r"110\.png.*--skip-damaged"):
                     evaluate(source, [replace(learned, expansion="none")], components=2)

@@ -109,11 +109,11 @@ def test_damaged_modules_are_the_same_or_an_error(tmp_path: Path) -> None:
     for number in range(1500):
         path.write_bytes(damaged(whole, rng))
         try:
-            found = load_modules(path)
+            result = load_modules(path)
         except LogDamagedError:
             continue
         loaded += 1
-        assert [stated(module) for module in found] == first, number
+        assert [stated(module) for module in result] == first, number
     assert loaded < 750
 
 

@@ -31,8 +31,8 @@ def test_object_1_then_object_3(components: int) -> None:
     with open_recording(SAMPLE, loop=True) as source:
         learner = open_learner(config(components), source.spec, 2)
         learn_blocks(source, learner, max_iterations=icub.ITERATIONS, max_modules=2)
-    found = [(m.stream_index, "".join(map(str, m.policy))) for m in learner.modules]
-    assert found == list(icub.OPTIMAL)
+    result = [(m.stream_index, "".join(map(str, m.policy))) for m in learner.modules]
+    assert result == list(icub.OPTIMAL)
     fastest = [float(m.eta.max()) for m in learner.modules]
     assert fastest[0] < 0.11  # the toggle of object 1, and nothing of the noise beside it
     assert fastest[1] < 0.03

@@ -79,8 +79,8 @@ def test_each_oscillatory_stream_alone_gives_the_slow_feature_of_batch_sfa(strea
     y = project(sfa.phi, sfa.phi @ sfa.mean, np.tile(x, (4, 1)))
     assert slowness(y)[0] == pytest.approx([0.008, 0.006, 0.004][stream], rel=0.01)
     assert y.var() == pytest.approx(1.0, abs=0.1)
-    found, true = sfa.phi[0], batch_sfa(np.tile(x, (2, 1)), 1)[0]
-    assert abs(found @ true) / np.sqrt((found @ found) * (true @ true)) > 0.99
+    result, true = sfa.phi[0], batch_sfa(np.tile(x, (2, 1)), 1)[0]
+    assert abs(result @ true) / np.sqrt((result @ result) * (true @ true)) > 0.99
 
 
 @pytest.mark.parametrize("kernel", [STRICT, GRAM])
@@ -232,12 +232,12 @@ def test_any_numbers_are_learned_within_the_arrays_alike_by_both_modules(
     for place, value in values:
         frames.flat[place % frames.size] = value
     config = config_of(K, min(K, 1 + seed % 3))
-    found = []
+    result = []
     for module in both_modules():
         with module:
             a, xi = learn_in(kernel, config, freeze(frames), [n], (0,) if gap else ())
-            found.append([xi, *a])
-    assert_same_bits(*found)
+            result.append([xi, *a])
+    assert_same_bits(*result)
 
 
 @pytest.mark.parametrize("what", [0, 2])

@@ -82,8 +82,8 @@ def test_an_agent_thinks_as_the_reference_does(
         xi = np.where(rng.random(len(y)) < 0.1, np.nan, rng.random(len(y)) * 0.02)
         known_by, draws = int(rng.choice([NOVEL, NOVEL, NOVEL, 1, CONSTANT])), rng.random(3)
         expected, t = copied(known.agent), known.t
-        told = reference.think(expected, known.rules, known_by, xi, y, t, draws)
-        assert_told(known.think(xi, known_by, tuple(draws), y), told)
+        reported = reference.think(expected, known.rules, known_by, xi, y, t, draws)
+        assert_told(known.think(xi, known_by, tuple(draws), y), reported)
         assert_like(known.agent, expected)
         memory = known.memory["scale"]
         Q = reference.action_values(
@@ -105,8 +105,8 @@ def test_whatever_the_numbers_it_goes_on(
     for _ in range(15):
         y = np.where(rng.random(shape) < 0.3, rng.choice(special, shape), rng.random(shape))
         xi = np.where(rng.random(len(y)) < 0.5, rng.choice(special, len(y)), rng.random(len(y)))
-        told = known.think(xi, NOVEL, tuple(rng.random(3)), y)
-        assert 0 <= told["next_stream"] < len(known.agent.policy)
+        reported = known.think(xi, NOVEL, tuple(rng.random(3)), y)
+        assert 0 <= reported["next_stream"] < len(known.agent.policy)
         assert set(known.agent.policy) <= {0, 1}
 
 
@@ -132,9 +132,9 @@ def test_it_recognises_what_the_reference_does(
     mean[: M // 2] += 0.01
     frozen = Frozen(phi, offset, mean, band, centres, counts)
     expected = reference.recognise(known.agent, known.rules, frozen, shown, x, PIXEL)
-    found = known.recognise(frozen, shown, shown)
-    assert found[0] == expected[0]
-    for one, two in zip(found[1:], expected[1:], strict=True):
+    result = known.recognise(frozen, shown, shown)
+    assert result[0] == expected[0]
+    for one, two in zip(result[1:], expected[1:], strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12)
 
 
@@ -157,16 +157,16 @@ def test_a_learner_is_the_reference_step_by_step(algorithm: str, outputs: int) -
             gap = reference.has_gap(agent.memory, block.stream, block.t)
             xi = feature.update(x, gap)
             y = (x - feature.mean) @ feature.phi.T
-        told = reference.think(agent, copy.rules, gate[0], xi, y, block.t, draws)
+        reported = reference.think(agent, copy.rules, gate[0], xi, y, block.t, draws)
         before = len(learner.modules)
         signals = learner.step(block)
-        assert_told({name: getattr(signals, name) for name in told}, told)
-        for found, expected in zip(
+        assert_told({name: getattr(signals, name) for name in reported}, reported)
+        for result, expected in zip(
             (signals.y_frozen, signals.eta_inst_frozen, signals.roc_error_frozen, signals.y),
             (*gate[1:], y),
             strict=True,
         ):
-            np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
+            np.testing.assert_allclose(result, expected, rtol=1e-7, atol=1e-9)
         if len(learner.modules) == before:
             assert_like(learner.agent, agent)
     assert learner.modules, "nothing was learned: the comparison would not cover the gate"
@@ -197,15 +197,15 @@ def test_learners_have_the_same_bits_on_every_processor(config: LearnerConfig) -
         rng = np.random.default_rng(0)
         frames = freeze(rng.integers(0, 256, (5, config.tau, 3, 7), dtype=np.uint8))
         spec = SourceSpec(spec.streams, (3, 7), "uint8")
-    found = []
+    result = []
     for module in both_modules():
         with module:
-            found.append(digest(config, spec, frames))
-    assert found[0] == found[1]
+            result.append(digest(config, spec, frames))
+    assert result[0] == result[1]
 
 
 def test_many_streams_and_special_numbers_have_the_same_bits_on_every_processor() -> None:
-    found = []
+    result = []
     for module in both_modules():
         with module:
             known, rng = (
@@ -218,8 +218,8 @@ def test_many_streams_and_special_numbers_have_the_same_bits_on_every_processor(
                 known.think(rng.random(20), NOVEL, tuple(rng.random(3)), y)
                 if k == 150:
                     finite = known.values(), *copied(known.agent)[1:]
-            found.append((*finite, known.values(), *known.agent[1:]))
-    assert_same_bits(*found)
+            result.append((*finite, known.values(), *known.agent[1:]))
+    assert_same_bits(*result)
 
 
 DAMAGES = [("stream", -1), ("stream", 3), ("stream", 2**62), ("last_stream", -2)]

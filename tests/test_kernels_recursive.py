@@ -66,7 +66,7 @@ def test_equals_the_reference(
         expected = copied(sfa.state)
         values = frames * (1 / 255) if frames.dtype == np.uint8 else frames
         change = reference.update(expected, values, gap, sfa.window)
-        found = sfa.update(frames, gap)
+        result = sfa.update(frames, gap)
         assert sfa.state.counts.tolist() == expected.counts.tolist()
         k = expected.counts[0]
         assert sfa.mean == pytest.approx(expected.mean, abs=1e-12)
@@ -86,7 +86,7 @@ def test_equals_the_reference(
         size = np.abs(weights).max(initial=0.0)
         weights *= turned(weights, expected.weights[:, :k])
         assert weights == pytest.approx(expected.weights[:, :k], abs=1e-3 * size)
-        assert found == pytest.approx(change, abs=1e-3, nan_ok=True)
+        assert result == pytest.approx(change, abs=1e-3, nan_ok=True)
 
 
 def test_outputs_keep_their_signs() -> None:

@@ -13,11 +13,11 @@ from cdmisfa import kernels
 
 def fused(x: float, y: np.ndarray, z: np.ndarray) -> list[np.ndarray]:
     """(n,) of x y + z by both modules: y and z are parts of a product of matrices."""
-    found = []
+    result = []
     for module in both_modules():
         with module, np.errstate(all="ignore"):
-            found.append(kernels.multiply(np.array([[1.0, x]]), np.stack([z, y]))[0])
-    return found
+            result.append(kernels.multiply(np.array([[1.0, x]]), np.stack([z, y]))[0])
+    return result
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -46,5 +46,5 @@ def test_what_is_exact_is_rounded_once() -> None:
     rng = np.random.default_rng(0)
     for x, y, z in rng.standard_normal((200, 3)) * 10.0 ** rng.integers(-9, 9, (200, 3)):
         exact = float(Fraction(x) * Fraction(y) + Fraction(z))
-        for found in fused(x, np.full(5, y), np.full(5, z)):
-            assert found.tolist() == [exact] * 5
+        for result in fused(x, np.full(5, y), np.full(5, z)):
+            assert result.tolist() == [exact] * 5

@@ -87,8 +87,8 @@ def test_numbers_come_back_as_they_were_exported(cdmisfa: Cdmisfa, tmp_path: Pat
     fields = [f"observation.{view}" for view in views]
     with external(out, fields=fields) as source:
         assert source.pauses == {"data": [(60, 60 + PAUSE)]}
-        found = [block.frames for block in source.take_all(101 + PAUSE)]
-    for block, numbers in zip(found, expected, strict=True):
+        result = [block.frames for block in source.take_all(101 + PAUSE)]
+    for block, numbers in zip(result, expected, strict=True):
         np.testing.assert_array_equal(block, numbers.astype(np.float32))
     with pytest.raises(UsageError, match="no field state; choose of observation"):
         external(out, fields=["state"])

@@ -32,18 +32,18 @@ def feed(view, spec, iterations=30, tau=40):
 @pytest.fixture
 def sent(monkeypatch):
     """What viewers are handed, in the order in which it is: the values of each line by its path."""
-    found = {}
+    result = {}
 
     def keep(self, path, at, columns):
         (values, *_) = columns
         if path.startswith(("signals/", "streams/")):
-            found.setdefault(path, []).append(np.concatenate(values.as_arrow_array().to_pylist()))
+            result.setdefault(path, []).append(np.concatenate(values.as_arrow_array().to_pylist()))
         else:
-            found.setdefault(path, [])
+            result.setdefault(path, [])
 
     monkeypatch.setattr("replay.view.writer.ViewWriter.send", keep)
     monkeypatch.setattr(live, "MOST_BLOCKS", 7)
-    return found
+    return result
 
 
 @pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])

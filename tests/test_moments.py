@@ -84,12 +84,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     must("record", "oscillatory", "-o", folder / "log", "--frames", 1500)
     for algorithm in OF:
         for name, source in (("live", "oscillatory"), ("loop", folder / "log")):
-            told = (*words(algorithm), *(["--loop"] if name == "loop" else []), *LEARN)
+            reported = (*words(algorithm), *(["--loop"] if name == "loop" else []), *LEARN)
             for out, stops in ((name, (ENDS,)), (f"{name}-resumed", (17, 23, 64, ENDS))):
                 for stop in stops:
                     resume = () if stop == stops[0] else ("--resume",)
                     where = ("-o", folder / f"{algorithm}-{out}", *resume)
-                    must("learn", source, *told, *where, "--max-iterations", stop)
+                    must("learn", source, *reported, *where, "--max-iterations", stop)
     defaults["keyframes"] = None
     return folder
 
@@ -100,8 +100,8 @@ def straight() -> Callable[[str, int], Learner]:
 
     def after(algorithm: str, iterations: int) -> Learner:
         chosen = (f"learner.algorithm={algorithm}", *OF[algorithm])
-        source, told = open_source(["oscillatory"], settings=chosen, seed=3)
-        learner = open_learner(told.learner, source.spec, 3)
+        source, reported = open_source(["oscillatory"], settings=chosen, seed=3)
+        learner = open_learner(reported.learner, source.spec, 3)
         for _ in range(iterations):
             learner.step(source.take(learner.stream, learner.tau))
         return learner
@@ -119,9 +119,9 @@ def straight() -> Callable[[str, int], Learner]:
 def test_any_moment_is_that_of_the_straight_run(
     place: Path, straight: Callable[[str, int], Learner], algorithm: str, name: str, k: int
 ) -> None:
-    found = Run(place / f"{algorithm}-{name}").at(k)
-    assert found.iteration == k
-    same(found, straight(algorithm, k))
+    result = Run(place / f"{algorithm}-{name}").at(k)
+    assert result.iteration == k
+    same(result, straight(algorithm, k))
 
 
 @pytest.mark.parametrize("algorithm", OF)
@@ -198,8 +198,8 @@ def test_a_keyframe_that_lies_is_found_out(
 
     monkeypatch.setattr("replay.runs.keyframes.encode_keyframe", kept)
     keyframes_every(10)
-    told = (*words("2.0"), *LEARN, "--max-iterations", 30)
-    assert cdmisfa("learn", "oscillatory", *told, "-o", tmp_path / "run").code == 0
+    reported = (*words("2.0"), *LEARN, "--max-iterations", 30)
+    assert cdmisfa("learn", "oscillatory", *reported, "-o", tmp_path / "run").code == 0
     checked = cdmisfa("check", tmp_path / "run")
     assert checked.code == 4
     assert checked.out.startswith("iteration 19: keyframe abstraction.v[3, 1] differs: ")
@@ -213,29 +213,30 @@ def test_without_its_source_a_run_has_its_keyframes(
     keyframes_every(10)
     log, run = tmp_path / "log", tmp_path / "run"
     cdmisfa("record", "oscillatory", "-o", log, "--frames", 2000)
-    told = (*words("2.0"), *LEARN, "--max-iterations", 25)
-    assert cdmisfa("learn", log, *told, "-o", run).code == 0
+    reported = (*words("2.0"), *LEARN, "--max-iterations", 25)
+    assert cdmisfa("learn", log, *reported, "-o", run).code == 0
     log.rename(tmp_path / "moved")
     assert cdmisfa("inspect", run, "--iteration", 20, "--json").json["t"] == 800
-    gone = cdmisfa("inspect", run, "--iteration", 21)
-    assert gone.code == 2
-    assert len(gone.err.splitlines()) == 1
-    assert all(word in gone.err for word in ("no such file", "--source", "20 iterations"))
+    removed = cdmisfa("inspect", run, "--iteration", 21)
+    assert removed.code == 2
+    assert len(removed.err.splitlines()) == 1
+    assert all(word in removed.err for word in ("no such file", "--source", "20 iterations"))
     assert cdmisfa("inspect", run, "--iteration", 21, "--source", tmp_path / "moved").code == 0
 
 
 def test_at_prints_all_of_the_memory(place: Path, cdmisfa: Cdmisfa) -> None:
     run = place / "2.0-live"
-    found = cdmisfa("inspect", run, "--iteration", 50, "--json").json
+    result = cdmisfa("inspect", run, "--iteration", 50, "--json").json
     learner = Run(run).at(50)
-    assert [m["iteration"] for m in found["modules"]] == [8, 42]
-    assert found["arrays"].keys() == learner.state.arrays.keys()
+    assert [m["iteration"] for m in result["modules"]] == [8, 42]
+    assert result["arrays"].keys() == learner.state.arrays.keys()
     for name, array in learner.state.arrays.items():
         if not array.dtype.names:
-            printed = np.array(found["arrays"][name], float).reshape(array.shape)
+            printed = np.array(result["arrays"][name], float).reshape(array.shape)
             assert np.array_equal(printed, array, equal_nan=True), name
     assert (
-        f"memory: {len(found['arrays'])} arrays, " in cdmisfa("inspect", run, "--iteration", 50).out
+        f"memory: {len(result['arrays'])} arrays, "
+        in cdmisfa("inspect", run, "--iteration", 50).out
     )
 
 
@@ -246,9 +247,9 @@ def test_a_fork_goes_on_as_told(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -
     )
     assert done.code == 0, done.err
     assert done.json["iterations"] == ENDS
-    found = first_difference(parent, fork)
-    assert found is not None
-    assert 30 <= found.iteration < 42
+    result = first_difference(parent, fork)
+    assert result is not None
+    assert 30 <= result.iteration < 42
     about = json.loads((fork / "run.json").read_text())["fork"]
     assert (about["at"], about["changed"]) == (30, {"learner.nu": [0.05, 0.02]})
     assert (fork / about["parent"]).resolve() == parent.resolve()
@@ -284,10 +285,10 @@ def test_forks_of_forks_are_resumed_and_checked(
 ) -> None:
     keyframes_every(15)
     one, two, straight = (tmp_path / n for n in ("one", "two", "straight"))
-    told = ("--no-rerun",)
-    fork = ("fork", place / parent, "--iteration", at, "--set", key, *told, "-o", one)
+    reported = ("--no-rerun",)
+    fork = ("fork", place / parent, "--iteration", at, "--set", key, *reported, "-o", one)
     assert cdmisfa(*fork, "--max-iterations", 60).code == 0
-    again = ("fork", one, "--iteration", 52, "--seed", 9, *told)
+    again = ("fork", one, "--iteration", 52, "--seed", 9, *reported)
     assert cdmisfa(*again, "-o", two, "--max-iterations", 70).code == 0
     assert cdmisfa(*again, "-o", straight, "--max-iterations", 110).code == 0
     resumed = cdmisfa("learn", "--resume", "-o", two, "--max-iterations", 110, "--no-rerun")
@@ -295,10 +296,10 @@ def test_forks_of_forks_are_resumed_and_checked(
     assert first_difference(two, straight) is None
     assert check_run(two).difference is None
     assert check_run(two, start=40, stop=100).difference is None
-    keyframe, found = read_keyframe(two, 52), first_difference(one, two)
+    keyframe, result = read_keyframe(two, 52), first_difference(one, two)
     assert keyframe is not None
-    assert found is not None
-    assert (keyframe.iteration, found.iteration >= 52) == (52, True)
+    assert result is not None
+    assert (keyframe.iteration, result.iteration >= 52) == (52, True)
 
 
 SAME, OTHER = "same results, at other iterations", "different results"

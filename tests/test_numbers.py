@@ -76,8 +76,8 @@ def test_what_is_not_finite_is_refused_or_kept_in_a_range() -> None:
     ranges = {"ranges": [0.5, float("inf"), float("nan"), 50.0, -1.0]}
     with pytest.raises(UsageError, match=r"holds inf at index 1.* such as --set input.range"):
         numbers_of([Field("ranges")], ranges, None)
-    kept = numbers_of([Field("ranges")], ranges, (0.1, 10.0))
-    assert kept.tolist() == [0.5, 0.1, 0.1, 10.0, 0.1]
+    remaining = numbers_of([Field("ranges")], ranges, (0.1, 10.0))
+    assert remaining.tolist() == [0.5, 0.1, 0.1, 10.0, 0.1]
 
 
 def angles(count: int = COUNT) -> np.ndarray:

@@ -43,9 +43,9 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
     assert len(view.blueprints) == 1
     for name, signals in zip((r"1_a\/run", r"2_b\/run", "3_c"), records, strict=True):
         expected = [s.epsilon for s in signals]
-        found = view.rows[f"/compare/{name}/epsilon"]
-        assert found["iteration"] == list(range(12))
-        np.testing.assert_array_equal(scalars(found)[:, 0], expected)
+        result = view.rows[f"/compare/{name}/epsilon"]
+        assert result["iteration"] == list(range(12))
+        np.testing.assert_array_equal(scalars(result)[:, 0], expected)
         powers = scalars(view.rows[f"/compare/{name}/eta_dot"])[:, 0]
         np.testing.assert_allclose(10**powers, [np.ravel(s.eta_dot)[0] for s in signals])
     with pytest.raises(UsageError, match="--force"):

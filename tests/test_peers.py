@@ -64,10 +64,10 @@ def test_others_readers_see_every_message(recording: Path, reader: str) -> None:
     library = pytest.importorskip(reader)
     with recording.open("rb") as file:
         if reader == "mcap":
-            found = make_reader(file, validate_crcs=True).iter_messages()
+            result = make_reader(file, validate_crcs=True).iter_messages()
         else:
-            found = library.read_message(file, validate_crc=True)
-        theirs = [(channel.topic, m.log_time, bytes(m.data)) for _, channel, m in found]
+            result = library.read_message(file, validate_crc=True)
+        theirs = [(channel.topic, m.log_time, bytes(m.data)) for _, channel, m in result]
     with LogReader(recording) as ours:
         assert theirs == [(m.channel.topic, m.log_time, m.data) for m in ours.messages()]
     np.testing.assert_array_equal([pixels(data) for _, _, data in theirs], EXPECTED)

@@ -259,12 +259,12 @@ def test_rules_choose_what_they_are_for(
 
 
 def test_eight_outputs_are_decided_as_one_and_marked(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    names, told = ("noise", "swing", "stroll"), ProgressConfig(components=8)
+    names, reported = ("noise", "swing", "stroll"), ProgressConfig(components=8)
     one = run_session(
         MovingPictures(*names), ProgressConfig(components=8, outputs=1), tmp_path / "one"
     )
-    eight = run_session(MovingPictures(*names), told, tmp_path / "run", rerun=False)
-    assert told.outputs == 8
+    eight = run_session(MovingPictures(*names), reported, tmp_path / "run", rerun=False)
+    assert reported.outputs == 8
     assert [(m.stream, m.iteration) for m in eight.modules] == [
         (m.stream, m.iteration) for m in one.modules
     ]
@@ -284,8 +284,8 @@ def test_eight_outputs_are_decided_as_one_and_marked(cdmisfa: Cdmisfa, tmp_path:
     said = cdmisfa("info", tmp_path / "run").out
     assert re.search(rf"{stroll.index} +stroll +\d+ +{stroll.eta[0]:.4f}, \(", said)
     assert "in brackets: not slow on new frames" in said
-    found = cdmisfa("info", tmp_path / "run", "--json").json["modules"]
-    assert [one["slow"] for one in found] == [m.slow.tolist() for m in opened]
+    result = cdmisfa("info", tmp_path / "run", "--json").json["modules"]
+    assert [one["slow"] for one in result] == [m.slow.tolist() for m in opened]
 
 
 @pytest.mark.parametrize("background", [0, 40])

@@ -117,9 +117,9 @@ def test_what_cannot_be_learned_from_is_one_line(
     given: Any, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with pytest.raises(CdmisfaError, match=said) as found:
+    with pytest.raises(CdmisfaError, match=said) as result:
         learn(given)
-    assert "\n" not in str(found.value)
+    assert "\n" not in str(result.value)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -149,9 +149,11 @@ def test_a_run_gives_what_its_log_holds(tmp_path: Path) -> None:
     again = Run(tmp_path / "run")
     assert again.signals["reward"].tolist() == pytest.approx(rewards, nan_ok=True)
     for ask in (again.signals.__getitem__, again.signals.to_arrow):
-        with pytest.raises(UsageError, match=r"^no signal 'rewards': did you mean reward") as found:
+        with pytest.raises(
+            UsageError, match=r"^no signal 'rewards': did you mean reward"
+        ) as result:
             ask("rewards")
-        assert isinstance(found.value, KeyError)
+        assert isinstance(result.value, KeyError)
     assert "rewards" not in again.signals
     table = again.signals.to_arrow("iteration", "reward", "eta")
     assert table.num_rows == len(rewards)

@@ -34,14 +34,14 @@ def written(times: Iterable[int], **options: Any) -> bytes:
 
 def read(path: Path, topics: list[str] | None = None) -> list[tuple[str, int, int, int, bytes]]:
     with LogReader(path) as reader:
-        found = [
+        result = [
             (m.channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
             for m in reader.messages(topics)
         ]
         assert reader.complete
         assert not reader.missing
         assert not reader.problems
-        return found
+        return result
 
 
 @given(

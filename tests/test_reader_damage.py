@@ -53,19 +53,19 @@ TRUE = {("/ab"[0] + "ab"[i % 2], i, payload(i)) for i in range(MESSAGES)}
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_flipped_bit_is_never_believed(tmp_path: Path, kind: str) -> None:
     raw, path = KINDS[kind], tmp_path / "log.mcap"
-    told = 0
+    reported = 0
     for at in range(0, len(raw), 13):
         path.write_bytes(raw[:at] + bytes([raw[at] ^ 1 << at % 8]) + raw[at + 1 :])
         try:
-            found = read_all(path)
+            result = read_all(path)
         except LogDamagedError as error:
-            told += str(error).startswith(f"{path}: ")
+            reported += str(error).startswith(f"{path}: ")
             continue
         with LogReader(path) as reader:
             whole = reader.complete
-        assert {(t, d) for _, t, d in found} <= {(t, d) for _, t, d in TRUE}
-        assert len(found) == MESSAGES or not whole
-    assert told > len(raw) / 26
+        assert {(t, d) for _, t, d in result} <= {(t, d) for _, t, d in TRUE}
+        assert len(result) == MESSAGES or not whole
+    assert reported > len(raw) / 26
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -82,14 +82,14 @@ def test_a_cut_leaves_everything_before_it(tmp_path: Path, kind: str) -> None:
     for size in range(8, len(raw), 19):
         path.write_bytes(raw[:size])
         with LogReader(path) as reader:
-            found = [(m.channel.topic, m.log_time, m.data) for m in reader.messages()]
+            result = [(m.channel.topic, m.log_time, m.data) for m in reader.messages()]
             assert not reader.complete
             assert reader.missing
-        assert found == sorted(TRUE, key=lambda m: m[1])[: len(found)]
-        assert len(found) >= before
-        before = len(found)
+        assert result == sorted(TRUE, key=lambda m: m[1])[: len(result)]
+        assert len(result) >= before
+        before = len(result)
         if expected_when_known:
-            assert len(found) == sum(count for end, count in ends if end <= size)
+            assert len(result) == sum(count for end, count in ends if end <= size)
     assert before == MESSAGES
 
 

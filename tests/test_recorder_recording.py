@@ -137,13 +137,13 @@ def interrupt(folder: Path, number: int) -> tuple[int, int]:
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_what_a_signal_leaves_is_resumed_to_the_same_bytes(oscillatory, tmp_path, number):
     folder = tmp_path / "a"
-    code, told = interrupt(folder, number)
+    code, reported = interrupt(folder, number)
     killed = number == signal.SIGKILL
     assert code == (-number if killed else 128 + number)
     assert not list(folder.glob("*.mcap"))
     for view in STREAMS:  # of a kill at most a second is lost
         held = whole_frames(partial_path(folder / f"{view}.mcap"), view)
-        assert held >= told - (50 if killed else 0)
+        assert held >= reported - (50 if killed else 0)
     noted = json.loads((folder / RECORDING).read_text())
     assert noted["frames"] == dict.fromkeys(STREAMS, 1000000)
     files = record_scene("oscillatory", folder, frames=3000, resume=True)
@@ -152,35 +152,35 @@ def test_what_a_signal_leaves_is_resumed_to_the_same_bytes(oscillatory, tmp_path
 
 
 def test_a_stopped_recording_knows_how_long_it_was_to_be(oscillatory, tmp_path):
-    folder, told = tmp_path / "a", []
+    folder, reported = tmp_path / "a", []
     before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
 
     def stop() -> bool:
         assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
-        return len(told) in (9, 20)
+        return len(reported) in (9, 20)
 
     why = "a is not finished: continue with --resume"
     with pytest.raises(RecordingStoppedError, match=why):
-        record_scene("oscillatory", folder, frames=3000, progress=told.append, stop=stop)
+        record_scene("oscillatory", folder, frames=3000, progress=reported.append, stop=stop)
     left = [whole_frames(partial_path(folder / f"{view}.mcap"), view) for view in STREAMS]
     assert left == [192] * 3
-    options = {"views": ["x2"], "progress": told.append, "stop": stop}
+    options = {"views": ["x2"], "progress": reported.append, "stop": stop}
     with pytest.raises(RecordingStoppedError, match=why):
         record_scene("oscillatory", folder, resume=True, **options)
-    record_scene("oscillatory", folder, resume=True, progress=told.append)
-    assert told[-1] == 3000
+    record_scene("oscillatory", folder, resume=True, progress=reported.append)
+    assert reported[-1] == 3000
     assert contents(folder) == contents(oscillatory)
 
 
 @pytest.mark.parametrize("split", [None, 3.0])
 def test_a_complete_recording_is_left_as_it_is(tmp_path, split):
-    folder, told = tmp_path / "a", []
+    folder, reported = tmp_path / "a", []
     first = record_scene("oscillatory", folder, frames=400, split=split)
     before = {path.name: path.stat().st_ino for path in folder.iterdir()}
-    again = {"split": split, "resume": True, "progress": told.append}
+    again = {"split": split, "resume": True, "progress": reported.append}
     assert record_scene("oscillatory", folder, frames=400, **again) == first
     assert record_scene("oscillatory", folder, **again) == first
-    assert told == []
+    assert reported == []
     assert {path.name: path.stat().st_ino for path in folder.iterdir()} == before
     first[-1].file.rename(partial_path(first[-1].file))
     assert record_scene("oscillatory", folder, frames=400, **again) == first

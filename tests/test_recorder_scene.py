@@ -48,9 +48,9 @@ def test_objects_are_where_the_truth_says(recorded):
     with open_recording(recorded) as source:
         truth = source.take(0, FRAMES).truth
     scenery = scenery_of(section_table(IcubConfig()))
-    told = messages(recorded / "right.mcap", "/scene")
-    assert len(told) == FRAMES
-    for t, (_, data) in enumerate(told):
+    reported = messages(recorded / "right.mcap", "/scene")
+    assert len(reported) == FRAMES
+    for t, (_, data) in enumerate(reported):
         entities = SceneUpdate_pb2.SceneUpdate.FromString(data).entities
         assert [e.id for e in entities] == ["table", "box", "cylinder", "ball"]
         things = [scenery.table, *scenery.objects]

@@ -34,11 +34,11 @@ SMALL = IcubConfig(
 def seen_in(scene: IcubConfig, *blocks: tuple[int, int, int]) -> list[np.ndarray]:
     """Frames of (view, first, n) of a scene."""
     with IcubSource(scene, RecordConfig()) as source:
-        found = []
+        result = []
         for view, first, n in blocks:
             source.seek(first)
-            found.append(source.take(view, n).frames)
-    return found
+            result.append(source.take(view, n).frames)
+    return result
 
 
 def test_what_came_later_is_off_and_unstated_in_the_plain_scene():

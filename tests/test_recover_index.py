@@ -74,10 +74,10 @@ def test_what_stands_twice_is_made_again(tmp_path: Path, kind: str) -> None:
     for number in range(40):
         bits = [8 * rng.choice(places) + rng.randrange(8) for _ in range(1 + number % 3)]
         path.write_bytes(flipped(raw, *bits))
-        found = recover_log(path, out, force=True)
-        assert (messages(out), found.lost) == (true, ()), bits
-        assert found.mended or len(set(bits)) < len(bits), bits
-        assert [channel.lost for channel in found.channels] == [0, 0, 0]
+        result = recover_log(path, out, force=True)
+        assert (messages(out), result.lost) == (true, ()), bits
+        assert result.mended or len(set(bits)) < len(bits), bits
+        assert [channel.lost for channel in result.channels] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("kind", LOGS)
@@ -92,8 +92,8 @@ def test_no_message_is_lost_where_the_summary_is_damaged_too(tmp_path: Path, kin
         bits = [8 * rng.choice(indexes) + rng.randrange(8) for _ in range(number % 2)]
         broken = flipped(raw, *bits, 8 * rng.randrange(end, len(raw)) + rng.randrange(8))
         path.write_bytes((broken, raw[: rng.randrange(end, len(raw))])[number % 5 == 4])
-        found = recover_log(path, out, force=True)
-        assert (messages(out), found.lost) == (true, ()), bits
+        result = recover_log(path, out, force=True)
+        assert (messages(out), result.lost) == (true, ()), bits
 
 
 def test_a_damaged_chunk_costs_itself_whatever_else_is_damaged(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_a_damaged_chunk_costs_itself_whatever_else_is_damaged(tmp_path: Path) -
     for chunk in segments:
         bits = [8 * rng.choice(places) + rng.randrange(8) for _ in range(4)]
         path.write_bytes(flipped(raw, *bits, 8 * (chunk.data_offset + chunk.stored // 2)))
-        found = recover_log(path, out, force=True)
+        result = recover_log(path, out, force=True)
         assert messages(out) == [m for m in true if not chunk.start <= m[1] <= chunk.end]
-        assert any(chunk.name in problem.where for problem in found.lost)
-        assert sum(c.lost or 0 for c in found.channels) == MESSAGES - len(messages(out))
+        assert any(chunk.name in problem.where for problem in result.lost)
+        assert sum(c.lost or 0 for c in result.channels) == MESSAGES - len(messages(out))

@@ -104,10 +104,10 @@ def test_any_rank_and_any_block_length(rank: int, n: int, seed: int) -> None:
     sfa = RecursiveFeature(9, 16, outputs=3)
     for start in range(0, len(frames), n):
         sfa.update(frames[start : start + n])
-    kept = sfa.state.counts[0]
-    assert kept <= rank
-    basis = sfa.state.basis[:kept]
-    assert np.allclose(basis @ basis.T, np.eye(kept), atol=1e-6)
+    remaining = sfa.state.counts[0]
+    assert remaining <= rank
+    basis = sfa.state.basis[:remaining]
+    assert np.allclose(basis @ basis.T, np.eye(remaining), atol=1e-6)
     assert np.isfinite(sfa.phi).all()
 
 

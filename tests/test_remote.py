@@ -54,9 +54,9 @@ def test_damage_is_found_and_named_by_its_url(
     data[len(data) // 2] ^= 1
     web.files["/broken.mcap"] = bytes(data)
     for url in map(web.url, web.files):
-        found = cdmisfa("verify", url, "--json")
-        assert (found.code, found.json["files"][0]["file"]) == (3, url)
-        assert found.json["problems"][0]["where"].startswith(url)
+        result = cdmisfa("verify", url, "--json")
+        assert (result.code, result.json["files"][0]["file"]) == (3, url)
+        assert result.json["problems"][0]["where"].startswith(url)
         saved = cdmisfa("recover", url, "-o", tmp_path / "saved.mcap", "--force", "--json")
         assert (saved.code, url in saved.json["lost"][0]["where"]) == (3, True)
 

@@ -56,8 +56,8 @@ def tip(browser: Any, key: str) -> str:
 
 def test_pointing_shows_the_frame_that_was_watched(browser: Any, report: Path) -> None:
     shown(browser, report)
-    frames, found = Page(report).frames["timeline"], library.Run(report.parent)
-    every = found.frames()
+    frames, result = Page(report).frames["timeline"], library.Run(report.parent)
+    every = result.frames()
     box = browser.execute_script(
         "const a = document.querySelector('[data-frames=timeline] .area');"
         "a.scrollIntoView({block: 'center'}); const r = a.getBoundingClientRect();"
@@ -119,9 +119,9 @@ def test_everybody_can_read_it(
         across = "return document.documentElement.scrollWidth"
         assert browser.execute_script(across) <= width
         browser.execute_script(rules)
-        found = browser.execute_async_script("axe.run().then(arguments[0])")
-        assert [(v["id"], v["nodes"][0]["html"]) for v in found["violations"]] == []
-        assert len(found["passes"]) > 10
+        result = browser.execute_async_script("axe.run().then(arguments[0])")
+        assert [(v["id"], v["nodes"][0]["html"]) for v in result["violations"]] == []
+        assert len(result["passes"]) > 10
 
 
 def test_it_loads_nothing_and_runs_no_other_script(browser: Any, report: Path) -> None:

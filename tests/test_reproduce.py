@@ -42,9 +42,9 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def judged(experiment: Experiment, trials: list[Trial]) -> Findings:
-    found = Findings()
-    experiment.evaluate(trials, found)
-    return found
+    result = Findings()
+    experiment.evaluate(trials, result)
+    return result
 
 
 @pytest.mark.parametrize("name", ["oscillatory", "five", "stability"])
@@ -125,10 +125,10 @@ def trials_with(midpoints: dict[float, float], spread: float = 0.0) -> list[Tria
 def test_the_order_of_table_1_is_judged_where_enough_was_rewarded(
     midpoints: dict[float, float], holds: list[bool]
 ) -> None:
-    found = judged(nonstationary.NonStationary(), trials_with(midpoints))
-    assert [claim["holds"] for claim in found.claims] == holds
-    assert "Above 0.86 they are fewer than 30" in found.notes[0]
-    (table,) = found.tables
+    result = judged(nonstationary.NonStationary(), trials_with(midpoints))
+    assert [claim["holds"] for claim in result.claims] == holds
+    assert "Above 0.86 they are fewer than 30" in result.notes[0]
+    (table,) = result.tables
     above = [row[2] == "above 0.86" for row in table["rows"]]
     assert above == [midpoint > 0.86 for midpoint in midpoints.values()]
 

@@ -150,8 +150,8 @@ def test_kill_9_anywhere_loses_nothing(whole: Path, tmp_path: Path) -> None:
     def reached(iteration: int) -> Callable[[], bool]:
         def has() -> bool:
             with contextlib.suppress(CdmisfaError):  # the log is just being begun
-                found = read_keyframe(out)
-                return found is not None and found.iteration >= iteration
+                actual = read_keyframe(out)
+                return actual is not None and actual.iteration >= iteration
             return False
 
         return has
@@ -307,8 +307,8 @@ class TestWithoutItsSource:
     ) -> None:
         run = tmp_path / "a" / "run"
         words = (oscillatory_recording, *self.WORDS)
-        begun = cdmisfa("learn", *words, "-o", run, "--max-iterations", 6)
-        assert begun.code == 0, begun.err
+        started = cdmisfa("learn", *words, "-o", run, "--max-iterations", 6)
+        assert started.code == 0, started.err
         monkeypatch.chdir(run.parent)
         gone_on = cdmisfa(
             "learn", "--resume", "-o", "run", "--max-iterations", 30, "--no-rerun", "--json"

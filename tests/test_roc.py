@@ -44,11 +44,11 @@ def test_a_block_is_known_to_the_first_module_that_is_near_under_its_label() -> 
     stack, seen = np.stack([centres, centres]), np.stack([counts, counts])
     outputs = np.stack([block(7.0), block(1.05)])
     for threshold, known_by in ((0.1, 2), (10.0, 1), (0.01, 0)):
-        found, error = roc.known_to(stack, seen, 0, outputs, threshold)
-        assert found == known_by
+        result, error = roc.known_to(stack, seen, 0, outputs, threshold)
+        assert result == known_by
         np.testing.assert_allclose(error, [6.0, 0.05])
-    found, error = roc.known_to(stack, seen, 1, outputs, 0.1)
-    assert found == 0
+    result, error = roc.known_to(stack, seen, 1, outputs, 0.1)
+    assert result == 0
     assert np.isnan(error).all()
 
 

@@ -46,41 +46,41 @@ NO_FMA = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4,-AVX,-AVX512F"}
 
 def learned() -> dict[str, str]:
     """The `signals_sha256` of each learner, of vectors and of images."""
-    found = {}
+    actual = {}
     for algorithm in ("2.0", "1.0", "progress"):
-        told = configure("oscillatory", Layers.read(words=[f"learner.algorithm={algorithm}"]))
-        source = told.open_scene()
-        result = run_session(source, told.learner, seed=3, max_iterations=20)
-        found[algorithm] = result.signals_sha256
+        reported = configure("oscillatory", Layers.read(words=[f"learner.algorithm={algorithm}"]))
+        source = reported.open_scene()
+        result = run_session(source, reported.learner, seed=3, max_iterations=20)
+        actual[algorithm] = result.signals_sha256
         if algorithm == "1.0":
             continue
-        images, told = open_source(
+        images, reported = open_source(
             [ROOT / "sample_logs" / "icub"],
             settings=[f"learner.algorithm={algorithm}"],
             seed=3,
             loop=True,
         )
         with contextlib.closing(images):
-            result = run_session(images, told.learner, seed=3, max_iterations=2)
-        found[f"{algorithm} of images"] = result.signals_sha256
-    return found
+            result = run_session(images, reported.learner, seed=3, max_iterations=2)
+        actual[f"{algorithm} of images"] = result.signals_sha256
+    return actual
 
 
 def elsewhere(*emulator: str, **environment: str) -> tuple[bool, dict[str, str]]:
     # OpenBLAS takes this for the processor, whatever the emulated one can do.
-    kept = {name: value for name, value in os.environ.items() if name != "OPENBLAS_CORETYPE"}
+    remaining = {name: value for name, value in os.environ.items() if name != "OPENBLAS_CORETYPE"}
     done = subprocess.run(
         [*emulator, sys.executable, "-c", PROGRAM, str(ROOT / "tests")],
         cwd=ROOT,
-        env={**kept, **environment},
+        env={**remaining, **environment},
         capture_output=True,
         text=True,
         timeout=600,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    wide, found = json.loads(done.stdout)
-    return wide, found
+    wide, result = json.loads(done.stdout)
+    return wide, result
 
 
 def test_the_signals_are_those_of_every_machine() -> None:

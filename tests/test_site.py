@@ -122,6 +122,6 @@ def test_everybody_can_read_the_pages(browser: Any, site: Path, width: int, mode
     for page in ("index.html", "gallery.html", "how-to/open-data.html"):
         browser.get((site / page).as_uri())
         browser.execute_script(rules)
-        found = browser.execute_async_script("axe.run({iframes: false}).then(arguments[0])")
-        violations = [(v["id"], v["nodes"][0]["html"]) for v in found["violations"]]
+        result = browser.execute_async_script("axe.run({iframes: false}).then(arguments[0])")
+        violations = [(v["id"], v["nodes"][0]["html"]) for v in result["violations"]]
         assert violations == [], page

@@ -46,7 +46,7 @@ CEILINGS = {
 FILES_IN_A_FOLDER = 15
 LINES_OF_A_FILE = 400
 LINES_OF_A_FUNCTION = 60
-NAMES_DEFINED_TWICE = 10
+NAMES_DEFINED_TWICE = 2
 
 
 def sources(*folders: str) -> Iterator[Path]:

@@ -77,12 +77,12 @@ def test_a_recording_is_named_by_its_bytes_and_swept_as_its_scene_is(tmp_path: P
         record_scene("oscillatory", tmp_path / name, frames=frames)
     a, b, c = (plan(tmp_path / n, grid={}, seeds=[0])[0] for n in ("a", "b", "c"))
     assert a.id == b.id != c.id
-    found = []
+    result = []
     for source in (tmp_path / "a", "oscillatory"):
-        folder = tmp_path / f"sweep{len(found)}"
+        folder = tmp_path / f"sweep{len(result)}"
         sweep(source, folder, seeds=[0, 1], max_iterations=30)
-        found.append([row["result"] for row in read_trial_rows(folder)])
-    assert found[0] == found[1]
+        result.append([row["result"] for row in read_trial_rows(folder)])
+    assert result[0] == result[1]
 
 
 def test_a_trial_is_a_run(tmp_path: Path) -> None:
@@ -276,9 +276,9 @@ def test_means_and_deviations_are_over_finished_seeds(known: Path) -> None:
 
 def test_results_are_printed_in_every_form(cdmisfa: Cdmisfa, known: Path) -> None:
     def shown(*options: str) -> str:
-        found = cdmisfa("sweep", known, "--summary", *options)
-        assert found.code == 0, found.err
-        return found.out
+        result = cdmisfa("sweep", known, "--summary", *options)
+        assert result.code == 0, result.err
+        return result.out
 
     first, second = csv.DictReader(shown("--csv").splitlines())
     assert (first["learner.nu"], float(first["iterations_sd"])) == ("1", 10.0)

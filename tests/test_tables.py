@@ -67,8 +67,8 @@ def test_what_is_not_finite_is_left_out_by_its_name_or_kept_in_a_range(
     frames, said = taken(path)
     assert [a for (a,) in frames] == [*range(-4, -1), *range(8)]
     assert said[0].endswith(f"skipped, the first is {place}")
-    kept, said = taken(path, range=(-3.0, 5.0))
-    assert [a for (a,) in kept] == [-3, -3, -2, -3, *range(6), 5, 5]
+    remaining, said = taken(path, range=(-3.0, 5.0))
+    assert [a for (a,) in remaining] == [-3, -3, -2, -3, *range(6), 5, 5]
     assert said == ()
     with pytest.raises(UsageError, match=f"{place} has no finite number in t, a: to skip"):
         taken(path, time=None, rate=5)
@@ -130,6 +130,6 @@ def test_an_empty_column_and_rows_out_of_order_are_said(tmp_path: Path) -> None:
 def test_distances_in_a_list_that_were_not_measured_are_the_end_of_a_range(tmp_path: Path) -> None:
     lists = [[1.0, None], [np.nan, 2.0], None, [3.0, np.inf]]
     path = write_table(tmp_path / "t.parquet", {"t": np.arange(4) / 10, "r": lists})
-    kept, said = taken(path, fields=["r"], range=(0.5, 9.0), align="index")
-    assert kept == [[1, 0.5], [0.5, 2], [3, 0.5]]
+    remaining, said = taken(path, fields=["r"], range=(0.5, 9.0), align="index")
+    assert remaining == [[1, 0.5], [0.5, 2], [3, 0.5]]
     assert said[0].endswith("skipped, the first is row 2")

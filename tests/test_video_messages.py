@@ -104,6 +104,6 @@ def test_a_running_robots_video_is_shown_from_its_first_whole_picture() -> None:
         with open_live([word], options) as source:
             frames = source.take(0, 30).frames
     shown = decoded("h264")
-    found = [next((k for k in range(COUNT) if (shown[k] == f).all()), None) for f in frames]
-    assert None not in found
-    assert len(set(found)) > 3
+    result = [next((k for k in range(COUNT) if (shown[k] == f).all()), None) for f in frames]
+    assert None not in result
+    assert len(set(result)) > 3

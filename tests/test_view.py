@@ -50,8 +50,8 @@ def test_every_signal_of_every_iteration_is_there(shown):
             entity = rows[f"/signals/{name}"]
             assert entity["iteration"] == [s.iteration for s in records for _ in range(count)]
             assert entity["frame"] == [s.t + i for s in records for i in range(count)]
-        for entity, found in expected.items():
-            np.testing.assert_array_equal(scalars(rows[entity]), np.concatenate(found))
+        for entity, result in expected.items():
+            np.testing.assert_array_equal(scalars(rows[entity]), np.concatenate(result))
 
 
 def test_every_frame_has_the_log_time_of_the_log_at_any_rate(tmp_path):

@@ -79,9 +79,9 @@ def test_one_pass_reads_records_in_batches_and_the_frames_asked_for(tmp_path, mo
     monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", 7)
     log = tmp_path / "run.mcap"
     written = write_run(log, spec, ITERATIONS, phi_every=10)
-    found = list(read_batches(log, read_header(log)))
-    assert [sum(map(len, s.signals)) for s in found] == [7, 7, 7, 7, 2]
-    same((columns for s in found for columns in s.signals), written)
+    result = list(read_batches(log, read_header(log)))
+    assert [sum(map(len, s.signals)) for s in result] == [7, 7, 7, 7, 2]
+    same((columns for s in result for columns in s.signals), written)
     some = read_batches(log, read_header(log), every=30)
     times = [t for s in some for frames, _ in s.watched for t in frames.tolist()]
     assert times == list(range(0, ITERATIONS * 40, 30 if spec is IMAGE else 1))

@@ -70,8 +70,8 @@ def at(records, frame):
 )
 def test_what_was_watched_stands_at_its_iteration(shown, entity):
     _, records, rows = shown
-    found = zip(rows[entity]["frame"], rows[entity]["iteration"], strict=True)
-    shown = [(t, k) for t, k in found if t != GAP_AFTER * TAU]  # where lines end
+    result = zip(rows[entity]["frame"], rows[entity]["iteration"], strict=True)
+    shown = [(t, k) for t, k in result if t != GAP_AFTER * TAU]  # where lines end
     assert max(shown)[0] >= records[-1].t
     assert shown == [(t, at(records, t).iteration) for t, _ in shown]
 
@@ -127,9 +127,9 @@ def test_an_output_is_there_on_all_frames_of_its_own_stream_alone(shown, number)
     frames = {t: image for part in watched for t, image in zip(*part, strict=True)}
     own = {t for r in records if r.stream == stream for t in range(r.t, r.t + TAU)}
     said = {t: value for t, (value,) in y.items() if np.isfinite(value)}
-    kept = [t for t in frames if t in own and t % EVERY == 0]
-    assert min(kept) < next(r.t for r in records if r.saved and r.module == number)
-    assert sorted(said) == sorted(kept)
+    remaining = [t for t in frames if t in own and t % EVERY == 0]
+    assert min(remaining) < next(r.t for r in records if r.saved and r.module == number)
+    assert sorted(said) == sorted(remaining)
     for t, value in said.items():
         assert value == pytest.approx(module.transform(frames[t][None])[0, 0])
     for end in (t for t in y if t not in said):  # a line ends where another stream was watched

@@ -38,12 +38,12 @@ def shown(request, tmp_path_factory):
 
 def test_each_stream_has_a_lane_that_says_what_became_of_it(shown):
     _, _, view = shown
-    told = {
+    reported = {
         1: [(0, "not decided"), (10, "learned")],
         2: [(0, "not decided"), (10, "explained by module 1"), (22, "explained by module 2")],
         3: [(0, "not decided"), (10, "rejected"), (25, "not decided")],
     }
-    for place, changes in told.items():
+    for place, changes in reported.items():
         (entity,) = [e for e in view.rows if e.startswith(f"/state/{place}_")]
         expected = [(k * TAU, state) for k, state in changes]
         assert view.states(entity) == [*expected, (ITERATIONS * TAU, "")]
@@ -59,13 +59,13 @@ def test_each_stream_has_its_learning_error_where_it_was_watched(shown):
         for signal in ("learning_error", "tested", "fitted", "change"):
             rows = view.rows[f"/streams/log_{signal}/{s + 1}_{name}"]
             expected = np.where(tested, [getattr(r, signal) for r in own], np.nan)
-            found = dict(zip(rows["frame"], scalars(rows)[:, 0], strict=True))
-            np.testing.assert_array_equal([found.pop(r.t) for r in own], np.log10(expected))
+            result = dict(zip(rows["frame"], scalars(rows)[:, 0], strict=True))
+            np.testing.assert_array_equal([result.pop(r.t) for r in own], np.log10(expected))
             ends = [a.t + TAU for a, b in itertools.pairwise(own) if b.t > a.t + TAU]
-            assert list(found) == ends  # where the line ends: another stream is watched
-            assert np.isnan(list(found.values())).all()
-        found = view.numbers(f"/streams/interest/{s + 1}_{name}")
-        np.testing.assert_array_equal(found, [r.interest[s] for r in records])
+            assert list(result) == ends  # where the line ends: another stream is watched
+            assert np.isnan(list(result.values())).all()
+        result = view.numbers(f"/streams/interest/{s + 1}_{name}")
+        np.testing.assert_array_equal(result, [r.interest[s] for r in records])
 
 
 def test_nothing_is_there_that_the_run_does_not_tell(shown):
@@ -90,8 +90,8 @@ def check_no_view_is_empty(run):
     for name, wanted in shown.contents():
         for entity in wanted:
             pattern = entity.replace("**", "*")
-            found = [n for n in shown.names if fnmatch.fnmatchcase(n, pattern)]
-            assert any(has_something(shown, n) for n in found), (name, entity)
+            result = [n for n in shown.names if fnmatch.fnmatchcase(n, pattern)]
+            assert any(has_something(shown, n) for n in result), (name, entity)
             checked += 1
     return checked
 

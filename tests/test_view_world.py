@@ -60,9 +60,9 @@ def test_objects_stand_where_the_world_knew_them_and_the_head_looks_at_what_is_w
     truth = np.sin(t[:, None] / 50 + np.arange(len(TRUTH)))
     for i, name in enumerate(("box", "cylinder", "ball")):
         assert rows[f"/scene/{name}"]["frame"] == t.tolist()
-        found = np.array([p for (p,) in rows[f"/scene/{name}"]["Transform3D:translation"]])
+        result = np.array([p for (p,) in rows[f"/scene/{name}"]["Transform3D:translation"]])
         expected = truth[:, 2 * i : 2 * i + 2] * (1, -1)
-        np.testing.assert_allclose(found[:, :2], expected, atol=1e-6)
+        np.testing.assert_allclose(result[:, :2], expected, atol=1e-6)
     turns = [
         r for b, r in zip([None, *records], records, strict=False) if not b or b.stream != r.stream
     ]
@@ -95,9 +95,9 @@ def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
         y = np.concatenate(list(expected.values()))
         t = np.concatenate([start + np.arange(TAU) for start in expected])
         output = view.rows[f"/learned/{number}/output"]
-        found = dict(zip(output["frame"], scalars(output)[:, 0], strict=True))
-        np.testing.assert_array_equal([found[frame] for frame in t.tolist()], y)
-        assert np.isfinite(list(found.values())).sum() == len(y)
+        result = dict(zip(output["frame"], scalars(output)[:, 0], strict=True))
+        np.testing.assert_array_equal([result[frame] for frame in t.tolist()], y)
+        assert np.isfinite(list(result.values())).sum() == len(y)
         followed = scalars(view.rows[f"/learned/{number}/followed"])[:, 0]
         assert len(followed) == len(records) * TAU
         r = f"{np.corrcoef(followed[t], y)[0, 1]:.2f}"

@@ -106,8 +106,8 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(
 
 def all_views(client):
     state = client.get_state()
-    found = [view for view in state.views if view.name in ("Results", "Current frame x")]
-    return state.views if found and not state.loading else None
+    result = [view for view in state.views if view.name in ("Results", "Current frame x")]
+    return state.views if result and not state.loading else None
 
 
 def shows(client, view, grey):
@@ -180,12 +180,12 @@ def test_a_browser_draws_the_page(page, tmp_path):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
 def test_the_page_and_its_data_are_on_this_machine_only(page):
-    found = re.fullmatch(
+    result = re.fullmatch(
         r"http://127\.0\.0\.1:(\d+)/\?url=\S*127\.0\.0\.1%3A(\d+)%2Fproxy", page[1]
     )
-    assert found is not None, page
-    wait_for(lambda: len(addresses(found.groups())) == 2, 60, page[0])
-    assert addresses(found.groups()) == {f"0100007F:{int(port):04X}" for port in found.groups()}
+    assert result is not None, page
+    wait_for(lambda: len(addresses(result.groups())) == 2, 60, page[0])
+    assert addresses(result.groups()) == {f"0100007F:{int(port):04X}" for port in result.groups()}
 
 
 def addresses(ports):

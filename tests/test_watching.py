@@ -69,15 +69,15 @@ def test_our_policy_gives_the_signals_of_a_run(algorithm: str) -> None:
     ended = learn_blocks(source, learner, [digest], max_iterations=400)
     env = WatchEnv(OscillatorySource(), algorithm, max_iterations=400, **SETTINGS[algorithm])
     for _ in range(2):  # an episode begins anew
-        told, over = SignalsHash(), False
+        reported, over = SignalsHash(), False
         _, info = env.reset(seed=7)
         while not over:
             _, reward, terminated, truncated, info = env.step(info["stream"])
             signals: Any = env.signals
             assert reward == np.nan_to_num(signals.reward)
-            told.add(signals)
+            reported.add(signals)
             over = terminated or truncated
-        assert told.hexdigest() == digest.hexdigest()
+        assert reported.hexdigest() == digest.hexdigest()
         assert truncated == (ended == "max_iterations")
 
 
@@ -124,6 +124,6 @@ def test_the_example_of_ppo_runs(tmp_path: Path) -> None:
         "        assert self.env.observation_space.contains(seen)\n"
         "        return self.env.action_space.sample(), None\n"
     )
-    found = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(EXAMPLES.parent)])}
-    done = python(EXAMPLES / "ppo.py", check=True, env=found)
+    result = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(EXAMPLES.parent)])}
+    done = python(EXAMPLES / "ppo.py", check=True, env=result)
     assert [line.partition(":")[0] for line in done.stdout.splitlines()] == ["PPO", "the learner"]

@@ -70,16 +70,16 @@ class View:
 
     def titles(self) -> list[str]:
         """What the views and containers of the layout are called."""
-        found = (
+        result = (
             part.get(f"{kind}Blueprint:display_name")
             for part in self.layout.values()
             for kind in ("View", "Container")
         )
-        return [name for name in found if name]
+        return [name for name in result if name]
 
     def views(self, kind: str) -> list[tuple[str, list[str], Any, Any, Any]]:
         """Name, entities, range of time and of values, and legend of the views of a class."""
-        found = []
+        result = []
         for path, parts in list(self.layout.items()):
             if parts.get("ViewBlueprint:class_identifier") == kind:
                 query = self.layout[f"{path}/ViewContents"]["ViewContents:query"]
@@ -89,19 +89,19 @@ class View:
                 time = self.layout[f"{path}/TimeAxis"].get("TimeAxis:view_range")
                 values = self.layout[f"{path}/ScalarAxis"].get("ScalarAxis:range")
                 legend = self.layout[f"{path}/PlotLegend"].get("PlotLegend:visible")
-                found.append((parts["ViewBlueprint:display_name"], entities, time, values, legend))
-        return found
+                result.append((parts["ViewBlueprint:display_name"], entities, time, values, legend))
+        return result
 
     def contents(self) -> list[tuple[str, list[str]]]:
         """Name of each view of the layout, and the entities that it asks for."""
-        found = []
+        result = []
         for path, parts in list(self.layout.items()):
             if "ViewBlueprint:class_identifier" in parts:
                 origin = parts["ViewBlueprint:space_origin"]
                 wanted = self.layout[f"{path}/ViewContents"]["ViewContents:query"]
                 wanted = [origin] if wanted == ["$origin/**"] else wanted
-                found.append((parts["ViewBlueprint:display_name"], wanted))
-        return found
+                result.append((parts["ViewBlueprint:display_name"], wanted))
+        return result
 
     def numbers(self, entity: str) -> NDArray[np.float64]:
         """All numbers of an entity, without NaN, (n,)."""

@@ -83,8 +83,8 @@ def known_to(
 ) -> tuple[int, FloatArray]:
     """What knows a block by clusters, and the errors (M,)."""
     nodes = zip(centres[:, label], counts[:, label], y_frozen, strict=True)
-    found = [nearest(*node) for node in nodes]
-    error = np.array([math.nan if winner < 0 else distance for winner, distance in found])
+    result = [nearest(*node) for node in nodes]
+    error = np.array([math.nan if winner < 0 else distance for winner, distance in result])
     known = np.flatnonzero(error < threshold)
     return (int(known[0]) + 1 if len(known) else NOVEL), error
 
@@ -229,8 +229,8 @@ def other_stream(stream: int, n_streams: int, draw: float) -> int:
 
 
 def mean_change(xi: FloatArray) -> float:
-    told = xi[~np.isnan(xi)]
-    return float(told.mean()) if len(told) else math.nan
+    finite = xi[~np.isnan(xi)]
+    return float(finite.mean()) if len(finite) else math.nan
 
 
 def has_gap(memory: NDArray[np.void], stream: int, t: int) -> bool:

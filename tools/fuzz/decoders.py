@@ -131,11 +131,11 @@ def _packed() -> Iterator[bytes]:
     deep = Image.fromarray(np.asarray(gray).astype(np.uint16))
     images = (gray, gray.convert("RGBA"), gray.convert("P"), deep)
     for image, form in (*((one, "PNG") for one in images), (gray, "JPEG")):
-        image.save(found := BytesIO(), form)
-        yield found.getvalue()
+        image.save(result := BytesIO(), form)
+        yield result.getvalue()
     for mode in ("RGB", "CMYK"):
-        gray.convert(mode).save(found := BytesIO(), "JPEG", progressive=mode == "RGB")
-        yield found.getvalue()
+        gray.convert(mode).save(result := BytesIO(), "JPEG", progressive=mode == "RGB")
+        yield result.getvalue()
 
 
 def _raw() -> Iterator[RawImage]:

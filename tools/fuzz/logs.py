@@ -64,13 +64,13 @@ def kept(path: Path) -> Case:
 
 def examine_all(numbers: range) -> int:
     """Examine broken logs; return how many break something."""
-    found = 0
+    result = 0
     with tempfile.TemporaryDirectory() as folder:
         for number in numbers:
             if what := examine(number, Path(folder) / "log.mcap"):
-                found += 1
+                result += 1
                 print(f"case {number}: {what}", flush=True)
-    return found
+    return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,9 +83,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     end = chosen.first + chosen.cases
     shares = [range(chosen.first + job, end, chosen.jobs) for job in range(chosen.jobs)]
     with multiprocessing.get_context("fork").Pool(chosen.jobs) as pool:
-        found = sum(pool.map(examine_all, shares))
-    print(f"{chosen.cases} cases, {found} defects")
-    return int(found > 0)
+        result = sum(pool.map(examine_all, shares))
+    print(f"{chosen.cases} cases, {result} defects")
+    return int(result > 0)
 
 
 if __name__ == "__main__":

@@ -108,10 +108,10 @@ def _recording(compression: str, folder: Path) -> bytes:
 @cache
 def bases() -> dict[str, bytes]:
     """Return valid logs of every layout, by name; each "recording" can be learned from."""
-    found: dict[str, bytes] = {}
+    result: dict[str, bytes] = {}
     for name in ("zstd", "lz4", "none"):
         with tempfile.TemporaryDirectory() as folder:
-            found[f"recording {name}"] = _recording(name, Path(folder))
+            result[f"recording {name}"] = _recording(name, Path(folder))
     others: dict[str, dict[str, Any]] = {
         "chunks zstd": {"compression": CompressionType.ZSTD, "enable_data_crcs": True},
         "chunks none": {"compression": CompressionType.NONE, "enable_data_crcs": True},
@@ -122,8 +122,8 @@ def bases() -> dict[str, bytes]:
     }
     for name, options in others.items():
         times = (7 * i % 20 for i in range(FRAMES))
-        found[name] = files.written(times, lambda i: bytes([i]) * (9 + i % 7), 180, **options)
-    return found
+        result[name] = files.written(times, lambda i: bytes([i]) * (9 + i % 7), 180, **options)
+    return result
 
 
 @cache
@@ -138,12 +138,12 @@ def _taken_apart(base: str) -> _Log:
 
 
 def _records(raw: bytes, at: int, stop: int) -> list[Record]:
-    found = []
+    result = []
     while at < stop:
         opcode, length = HEADER.unpack_from(raw, at)
-        found.append(Record(opcode, raw[at + 9 : at + 9 + length]))
+        result.append(Record(opcode, raw[at + 9 : at + 9 + length]))
         at += 9 + length
-    return found
+    return result
 
 
 def _chunk_parts(content: bytes) -> tuple[bytes, int, str, bytes]:

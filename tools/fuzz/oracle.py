@@ -92,13 +92,13 @@ def _truth(base: str) -> frozenset[tuple[int, bytes]]:
 
 def _read(case: Case, path: Path, *, skip_damaged: bool) -> None:
     with LogReader(path, skip_damaged=skip_damaged) as reader:
-        found = list(reader.messages())
+        result = list(reader.messages())
         for attachment in reader.attachments:
             reader.attachment_data(attachment)
         reported = reader.problems or reader.crc_absent() or (skip_damaged and reader.missing)
         if case.trusted and not reported:
             true = _truth(case.base)
-            if not all((m.log_time, m.data) in true for m in found):
+            if not all((m.log_time, m.data) in true for m in result):
                 raise BrokenPromise("a message was changed, its checksum does not say so")
 
 

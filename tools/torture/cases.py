@@ -62,11 +62,11 @@ def run(module: Any, seeds: Iterator[int], shared: Any, deadline: float, jobs: i
     """Run cases until the deadline, at least two of each job; count their results."""
     counts: Counter[str] = Counter()
     running: list[Running] = []
-    begun, beside = 0, jobs * getattr(module, "BESIDE", 1)
-    while running or begun < 2 * beside or time.monotonic() < deadline:
-        while len(running) < beside and (begun < 2 * beside or time.monotonic() < deadline):
+    started, beside = 0, jobs * getattr(module, "BESIDE", 1)
+    while running or started < 2 * beside or time.monotonic() < deadline:
+        while len(running) < beside and (started < 2 * beside or time.monotonic() < deadline):
             running.append(begin(module, next(seeds), shared))
-            begun += 1
+            started += 1
         for case in wait(running, 0.5):
             running.remove(case)
             counts[end(module, case)] += 1

@@ -32,7 +32,7 @@ STDOUT = "stdout"
 @click.argument("source", nargs=-1, required=True, type=options.WORD)
 @options.output(
     "File to write for one log: .parquet, .csv, .mcap or .rrd (a view). Or the folder to write "
-    "into, one file for each log. [default: print a summary only]",
+    "into, one file for each log. [default: print a summary only]"
 )
 @options.option("--to FORMAT", type=click.Choice([*FILE_FORMS, STDOUT]))
 @options.option("--frames N")

@@ -181,11 +181,7 @@ def _print_summary(folder: Path, *, as_csv: bool, as_json: bool) -> None:
 @options.as_json
 @options.quiet
 def reproduce_command(
-    name: str,
-    output: Path | None,
-    recording: Path | None,
-    as_json: bool,
-    **how: Any,
+    name: str, output: Path | None, recording: Path | None, as_json: bool, **how: Any
 ) -> None:
     """Reproduce an experiment of the CD-MISFA paper.
 
@@ -225,11 +221,7 @@ def reproduce_command(
             )
         with bar(experiment, "trials") as shown:
             document = reproduce(
-                experiment,
-                root / experiment,
-                recording=recording,
-                progress=shown.update,
-                **how,
+                experiment, root / experiment, recording=recording, progress=shown.update, **how
             )
         documents.append(document)
     if as_json:
