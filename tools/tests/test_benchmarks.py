@@ -17,7 +17,6 @@ from benchmarks import (
     modules,
     recorder,
     report,
-    scaling,
     startup,
 )
 
@@ -43,7 +42,6 @@ RUNS: dict[str, Callable[[Path], object]] = {
         "messages", long_recordings.write_long(p / "log", 50 * long_recordings.MEGABYTE)
     ),
     "recorder": lambda p: recorder.recording("oscillatory", 4, p, 1)(),
-    "scaling": lambda p: scaling.agent_steps(300, 4)(),
     "startup": lambda p: startup.cpu_ms(startup.WARM["import of numpy"], p, "kept"),
 }
 
