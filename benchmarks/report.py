@@ -170,8 +170,8 @@ PARTS = {
     ),
     "corpus": Part(
         "Indexing many logs",
-        "Recordings of three views with 1,000 frames each, on two cores.",
-        (0, 1, 2, 3, 4),
+        "Recordings of three views with 1,000 frames each, two processes.",
+        (0, 1, 3, 4),
     ),
     "long_recordings": Part(
         "Memory for long recordings",
@@ -202,7 +202,8 @@ fewer rounds.
 
 Times depend on the machine; trust the ratios. The candidates of a table take turns within one
 process, and a ratio is the median over the rounds, so it may differ from the ratio of two cells.
-Times are CPU time unless "wall" is written.
+Times are CPU time unless "wall" is written. The machine also did other work: times
+and dropped frames are upper bounds.
 """
 
 
