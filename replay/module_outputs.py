@@ -38,7 +38,7 @@ class Subsample:
 
     Attributes:
         count: rows that came.
-        step: how many of them a selected one represents.
+        step: number of rows that a selected row represents.
 
     Example:
         >>> rows = Subsample(4)
@@ -91,7 +91,7 @@ class ModuleOutputs:
 
     Args:
         module: a frozen module with the frame shape of the run.
-        spec: of the run's source.
+        spec: specification of the run's source.
 
     Attributes:
         count: frames that were taken.

@@ -213,7 +213,7 @@ def is_recording(words: Sequence[str]) -> bool:
     """Return whether words name one of our recordings.
 
     Raises:
-        UsageError: there is no such log.
+        UsageError: the log does not exist.
         LogDamagedError: a log is damaged.
     """
     places = locations(words)

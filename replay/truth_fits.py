@@ -25,8 +25,8 @@ class TruthFit:
     """A function of a true quantity that an output follows.
 
     Attributes:
-        column: of the truth.
-        function: in words, of the truth's name.
+        column: column of the ground truth.
+        function: formula with the name of the quantity.
         r: correlation of the output with the function, 0 to 1.
         weights: (K,) of the terms.
         terms: (n,) truth -> (n, K).
@@ -47,7 +47,7 @@ def truth_fits(names: Sequence[str], truth: FloatArray, y: FloatArray) -> list[T
     """Return how an output follows each true quantity, the one that it follows most first.
 
     Args:
-        names: of the columns of truth.
+        names: names of the columns of truth.
         truth: (n, D) ground truth; the last `FITTED` frames count.
         y: (n,) the output.
     """
@@ -75,7 +75,7 @@ def simplest_fit(
         y: (n,) the output.
         column: number of the quantity.
         name: its name.
-        angle: it is one that goes round.
+        angle: whether the quantity is an angle that covers a whole turn.
     """
     if len(truth) < 3 or np.std(truth) == 0 or np.std(y) == 0:
         return None

@@ -49,7 +49,7 @@ class Program(subprocess.Popen[bytes]):
     to a file: it hangs where it cannot write to a pipe.
 
     Args:
-        arguments: of the program.
+        arguments: command line arguments of the program.
     """
 
     def __init__(self, *arguments: str) -> None:
@@ -148,7 +148,7 @@ def served(view: Path, port: int = 0) -> Iterator[tuple[Program, str]]:
 
     Args:
         view: the file.
-        port: of the page; by default a free one.
+        port: port of the page; by default a free one.
 
     Yields:
         The server, and the address of the page.

@@ -33,7 +33,7 @@ class Episode:
     Attributes:
         log: the files.
         name: the path relative to the folder of all logs.
-        spec: that of the log; a stream that is named by its file is called "stream".
+        spec: specification of the log; a stream that is named by its file is called "stream".
         first: number of its first frame on its own clock.
         count: number of its frames.
         ranges: frames of each stream, on the clock of the log; empty without gaps.

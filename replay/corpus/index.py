@@ -107,7 +107,7 @@ def index_logs(
         UsageError: a word names nothing, another process writes the index, or the file exists and
             is no index.
         LogDamagedError: the index is damaged.
-        LogWriteError: it cannot be written.
+        LogWriteError: the index cannot be written.
     """
     index = _index_of(words, out)
     make_folder(index.parent)
@@ -184,8 +184,8 @@ def indexed_logs(index: Path) -> list[IndexedLog]:
     The files of recordings in one folder are one log if they are views of one recording.
 
     Raises:
-        UsageError: it is no index, or one of another version.
-        LogDamagedError: it is damaged.
+        UsageError: the file is not an index, or has another version.
+        LogDamagedError: the file is damaged.
     """
     table = read_index(index)
     table = table.filter(pc.equal(table["number"], 0))
@@ -225,7 +225,7 @@ def logs_of_corpus(words: Sequence[str | Path]) -> list[list[Path]] | None:
 
     Raises:
         UsageError: the index holds no log, or has another version.
-        LogDamagedError: it is damaged.
+        LogDamagedError: the file is damaged.
     """
     if not may_be_corpus(words):
         return None
@@ -256,8 +256,8 @@ def read_index(path: Path) -> pa.Table:
     """Return the rows of an index.
 
     Raises:
-        UsageError: it is no index, or one of another version.
-        LogDamagedError: it is damaged.
+        UsageError: the file is not an index, or has another version.
+        LogDamagedError: the file is damaged.
     """
     _check_index(path)
     try:

@@ -71,7 +71,7 @@ def size_and_time(place: Path) -> tuple[int, str]:
     """Return size and time of change of a log on this machine, as `ListedLog` has them.
 
     Raises:
-        OSError: it does not exist.
+        OSError: the log does not exist.
     """
     files = [path for path in place.rglob("*") if path.is_file()] if place.is_dir() else [place]
     states = [os.stat(file) for file in files]

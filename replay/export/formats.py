@@ -44,7 +44,7 @@ def export(
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images in a video.
         inputs: options of logs; by default all streams of images.
-        task: task of a LeRobot dataset, in words; by default what the log states.
+        task: description of the task of a LeRobot dataset; by default that of the log.
         about: called with the opened recording or logs.
 
     Returns:

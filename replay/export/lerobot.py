@@ -120,7 +120,7 @@ def _whole_rate(spec: SourceSpec) -> int:
 
 
 def _task(source: LoggedSource) -> str:
-    """Return the tasks that were recorded, in words, or else the scene."""
+    """Return the descriptions of the recorded tasks, or else of the scene."""
     tasks = source.origin().get("tasks")
     if isinstance(tasks, list) and tasks:
         return " and ".join(map(str, tasks))

@@ -94,7 +94,7 @@ def signals_table(run: Path, names: Sequence[str]) -> pa.Table:
     """Return some signals of a run as an Arrow table, a row an iteration.
 
     Raises:
-        UsageError: there is no such run.
+        UsageError: the run does not exist.
         LogDamagedError: the run cannot be read.
     """
     header = read_header(run)

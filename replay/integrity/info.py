@@ -263,7 +263,7 @@ def count_decoded(
     """Decode every chunk of a log, which finds all damage, and count the messages.
 
     Args:
-        reader: of the log, which is read in one pass.
+        reader: reader of the log, which reads it in one pass.
         each: called with every chunk after it was decoded, in file order.
     """
     counts = {number: ChannelCount() for number in reader.channels}

@@ -67,8 +67,8 @@ class ModuleInfo:
     """A module: the slowness of each output, and 1 or 0 where it is known to be slow or not.
 
     Attributes:
-        iteration: at whose end it was saved.
-        policy: that led to it; of each stream 0 to stay and 1 to switch.
+        iteration: iteration at whose end the module was saved.
+        policy: policy during learning; for each stream 0 to stay and 1 to switch.
     """
 
     index: int

@@ -28,7 +28,7 @@ def run_facts(place: Path, channels: Sequence[ChannelInfo]) -> dict[str, Any]:
 
     Args:
         place: the folder of the run, or its log.
-        channels: of its log.
+        channels: channels of its log.
     """
     try:
         log = run_log(place)

@@ -191,7 +191,7 @@ class _RunContent(_Content):
 
     Args:
         path: log of the run, whole.
-        reader: of the log.
+        reader: reader of the log.
         beside: also check the files beside it.
     """
 

@@ -113,9 +113,9 @@ def by_number(views: Iterable[Sequence[Span]], facts: ViewMetadata, name: str) -
 
     Args:
         views: the frames that each stream has.
-        facts: of the recording; where it states gaps, frames that a stream lacks are gaps, else
-            they are left out of all streams.
-        name: of the recording, for the error.
+        facts: metadata of the recording; if it states gaps, missing frames of a stream are gaps,
+            else they are skipped in all streams.
+        name: name of the recording in errors.
 
     Raises:
         LogDamagedError: no frame is in every stream.
@@ -193,8 +193,8 @@ def retimed(times: IntArray, rows: Rows, fps: float) -> str:
     Jitter is allowed, and, where no row is missing, a rate that is known to a hundredth.
 
     Args:
-        times: of the rows, nanoseconds.
-        rows: which of them each frame shows, each at least once.
+        times: times of the rows in nanoseconds.
+        rows: row that each frame shows; each row at least once.
         fps: frames a second.
     """
     row_of = np.asarray(rows)
@@ -214,8 +214,8 @@ def counts(count: int, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
     """Return counts of a stream's rows, of frames that repeat one, and of rows in no frame.
 
     Args:
-        count: of the rows.
-        rows: which of them each frame shows.
+        count: number of rows.
+        rows: row that each frame shows.
         gaps: frames that are not counted.
     """
     visible = len(rows)

@@ -162,7 +162,7 @@ def identity_of(path: Path, reader: LogReader | None = None) -> Identity:
 
     Args:
         path: the log.
-        reader: of an MCAP file.
+        reader: reader of an MCAP file.
     """
     if reader is not None:
         return McapIdentity(reader)
@@ -191,7 +191,7 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
         whole: read all messages of a bag, not only its index.
 
     Raises:
-        LogDamagedError: it cannot be read.
+        LogDamagedError: the log cannot be read.
         CdmisfaError: a package that reads it is missing.
     """
     kind = log_format(path)

@@ -39,12 +39,12 @@ def report_of_run(path: Path, reproducible: str = "not checked", again: str = ""
     """Return the page of a run.
 
     Args:
-        path: its folder, or its log.
+        path: folder or log of the run.
         reproducible: whether learning it again is expected to give the same bits.
         again: the command that learns it again.
 
     Raises:
-        UsageError: there is no such run.
+        UsageError: the run does not exist.
         LogDamagedError: not even its header can be read.
     """
     page = ""

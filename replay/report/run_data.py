@@ -102,17 +102,17 @@ class RunData:
         frames: number of watched frames to keep.
 
     Raises:
-        UsageError: there is no such run.
+        UsageError: the run does not exist.
         LogDamagedError: not even its header can be read.
 
     Attributes:
         document: its run.json; empty if there is none.
-        outline: its signals.
+        outline: outline of its signals.
         events: the first and the last.
         modules: at most `MOST_MODULES`.
         watched: (n,) frames and (n, *frame_shape) values, thinned.
         last: the last image of each stream, or its last rows of numbers.
-        problems: damage and missing files, in words.
+        problems: a sentence for each damage or missing file.
     """
 
     def __init__(self, path: Path, frames: int) -> None:

@@ -154,8 +154,8 @@ class Attempt:
         blocks: number of them.
         shares: share of the blocks in which each rule held.
         together: number of blocks in which all rules held.
-        save: of the module, if it was saved.
-        state: of a stream without a module, in words.
+        save: save of the module, or None.
+        state: state of a stream without a module, or "".
     """
 
     name: str

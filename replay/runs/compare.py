@@ -178,7 +178,7 @@ def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any
 
 
 def outcome(outline: Outline, *, timed: bool = False) -> dict[str, str]:
-    """Return the outcome of each stream of a run, in words, by the stream's name.
+    """Return the outcome of each stream of a run as text, by the stream's name.
 
     Args:
         outline: outline of the run.
@@ -198,7 +198,7 @@ def outcome(outline: Outline, *, timed: bool = False) -> dict[str, str]:
 
 
 def differing_outcomes(first: Outline, second: Outline) -> tuple[tuple[str, str, str], ...]:
-    """Return the streams whose outcome or its iteration differs, with both outcomes in words."""
+    """Return the streams whose outcome or its iteration differs, with both outcomes as text."""
     a, b = (outcome(outline, timed=True) for outline in (first, second))
     return tuple(
         (name, a.get(name, "-"), b.get(name, "-"))

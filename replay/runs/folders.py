@@ -89,7 +89,7 @@ def read_request(folder: Path) -> list[tuple[str, dict[str, Any]]]:
     """Return id and point of the trials that a sweep was last asked for, in the order of its grid.
 
     Raises:
-        UsageError: there is no such file, or it is too large.
+        UsageError: the file does not exist, or is too large.
         LogDamagedError: it is damaged, or cannot be read.
     """
     path, remedy = folder / REQUEST, "run the sweep again to write it"

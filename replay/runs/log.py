@@ -87,7 +87,7 @@ class RunHeader:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event in words, at the end of an iteration's block."""
+    """An event with its text, at the end of an iteration's block."""
 
     t: int
     iteration: int
@@ -100,7 +100,7 @@ def read_header(path: Path) -> RunHeader:
 
     Raises:
         UsageError: the file is no run's log, or of another version of the signals.
-        LogDamagedError: it cannot be read.
+        LogDamagedError: the log cannot be read.
     """
     with LogReader(run_log(path)) as reader:
         return header_in(reader)

@@ -135,7 +135,7 @@ class RunWriter(Sink):
         self.flush()
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-        """Write in words what happened at frame t; see `Sink`."""
+        """Write the text of an event at frame t; see `Sink`."""
         entry = Log_pb2.Log(
             level=Log_pb2.Log.Level.Value(level), message=text, name=f"iteration {iteration}"
         )

@@ -38,8 +38,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         OSError: the file cannot be opened.
-        UsageError: it is no regular file, or too large.
-        ValueError: it holds something else; it says what in one short line.
+        UsageError: the path is not a regular file, or the file is too large.
+        ValueError: the file has other content; the message names it in one short line.
     """
     with open(open_regular(path, MAX_BYTES), "rb") as file:
         size = os.fstat(file.fileno()).st_size
@@ -68,7 +68,7 @@ def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
         data: their bytes.
 
     Raises:
-        ValueError: it is something else; it says what in one short line.
+        ValueError: the data has other content; the message names it in one short line.
     """
     arrays: dict[str, NDArray[Any]] = {}
     at = 0

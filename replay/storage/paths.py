@@ -20,7 +20,7 @@ def log_files(path: str | Path) -> list[Path]:
     In a folder a `.partial` counts where the finished file is not there.
 
     Raises:
-        UsageError: there is none.
+        UsageError: the folder has no log.
     """
     path = location(path)
     if not path.exists():
@@ -57,7 +57,7 @@ def starts_as_log(path: Path) -> bool:
     """Return whether a file begins as every MCAP file does.
 
     Raises:
-        UsageError: it is no regular file, or may not be read.
+        UsageError: the path is not a regular file, or not readable.
         LogDamagedError: the disk does not give it.
     """
     with opened_regular(path) as file:

@@ -32,8 +32,8 @@ class ViewSink:
 
     Args:
         recording: where they go.
-        spec: of the frames.
-        modules: in their order.
+        spec: specification of the source.
+        modules: the modules in order.
     """
 
     def __init__(
@@ -99,8 +99,8 @@ def written_view(
 
     Args:
         out: the file.
-        spec: of the source.
-        modules: in their order.
+        spec: specification of the source.
+        modules: the modules in order.
         force: replace an existing file.
 
     Raises:

@@ -62,7 +62,7 @@ def build_view(
         force: replace an existing file.
         tab: name of the tab that is open; by default the first.
         beside: more camera logs, or files of the recording.
-        inputs: which streams of camera logs; by default all of images.
+        inputs: streams of external logs; by default all with images.
         about: called with a recording or camera logs before they are shown, to print what they are.
 
     Raises:
@@ -149,7 +149,7 @@ def recording_to(
 def _write_run(recording: rr.RecordingStream, log: Path, every: int, tab: str | None) -> None:
     header, folder = read_header(log), log.parent
     streams = list(range(len(header.spec.streams)))
-    if len(streams) > MOST_STREAMS:  # the most watched are known at the end only
+    if len(streams) > MOST_STREAMS:  # the most attended streams are known only at the end
         streams = read_outline(log).streams(MOST_STREAMS)
     known = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
     tally, writer = Tally(header), ViewWriter(recording, header.spec)
@@ -225,7 +225,7 @@ def recording_layout(
     """Return the tabs of a recording: its world, where there is one, and its views.
 
     Args:
-        spec: of its source.
+        spec: specification of its source.
         end: the frame where it ends.
         has_scene: the world is there in 3D.
         tab: name of the one that is open.

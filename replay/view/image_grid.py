@@ -1,4 +1,4 @@
-"""Images on a wall, with frames and words: the streams of a run that is in no known world."""
+"""A grid of labelled images: the streams of a run without a known 3D scene."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from replay.view.writer import Interval, ViewWriter, changes, drawable, part
 
 GRID = "latest_frames"
 
-# Width of the wall over its height, as near as whole images allow.
+# Aspect ratio of the grid, about that of its panel.
 SHAPE = 1.7
 
-# Room below an image for its words, and between two, in heights of an image.
+# Space below an image for its label, and between images, in heights of an image.
 ROOM, SPACE = 0.5, 0.06
 
-# Pixels between two frames of a strip of frames.
+# Pixels between two frames of a contact sheet.
 BETWEEN = 4
 
 
 def grid_positions(
     count: int, width: int, height: int, columns: int | None = None
 ) -> list[tuple[float, float]]:
-    """Return corners (x, y) of images of a size on a wall, in rows of so many, or as fit."""
+    """Return corners (x, y) of images in a grid; `columns` follows from `SHAPE` by default."""
     across, down = width + SPACE * height, (1 + ROOM) * height
 
     def badness(columns: int) -> float:
@@ -43,14 +43,14 @@ def grid_positions(
 def grid_bounds(
     count: int, height: int, width: int, columns: int | None = None
 ) -> tuple[Interval, Interval]:
-    """Return ranges of x and y that hold a wall of images of a size; see `grid_positions`."""
+    """Return ranges of x and y that enclose a grid of images; see `grid_positions`."""
     x, y = map(max, zip(*grid_positions(count, width, height, columns), strict=True))
     margin = SPACE * height
     return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
 
 
 def sheet_size(height: int, width: int) -> tuple[int, int]:
-    """Return width and height of a strip of frames of a size."""
+    """Return width and height of one row of a contact sheet."""
     return SAMPLE_FRAMES * (width + BETWEEN) - BETWEEN, height
 
 
@@ -62,7 +62,7 @@ def place_image(
     words: str,
     rgb: Rgb,
 ) -> None:
-    """Write where an image of a size (width, height) hangs, with a frame, and words below it."""
+    """Place an image of a size (width, height) in the grid, with a border and a label."""
     width, height = size
     writer.log(path, rr.Transform3D(translation=[*corner, 0.0]))
     rgbs = packed_all([rgb])
@@ -74,14 +74,14 @@ def place_image(
 
 
 class ImageGridView:
-    """Writes the streams of a run as images on a wall.
+    """Writes the streams of a run as a grid of images.
 
-    Each shows the last image of the last block in which its stream was watched. The stream that
-    is watched is framed.
+    Each image is the last one of the latest block in which its stream was attended. The attended
+    stream has a border.
 
     Args:
-        writer: of the recording.
-        streams: that are shown.
+        writer: writer of the Rerun recording.
+        streams: indices of the visible streams.
         by_progress: the run is one of the progress learner.
     """
 
@@ -112,7 +112,7 @@ class ImageGridView:
                 self._writer.frames(self._paths[s], at, images[rows])
 
     def _frame(self, columns: SignalColumns) -> None:
-        """Put the frame around the watched stream; around one that is not shown it has no size."""
+        """Put the border around the attended stream, of size 0 if the stream is not visible."""
         turns = changes(columns["stream"], self._framed)
         if not len(turns):
             return
@@ -129,7 +129,7 @@ class ImageGridView:
         self._writer.send(f"{GRID}/frame", at, boxes)
 
     def _write_words(self, columns: SignalColumns, s: int) -> None:
-        """Write below an image its stream's name, and state or module, where they change."""
+        """Write the label of an image when the state or the module of its stream changes."""
         name, words = drawable(self._writer.spec.streams[s]), self._words[s]
         texts: list[tuple[int, str]] = []
         if self._by_progress:

@@ -119,7 +119,7 @@ def blueprint(
         tab: name of the open tab; by default the first.
 
     Raises:
-        UsageError: there is no such tab.
+        UsageError: the tab does not exist.
     """
     names = [str(part.name) for part in tabs]
     if tab is not None and tab.lower() not in map(str.lower, names):

@@ -1,6 +1,6 @@
-"""A run in the viewer while it learns.
+"""Show a run in the viewer while it learns.
 
-Signals are kept in memory and written in large pieces, so that the learner hardly waits.
+Signals are buffered and written in large pieces, so that the learner hardly waits.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from replay.view.run_layout import MOST_MODULES, run_layout
 from replay.view.scene import SceneView
 from replay.view.writer import MOST_STREAMS, ViewWriter
 
-# Time between two pieces.
+# Seconds between two pieces: a shorter interval slows the learner, a longer one the display.
 EVERY_SECONDS = 1.5
 
-# Frames from one pose of the scene to the next, and from one logged image to the next.
+# Frames between two poses of the scene, and between two logged images.
 EVERY_FRAMES = 10
 
-# Most blocks that wait, however quick the learner is.
+# Most buffered blocks, which bounds the memory of a fast learner.
 MOST_BLOCKS = 500
 
-# Blocks of which a lane has the state of most: the length of the run is not known.
+# Blocks per state in timelines of most blocks: fixed, as the length of the run is unknown.
 PIECE = 10
 
 
@@ -50,7 +50,7 @@ class LiveView(Sink):
         manifest: what the run was started with, as for `RunWriter`.
         tau: frames of a block.
         outputs: outputs of an abstraction.
-        run: its folder, where it has one.
+        run: folder of the run, if it has one.
 
     Attributes:
         address: where Rerun's viewers connect, on this machine.
@@ -111,7 +111,7 @@ class LiveView(Sink):
         """Show what the log of a resumed run holds already, before its next block.
 
         Raises:
-            UsageError: there is no such run.
+            UsageError: the run does not exist.
             LogDamagedError: its log cannot be read.
         """
         for batch in read_batches(run, every=EVERY_FRAMES):
@@ -119,7 +119,7 @@ class LiveView(Sink):
             self._writer.flush()
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-        """Log an event in words; see `Sink`."""
+        """Log the text of an event; see `Sink`."""
         self._writer.event(t, iteration, text, level)
 
     def finish(self) -> None:

@@ -1,8 +1,8 @@
-"""The modules of a run: weights, outputs, and frames of least to greatest output.
+"""The modules of a run: weights, outputs, and frames with the least to the greatest output.
 
-`/modules/<number>/output` holds a module's outputs wherever its own stream was watched, before its
-save, too: on the frames that the log has. Where a run's modules are unknown, since it was broken
-off or is still learning, it holds what the signals say, from the save on.
+`/modules/<number>/output` has a module's outputs on the logged frames of its stream, also before
+its save. If modules.npz is missing, as in an interrupted run or one that is still learning, it has
+the outputs in the signals, from the save on.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from replay.view.writer import ViewWriter, drawable
 
 PHI = "abstraction/phi"
 
-# Modules whose output is drawn over the quantity that it follows: the first.
+# Modules whose output is drawn over the quantity that it follows: as many as fit below the scene.
 FOLLOWED = 6
 
 # Last frames of a run for which it is drawn.
 FOLLOWED_FRAMES = 1_000_000
 
-# Blocks before the save whose output is drawn: earlier ones are of an abstraction that changes.
+# Blocks before the save whose output is drawn: in earlier ones the weights still changed.
 LAST_BLOCKS = 40
 
-# Width of the line that is followed, behind the output.
+# Width of the line of the followed quantity, behind the output, in points.
 BROAD = 4.0
 
 
@@ -55,7 +55,7 @@ def saved_mark() -> rr.SeriesPoints:
 def hang_weights(
     writer: ViewWriter, path: str, labels: Sequence[str], rgbs: Sequence[Rgb] = ()
 ) -> None:
-    """Write where the weights of several outputs hang, framed, in grey by default."""
+    """Place the weights of several outputs in a grid, with grey borders by default."""
     if not writer.spec.images or len(labels) == 1:
         return
     height, width = writer.spec.frame_shape
@@ -93,7 +93,7 @@ class Weights:
     its previous weights are shown, or none (white).
 
     Args:
-        writer: of the recording.
+        writer: writer of the Rerun recording.
         by_progress: the run is one of the progress learner.
     """
 
@@ -127,8 +127,8 @@ class ModulesView:
     """Writes the modules of a run.
 
     Args:
-        writer: of the recording.
-        modules: of the run, where they are known.
+        writer: writer of the Rerun recording.
+        modules: modules of the run; empty if they are unknown.
         by_progress: the run is one of the progress learner.
 
     Attributes:

@@ -1,7 +1,7 @@
-"""A run as rows of a Rerun recording: every signal as it is, and curves for people.
+"""Write a run into a Rerun recording: every signal unchanged, and curves derived from signals.
 
 `/signals/<name>` has the values of a signal for every iteration, as in run.mcap. A signal that the
-run never has gets no entity. Lines end where frames, or frames of their stream, were not watched.
+run never has gets no entity. Lines are interrupted where their stream was not attended.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from replay.view.writer import WIDTH, ViewWriter, changes, drawable, part, power
 # Signals that are the timelines.
 TIMELINES = ("iteration", "t", "log_time")
 
-# Number of the first colour of signals that are drawn beside another one.
+# Index of the first colour of signals that share a plot with another signal.
 BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2, "roc_error": 1}
 
-# Signals drawn as powers of ten, too: they fall through several.
+# Signals that are also drawn as log10, as they fall over several powers of ten.
 POWERS = ("eta_dot", "xi")
 
-# Signals of the watched stream: each has its line, of powers of ten, through its own blocks.
+# Signals of the attended stream: drawn as log10, one line a stream through its blocks.
 OF_STREAM = ("learning_error", "tested", "fitted", "change")
 
-# Signals whose name is their symbol, spelled out.
+# Signals whose name spells out their symbol, which alone labels their lines.
 SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi", "xi_dot")
 
-# Interest from which on a stream promises most because it was hardly watched: it has no line.
+# Interest of a stream that was hardly attended is set to a value above this, and is not drawn.
 HARDLY_WATCHED = 1000.0
 
-# Blocks over which the share of each stream is taken.
+# Blocks over which the share of each stream is averaged; the titles of panels state 50.
 SHARE_BLOCKS = 50
 
 WATCHED_NAME = "world/watched/name"
@@ -54,12 +54,12 @@ class RunView:
     """Writes a run into a recording.
 
     Args:
-        writer: of the recording.
-        header: of the run's log.
+        writer: writer of the Rerun recording.
+        header: header of the run's log.
         streams: the streams with lines and state timelines.
-        folder: of the run.
+        folder: folder of the run.
         every: frames from one pose of the scene to the next.
-        modules: of the run, where they are known.
+        modules: modules of the run; empty if they are unknown.
         piece: see `StateTimelines`.
 
     Attributes:
@@ -99,7 +99,7 @@ class RunView:
             writer.take(batch)
 
     def finish(self, outline: Outline) -> None:
-        """Write the end of lanes and the modules, and send all rows that wait."""
+        """End the state timelines, write the modules, and send all buffered rows."""
         if outline.iterations:
             self._timelines.end(outline.end, int(outline.blocks.iterations[-1]))
         for note in self.modules.finish(outline):
@@ -108,10 +108,10 @@ class RunView:
 
 
 class Inputs:
-    """Writes the watched frames, the ground truth, and events in words.
+    """Writes the attended frames, the ground truth, and events.
 
     Args:
-        writer: of the recording.
+        writer: writer of the Rerun recording.
     """
 
     def __init__(self, writer: ViewWriter) -> None:
@@ -135,7 +135,7 @@ class Inputs:
             self._writer.event(event.t, event.iteration, event.text, event.level)
 
     def _name(self, columns: SignalColumns) -> None:
-        """Frame the watched image in the colour and with the name of its stream."""
+        """Put a border around the attended image, with colour and name of its stream."""
         turns = changes(columns["stream"], self._named)
         if not len(turns):
             return
@@ -162,8 +162,8 @@ class SignalCurves:
     """Writes the signals of a run as curves.
 
     Args:
-        writer: of the recording.
-        header: of the run's log.
+        writer: writer of the Rerun recording.
+        header: header of the run's log.
         streams: the streams with lines.
     """
 
@@ -254,7 +254,7 @@ class SignalCurves:
             yield Curve(f"decision/advantage/{place}", names, advantage, rgbs)
 
     def _attention(self, columns: SignalColumns) -> Curve:
-        """Return the share of the recent blocks in which each shown stream was watched."""
+        """Return the share of recent blocks in which each visible stream was attended."""
         watched = columns["stream"][:, None] == np.array(self._streams)
         blocks = np.concatenate([self._recent, watched])
         sums = np.cumsum(blocks, axis=0)
@@ -270,7 +270,7 @@ class SignalCurves:
         """Yield signals of each shown stream in its own blocks, and its interest in all.
 
         Signals are NaN where the stream's candidate was not tested yet, so that no line leads from
-        one candidate to the next; interest is where the stream was hardly watched.
+        one candidate to the next; interest is NaN where the stream was hardly attended.
         """
         for s in self._streams:
             watched, name = columns["stream"] == s, self._names[s]

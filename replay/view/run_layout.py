@@ -13,22 +13,22 @@ from replay.view.image_grid import GRID, grid_bounds, sheet_size
 from replay.view.layouts import RECENT, Panel, Tab, Views, beside, curve_view, images
 from replay.view.writer import MOST_STREAMS, Interval, ViewWriter, drawable
 
-# Modules that have a page each; of more, those that stand on one page.
+# Most modules with a page each; of more modules, the number on one page.
 PAGES, MOST_MODULES = 12, 6
 
-# Modules that stand beside one another in the gate.
+# Modules side by side in the tab on novelty.
 ACROSS = 3
 
-# Height of a panel of lanes without them, and of each, in points.
+# Height of a panel of state timelines without its rows, and height of a row, in points.
 ROW, LANE = 55, 40
 
-# Lanes that get their full height; more are scrolled.
+# Most state timelines with full height; more are scrolled.
 MOST_LANES = 9
 
-# Height of a tab on a screen of 1280 x 720, in points, and least one of a row of plots.
+# Height of a tab on a screen of 1280 x 720, and least height of a row of plots, in points.
 HEIGHT, LEAST = 624, 60
 
-# Share of an axis that is added on either side of the values that it must hold.
+# Share of an axis that is added on either side of its values.
 MARGIN = 0.05
 
 
@@ -46,7 +46,7 @@ def run_layout(
     Where there is a world, or something is known of it, it comes first.
 
     Args:
-        outline: the run in short.
+        outline: outline of the run.
         writer: the written rows; None before there are any.
         has_scene: the world is there in 3D.
         followed: panels of what each module has learned.
@@ -54,7 +54,7 @@ def run_layout(
         tab: name of the tab that is open; by default the first.
 
     Raises:
-        UsageError: there is no such tab.
+        UsageError: the tab does not exist.
     """
     layout = RunLayout(outline, writer, has_scene=has_scene)
     tabs = [layout.world(followed)] if has_scene or followed else []
@@ -66,7 +66,7 @@ class RunLayout:
     """The tabs of a run; they adapt to its streams and modules, and to the signals it has.
 
     Args:
-        outline: the run in short.
+        outline: outline of the run.
         writer: the written rows; None before there are any: then every panel is there.
         has_scene: the world is there in 3D.
     """
@@ -99,13 +99,13 @@ class RunLayout:
         return rrb.Vertical(*(beside(views) for _, views in placed), row_shares=heights, name=name)
 
     def _heights(self, panels: Sequence[Panel]) -> list[float]:
-        """Return the heights of rows, so that a small screen shows each lane."""
+        """Return the heights of rows, such that a small screen shows each state timeline."""
         counts = [p.state_rows + (len(self._spec.streams) if p.per_stream else 0) for p in panels]
         high = [ROW + LANE * min(count, MOST_LANES) if count else 0 for count in counts]
         plots = sum(p.height for p, count in zip(panels, counts, strict=True) if not count)
         left = max(HEIGHT - sum(high), LEAST * counts.count(0))
         pairs = zip(panels, high, strict=True)
-        return [float(lane or left * panel.height / plots) for panel, lane in pairs]
+        return [float(height or left * panel.height / plots) for panel, height in pairs]
 
     def _views(self, panel: Panel) -> Views:
         """Return the views of a panel: none, one, or one for each module."""
@@ -166,7 +166,7 @@ class RunLayout:
         return (low - room if panel.low is None else low), high + room
 
     def world(self, followed: Sequence[Panel]) -> rrb.Container:
-        """Return the world, what the learner sees and learned of it, and what happened."""
+        """Return the tab with the world, current frame, results, events and followed quantities."""
         summary = rrb.TextDocumentView(origin="/summary", name="Results")
         words = rrb.Tabs(summary, layouts.events("Events"))
         if self._has_scene:
@@ -224,7 +224,7 @@ class RunLayout:
         return rrb.Horizontal(*columns, column_shares=[3, 4], name=name)
 
     def _module_views(self, i: int) -> Views:
-        """Return a module's weights, and its output wherever its own stream was watched."""
+        """Return a module's weights, and its output while its stream was attended."""
         colours = self._facts["colours"]
         output = f"Output of module {i} [SD] while its stream was attended"
         return [
@@ -237,8 +237,8 @@ class RunLayout:
         if self._has_scene or not self._spec.images:
             return self._input(title)
         count = min(len(self._spec.streams), MOST_STREAMS)
-        wall = grid_bounds(count, *self._spec.frame_shape)
-        return images(f"/{GRID}", "Latest attended frame of each stream", wall)
+        bounds = grid_bounds(count, *self._spec.frame_shape)
+        return images(f"/{GRID}", "Latest attended frame of each stream", bounds)
 
     def _input(self, name: str) -> rrb.View | rrb.Container:
         """Return the learner's input: an image with the name of its stream, or the last values."""

@@ -42,7 +42,7 @@ WATCHING = f"{SCENE}/watching"
 # Length of a view's pyramid, metres.
 REACH = 0.6
 
-# Radii of the edges of a view's pyramid, and of that of the watched one.
+# Radii of the edges of a view's pyramid, and of that of the attended view, metres.
 THIN, THICK = 0.0015, 0.005
 
 # Edges of a pyramid: four along its sides, one around its end.
@@ -69,14 +69,14 @@ def world_of_run(
     """Return a run's world, and its uncertain parts.
 
     Args:
-        writer: of the recording.
-        header: of the run's log.
-        folder: of the run.
-        streams: that are shown.
+        writer: writer of the Rerun recording.
+        header: header of the run's log.
+        folder: folder of the run.
+        streams: indices of the visible streams.
         every: frames from one pose of the scene to the next.
 
     Returns:
-        The scene, where the run's source describes it; of another source of images a wall of them.
+        The 3D scene if the run's source describes it, else a grid of images; None without images.
     """
     source, notes, scenery = _table(header.manifest.get("source")), list[str](), None
     try:
@@ -140,7 +140,7 @@ class SceneView:
     """Writes the scene of a run, or of a recording, into a Rerun recording.
 
     Args:
-        writer: of the recording.
+        writer: writer of the Rerun recording.
         scenery: the robot and the objects around it.
         every: frames from one pose to the next.
 
@@ -189,7 +189,7 @@ class SceneView:
             self._writer.buffer(f"{SCENE}/{thing.name}", (frames, None), places, encode=_places)
 
     def _turn(self, columns: SignalColumns) -> None:
-        """Turn the head to the view that is watched."""
+        """Turn the head to the attended view."""
         streams = columns["stream"]
         poses: list[tuple[int, int, Gaze, Rgb]] = []
         for i in changes(streams, self._watched).tolist():
@@ -203,7 +203,7 @@ class SceneView:
         self._look(poses)
 
     def _roam(self, batch: Batch, frames: IntArray, truth: FloatArray) -> None:
-        """Turn a head that roams, while it is watched, to where the truth says."""
+        """Turn a roaming head to its true yaw while its view is attended."""
         blocks, (view, yaw) = batch.blocks, ROAMING
         if view not in self._spec.streams or yaw not in self._spec.truth or not len(blocks.starts):
             return
@@ -215,7 +215,7 @@ class SceneView:
         self._look([(*when, look, colour(s)) for when, look in zip(at, gazes, strict=True)])
 
     def _look(self, poses: Sequence[tuple[int, int, Gaze, Rgb]]) -> None:
-        """Show where the head looks at frames, in iterations, and the watched view's colour."""
+        """Write the direction of the head at frames and iterations, in the colour of the view."""
         if not poses:
             return
         frames, iterations, gazes, rgbs = zip(*poses, strict=True)

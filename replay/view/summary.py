@@ -10,7 +10,7 @@ from cdmisfa.core.signals import ACTIONS, STATE_WORDS, STATES
 from replay.runs.run import Outline
 from replay.view.writer import MOST_STREAMS
 
-# Start of the event that says why a run ended.
+# Prefix of the event with the reason for the end of a run.
 ENDED = "ended:"
 
 # Settings that the summary names, by learner.
@@ -19,7 +19,7 @@ SETTINGS = {
     "progress": ("tau", "components", "window", "attention"),
 }
 
-# Most streams whose names are given together.
+# Most streams that are listed by name.
 NAMED = 4
 
 
@@ -27,9 +27,9 @@ def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str
     """Return the summary of a run as Markdown: modules or streams, reason for the end, settings.
 
     Args:
-        outline: the run in short.
-        name: of the run.
-        events: what happened in it, in words.
+        outline: outline of the run.
+        name: name of the run.
+        events: texts of its events.
     """
     header, names, by_progress = outline.header, outline.names(), outline.header.by_progress
     lines = [
@@ -100,7 +100,7 @@ def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
 
 
 def policy_text(policy: Sequence[int], streams: Sequence[str]) -> str:
-    """Return a policy in words, as "stay on x1" or "stay on 40 of 78 streams"."""
+    """Return a policy as text, as "stay on x1" or "stay on 40 of 78 streams"."""
     stays = [
         s for s, action in zip(streams, policy, strict=True) if action == ACTIONS.index("stay")
     ]

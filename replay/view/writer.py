@@ -33,11 +33,11 @@ ITERATION = "iteration"
 # Timeline of the log time: the name Rerun's own MCAP loader gives it.
 LOG_TIME = "message_log_time"
 
-# Streams with lines and lanes of their own: the most watched ones.
+# Most streams with lines and state timelines: the most attended ones; more would be unreadable.
 MOST_STREAMS = 16
 
-# Lines with more values than the screen has columns are drawn from the least to the most. Their
-# mean, the viewer's default, may be a value that never occurred.
+# Draw lines with more values than pixels from their minimum to their maximum. The mean, the
+# default of Rerun 0.41, may be a value that never occurred.
 AGGREGATION = rr.components.AggregationPolicy.MinMax
 
 # Rows of an entity that are sent at once.
@@ -58,7 +58,7 @@ At = tuple[IntArray, IntArray | None]
 
 Encode = Callable[[NDArray[Any]], Any]
 
-# Letters in the viewer's font: at any other the viewer panics and ends.
+# Characters in the viewer's font: Rerun 0.41 panics at any other.
 _DRAWN = (
     (0x20, 0x7E),  # ASCII
     (0xA1, 0x17F),  # Latin
@@ -140,11 +140,11 @@ class ViewWriter:
         self._buffers: dict[str, _Buffer] = {}
 
     def log(self, path: str, value: Any) -> None:
-        """Log a value that holds at all times."""
+        """Log a value without a time."""
         self.recording.log(path, value, static=True)
 
     def event(self, t: int, iteration: int | None, text: str, level: str = "INFO") -> None:
-        """Log an event in words."""
+        """Log the text of an event."""
         level = "WARN" if level == "WARNING" else level
         self.log_at("events", t, iteration, rr.TextLog(drawable(text), level=level))
 
@@ -222,7 +222,7 @@ class ViewWriter:
 
         Args:
             path: the entity.
-            at: of the rows.
+            at: frames and iterations of the rows.
             values: (n, ...).
             style: value that is logged once, before the first row.
             encode: makes Rerun's component columns of values.

@@ -69,7 +69,7 @@ def array_streams(
             width), or in colours (n, height, width, 3 or 4), of uint8, uint16, bool, or floats of
             0 to 1; arrays, lists, or tables of pandas, Polars, Arrow or DuckDB.
         options: whether colours are shown.
-        path: of their file.
+        path: path of their file; None for arrays of the caller.
 
     Raises:
         UsageError: an array has another form, or holds numbers that are not finite.
@@ -97,7 +97,7 @@ def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
     """Load the arrays of a user's file, by name; the one of .npy is mapped, and called as the file.
 
     Raises:
-        UsageError: there is no such file, or it is too large.
+        UsageError: the file does not exist, or is too large.
         LogDamagedError: the file holds something else.
     """
     check_regular(path)

@@ -31,7 +31,7 @@ def extent_of(path: Path) -> Extent:
     """Return how far the file of a video goes, by the parts of its container.
 
     Raises:
-        UsageError: it is no regular file, or may not be read.
+        UsageError: the path is not a regular file, or not readable.
         LogDamagedError: the disk does not give it.
     """
     with opened_regular(path) as file:

@@ -37,10 +37,10 @@ class Dataset:
     """The frames of a dataset: where each episode begins, and when each frame is.
 
     Attributes:
-        info: its description.
-        rows: its table of episodes.
+        info: description in meta/info.json.
+        rows: rows of the tables of episodes.
         starts: the first frame of each episode, and the end of the last.
-        times: of each frame, nanoseconds.
+        times: time of each frame in nanoseconds.
     """
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:

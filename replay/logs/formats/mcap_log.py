@@ -75,7 +75,7 @@ class Messages:
     """The messages on a topic, by log time, ties in the order of the files.
 
     Args:
-        channels: of the topic, each with the reader of its file.
+        channels: channels of the topic, each with the reader of its file.
         expected: chunks that each reader expects next, shared by all topics.
 
     Attributes:

@@ -119,7 +119,7 @@ def message_stream(
     Args:
         path: the log.
         topic: the topic.
-        kind: of its messages.
+        kind: type of its messages.
         options: whether images or fields are read.
         times: log times in nanoseconds, in order.
         fetch: reads a message.

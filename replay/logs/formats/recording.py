@@ -50,7 +50,7 @@ class ViewFile:
 
     Attributes:
         path: the file.
-        facts: its metadata.
+        facts: metadata of the file.
         ranges: the frames that are there with their ground truth, each [start, stop); one range,
             except with `skip_damaged`, and of live streams with gaps.
     """
@@ -63,12 +63,12 @@ class ViewFile:
         Args:
             path: the file.
             skip_damaged: skip damaged parts.
-            reader: of the file, which the caller closes; then no frame is known until
+            reader: reader of the file, which the caller closes; then no frame is known until
                 `check_chunk` was called with each chunk, and `finish`.
 
         Raises:
             NoRecordingError: it is no view of a recording.
-            LogDamagedError: it is damaged.
+            LogDamagedError: the file is damaged.
         """
         self.path, by_chunk = path, reader is not None
         self.ranges: list[Span] = []
@@ -275,7 +275,7 @@ class _ChannelRows:
         """Check how messages of a chunk are laid out, and copy their values.
 
         Args:
-            number: of the chunk in `segments`.
+            number: index of the chunk in `segments`.
             low: the first message.
             n: how many.
             out: (n, bytes of a message's values), written; None to check only.

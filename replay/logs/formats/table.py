@@ -86,7 +86,7 @@ def number_stream(
     Args:
         path: the log.
         topic: the name of the stream.
-        columns: of each field its numbers, (n, I); NaN if there is none.
+        columns: numbers of each field, (n, I); NaN if missing.
         times: (n,) nanoseconds, -1 if there is none; None of rows at an even rate.
         options: the range that numbers are kept in.
         where: names a row.

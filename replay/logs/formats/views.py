@@ -137,7 +137,7 @@ def first_pose(reader: LogReader) -> HeadPose | None:
     """Return where the head is in a view's log, None if the log does not state it.
 
     Raises:
-        LogDamagedError: it cannot be read.
+        LogDamagedError: the log cannot be read.
     """
     entry = next(reader.messages({POSE_TOPIC}), None)
     if entry is None:
