@@ -187,16 +187,6 @@ class Recomputation:
                 )
             on_error.pop_all()
         return recomputation
-        again = cls(Path(run), iterations, source)
-        with contextlib.ExitStack() as failing:
-            failing.enter_context(again)
-            _, difference = again.compare(iterations)
-            if difference is not None:
-                raise NotReproducedError(
-                    f"{again.log}: learned again, {difference}: name its own source with --source"
-                )
-            failing.pop_all()
-        return again
 
     @property
     def source(self) -> SeekableSource:

@@ -83,7 +83,6 @@ def following_slowness(
         follows another.
     """
     phi = np.concatenate([phi for phi, _ in features])
-    phi = np.concatenate([phi for phi, _ in features])
     offset = np.concatenate([kernels.mean_output(phi, mean) for phi, mean in features])
     count, steps = 0, 0
     total, squares, moved = (np.zeros(len(phi)) for _ in range(3))
