@@ -91,9 +91,8 @@ class Module(Described):
         if outputs is not None:
             chosen = chosen[outputs if isinstance(outputs, slice) else np.atleast_1d(outputs)]
         phi = np.ascontiguousarray(chosen, np.float64)
-        return _projected(
-            self.rows(frames), self.expansion, phi, kernels.mean_output(phi, self._mean)
-        )
+        offset = kernels.mean_output(phi, self._mean)
+        return _projected(self.rows(frames), self.expansion, phi, offset)
 
     @property
     def _mean(self) -> NDArray[np.float64]:

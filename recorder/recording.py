@@ -231,9 +231,8 @@ class ViewLogs:
         for log in self._logs.values():
             log.finish()
         store_start(self._folder, list(self._parts))
-        return [
-            view_recording(view, path, n) for view, done in self._parts.items() for path, n in done
-        ]
+        parts = ((view, *part) for view, done in self._parts.items() for part in done)
+        return [view_recording(*part) for part in parts]
 
     def abandon(self) -> None:
         """Close unfinished files as readable partial files."""

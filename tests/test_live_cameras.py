@@ -294,7 +294,7 @@ def test_a_full_queue_is_emptied_and_says_so() -> None:
     source = cameras.source()
     cameras.hands[0].give(*[flat(k) for k in range(25)])
     wait_for(lambda: source.alignment["left"]["lost"] == 20, seconds=20)
-    lost = "left: discarded 10 images: they arrived faster than they were used"
+    lost = "left: discarded 10 images: they came faster than they were used"
     assert cameras.said == [lost, lost]
     cameras.close(source)
 

@@ -221,9 +221,8 @@ class CuriousLearner:
             Number of iterations done.
         """
         kernel = self.abstraction.kernel
-        return kernels.iterations(
-            self._agent, self._frozen, kernel, raw, x, uniforms, swap_below, curves
-        )
+        agent, frozen = self._agent, self._frozen
+        return kernels.iterations(agent, frozen, kernel, raw, x, uniforms, swap_below, curves)
 
     def summary(self) -> dict[str, Any]:
         """Return the learner's part of a run's result, as JSON values."""

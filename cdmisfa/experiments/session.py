@@ -267,9 +267,8 @@ class Session:
         with contextlib.ExitStack() as stack:
             if self.folder is not None:
                 options = {"force": self._force, "resumed": self._resumed}
-                log = stack.enter_context(
-                    opened_log(self.folder, self.source, self.manifest, **options)
-                )
+                run_log = opened_log(self.folder, self.source, self.manifest, **options)
+                log = stack.enter_context(run_log)
                 state = Keyframes(log, self.source, self.learner, self._versions, keyframes)
                 all_sinks += [log, state]
             if live is not None:

@@ -55,9 +55,8 @@ def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) ->
     """
     sfa: RecursiveFeature | None = None
     for x, gap in pieces:
-        sfa = sfa or RecursiveFeature(
-            x.shape[1], STORED_PER_COMPONENT * components // 2, window=frames
-        )
+        size = STORED_PER_COMPONENT * components // 2
+        sfa = sfa or RecursiveFeature(x.shape[1], size, window=frames)
         sfa.update(x, gap)
     assert sfa is not None
     state = sfa.state

@@ -279,9 +279,7 @@ class Readers:
                 state.lost += count
                 state.queue.clear()
                 state.bytes = 0
-                self._say(
-                    f"{name}: discarded {count} images: they arrived faster than they were used"
-                )
+                self._say(f"{name}: discarded {count} images: they came faster than they were used")
             state.queue.append(stamped)
             state.bytes += size
             resumed = state.silent

@@ -196,14 +196,11 @@ class GymSource(SteppedSource):
         """Step all environments together, and render them."""
         environments = self._environments
         generators = [np.random.default_rng([seed, i]) for i in range(len(environments))]
-        played = [
-            play(e, rng, hold, policy) for e, rng in zip(environments, generators, strict=True)
-        ]
+        pairs = zip(environments, generators, strict=True)
+        played = [play(environment, rng, hold, policy) for environment, rng in pairs]
         for step in zip(*played, strict=True):
-            observations, actions, begins = zip(*step, strict=True)
-            spaces = [
-                (e.observation_space, o) for e, o in zip(environments, observations, strict=True)
-            ]
+            obs, actions, begins = zip(*step, strict=True)
+            spaces = [(e.observation_space, o) for e, o in zip(environments, obs, strict=True)]
             spaces += [(e.action_space, a) for e, a in zip(environments, actions, strict=True)]
             numbers = [np.ravel(values) for space, values in spaces if _count(space)]
             images = [np.asarray(e.render()) for e in environments]

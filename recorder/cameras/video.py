@@ -109,9 +109,8 @@ class VideoCamera:
         timeout = TIMEOUT if self._remote else None
         try:
             with budget():
-                return self._av.open(
-                    self._address, format=self._form, options=options, timeout=timeout
-                )
+                opening = {"format": self._form, "options": options, "timeout": timeout}
+                return self._av.open(self._address, **opening)
         except (OSError, ValueError, MemoryError, self._av.FFmpegError) as error:
             raise CdmisfaError(f"{self._public_word} cannot be opened: {_reason(error)}") from None
 
