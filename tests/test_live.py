@@ -41,7 +41,7 @@ def sent(monkeypatch):
         else:
             result.setdefault(path, [])
 
-    monkeypatch.setattr("replay.view.writer.ViewWriter.send", keep)
+    monkeypatch.setattr("replay.view.writer.Writer.send", keep)
     monkeypatch.setattr(live, "MOST_BLOCKS", 7)
     return result
 

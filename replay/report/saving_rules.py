@@ -111,9 +111,8 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
             windows = tests / window
             firm = change < settled * np.clip(windows / SETTLING_WINDOWS, 0.0, 1.0) ** 2
             turning = (windows >= SETTLING_WINDOWS) & (change < ROTATING_CHANGE * settled)
-            exact["change"] = was_tested & (
-                firm | (turning & (np.abs(regret) < IMPROVEMENT_NEGLIGIBLE))
-            )
+            turning &= np.abs(regret) < IMPROVEMENT_NEGLIGIBLE
+            exact["change"] = was_tested & (firm | turning)
     variance = lines["variance"].reshape(outline.iterations, -1)[:, 0]
     rows: list[tuple[str, str, NDArray[Any], float | None, float | None]] = [
         ("error", "Learning error: change + disagreement", lines["learning_error"], None, None),

@@ -15,7 +15,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.modules import Module, columns_of
 from replay.view.build import recording_to, view_entities
 from replay.view.layouts import RECENT, blueprint, curve_view, images
-from replay.view.writer import MOST_STREAMS, ViewWriter, drawable, part
+from replay.view.writer import MOST_STREAMS, Writer, drawable, part
 
 if TYPE_CHECKING:
     from replay.export.applied import Applied, AppliedSink
@@ -40,7 +40,7 @@ class ViewSink:
         self, recording: rr.RecordingStream, spec: SourceSpec, modules: Sequence[Module]
     ) -> None:
         self._recording, self._spec, self._end = recording, spec, 0
-        self._writer, self._modules = ViewWriter(recording, spec), list(columns_of(modules))
+        self._writer, self._modules = Writer(recording, spec), list(columns_of(modules))
 
     def add(self, applied: Applied) -> None:
         """Write the outputs on a block."""
@@ -73,19 +73,11 @@ class ViewSink:
         entity, end = f"/{view_entities(self._spec)[s]}", self._end
         column = rrb.Vertical(
             images(entity, name) if self._spec.images else curve_view(name, [entity], end),
-            curve_view(
-                "Novelty of each block (a module explains the block below 1)",
-                [f"/novelty/{stream}"],
-                end,
-            ),
-            curve_view(
-                "Slowness of output 1 of each module [cycles/frame]", [f"/slowness/{stream}"], end
-            ),
+            curve_view("Novelty of each block: explained below 1", [f"/novelty/{stream}"], end),
+            curve_view("Slowness of first outputs [cycles/frame]", [f"/slowness/{stream}"], end),
         )
         outputs = [
-            curve_view(
-                f"Outputs of module {m.index} [SD]", [f"/outputs/{stream}/{m.index}"], recent=RECENT
-            )
+            curve_view(f"Module {m.index}: y [SD]", [f"/outputs/{stream}/{m.index}"], recent=RECENT)
             for m, _ in self._modules
         ]
         return rrb.Horizontal(column, rrb.Vertical(*outputs), column_shares=[2, 3], name=name)

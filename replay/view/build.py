@@ -31,7 +31,7 @@ from replay.view.run import RunView
 from replay.view.run_layout import run_layout
 from replay.view.scene import SceneView, scenery_of_recording
 from replay.view.summary import summary_text
-from replay.view.writer import MOST_STREAMS, ViewWriter, drawable, part
+from replay.view.writer import MOST_STREAMS, Writer, drawable, part
 
 # Rerun's application id: the viewer remembers one layout for it.
 APPLICATION = "cdmisfa"
@@ -152,7 +152,7 @@ def _write_run(recording: rr.RecordingStream, log: Path, every: int, tab: str | 
     if len(streams) > MOST_STREAMS:  # the most attended streams are known only at the end
         streams = read_outline(log).streams(MOST_STREAMS)
     known = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
-    tally, writer = Tally(header), ViewWriter(recording, header.spec)
+    tally, writer = Tally(header), Writer(recording, header.spec)
     view = RunView(writer, header, streams, folder, every=every, modules=known)
     events: list[str] = []
     for batch in read_batches(log, header, every=every):
@@ -190,7 +190,7 @@ def _write_recording(
         ours = source.recorded
         files = [view.path for stream in source.streams for view in stream.views]
         scenery = scenery_of_recording(files) if ours else None
-        writer = ViewWriter(recording, spec)
+        writer = Writer(recording, spec)
         world = None if scenery is None else SceneView(writer, scenery, every)
         for note in (*source.warnings, *(world.notes if world is not None else ())):
             writer.event(first, None, note, "WARN")

@@ -16,7 +16,7 @@ from replay.runs.log import read_columns
 from replay.view.build import recording_to
 from replay.view.layouts import blueprint, curve_view
 from replay.view.summary import text_table
-from replay.view.writer import ITERATION, MOST_STREAMS, ViewWriter, drawable, part, power_of_ten
+from replay.view.writer import ITERATION, MOST_STREAMS, Writer, drawable, part, power_of_ten
 
 # Signals that are overlaid where a run has them, with the titles of their panels.
 CURVES = {
@@ -64,7 +64,7 @@ def build_overlay(
         recording.log("summary", table, static=True)
         for number, (run, row, root) in enumerate(zip(runs, compared, roots, strict=True)):
             header, selected = row.outline.header, row.outline.streams(MOST_STREAMS)
-            writer = ViewWriter(recording, header.spec)
+            writer = Writer(recording, header.spec)
             for signals in read_columns(run, header):
                 _write_curves(writer, root, signals, selected, number, row.name)
             writer.flush()
@@ -73,7 +73,7 @@ def build_overlay(
 
 
 def _write_curves(
-    writer: ViewWriter,
+    writer: Writer,
     root: str,
     signals: SignalColumns,
     selected: Sequence[int],

@@ -13,7 +13,7 @@ from replay.module_outputs import SAMPLE_FRAMES
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
-from replay.view.writer import Interval, ViewWriter, changes, drawable, part
+from replay.view.writer import Interval, Writer, changes, drawable, part
 
 GRID = "latest_frames"
 
@@ -55,12 +55,7 @@ def sheet_size(height: int, width: int) -> tuple[int, int]:
 
 
 def place_image(
-    writer: ViewWriter,
-    path: str,
-    corner: Sequence[float],
-    size: Sequence[int],
-    words: str,
-    rgb: Rgb,
+    writer: Writer, path: str, corner: Sequence[float], size: Sequence[int], words: str, rgb: Rgb
 ) -> None:
     """Place an image of a size (width, height) in the grid, with a border and a label."""
     width, height = size
@@ -85,7 +80,7 @@ class ImageGridView:
         by_progress: the run is one of the progress learner.
     """
 
-    def __init__(self, writer: ViewWriter, streams: Sequence[int], *, by_progress: bool) -> None:
+    def __init__(self, writer: Writer, streams: Sequence[int], *, by_progress: bool) -> None:
         self._writer, self._by_progress = writer, by_progress
         height, width = writer.spec.frame_shape
         self._size = width, height

@@ -27,7 +27,7 @@ from replay.view.build import APPLICATION
 from replay.view.run import RunView
 from replay.view.run_layout import MOST_MODULES, run_layout
 from replay.view.scene import SceneView
-from replay.view.writer import MOST_STREAMS, ViewWriter
+from replay.view.writer import MOST_STREAMS, Writer
 
 # Seconds between two pieces: a shorter interval slows the learner, a longer one the display.
 EVERY_SECONDS = 1.5
@@ -76,7 +76,7 @@ class LiveView(Sink):
         self._recording.set_sinks(sink)
         self.address = str(sink.uri)
         self._recording.send_recording_name("live")
-        self._writer = writer = ViewWriter(self._recording, spec)
+        self._writer = writer = Writer(self._recording, spec)
         writer.log(
             "summary", rr.TextDocument("The run has not finished: results follow at its end.")
         )

@@ -24,7 +24,7 @@ from replay.runs.run import Outline
 from replay.truth_fits import truth_fits
 from replay.view.image_grid import BETWEEN, grid_positions, place_image, sheet_size
 from replay.view.layouts import Panel
-from replay.view.writer import ViewWriter, drawable
+from replay.view.writer import Writer, drawable
 
 PHI = "abstraction/phi"
 
@@ -53,7 +53,7 @@ def saved_mark() -> rr.SeriesPoints:
 
 
 def hang_weights(
-    writer: ViewWriter, path: str, labels: Sequence[str], rgbs: Sequence[Rgb] = ()
+    writer: Writer, path: str, labels: Sequence[str], rgbs: Sequence[Rgb] = ()
 ) -> None:
     """Place the weights of several outputs in a grid, with grey borders by default."""
     if not writer.spec.images or len(labels) == 1:
@@ -65,7 +65,7 @@ def hang_weights(
         place_image(writer, f"{path}/{j + 1}", corner, (width, height), words, rgb)
 
 
-def write_weights(writer: ViewWriter, path: str, t: int, iteration: int, phi: FloatArray) -> None:
+def write_weights(writer: Writer, path: str, t: int, iteration: int, phi: FloatArray) -> None:
     """Show (J, I) weights at a frame and iteration: as images, or bars.
 
     Each output's image, at `path` or of several at `path/<number>`, is in full colour at its own
@@ -97,7 +97,7 @@ class Weights:
         by_progress: the run is one of the progress learner.
     """
 
-    def __init__(self, writer: ViewWriter, *, by_progress: bool) -> None:
+    def __init__(self, writer: Writer, *, by_progress: bool) -> None:
         self._writer, self._by_progress, self._stream = writer, by_progress, -1
         self._phi: dict[int, FloatArray] = {}
 
@@ -135,7 +135,7 @@ class ModulesView:
         sheets: modules with images of least to greatest output.
     """
 
-    def __init__(self, writer: ViewWriter, modules: Sequence[Module], *, by_progress: bool) -> None:
+    def __init__(self, writer: Writer, modules: Sequence[Module], *, by_progress: bool) -> None:
         self._by_progress = by_progress
         self._writer, self._notes, self.sheets = writer, list[str](), set[int]()
         known = [m for m in modules if m.stream_index < len(writer.spec.streams)]

@@ -24,7 +24,7 @@ from replay.runs.run import Outline, rules_of
 from replay.view.modules import ModulesView, Weights, saved_mark
 from replay.view.scene import world_of_run
 from replay.view.state_timelines import StateTimelines
-from replay.view.writer import WIDTH, ViewWriter, changes, drawable, part, power_of_ten
+from replay.view.writer import WIDTH, Writer, changes, drawable, part, power_of_ten
 
 # Signals that are the timelines.
 TIMELINES = ("iteration", "t", "log_time")
@@ -69,7 +69,7 @@ class RunView:
 
     def __init__(
         self,
-        writer: ViewWriter,
+        writer: Writer,
         header: RunHeader,
         streams: Sequence[int],
         folder: Path,
@@ -114,7 +114,7 @@ class Inputs:
         writer: writer of the Rerun recording.
     """
 
-    def __init__(self, writer: ViewWriter) -> None:
+    def __init__(self, writer: Writer) -> None:
         self._writer, self._spec, self._named = writer, writer.spec, -1
         if self._spec.images:
             height, width = self._spec.frame_shape
@@ -167,7 +167,7 @@ class SignalCurves:
         streams: the streams with lines.
     """
 
-    def __init__(self, writer: ViewWriter, header: RunHeader, streams: Sequence[int]) -> None:
+    def __init__(self, writer: Writer, header: RunHeader, streams: Sequence[int]) -> None:
         self._writer, self._names, self._streams = writer, header.spec.streams, list(streams)
         self._by_progress, self._rules = header.by_progress, rules_of(header)
         self._thresholds = list(thresholds_of(header))

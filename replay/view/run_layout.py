@@ -11,7 +11,7 @@ from replay.runs.run import Outline
 from replay.view import layouts
 from replay.view.image_grid import GRID, grid_bounds, sheet_size
 from replay.view.layouts import RECENT, Panel, Tab, Views, beside, curve_view, images
-from replay.view.writer import MOST_STREAMS, Interval, ViewWriter, drawable
+from replay.view.writer import MOST_STREAMS, Interval, Writer, drawable
 
 # Most modules with a page each; of more modules, the number on one page.
 PAGES, MOST_MODULES = 12, 6
@@ -34,7 +34,7 @@ MARGIN = 0.05
 
 def run_layout(
     outline: Outline,
-    writer: ViewWriter | None = None,
+    writer: Writer | None = None,
     *,
     has_scene: bool = False,
     followed: Sequence[Panel] = (),
@@ -71,7 +71,7 @@ class RunLayout:
         has_scene: the world is there in 3D.
     """
 
-    def __init__(self, outline: Outline, writer: ViewWriter | None, *, has_scene: bool) -> None:
+    def __init__(self, outline: Outline, writer: Writer | None, *, has_scene: bool) -> None:
         self._outline, self._header, self._end = outline, outline.header, outline.end
         self._writer, self._spec, self._has_scene = writer, outline.header.spec, has_scene
         keys = ("roc_error", "delta", "novel_share", "min_variance")
@@ -214,9 +214,7 @@ class RunLayout:
                 ends["of the stream"] = int(later[-1]) + self._outline.tau
             entities = [f"/modules/{i}/output", f"/modules/{i}/saved"]
             windows: Views = [
-                curve_view(
-                    f"Output in the last {RECENT} frames {words}", entities, end, start=end - RECENT
-                )
+                curve_view(f"Last {RECENT} frames {words}", entities, end, start=end - RECENT)
                 for words, end in ends.items()
             ]
             output.append(beside(windows))

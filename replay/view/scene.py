@@ -32,7 +32,7 @@ from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, RunHeader
 from replay.storage.paths import log_files
 from replay.view.image_grid import ImageGridView
-from replay.view.writer import ViewWriter, changes, drawable, part
+from replay.view.writer import Writer, changes, drawable, part
 
 # The entity whose frame is the robot's root frame.
 SCENE = "scene"
@@ -64,7 +64,7 @@ PRESET = "the run's recording was not found: the 3D scene is that of its preset"
 
 
 def world_of_run(
-    writer: ViewWriter, header: RunHeader, folder: Path, streams: Sequence[int], every: int
+    writer: Writer, header: RunHeader, folder: Path, streams: Sequence[int], every: int
 ) -> tuple[SceneView | ImageGridView | None, list[str]]:
     """Return a run's world, and its uncertain parts.
 
@@ -148,7 +148,7 @@ class SceneView:
         notes: why the robot's body is not shown.
     """
 
-    def __init__(self, writer: ViewWriter, scenery: Scenery, every: int) -> None:
+    def __init__(self, writer: Writer, scenery: Scenery, every: int) -> None:
         self._writer, self._spec, self._every = writer, writer.spec, every
         self._scenery, self._watched, self._is_posed = scenery, -1, False
         self._looks: Gaze | None = None

@@ -20,7 +20,7 @@ from replay import palette
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
-from replay.view.writer import ViewWriter, drawable, part
+from replay.view.writer import Writer, drawable, part
 
 # Returns the code of the state in each of n blocks, (n,).
 Codes = Callable[[SignalColumns], IntArray]
@@ -53,7 +53,7 @@ class StateTimelines:
 
     def __init__(
         self,
-        writer: ViewWriter,
+        writer: Writer,
         selected: Sequence[int],
         *,
         by_progress: bool,
@@ -127,7 +127,7 @@ class StateTimeline:
     """
 
     def __init__(
-        self, writer: ViewWriter, path: str, states: States, piece: int | None = 1, mixed: str = ""
+        self, writer: Writer, path: str, states: States, piece: int | None = 1, mixed: str = ""
     ) -> None:
         self._writer, self._path, self._states = writer, path, states
         self._piece, self._mixed, self._tau = piece, mixed, 0

@@ -1,6 +1,6 @@
 """Write numbers, images and texts into a Rerun recording, many rows at a time.
 
-Every part of a view writes through `ViewWriter`, which knows the clock of the frames, buffers the
+Every part of a view writes through `Writer`, which knows the clock of the frames, buffers the
 rows of each entity, and remembers the range of its values. Sending rows one by one would cost a
 hundred times more. Rerun reads an array after the call that sends it, so arrays are copied, except
 read-only images.
@@ -123,7 +123,7 @@ class _Buffer:
     bytes: int = 0
 
 
-class ViewWriter:
+class Writer:
     """Writes the rows of a view into a Rerun recording.
 
     Args:
