@@ -27,13 +27,15 @@ from replay.open_sources import open_log
 from replay.storage.identity import Identity
 from replay.stored_source import Span, StoredSource
 
-# Printed warnings of one kind, as about skipped logs; further ones are counted.
+# Largest number of warnings of one kind that are printed; the others are only counted, so that a
+# folder with many damaged logs does not flood the terminal.
 MOST_LINES: Final = 5
 
-# Most episodes of one source: the files of a run list every one of them.
+# Largest number of episodes of one source, because the files of a run list every episode.
 MOST_EPISODES: Final = 20_000
 
-# Keys in the description of a source on how images become frames; they apply to all logs.
+# Keys of a source's description that state how images become frames. They are the same for all
+# logs, so that `described` copies them from the first one.
 _STATED: Final = ("recipe", "size", "fit", "color", "range_metres", "range", "time", "stamp")
 
 Taken = TypeVar("Taken")
@@ -43,16 +45,16 @@ Progress = Callable[[float, float | None], None]
 
 
 class EpisodeSource(StoredSource):
-    """Logs one after the other, ordered by their start times and then by their paths.
+    """Source that reads logs one after the other, ordered by start time, then by path.
 
-    Streams of the same name are one. Between two logs is a gap of `PAUSE` frames, and a log that
-    lacks a stream is a gap in it. One log is open at a time.
+    Streams of the same name form one stream. Between two logs is a gap of `PAUSE` frames; a log
+    that lacks a stream is a gap of that stream. Only one log is open at a time.
 
     Attributes:
         left_out: a line for each log that cannot be read completely.
         framings: for each stream how an image becomes a frame, or None.
         changes: for each stream the first line that states how its images changed.
-        turns: see `turn_to`.
+        turns: frames that are lost when a head turns to another stream; see `turn_to`.
     """
 
     gaps = to_judge = True
@@ -72,13 +74,13 @@ class EpisodeSource(StoredSource):
         Args:
             logs: the files of each log.
             inputs: how images of external logs become frames.
-            loop: begin again at the end.
+            loop: True to start again at the end.
             skip_damaged: skip damaged parts of a log; else the rest of the log is left out.
             progress: called with the number of opened logs and the total.
 
         Raises:
-            UsageError: none of them has frames.
-            LogDamagedError: none can be read.
+            UsageError: no log has frames.
+            LogDamagedError: no log can be read.
         """
         if inputs is not None and inputs.color == "auto":
             raise UsageError(
@@ -121,7 +123,7 @@ class EpisodeSource(StoredSource):
         """Put logs with the frame shape, type and rate of the first log on one clock.
 
         Yields:
-            A line for each other log, which is skipped.
+            A warning for each other log, which is skipped.
         """
         first = episodes[0]
         alike = [episode for episode in episodes if are_alike(episode.spec, first.spec)]
@@ -155,23 +157,23 @@ class EpisodeSource(StoredSource):
         return self._pixels[stream]
 
     def skipped_damage(self) -> list[str]:
-        """Return a line for each log that is damaged, and was left out from there on."""
+        """Return a warning for each damaged log, whose frames are skipped from the damage on."""
         return list(_few(self._lost))
 
     def hold_out(self, count: int) -> None:
-        """Keep the last episodes from `take` that lie within so many frames, or else these."""
+        """Hold out the last episodes that fit into `count` frames, or else the last frames."""
         first = bisect.bisect_left(self._starts, self.frames - count)
         whole = first < len(self._starts)
         super().hold_out(self.frames - self._starts[first] if whole else count)
 
     def episode(self, stream: int, t: int) -> Span:
-        """Return the log [start, stop) that a frame is of, or the episode of a dataset."""
+        """Return the frames [start, stop) of the log, or dataset episode, that contains frame t."""
         t %= self.frames
-        one = self._episodes[bisect.bisect_right(self._starts, t) - 1]
-        if one.many:
-            spans = one.spans(self._spec.streams[stream])
+        episode = self._episodes[bisect.bisect_right(self._starts, t) - 1]
+        if episode.many:
+            spans = episode.spans(self._spec.streams[stream])
             return next(span for span in spans if span[0] <= t < span[1])
-        return one.start, one.start + one.count
+        return episode.start, episode.start + episode.count
 
     def take(self, stream: int, n: int) -> Block:
         """See `StoredSource.take`; damaged parts are skipped."""
@@ -229,16 +231,16 @@ class EpisodeSource(StoredSource):
         place = t % self.frames
         number = bisect.bisect_right(self._starts, place) - 1
         self._reading = number, place
-        one, source = self._episodes[number], self._log(number)
-        source.seek(place - one.start + one.first)
-        block = source.take(one.spec.streams.index(self._spec.streams[stream]), n)
+        episode, source = self._episodes[number], self._log(number)
+        source.seek(place - episode.start + episode.first)
+        block = source.take(episode.spec.streams.index(self._spec.streams[stream]), n)
         return replace(block, stream=stream, t=t)
 
     def _log(self, number: int) -> LoggedSource:
-        """Return a log, opened, after closing any other one.
+        """Return a log; open it and close the previous one if it is not open yet.
 
         Raises:
-            LogDamagedError: it cannot be opened any more, or has changed.
+            LogDamagedError: the log can no longer be opened, or has changed.
         """
         if self._open_now is None or self._open_now[0] != number:
             self.close()
@@ -261,9 +263,9 @@ class EpisodeSource(StoredSource):
     def _leave_out(self, error: LogDamagedError) -> None:
         """Skip a damaged log from the current block on."""
         number, t = self._reading
-        one = self._episodes[number]
-        one.whole = 0 if self.centre == "episode" else min(t - one.start, one.whole)
-        rest = "the rest of this log is" if one.whole else "this log is"
+        episode = self._episodes[number]
+        episode.whole = 0 if self.centre == "episode" else min(t - episode.start, episode.whole)
+        rest = "the rest of this log is" if episode.whole else "this log is"
         self._lost.append(f"{error}: {rest} skipped")
         self.left_out = (*self.left_out, self._lost[-1])
 

@@ -24,7 +24,7 @@ LAST_NS: Final = 2**62
 
 Value = TypeVar("Value")
 
-# Rows of a stream: one a message, image or row of a table, from 0.
+# Numbers of rows of a stream, from 0. A row is one message, image or row of a table.
 Rows = range | IntArray
 
 
@@ -33,7 +33,7 @@ class UnreadableError(LogDamagedError):
 
 
 class NothingLoggedError(LogDamagedError):
-    """A log that was cut before its first message."""
+    """The log was cut before its first message."""
 
 
 # Errors of a single image; later images may be readable.
@@ -44,34 +44,34 @@ BROKEN: Final = (MalformedImage, MalformedRecord, UnreadableError)
 class LogStream:
     """One topic, video, folder of images, table, array, or view of a recording.
 
-    Its rows are read one by one, by `fetch` and `decode`, or, where none is broken by itself, many
-    at once, by `read`.
+    Rows are read one at a time with `fetch` and `decode`. Formats in which a single row cannot be
+    damaged by itself have `read`, which reads many rows at once.
 
     Attributes:
         path: the log.
         topic: the topic; in formats without topics the name of the file or column.
         count: number of rows.
-        times: (count,) nanoseconds, not decreasing; None of rows at any even rate.
-        begins: time of the first row where `times` is None, nanoseconds.
-        fetch: reads the stored bytes of a row; not in several threads.
-        decode: turns them into an image, gray and of its own size, or numbers (I,).
+        times: (count,) log times (ns), not decreasing; None for rows that may have any even rate.
+        begins: log time of the first row if `times` is None (ns).
+        fetch: reads the stored bytes of a row; one thread at a time may call it.
+        decode: turns these bytes into a gray image of its original size, or numbers (I,).
         compressed: returns the JPEG or PNG in these bytes, which threads can decode ahead; None if
             the images have another encoding.
         read: returns the frames or images of rows, (n, ...), and their ground truth, (n, D).
         memory_bytes: returns the bytes of the memory budget that `fetch` holds.
         program: name of the decoding library in errors.
         where: returns the name of a row in errors.
-        stamp: returns the time in their header, nanoseconds; None without a header.
-        pixel_format: returns the pixel format that they state; None if they state none.
+        stamp: returns the time in the header of a message (ns); None without a header.
+        pixel_format: returns the pixel format that a message states; None if it states none.
         encoding: encoding of its images in formats without messages.
-        recipe: how an image becomes a frame, for the record.
-        fields: the numbers that are taken instead of images, in their order.
-        warnings: a line for each thing that the user should know.
-        remarks: a line for each property that its format cannot prove, as checksums.
+        recipe: text that states how an image becomes a frame, stored with runs.
+        fields: names of the numbers that are read instead of images, in order.
+        warnings: lines to print for the user.
+        remarks: a line for each property that the format cannot guarantee, as without checksums.
         missing: the missing part of a truncated file, or "".
         reader: the MCAP file, if all rows are in one.
         digest: returns name, type, shape and hash of an array of the caller, as JSON values.
-        views: the files of a view of our recordings, by first frame; rows are then frame numbers.
+        views: in recordings the files of the view, by first frame; rows are frame numbers.
     """
 
     path: Path
@@ -103,7 +103,7 @@ class LogStream:
 
         Raises:
             UsageError: there are no rows.
-            LogDamagedError: a time lies elsewhere.
+            LogDamagedError: a time lies outside.
         """
         if not self.count:
             raise UsageError(f"{self.path}: {self.topic} has no messages or frames")
@@ -135,7 +135,7 @@ class LogStream:
         return f"{self.path}: {self.topic}{at}"
 
     def part(self, rows: IntArray, times: IntArray | None) -> LogStream:
-        """Return some rows of the stream, at the times given."""
+        """Return a stream of some of the rows, at the given times."""
 
         def at(function: Callable[[int], Any]) -> Callable[[int], Any]:
             return lambda row: function(int(rows[row]))
@@ -153,7 +153,7 @@ def check_times(where: object, times: IntArray) -> None:
 
 
 def joined(parts: Sequence[LogStream]) -> LogStream:
-    """Return streams with times as one, by time, ties in the order of the streams."""
+    """Merge streams with times into one, ordered by time, ties in the order of the streams."""
     times = np.concatenate([part.times for part in parts if part.times is not None])
     order = np.argsort(times, kind="stable")
     part_of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
@@ -189,13 +189,13 @@ def joined(parts: Sequence[LogStream]) -> LogStream:
 
 
 def picked(array: NDArray[Any], rows: Rows) -> NDArray[Any]:
-    """Return some rows of an array; of rows that follow one another without a copy."""
+    """Return rows of an array; a range of rows is not copied."""
     return array[rows.start : rows.stop] if isinstance(rows, range) else array[rows]
 
 
 @contextmanager
 def explained(path: object, program: str, remedy: str = "") -> Iterator[None]:
-    """Turn any error of a library that reads a file into one line.
+    """Turn any error of a library that reads a file into an error of one line.
 
     Raises:
         UnreadableError: the library raised an error, or would take more memory than its budget.
@@ -217,7 +217,7 @@ def explained(path: object, program: str, remedy: str = "") -> Iterator[None]:
 def limited(
     path: object, program: str, *, memory_bytes: int = 0, remedy: str = ""
 ) -> Iterator[None]:
-    """Do as `explained` within the memory budget for untrusted files.
+    """Limit the memory to the budget for untrusted files, and do as `explained`.
 
     PyArrow then uses the system's memory, because its own pool reserves memory outside any budget.
     """
@@ -267,7 +267,7 @@ class ExternalChannel:
         info: the channel.
         images: whether its messages are images that can be read.
         missing: the missing part of a truncated file, or "".
-        remarks: a line for each property that the format cannot prove, as checksums.
+        remarks: a line for each property that the format cannot guarantee, as without checksums.
     """
 
     info: ChannelInfo

@@ -33,7 +33,7 @@ PHI_TOPIC = "/phi"
 TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
 
-# Iterations between two weights that a log keeps.
+# Iterations between two copies of the abstraction's weights in a log.
 PHI_EVERY = 50
 
 
@@ -117,7 +117,7 @@ def header_in(reader: LogReader) -> RunHeader:
     schema = metadata.get("schema", "")[:20]
     if not (schema.isascii() and schema.isdigit() and 0 < int(schema) < 10**9):
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken (schema {schema!r})")
-    if int(schema) != SCHEMA_VERSION:  # asked first: all else may look different in it
+    if int(schema) != SCHEMA_VERSION:  # checked first: other versions may differ in all else
         written = f"{log} was written with version {schema} of the signals"
         raise UsageError(f"{written}: read it with the version of cdmisfa that wrote it")
     try:
@@ -134,7 +134,7 @@ TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, PHI_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 # Most iterations of a batch.
 BATCH_ITERATIONS = 500
 
-# Bytes of messages after which a batch ends earlier.
+# Bytes of messages after which a batch ends with fewer iterations, so that it fits into memory.
 MAX_BYTES = 16 * 1024 * 1024
 
 # (n,) frames and (n, ...) their values.
@@ -148,8 +148,9 @@ class Batch:
     """Messages of some consecutive iterations, decoded.
 
     Attributes:
-        blocks: blocks of the records, after the last block before them, to which the first of
-            the other messages may belong; empty if the records were not asked for.
+        blocks: the last block before the batch, to which its first messages may belong, then the
+            blocks of `signals`; empty if the signals are not read.
+        watched: frames of the attended stream.
         truth: ground truth, (n, D).
         phi: (t, (J, I)) weights of the abstraction.
     """
@@ -180,7 +181,7 @@ def read_batches(
         start: frame to begin at, the first of a block.
 
     Raises:
-        UsageError: there is no such run, or it has another version of the signals.
+        UsageError: the run does not exist, or has another version of the signals.
         LogDamagedError: a message is damaged, or a finished file is cut short.
     """
     log = run_log(path)
@@ -212,7 +213,8 @@ class BatchReader:
         log: path of the log, for messages.
         header: header of the log.
         channels: channels of the log.
-        every: see `read_batches`, as `topics`.
+        every: see `read_batches`.
+        topics: see `read_batches`.
     """
 
     def __init__(
@@ -229,6 +231,7 @@ class BatchReader:
         self._begin(Blocks.concatenated(()))
 
     def _begin(self, before: Blocks) -> None:
+        """Start an empty batch after the last block of the previous batch."""
         self._before = before
         self._data: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
         self._frames: dict[str, list[int]] = {topic: [] for topic in TOPICS}
@@ -282,6 +285,7 @@ class BatchReader:
         return batch
 
     def _records(self) -> tuple[SignalColumns, ...]:
+        """Return the decoded records of the batch."""
         where = f"{self._log} {SIGNALS_TOPIC}"
         records = tuple(decode_columns(self._data[SIGNALS_TOPIC], where))
         streams = len(self._spec.streams)
@@ -298,6 +302,7 @@ class BatchReader:
         return records
 
     def _images(self) -> tuple[Frames, ...]:
+        """Return the decoded images of the batch as one array, or none."""
         where, shape = f"{self._log} {WATCHED_TOPIC}", self._spec.frame_shape
         images = [parsed(RawImage_pb2.RawImage, m, where).data for m in self._data[WATCHED_TOPIC]]
         if not images:

@@ -19,9 +19,11 @@ SCHEMES: Final = ("s3", "http", "https")
 # Environment variable with the folder of copies, so that processes started here share it.
 COPIES: Final = "CDMISFA_COPIES"
 
+# User name and password, query and fragment of a URL: messages must not repeat them.
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@|[?#].*")
 
-# How long a web server may send nothing: aiohttp's own limit of 300 s in all ends large copies.
+# Longest time without data from a web server (s). aiohttp's default, 300 s for a whole copy, ends
+# large copies.
 _SILENT_SECONDS: Final = 60.0
 
 
@@ -36,9 +38,9 @@ def location(word: str | Path) -> Path:
     The copy is made once and removed when the process ends.
 
     Raises:
-        UsageError: the word is empty, or a URL of a scheme that is not read, or a package that
+        UsageError: the word is empty, the scheme of the URL is not supported, or a package that
             reads URLs is missing.
-        CdmisfaError: the server does not give it.
+        CdmisfaError: the server does not deliver the log.
     """
     if not is_url(word):
         if word == "":
@@ -57,6 +59,7 @@ def with_urls(text: str) -> str:
 
 @functools.cache
 def _copied(address: str) -> Path:
+    """Copy the log at a URL, and return the path of the copy."""
     public_url = _SECRET.sub("", address)
     scheme, _, place = public_url.partition("://")
     if scheme not in SCHEMES:
@@ -74,8 +77,8 @@ def _copied(address: str) -> Path:
     except FileNotFoundError:
         raise CdmisfaError(f"{public_url}: no such file") from None
     except Exception as error:  # whatever fsspec's file systems raise
-        what = one_line(error).replace(address, public_url)
-        raise CdmisfaError(f"{public_url}: {what}") from error
+        reason = one_line(error).replace(address, public_url)
+        raise CdmisfaError(f"{public_url}: {reason}") from error
     return target
 
 

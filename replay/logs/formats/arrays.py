@@ -1,4 +1,4 @@
-"""Arrays of numbers or of images, of the caller or in files of NumPy, at any even rate."""
+"""Arrays of numbers or images as streams: from the caller, or from NumPy files."""
 
 from __future__ import annotations
 
@@ -28,12 +28,14 @@ ENDINGS: Final = (".npy", ".npz")
 # Default rate in frames per second, as arrays have no times.
 FPS: Final = 50.0
 
-# How arrays of other types than uint8 become frames, for the record.
+# How arrays of other types than uint8 become frames. Runs store this text to identify their source,
+# so that its wording does not change.
 RECIPE: Final = (
     "pictures: truth as 0 and 255, 16 bit by its high byte, floats of 0 to 1 as round(255 x); "
     "numbers as they are, float64"
 )
 
+# Remedy in errors about an unsupported shape.
 _FORMS: Final = (
     "use (n,) or (n, values) for numbers, (n, height, width) for grey images, or "
     "(n, height, width, 3) for images in colour"
@@ -46,8 +48,8 @@ def streams(
     """Open a file of NumPy; each array of an .npz is a stream.
 
     Raises:
-        UsageError: no such array, or one that holds no frames.
-        LogDamagedError: the file holds something else.
+        UsageError: a chosen array does not exist or holds no frames.
+        LogDamagedError: the file is damaged or holds no arrays.
     """
     arrays = load_numbers(path)
     chosen = [name for name in arrays if not options.topics or fits_topic(name, options.topics)]
@@ -72,7 +74,7 @@ def array_streams(
         path: path of their file; None for arrays of the caller.
 
     Raises:
-        UsageError: an array has another form, or holds numbers that are not finite.
+        UsageError: an array has another shape, or holds numbers that are not finite.
     """
     if not arrays:
         raise UsageError("no array is given: give at least one")
@@ -94,11 +96,11 @@ def array_streams(
 
 
 def load_numbers(path: Path) -> dict[str, NDArray[Any]]:
-    """Load the arrays of a user's file, by name; the one of .npy is mapped, and called as the file.
+    """Return the arrays of a file by name; that of a .npy file is memory-mapped, named as the file.
 
     Raises:
         UsageError: the file does not exist, or is too large.
-        LogDamagedError: the file holds something else.
+        LogDamagedError: the file is damaged or holds no arrays.
     """
     check_regular(path)
     try:
@@ -129,7 +131,7 @@ def array_channels(path: Path) -> list[ExternalChannel]:
 
 
 def array_hash(name: str, array: NDArray[Any]) -> dict[str, Any]:
-    """Return what identifies an array of the caller, as JSON values."""
+    """Return name, type, shape and hash of an array of the caller, as JSON values."""
     digest = hashlib.sha256()
     for start in range(0, len(array), 1024):
         digest.update(np.ascontiguousarray(array[start : start + 1024]).data)
@@ -139,20 +141,20 @@ def array_hash(name: str, array: NDArray[Any]) -> dict[str, Any]:
 
 def _frames(array: NDArray[Any], color: bool, rows: Rows) -> tuple[NDArray[Any], FloatArray]:
     """Return rows of an array as images of uint8, or numbers of float64, never a view of it."""
-    part, none = picked(array, rows), np.empty((len(rows), 0))
+    part, no_truth = picked(array, rows), np.empty((len(rows), 0))
     if part.ndim == 2:
-        return part.astype(np.float64), none
+        return part.astype(np.float64), no_truth
     if part.dtype == np.uint16:
         pixels = (part >> 8).astype(np.uint8)
     else:
         pixels = pixels_of(part).astype(np.uint8)
     if pixels.ndim == 3 or color:
-        return pixels, none
+        return pixels, no_truth
     height, width = pixels.shape[1:3]
     gray = [
         raw_image(np.ascontiguousarray(x).reshape(-1).data, height, width, "rgb8") for x in pixels
     ]
-    return np.stack(gray), none
+    return np.stack(gray), no_truth
 
 
 def _checked(name: str, given: Any) -> NDArray[Any]:
