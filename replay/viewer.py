@@ -1,6 +1,6 @@
 """Rerun's own programs: the window of a view, its page in a browser, and its screenshot.
 
-All of them listen at 127.0.0.1 alone.
+All of them listen at 127.0.0.1 only.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ HOST = "127.0.0.1"
 # Size of a screenshot, in points.
 WINDOW = "1600x1000"
 
-# Seconds after which the viewer's notices are gone from a screenshot.
+# Seconds before a screenshot, in which the viewer's notices disappear.
 SETTLE = 6.0
 
 # Longest wait for an answer of the viewer, which is slow without a graphics card.
 SECONDS = 120.0
 
-# Installs a Vulkan driver that needs no graphics card.
+# Command that installs a Vulkan driver for machines without a graphics card.
 INSTALL = "apt-get install mesa-vulkan-drivers libvulkan1"
 
 ITERATION_PATTERN = re.compile(r"iteration\s*(\d+)", re.IGNORECASE)
@@ -73,10 +73,10 @@ class Program(subprocess.Popen[bytes]):
         self._output.close()
 
     def until_end(self) -> None:
-        """Wait until it ends.
+        """Wait until the program ends.
 
         Raises:
-            CdmisfaError: it ends with an error.
+            CdmisfaError: the program ends with an error.
         """
         if self.wait():
             raise self._failure()
@@ -88,10 +88,12 @@ class Program(subprocess.Popen[bytes]):
         return CdmisfaError(f"the viewer ended with code {self.returncode}: {why[0].strip()}")
 
     def wait_for(self, condition: Callable[[], Any]) -> Any:
-        """Repeat a question until its answer is true; Rerun's client raises until it has one.
+        """Call `condition` until its result is true, and return the result.
+
+        Errors are ignored, because Rerun's client raises them until the viewer answers.
 
         Raises:
-            CdmisfaError: the program ended, or there is no answer in time.
+            CdmisfaError: the program ended, or the result is not true in time.
         """
         end = time.monotonic() + SECONDS
         while time.monotonic() < end:
@@ -104,11 +106,11 @@ class Program(subprocess.Popen[bytes]):
         raise CdmisfaError(f"the viewer did not respond within {SECONDS:.0f} s")
 
     def connect(self, port: str, frame: int | None) -> Any:
-        """Return Rerun's client of the viewer once that shows its view, at a frame.
+        """Wait until the viewer shows its view, and return Rerun's client of it.
 
         Args:
-            port: where the viewer listens.
-            frame: where the time cursor is put; None leaves it at the end.
+            port: port at which the viewer listens.
+            frame: frame to put the time cursor at; None leaves it at the end.
         """
         from rerun.experimental import ViewerClient
 
@@ -163,7 +165,7 @@ def served(view: Path, port: int = 0) -> Iterator[tuple[Program, str]]:
 
 @contextlib.contextmanager
 def live_window(data: str, say: Callable[[str], None]) -> Iterator[None]:
-    """Show a live view in a window, or where there is no display at a page.
+    """Show a live view in a window, or without a display on a web page.
 
     The window stays open afterwards, with its last view.
 
@@ -220,7 +222,7 @@ def screenshot(view: Path, out: Path, frame: int | None = None) -> None:
 
 
 def frame_at(path: Path, at: str) -> int:
-    """Return the frame of a moment.
+    """Return the number of the frame that --at names.
 
     Args:
         path: a run or recording, or an .rrd file.
@@ -253,10 +255,10 @@ def free_port(port: int = 0) -> int:
     """Return a port of this machine at which nothing listens.
 
     Args:
-        port: the one that is wanted; 0 for any.
+        port: the requested port; 0 for any.
 
     Raises:
-        CdmisfaError: it is taken, or not for this user.
+        CdmisfaError: the port is taken, or this user may not use it.
     """
     with socket.socket() as probe:
         try:

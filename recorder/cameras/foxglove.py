@@ -27,7 +27,10 @@ from recorder.images.videos import VideoPackets
 # Names of the protocol, the newer one first.
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 
+# Number that the client gives to its only subscription.
 _SUBSCRIPTION: Final = 1
+
+# Opcode of the binary messages that carry data.
 _DATA: Final = 1
 
 # Seconds within which the server must answer.
@@ -49,7 +52,7 @@ logging.getLogger("websockets").addHandler(logging.NullHandler())
 
 
 class FoxgloveCamera:
-    """A topic with images, or with messages that have fields, of a Foxglove server.
+    """Camera that reads a topic of a Foxglove server: images, or messages with fields.
 
     Args:
         host: host of the server, with its port.
@@ -85,7 +88,7 @@ class FoxgloveCamera:
                 self._server,
                 subprotocols=PROTOCOLS,  # type: ignore[arg-type]
                 compression=None,
-                max_size=None,
+                max_size=None,  # a raw image can exceed the default of 1 MiB
                 open_timeout=_TIMEOUT,
                 proxy=None,
             )

@@ -39,6 +39,7 @@ MAX_NAMED: Final = 100
 # Packages whose versions every file states.
 PACKAGES: Final = ("cdmisfa", "numpy", "zstandard")
 
+# Prefix of the keys that state the versions of packages.
 _VERSION = "version_"
 
 # Keys that a file has only if they are not the default.

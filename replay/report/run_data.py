@@ -31,16 +31,16 @@ TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 # Frames on which a module's outputs are drawn and fitted: more dots would overlap in a plot.
 MOST_OUTPUTS = 2000
 
-# Last frames of a stream on which all outputs of its module are drawn side by side.
+# Number of last frames of a stream on which all outputs of its module are drawn side by side.
 RECENT = 80
 
-# Last frames of a stream of numbers that its card shows.
+# Number of last frames that the card of a stream of numbers shows.
 VALUES = 200
 
-# Most modules whose outputs are computed: the time to read a run grows with their number.
+# Largest number of modules whose outputs are computed: the time to read a run grows with their number.
 MOST_MODULES = 40
 
-# Events that are listed: the first and the last of a run.
+# Largest number of listed events: the first and the last of a run.
 MOST_EVENTS = 400
 
 
@@ -63,7 +63,7 @@ class ModuleData:
         self.recent: tuple[NDArray[Any], NDArray[Any]] = np.empty(0, np.int64), outputs
 
     def add(self, batch: Batch) -> None:
-        """Take the next batch of the log in."""
+        """Add the outputs on the next batch of the log."""
         for t, frames, y in self.stream.take(batch):
             truth = np.full((len(t), len(self._spec.truth)), np.nan)
             for at, values in batch.truth if self._spec.truth else ():

@@ -59,7 +59,8 @@ _TYPES = {
     "bool": _Type(_FIELD.TYPE_BOOL, _VARINT, np.dtype("u1"), "?"),
 }
 
-# Signals whose fields are numbered after that of `SHAPES`: numbers of fields stay as they are.
+# Signals that were added after `SHAPES` was numbered. Their fields are numbered after it, because
+# the numbers of fields must not change.
 _BEHIND_SHAPES = (
     *("roc_error_inst", "roc_error", "roc_error_frozen", "change", "tested", "fitted"),
     *("learning_error", "interest", "state", "typical", "regret"),

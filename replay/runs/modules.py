@@ -50,8 +50,8 @@ def load_modules(path: Path) -> tuple[Module, ...]:
     """Read the modules of a file or of a run's folder, in the order of learning.
 
     Raises:
-        UsageError: there is no such file.
-        LogDamagedError: the file holds something else.
+        UsageError: the file does not exist.
+        LogDamagedError: the file is damaged or holds no modules.
     """
     path = Path(path)
     path = path / MODULES_FILE if path.is_dir() else path

@@ -26,7 +26,7 @@ from replay.view.scene import world_of_run
 from replay.view.state_timelines import StateTimelines
 from replay.view.writer import WIDTH, Writer, changes, drawable, part, power_of_ten
 
-# Signals that are the timelines.
+# Signals that are timelines of the view, not curves.
 TIMELINES = ("iteration", "t", "log_time")
 
 # Index of the first colour of signals that share a plot with another signal.
@@ -51,7 +51,7 @@ WATCHED_NAME = "world/watched/name"
 
 
 class RunView:
-    """Writes a run into a recording.
+    """Writes a run into a view.
 
     Args:
         writer: writer of the Rerun recording.
@@ -64,7 +64,7 @@ class RunView:
 
     Attributes:
         modules: the view of the modules.
-        world: the view of the world; None where none is known.
+        world: the view of the simulated world; None if the run has none.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class Inputs:
 
 
 class Curve(NamedTuple):
-    """Values of the records, of those `of` them, or of each of their frames, drawn as lines."""
+    """Lines of a plot: values of the records that `of` selects, or of each of their frames."""
 
     path: str
     names: Sequence[str]
@@ -187,7 +187,7 @@ class SignalCurves:
                 ends = columns.frames[[0, -1]], columns.iterations[[0, -1]]
                 self._writer.lines(path, [name], ends, np.full((2, 1), value), [GREY])
             saved = np.flatnonzero(columns["saved"])
-            if len(saved):  # the value that must come down is marked where a module was saved
+            if len(saved):  # mark the save of a module on the value that must fall before it
                 falls = "learning_error" if self._by_progress else "eta_dot"
                 place = "streams/saved" if self._by_progress else "abstraction/saved"
                 values = power_of_ten(columns[falls]).reshape(len(columns), -1)[saved, :1]
@@ -228,7 +228,7 @@ class SignalCurves:
                 yield Curve(path, names, value, rgbs, per_frame=per_frame)
 
     def _learning(self, columns: SignalColumns) -> Iterator[Curve]:
-        """Yield what must fall or rise until a module is saved, and bands of saved ones."""
+        """Yield the values that must fall or rise before a save, and the bands of saved modules."""
         outputs = columns["y"].shape[2]
         for name in POWERS:
             values = power_of_ten(columns[name].astype(np.float64).reshape(len(columns), -1))
@@ -300,7 +300,7 @@ def line_names(signal: Signal, module: int, outputs: int) -> list[str]:
 
 
 def thresholds_of(header: RunHeader) -> Iterator[tuple[str, str, float]]:
-    """Yield entity, label and value of each line that is crossed where something is learned."""
+    """Yield entity, label and value of each threshold that a curve crosses before a save."""
     change, agreement = header.number("settled"), header.number("agreement")
     if header.by_progress and change and agreement:
         yield "thresholds/change", "settled below", math.log10(change)

@@ -1,4 +1,4 @@
-"""ROS bags, a rosbag2 (.db3) or a ROS 1 .bag, through rosbags."""
+"""Read ROS bags, rosbag2 (.db3) or ROS 1 (.bag), with the package rosbags."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ METADATA: Final = "metadata.yaml"
 # Largest metadata.yaml that is read, in bytes.
 MAX_METADATA: Final = 1024 * 1024
 
-# Largest ratio of a packed file's contents to its size, beyond the size of a chunk. Only images of
-# one colour are packed to less.
+# Largest ratio of unpacked to packed size, against files that would fill the disk. Contents up to
+# the size of a chunk are always accepted. Only images of one colour exceed the ratio.
 MOST_TIMES: Final = 100
 
 
@@ -78,18 +78,18 @@ class Bag(NamedTuple):
                 yield from storage.dbconn.execute(query, tuple(topics))
 
     def fetcher(self, topic: str, times: IntArray) -> Callable[[int], bytes]:
-        """Return a function that reads the messages on a topic, quickly in their order."""
-        coming: Iterator[tuple[str, int, Any]] = iter(())
-        following = -1
+        """Return a function that reads the message of a row of a topic, fastest row after row."""
+        remaining: Iterator[tuple[str, int, Any]] = iter(())
+        next_row = -1
 
         def fetch(row: int) -> bytes:
-            nonlocal coming, following
-            if row != following:
-                coming = self.messages([topic], int(times[row]))
-                following = int(np.searchsorted(times, times[row]))
-            while following <= row:
-                _, _, data = next(coming, ("", 0, b""))
-                following += 1
+            nonlocal remaining, next_row
+            if row != next_row:
+                remaining = self.messages([topic], int(times[row]))
+                next_row = int(np.searchsorted(times, times[row]))
+            while next_row <= row:
+                _, _, data = next(remaining, ("", 0, b""))
+                next_row += 1
             if not isinstance(data, bytes):  # SQLite keeps anything in any column
                 at = f"{self.path}: {topic} at {times[row]} ns"
                 raise LogDamagedError(f"{at}: the message is not stored as bytes")
@@ -112,7 +112,9 @@ def streams(
         kinds = [(topic, kind, topic) for topic, kind in bag.kinds().items()]
     opened_streams = []
     for topic, kind, _ in choose_topics(path, kinds, options):
-        bag = opened.enter_context(open_bag(path))  # readers hold one chunk: of one topic
+        bag = opened.enter_context(
+            open_bag(path)
+        )  # a reader holds one chunk, so one for each topic
         with limited(path, "rosbags"):
             times = np.array([stamp for _, stamp in bag.stamps([topic])], np.int64)
         if (times[1:] < times[:-1]).any():
@@ -187,11 +189,12 @@ def open_bag(path: Path) -> Iterator[Bag]:
 def _parts(path: Path) -> Iterator[Sequence[Path]]:
     """Yield the paths for rosbags: the bag, or its packed files, unpacked to a temporary folder.
 
-    rosbags unpacks files without a limit; chunks and messages take memory alone, of the budget.
+    Files are unpacked here, because rosbags sets no limit. It unpacks chunks and messages in memory,
+    which has a budget.
 
     Raises:
-        UsageError: a file of it is no regular one.
-        LogDamagedError: it is no bag, or unpacks to far more than it is.
+        UsageError: a file of the bag is not a regular file.
+        LogDamagedError: the folder is not a bag, or its files unpack to more than the limit.
     """
     if not path.is_dir():
         check_regular(path)
@@ -222,7 +225,7 @@ def _unpacked(packed: Path, folder: Path) -> Path:
     """Unpack a file into a folder, unless it becomes far too large or leaves no room on the disk.
 
     Raises:
-        LogDamagedError: it would, or it is not packed by zstd.
+        LogDamagedError: the file exceeds the limit, or was not packed by zstd.
     """
     target = folder / packed.stem
     with limited(packed, "zstd"), opened_regular(packed) as source, target.open("xb") as out:
