@@ -1,4 +1,4 @@
-"""Computation of many tasks: in this process, in local worker processes, or on a dask cluster."""
+"""Compute many tasks: in this process, in local worker processes, or on a dask cluster."""
 
 from __future__ import annotations
 
@@ -185,6 +185,7 @@ class _Filed:
 
 
 def _read(path: str) -> Any:
+    """Return the result in a file, and remove the file."""
     with open(path, "rb") as file:
         os.unlink(path)
         return pickle.load(file)

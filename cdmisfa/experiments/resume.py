@@ -1,4 +1,4 @@
-"""Computation of a run again from a keyframe, to resume, fork, inspect or verify it."""
+"""Compute a run again from a keyframe, to resume, fork, inspect or verify it."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def fork_span(
 
 
 def restore(learner: Learner, keyframe: Keyframe, spec: SourceSpec) -> None:
-    """Set a learner to the state of a keyframe, for a source of this spec."""
+    """Set a learner to the state of a keyframe; its modules get the frame shape of `spec`."""
     try:
         modules = (replace(m, frame_shape=spec.frame_shape) for m in keyframe.state.modules)
         learner.restore(replace(keyframe.state, modules=tuple(modules)))

@@ -1,4 +1,4 @@
-"""Trials on oscillatory streams entirely in C, without Python code for each block.
+"""Run trials on oscillatory streams entirely in C, without Python code for each block.
 
 A trial gives bit for bit what `CuriousLearner.step` gives on the same source. It needs streams that
 repeat, as the oscillatory streams do, so that one period of frames in memory is the whole source.
@@ -24,7 +24,7 @@ from cdmisfa.experiments.loop import ending
 from cdmisfa.modules import Module
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
 
-# Iterations in one call of C. It changes the speed only.
+# Iterations in one call of C. The number changes the speed only.
 CHUNK = 512
 
 
@@ -149,6 +149,7 @@ def _expand(
 
 
 def _records(n: int, outputs: int, streams: int) -> dict[str, NDArray[Any]]:
+    """Return empty arrays for the signals of n iterations; see `TrialResult.curves`."""
     return {
         "outcome": np.zeros(n, OUTCOME),
         "eta_dot": np.zeros((n, outputs)),
@@ -159,6 +160,7 @@ def _records(n: int, outputs: int, streams: int) -> dict[str, NDArray[Any]]:
 
 
 def _as_struct(record: Mapping[str, NDArray[Any]]) -> kernels.Struct | None:
+    """Return the arrays of `_records` as a C struct, or None if there are none."""
     arrays = {
         name: kernels.records(name, array)
         if name == "outcome"

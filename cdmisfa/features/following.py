@@ -44,8 +44,8 @@ class BatchOutputs(NamedTuple):
 def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) -> BatchOutputs:
     """Return the slowest outputs within the leading principal components of frames.
 
-    All frames have equal weights. The result approaches that of `batch_sfa` on the components; the
-    difference is what `STORED_PER_COMPONENT` times as many directions do not hold.
+    All frames have equal weights. The result is close to that of `batch_sfa` on the components, but
+    not equal, because only `STORED_PER_COMPONENT` directions a component are stored.
 
     Args:
         pieces: at least one piece of uint8 pixels, which count 1/255 each, or float64 values.

@@ -1,4 +1,4 @@
-"""`Recording`: recordings, external logs and arrays as the source of a run, or to look at."""
+"""`Recording`: recordings, external logs and arrays, to learn from or to view."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class Recording(Described):
             (n, height, width) or (n, height, width, 3); row i of all of them has the same time.
         loop: True to start again at the end.
         skip_damaged: True to skip damaged parts of files.
-        episodes: True if each path is an episode, one after the other. The logs of a folder that
-            `cdmisfa index` indexed always are.
+        episodes: True to read the paths one after the other, each as an episode. The logs of an
+            indexed folder (see `cdmisfa index`) always are episodes.
         options: which streams, and how they become frames: the input options of `cdmisfa learn`
             (`topics`, `fields`, `size`, `rate`, `start`, `end`, `align`, `color`) and the keys
             `input.*`, such as `fit="pad"` or `centre="episode"`.

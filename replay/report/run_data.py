@@ -37,7 +37,7 @@ RECENT = 80
 # Number of last frames that the card of a stream of numbers shows.
 VALUES = 200
 
-# Largest number of modules whose outputs are computed: the time to read a run grows with their number.
+# Largest number of modules whose outputs are computed: the time to read a run grows with it.
 MOST_MODULES = 40
 
 # Largest number of listed events: the first and the last of a run.

@@ -153,13 +153,13 @@ def slow_outputs(candidate: Candidate, config: ProgressConfig) -> NDArray[np.int
     low, high = VARIANCE_BOUNDS
     tested, fitted = candidate.tested, candidate.sfa.state.spectrum[: len(candidate.variance)]
     apart = [abs(log_ratio(float(a), float(b))) for a, b in zip(tested, fitted, strict=True)]
-    alive = (low < candidate.variance) & (candidate.variance < high)
+    varies = (low < candidate.variance) & (candidate.variance < high)
     agrees, below = np.array(apart) < config.agreement, config.slow * candidate.typical
-    return np.asarray(agrees & alive & (tested < below), dtype=np.int64)
+    return np.asarray(agrees & varies & (tested < below), dtype=np.int64)
 
 
 def is_learned(candidate: Candidate, config: ProgressConfig) -> bool:
-    """Return whether the slowest output may be saved: slow on new frames, alive and settled.
+    """Return whether the slowest output may be saved: slow on new frames, varying and settled.
 
     The threshold of settling grows with the number of tests, so that an output that hardly changes
     is saved sooner. An output that keeps rotating among equally slow directions has settled if the

@@ -134,7 +134,7 @@ def learn_command(
 
 
 def _learn_as_started(ctx: click.Context, run: Path | None) -> int:
-    """Resume a run with its own source and options; options that are given now win."""
+    """Resume a run with its stored source and options; options of the command line come first."""
     from cdmisfa.experiments.run_folder import read_command
 
     if run is None:

@@ -49,7 +49,7 @@ def load(name: str) -> Experiment:
     """Return an experiment by its name.
 
     Raises:
-        UsageError: there is none of this name.
+        UsageError: no experiment has this name.
     """
     if name not in EXPERIMENTS:
         raise UsageError(f"no experiment {name!r}: {did_you_mean(name, (*EXPERIMENTS, 'all'))}")
@@ -70,17 +70,17 @@ def reproduce(
     """Run an experiment's missing trials, and write and return their results.
 
     Args:
-        name: of the experiment.
-        folder: of the results.
-        trials: per condition; by default the paper's number.
-        quick: run a few instead, enough to test the claim.
-        recording: of the iCub scene; by default one beside the folder, made if it is missing.
-        jobs: processes.
+        name: name of the experiment.
+        folder: folder of the results.
+        trials: number of trials per condition; None: the paper's number.
+        quick: True to run only enough trials to test the claim.
+        recording: recording of the iCub scene; None: one beside the folder, made if it is missing.
+        jobs: number of processes.
         scheduler: see `run_trials`.
-        progress: called with the number of finished trials and of all.
+        progress: called with the number of finished trials and the total.
 
     Raises:
-        UsageError: there is no such experiment, or matplotlib is missing.
+        UsageError: the experiment does not exist, or matplotlib is missing.
         CdmisfaError: a trial failed; the others are kept.
     """
     experiment = load(name)
@@ -146,10 +146,10 @@ def _finished(folder: Path, row: Mapping[str, Any]) -> Trial:
 
 
 def check_claims(document: Mapping[str, Any]) -> None:
-    """Raise an error that names the claims of the paper that did not come out.
+    """Check that the claims of the paper hold in the results.
 
     Raises:
-        NotReproducedError: there are some.
+        NotReproducedError: a claim does not hold; the message names all such claims.
     """
     failed = [c for c in document["claims"] if c["holds"] is False]
     if failed:
@@ -157,9 +157,10 @@ def check_claims(document: Mapping[str, Any]) -> None:
         raise NotReproducedError(f"{document['experiment']} did not come out: {words}")
 
 
+# Header of the table that compares quantities with the paper.
 HEAD = ("quantity", "paper", "ours", "SD", "95 % interval", "n")
 
-# Words for whether a statement came out.
+# Words that state whether a claim holds; None: the trials do not decide it.
 VERDICTS = {True: "yes", False: "**no**", None: "*not judged*"}
 
 

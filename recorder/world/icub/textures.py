@@ -24,8 +24,8 @@ Colour = Sequence[float]
 def hashed(rows: int, columns: int, seed: int) -> Pixels:
     """Return (rows, columns) values in [0, 1) that depend on their position and the seed only.
 
-    The multipliers are those of SplitMix64 and xxHash, which mix bits well. The highest 24 bits of a
-    hash are kept, because float32 represents them exactly.
+    The multipliers are those of SplitMix64 and xxHash, which mix bits well. The highest 24 bits of
+    a hash are kept, because float32 represents them exactly.
     """
     i, j = np.indices((rows, columns), dtype=np.uint64)
     mixed = i * np.uint64(0x9E3779B97F4A7C15) + j * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(seed)

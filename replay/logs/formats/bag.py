@@ -112,9 +112,7 @@ def streams(
         kinds = [(topic, kind, topic) for topic, kind in bag.kinds().items()]
     opened_streams = []
     for topic, kind, _ in choose_topics(path, kinds, options):
-        bag = opened.enter_context(
-            open_bag(path)
-        )  # a reader holds one chunk, so one for each topic
+        bag = opened.enter_context(open_bag(path))  # a reader holds one chunk only
         with limited(path, "rosbags"):
             times = np.array([stamp for _, stamp in bag.stamps([topic])], np.int64)
         if (times[1:] < times[:-1]).any():
@@ -189,8 +187,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
 def _parts(path: Path) -> Iterator[Sequence[Path]]:
     """Yield the paths for rosbags: the bag, or its packed files, unpacked to a temporary folder.
 
-    Files are unpacked here, because rosbags sets no limit. It unpacks chunks and messages in memory,
-    which has a budget.
+    Files are unpacked here, because rosbags sets no limit. It unpacks chunks and messages in
+    memory, which has a budget.
 
     Raises:
         UsageError: a file of the bag is not a regular file.
