@@ -1,1 +1,1 @@
-"""Simulated and live streams of cdmisfa, and the recording of what any source shows."""
+"""Simulated and live streams of cdmisfa, and the recording of any source."""

@@ -116,7 +116,7 @@ def test_a_log_that_kills_its_worker_ends_the_work_and_the_rest_is_kept(
     deadly = camera(logs / "zz-deadly.mcap", 30)
     with monkeypatch.context() as patched:
         patched.setattr(applying, "apply_to_log", apply_or_die)
-        with pytest.raises(WorkersError, match="finished results are kept"):
+        with pytest.raises(WorkersError, match="run again to do the rest"):
             apply_to_logs(run, [str(logs)], tmp_path / "out", jobs=2)
     assert Path(f"{deadly}.deaths").read_text() == "."
     before = files(tmp_path / "out")

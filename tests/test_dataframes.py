@@ -64,7 +64,7 @@ def test_a_module_takes_tables_of_each_library(kind: str, module: Any) -> None:
     np.testing.assert_array_equal(module.transform(table(kind)), expected)
     with pytest.raises(UsageError, match=r"which is not finite|column speed"):
         module.transform(table(kind, COLUMNS | {"speed": [None] * ROWS}))
-    with pytest.raises(UsageError, match=r"column name has the type .*, which is not numeric"):
+    with pytest.raises(UsageError, match=r"column name has type .*, which is not numeric"):
         module.transform(table(kind, COLUMNS | {"name": ["a"] * ROWS}))
 
 

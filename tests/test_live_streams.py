@@ -249,7 +249,7 @@ REFUSED = {
     "learn av:nothing.mkv": "av:nothing.mkv cannot be opened",
     "record rtsp://me:secret@127.0.0.1:9/x -o x": "rtsp://127.0.0.1:9/x cannot",
     "record gym:Nothing-v0 -o x": "gym:Nothing-v0 cannot be created",
-    f"convert {TEST} -o x": "is a live stream: cdmisfa record",
+    f"convert {TEST} -o x": "is a live stream: record it with cdmisfa record",
 }
 
 

@@ -197,7 +197,7 @@ def test_local_processes_give_the_same_rows_also_after_one_was_killed(
             os.kill(busiest_worker(), signal.SIGKILL)
 
     how: dict[str, Any] = {"grid": GRID, "seeds": range(8), "jobs": 2}
-    with pytest.raises(WorkersError, match="finished results are kept"):
+    with pytest.raises(WorkersError, match="run again to do the rest"):
         sweep("oscillatory", tmp_path, **how, progress=kill_a_worker)
     assert 3 <= finished < 16
     report = sweep("oscillatory", tmp_path, **how)

@@ -1,1 +1,1 @@
-"""For all: blocks, signals, modules, configuration, errors, registries, processes."""
+"""Basics of all packages: blocks, signals, configuration, errors, registries, processes."""

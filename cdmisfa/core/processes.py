@@ -120,7 +120,7 @@ def workers(jobs: int) -> Iterator[Submit]:
         try:
             yield submit
         except BrokenProcessPool as error:
-            raise WorkersError("a worker process was killed: run the command again") from error
+            raise WorkersError("a worker was killed: run again to do the rest") from error
         finally:
             pool.shutdown(kill_workers=True)
 

@@ -238,7 +238,7 @@ class SignalsHash:
 
 
 def canonical_bytes(signals: BlockSignals) -> bytes:
-    """Return the bytes that stand for a record wherever runs are compared."""
+    """Return the bytes of a record with which runs are compared."""
     arrays: list[Any] = list(map(np.ascontiguousarray, _ARRAYS_OF(signals), _ARRAY_TYPES))
     layout = _layout(tuple([array.shape for array in arrays]))
     data = bytearray(b"".join([arrays[i] for i in layout.order]))

@@ -1,1 +1,1 @@
-"""One run, or many: sources, learners and logs put together."""
+"""Runs, sweeps and applications: the code that connects sources, learners and logs."""

@@ -1,1 +1,1 @@
-"""Slow feature analysis: frames in, slow outputs out."""
+"""Slow feature analysis: batch, incremental and recursive."""

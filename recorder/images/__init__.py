@@ -1,1 +1,1 @@
-"""Images and numbers of external logs and cameras: decoded, and turned into frames."""
+"""Images and numbers of external logs and cameras, and their conversion to frames."""

@@ -1,1 +1,1 @@
-"""Recordings on disk: one MCAP file a view, written whole or not at all."""
+"""Recordings on disk: one MCAP file for each view."""

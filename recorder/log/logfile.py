@@ -144,7 +144,7 @@ def write_error(path: Path, error: OSError) -> LogWriteError:
     """Return the error for a file that cannot be written."""
     return LogWriteError(
         f"{path} cannot be written: {error.strerror or error}; "
-        "check the free space and rights there, what was flushed is readable"
+        "check the free space and rights there; flushed data stay readable"
     )
 
 

@@ -1,1 +1,1 @@
-"""Read and write MCAP files, without trust in what a file states."""
+"""Reader and writer of MCAP files; the reader does not trust the content of a file."""

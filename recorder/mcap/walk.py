@@ -226,7 +226,7 @@ class LogStructure:
         inner = inner_end(self.file, opcode, content) if self.skip_damaged else None
         if inner is not None and inner < end and is_record(self.file, inner, limit):
             # Only the length of the record is damaged: its content ends where a record begins.
-            self._damaged(f"byte {self._at}", "a record's length is not that of what it holds")
+            self._damaged(f"byte {self._at}", "the length of a record contradicts its content")
             end, length = inner, inner - content
         if end > limit:
             if opcode == Opcode.CHUNK and self._limit is None:

@@ -1,1 +1,1 @@
-"""Simulated worlds: what their streams show at every t."""
+"""Simulated scenes: the iCub at a table, and the oscillatory streams."""

@@ -1,1 +1,1 @@
-"""Learn from any camera: one candidate a stream, and attention to undecided streams."""
+"""The progress learner: one candidate for each stream, and attention to undecided streams."""

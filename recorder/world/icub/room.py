@@ -1,6 +1,6 @@
-"""The furnished room by `room.toml`, the looks of the objects on the table, and their meshes.
+"""Meshes and textures of the furnished room, which `room.toml` describes, and of its objects.
 
-Meshes have few triangles, and textures in their true size: Bullet's own shapes show a quarter.
+Meshes have few triangles. They show a texture completely; Bullet's own shapes show a quarter of it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from cdmisfa.core.arrays import ByteArray
 from recorder.world.icub.config import TABLE_FROM, TABLE_TO, IcubConfig
 from recorder.world.icub.textures import texture
 
-# Metres after which the texture of a box repeats.
+# Length after which the texture of a box repeats (m). Set by hand, like the other values here.
 PERIOD = 1.6
 
-# Corners of a circle.
+# Number of corners of a circle: few, so that drawing is fast.
 AROUND = 16
 
-# Steps of a last digit to try in x, y and z, the smallest first.
+# Steps of the last digit to try in x, y and z, the smallest first; see `steady`.
 _STEPS = np.array(
     sorted(itertools.product(range(-3, 4), repeat=3), key=lambda steps: sum(map(abs, steps))),
     np.float32,
@@ -35,7 +35,7 @@ _STEPS = np.array(
 
 @dataclass(slots=True)
 class Mesh:
-    """A mesh as Bullet's `createVisualShape` takes it: triangles by their corners."""
+    """Mesh of triangles, in the arguments of Bullet's `createVisualShape`."""
 
     vertices: list[list[float]] = field(default_factory=list)
     normals: list[list[float]] = field(default_factory=list)
@@ -44,12 +44,12 @@ class Mesh:
 
 
 def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) -> Mesh:
-    """Return a box around the origin, fibres of its texture along an axis.
+    """Return a box around the origin, with the fibres of its texture along an axis.
 
     Args:
-        half: of its three sides, metres.
-        along: "x", "y" or "z".
-        period: metres of a texture; 0 shows a whole one on each side.
+        half: half the lengths of its sides (m).
+        along: axis of the fibres, "x", "y" or "z".
+        period: size of a texture (m); 0: one texture on each side.
     """
     mesh, fibres = Mesh(), "xyz".index(along)
     for axis in range(3):
@@ -64,7 +64,7 @@ def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) ->
                 mesh.normals.append(normal)
                 size = (period / 2 / half[u], period / 2 / half[v]) if period else (1, 1)
                 mesh.uvs.append([(a + 1) / 2 / size[0], (b + 1) / 2 / size[1]])
-            # Seen from outside, the corners are counterclockwise.
+            # The corners are counterclockwise from outside.
             straight = side * (1 if (v - u) % 3 == 1 else -1) > 0
             turns = (0, 1, 2, 0, 2, 3) if straight else (0, 2, 1, 0, 3, 2)
             mesh.indices += [first + i for i in turns]
@@ -72,10 +72,11 @@ def box_mesh(half: Sequence[float], along: str = "y", period: float = PERIOD) ->
 
 
 def round_mesh(rings: Sequence[tuple[float, float, float, float, float]]) -> Mesh:
-    """Return a body of revolution about z, from the bottom up, its texture once around.
+    """Return a body of revolution around z with one texture around it.
 
     Args:
-        rings: radius, height, the normal's parts outward and upward, and the place in the texture.
+        rings: from the bottom up, radius, height, the normal's outward and upward components, and
+            the position in the texture.
     """
     mesh = Mesh()
     for i, (radius, height, out, up, v) in enumerate(rings):
@@ -93,10 +94,10 @@ def round_mesh(rings: Sequence[tuple[float, float, float, float, float]]) -> Mes
 
 
 def steady(normal: Sequence[float]) -> list[float]:
-    """Return the float32 normal near a unit normal that normalising does not change.
+    """Return a float32 vector near a unit normal that normalising does not change.
 
     Bullet's renderer normalises in place each time that it draws a corner. Other normals change by
-    a last digit each time, and images then depend on how often the body was drawn before.
+    a last digit each time, so that images would depend on how often a body was drawn before.
     """
     near = np.asarray(normal, np.float32)
     for steps in _STEPS:
@@ -104,11 +105,11 @@ def steady(normal: Sequence[float]) -> list[float]:
         x, y, z = normal32 * normal32
         if x + y + z == x + z + y == y + z + x == 1:
             return [float(part) for part in normal32]
-    raise ValueError(f"{normal} is no unit normal")
+    raise ValueError(f"{normal} is not a unit normal")
 
 
 def can_mesh(radius: float, height: float) -> Mesh:
-    """Return a can: its side and its lid; the bottom is never visible."""
+    """Return a can: its side and its lid, because the bottom is never visible."""
     half = height / 2
     side = [(radius, -half, 1.0, 0.0, 0.0), (radius, half, 1.0, 0.0, 0.9)]
     return round_mesh([*side, (radius, half, 0.0, 1.0, 0.95), (0.0, half, 0.0, 1.0, 1.0)])
@@ -129,12 +130,12 @@ class Piece:
     """A body of the room.
 
     Attributes:
-        mesh: around its own origin.
-        centre: place of that origin, root frame.
-        colour: without a texture.
-        paint: its texture.
+        mesh: mesh around its own origin.
+        centre: position of that origin in the root frame (m).
+        colour: colour without a texture.
+        paint: texture, or None.
         gloss: share of mirrored light.
-        casts: whether it casts a shadow.
+        casts: True if it casts a shadow.
     """
 
     mesh: Mesh
@@ -147,10 +148,10 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """All bodies but the robot.
+    """All bodies except the robot.
 
     Attributes:
-        pieces: those that never move, the table's top first.
+        pieces: bodies that never move, the table's top first.
         objects: the box, the cylinder and the ball, as `World.place` moves them.
     """
 
@@ -159,7 +160,7 @@ class Room:
 
 
 def room_of(scene: IcubConfig) -> Room:
-    """Return the room of a scene; without one, the table that fills every image."""
+    """Return the room of a scene; a plain scene has only a table that fills every image."""
     document = _document()
     top, thickness = scene.table.top, scene.table.thickness
     if scene.room:
@@ -216,7 +217,7 @@ def _objects(scene: IcubConfig, looks: Mapping[str, Any]) -> tuple[Piece, ...]:
         ("cylinder", can_mesh(cylinder.radius, cylinder.height), cylinder.grey),
         ("ball", ball_mesh(ball.radius), ball.grey),
     )
-    if scene.physics:  # stripes that roll would hide how slowly the ball moves
+    if scene.physics:  # no stripes: while they roll, the image changes fast, however slow the ball
         looks = {**looks, "ball": {**looks["ball"], "texture": "plaster", "count": 6}}
     return tuple(
         Piece(

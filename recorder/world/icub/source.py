@@ -1,4 +1,4 @@
-"""The iCub scene as a `FrameSource`: only the attended view is rendered."""
+"""`IcubSource`: the iCub scene as a source of frames; only the attended view is rendered."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from recorder.world.icub.world import World
 # Columns of ground truth: the objects' positions in the paper's coordinates, metres.
 TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
 
-# More columns if physics moves the objects: heights of their middles, root frame, metres.
+# Further columns if physics moves the objects: heights of their centres in the root frame (m).
 HEIGHTS = tuple(f"object{i}_z" for i in (1, 2, 3))
 
 # Column with the factor of drifting light.
@@ -29,11 +29,11 @@ LIGHT = "light"
 
 
 class IcubSource(ClockedSource):
-    """The images of the robot's eyes in a scene, rendered on demand, on a clock.
+    """Source of the images of the robot's eyes in a scene, rendered on demand.
 
     Raises:
         CdmisfaError: the simulator is not installed.
-        UsageError: a scene that cannot be built.
+        UsageError: the scene cannot be built.
     """
 
     def __init__(self, scene: IcubConfig, record: RecordConfig) -> None:
@@ -55,13 +55,13 @@ class IcubSource(ClockedSource):
 
     @property
     def head_poses(self) -> Sequence[HeadPose]:
-        """The head's pose in each view but a roaming one."""
+        """Pose of the head in each view except a roaming one."""
         (x, y, z), eyes = self._world.neck.tolist(), self._scene.eyes
         return [HeadPose((x, y, z), quaternion(yaw, eyes.pitch)) for yaw in eyes.yaw]
 
     @property
     def turns(self) -> tuple[tuple[int, ...], ...]:
-        """Frames that a change of view loses; see `turn_to`."""
+        """Number of frames that each change of view loses; see `turn_to`."""
         scene = self._scene
         return turns(scene.eyes.yaw, scene.transit, roam=scene.roam)
 
@@ -83,7 +83,7 @@ class IcubSource(ClockedSource):
         return Block(stream, t, freeze(frames), freeze(np.concatenate(truth, axis=1)))
 
     def describe(self) -> Mapping[str, Any]:
-        """Return the scene's seed and configuration."""
+        """Return the kind, the seed and the configuration of the scene."""
         return {"kind": "icub", "seed": self._seed, "scene": section_table(self._scene)}
 
     def close(self) -> None:
