@@ -57,11 +57,13 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         if event.text.startswith("ended: "):
             ended = event.text.removeprefix("ended: ")
     pointed = "timeline" if run.watched.columns else ""
-    lanes = timeline(outline, pointed) if outline.iterations else None
-    if lanes is not None and pointed:
+    attention_plot = timeline(outline, pointed) if outline.iterations else None
+    if attention_plot is not None and pointed:
         t, values = run.watched.columns
         texts = _watched_texts(run, rules, t)
-        frames[pointed] = frames_to_point_at(lanes, t, values, texts, images=run.spec.images)
+        frames[pointed] = frames_to_point_at(
+            attention_plot, t, values, texts, images=run.spec.images
+        )
     return {
         "kind": "run",
         "title": run.path.resolve().name,
@@ -75,7 +77,7 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         ),
         "cards": _cards(run),
         "open_cards": OPEN_CARDS,
-        "timeline": lanes,
+        "timeline": attention_plot,
         "states": [
             (f"state{code}", STATE_WORDS[code])
             for code in np.unique(outline.changes[:, 2]).tolist()
