@@ -98,7 +98,7 @@ def test_the_end_of_a_recording_ends_the_run_and_is_told() -> None:
     assert learn_blocks(source, learner_for(source), (notes,)) == "log_exhausted"
     (t, iteration, why, level), *last = notes.told[3:]
     assert (notes.told[:3], t, iteration, level) == ([0, 1, 2], 120, 2, "WARNING")
-    assert "the streams end after 130 frames" in why
+    assert "the streams end at frame 130" in why
     assert last == [(120, 2, f"ended: {END_REASONS['log_exhausted']}", "INFO"), "finished"]
 
 

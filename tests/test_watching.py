@@ -108,7 +108,7 @@ def test_where_the_source_ends_it_is_truncated() -> None:
     with pytest.raises(ResetNeeded, match="call reset"):
         env.step(0)
     env.reset(seed=0)
-    with pytest.raises(LogExhaustedError, match="20 frames are left"):
+    with pytest.raises(LogExhaustedError, match="20 of 40 frames are left"):
         env.step(0)
 
 
