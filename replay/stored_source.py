@@ -27,7 +27,7 @@ PIECE: Final = 64
 AT_ONCE: Final = 64 * 1024 * 1024
 
 # Called with the number of hashed bytes and the total.
-Progress = Callable[[int, int], None]
+HashProgress = Callable[[int, int], None]
 
 
 class StoredSource(ClockedSource):
@@ -186,7 +186,7 @@ class StoredSource(ClockedSource):
         """Return a line for each stream with damaged parts that were replaced or skipped so far."""
         return []
 
-    def describe(self, progress: Progress = lambda done, size: None) -> Mapping[str, Any]:
+    def describe(self, progress: HashProgress = lambda done, size: None) -> Mapping[str, Any]:
         """Return the logs with the SHA-256 of all their bytes, and how they became frames.
 
         Args:

@@ -32,7 +32,7 @@ from replay.storage.paths import log_files
 # Bytes of a log, decompressed or not, that `info` decodes; it reads the index of larger logs.
 CHECK_BYTES: Final = 1024 * 1024 * 1024
 
-Times = NDArray[np.uint64]
+LogTimes = NDArray[np.uint64]
 Outcome = TypeVar("Outcome")
 
 
@@ -244,12 +244,12 @@ class ChannelCount:
     start: int | None = None
     end: int | None = None
 
-    def add(self, times: Times) -> None:
+    def add(self, times: LogTimes) -> None:
         """Add messages by their log times, (n,) nanoseconds."""
         self.messages += len(times)
         self.widen(times)
 
-    def widen(self, times: Times) -> None:
+    def widen(self, times: LogTimes) -> None:
         """Widen the range by log times, (n,) nanoseconds."""
         if len(times):
             low, high = int(times.min()), int(times.max())
@@ -301,12 +301,12 @@ def _count_by_index(reader: LogReader) -> dict[int, ChannelCount]:
     return counts
 
 
-def _times_of(reader: LogReader, segment: Segment, number: int) -> Times:
+def _times_of(reader: LogReader, segment: Segment, number: int) -> LogTimes:
     """Return the log times of a channel's messages in a chunk, by its message index if any."""
     if not segment.indexes:
         return _times_in(reader.table(segment), number)
     return np.concatenate([pairs[:, 0] for _, pairs in reader.index(segment, (number,))])
 
 
-def _times_in(table: MessageTable | None, number: int) -> Times:
+def _times_in(table: MessageTable | None, number: int) -> LogTimes:
     return np.empty(0, np.uint64) if table is None else table.log_time[table.channel == number]

@@ -30,7 +30,7 @@ UNEVEN: Final = 0.01
 JITTER: Final = 0.75
 
 # The row that each frame shows, (frames,), none after a later one.
-Rows = range | IntArray
+RowOfFrame = range | IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class FrameClock:
     """
 
     start_ns: int
-    rows: Sequence[Rows]
+    rows: Sequence[RowOfFrame]
     gaps: Sequence[Sequence[Span]]
     first: int = 0
 
@@ -132,7 +132,7 @@ def by_number(views: Iterable[Sequence[Span]], facts: ViewMetadata, name: str) -
         raise LogDamagedError(f"{name}: no frame is readable in every view")
     begins, end = common[0][0], common[-1][1]
     parts = [np.arange(low, high) for low, high in common] if len(common) > 1 else []
-    rows: Rows = np.concatenate(parts) if parts else range(begins, end)
+    rows: RowOfFrame = np.concatenate(parts) if parts else range(begins, end)
     absent = [outside(covered, begins, end) if facts.gaps else [] for covered in streams]
     return FrameClock(facts.start_ns, [rows] * len(streams), absent, begins)
 
@@ -187,7 +187,7 @@ def missing(times: IntArray) -> IntArray:
     return np.maximum(np.round(np.diff(times) / step) - 1, 0).astype(int)
 
 
-def retimed(times: IntArray, rows: Rows, fps: float) -> str:
+def retimed(times: IntArray, rows: RowOfFrame, fps: float) -> str:
     """Return a warning if frames by number are not at the times of their rows; else "".
 
     Jitter is allowed, and, where no row is missing, a rate that is known to a hundredth.
@@ -210,7 +210,7 @@ def retimed(times: IntArray, rows: Rows, fps: float) -> str:
     return f"at an uneven rate ({lost} missing): {lasts:.6g} s become {become:.6g} s of frames"
 
 
-def counts(count: int, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
+def counts(count: int, rows: RowOfFrame, gaps: Sequence[Span] = ()) -> dict[str, int]:
     """Return counts of a stream's rows, of frames that repeat one, and of rows in no frame.
 
     Args:
