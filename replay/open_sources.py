@@ -203,8 +203,8 @@ def holds_run(path: Path) -> bool:
     """Return whether a folder or a file is a run, and no external log.
 
     Raises:
-        UsageError: it does not exist.
-        LogDamagedError: it is no log, or a damaged one.
+        UsageError: the path does not exist.
+        LogDamagedError: the file is not a log, or is damaged.
     """
     return not is_external_format(path) and is_run(path)
 

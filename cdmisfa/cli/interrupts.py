@@ -22,8 +22,8 @@ class Stop:
     """Whether a signal has come; callable, as a loop's `stop`.
 
     Attributes:
-        number: of the last signal, 0 for none.
-        ended: the work is over, and a signal changes nothing any more.
+        number: number of the last signal, 0 for none.
+        ended: True if the work has finished, so that a further signal has no effect.
     """
 
     def __init__(self) -> None:

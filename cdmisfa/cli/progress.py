@@ -112,9 +112,9 @@ class RunProgress(Sink):
 
     Args:
         shown: the bar.
-        spec: of the source.
-        max_iterations: after which the run ends.
-        events: also print events, as a module that is saved.
+        spec: specification of the source.
+        max_iterations: number of iterations after which the run ends.
+        events: True to also print events, such as the save of a module.
     """
 
     def __init__(

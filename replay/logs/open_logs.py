@@ -176,7 +176,7 @@ def image_topics(path: Path) -> list[str]:
     """Return the topics of an MCAP file with images.
 
     Raises:
-        LogDamagedError: it is no MCAP file, or has nothing in it.
+        LogDamagedError: the file is not an MCAP file, or is empty.
     """
     with LogReader(path, skip_damaged=True) as reader:
         mcap_log.refuse_empty(reader)

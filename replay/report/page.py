@@ -59,8 +59,8 @@ def report_of_runs(paths: Sequence[Path], title: str) -> str:
     """Return the page that compares runs with the first of them.
 
     Raises:
-        UsageError: one is no run.
-        LogDamagedError: one cannot be read.
+        UsageError: a path is not a run.
+        LogDamagedError: the log of a run cannot be read.
     """
     rows = side_by_side(paths)
     outlines = [row.outline for row in rows]

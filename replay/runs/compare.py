@@ -84,8 +84,8 @@ def first_difference(first: Path, second: Path) -> Difference | None:
     """Return the first difference between two runs' signals, None if every bit is the same.
 
     Raises:
-        UsageError: one of them is no run.
-        LogDamagedError: one of them cannot be read.
+        UsageError: a path is not a run.
+        LogDamagedError: the log of a run cannot be read.
     """
     return first_differing(read_columns(first), read_columns(second))
 

@@ -119,7 +119,7 @@ def record_command(
 
 
 def _check_resumable(output: Path, scene: str) -> None:
-    """Refuse to resume recordings of live streams, and conversions: only scenes can go on here."""
+    """Refuse to resume a recording of live streams, or a conversion: `record` resumes scenes."""
     if scene in ("cameras", "gym"):
         raise UsageError(f"{output}: a recording of live streams cannot be resumed")
     if scene == "foreign":

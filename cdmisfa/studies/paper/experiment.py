@@ -26,8 +26,8 @@ class Trial:
     """A finished trial.
 
     Attributes:
-        settings: of the trial, its seed among them.
-        row: its results, in plain values.
+        settings: settings of the trial, with its seed.
+        row: results of the trial, as JSON values.
         arrays: curves for the figures.
     """
 
@@ -42,9 +42,9 @@ class Findings:
     Attributes:
         lines: of its table: the measured quantity, the paper's value as text, "-" where it has
             none, mean, SD and number of trials, the 95 % interval of a share, decimals to print.
-        tables: others, each its head and rows of texts.
-        claims: statements of the paper, and whether they came out: true, false, or None where
-            that cannot be judged.
+        tables: other tables, each with head and rows of texts.
+        claims: claims of the paper, and whether each holds: True, False, or None if the trials
+            cannot decide it.
         notes: limits and explanations.
     """
 
@@ -93,9 +93,9 @@ class Experiment(ABC):
     """An experiment of the paper.
 
     Attributes:
-        title: of its tables.
+        title: title of the tables.
         trials: trials per condition: the paper's number, and enough to test the claim.
-        sees: it needs a recording of the iCub scene.
+        sees: True if the experiment needs a recording of the iCub scene.
     """
 
     title: str

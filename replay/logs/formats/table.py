@@ -50,7 +50,7 @@ def streams(
 
     Raises:
         UsageError: no such column, or no numbers in it.
-        LogDamagedError: it is no table, or has words among numbers.
+        LogDamagedError: the file is not a table, or has words among numbers.
     """
     check_topics(path, path.stem, options.topics)
     table, csv = _read(path), path.suffix.lower() == ".csv"

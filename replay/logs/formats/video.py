@@ -44,7 +44,7 @@ def streams(
 
     Raises:
         UsageError: PyAV is missing, or its frames have no times.
-        LogDamagedError: it is no video, or a broken one.
+        LogDamagedError: the file is not a video, or is damaged.
     """
     check_topics(path, path.stem, options.topics)
     video = VideoFile(path, options.color is True)
