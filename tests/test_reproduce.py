@@ -91,7 +91,7 @@ def test_a_claim_that_fails_exits_4(
     monkeypatch.setattr(oscillatory.Stability, "run", unstable)
     done = cdmisfa("reproduce", "stability", "--trials", 1, "-o", tmp_path)
     assert done.code == 4
-    said = "stability did not come out: 2.0 keeps its policy after epsilon = 0 (0 of 1 trials)"
+    said = "stability is not reproduced: 2.0 keeps its policy after epsilon = 0 (0 of 1 trials)"
     assert done.err.endswith(f"{said}\n")
 
 
@@ -166,7 +166,7 @@ def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
         "Q": np.zeros((50, 3, 2), np.float32),
         "policy": np.zeros((50, 3), np.float32),
         "eta_dot": np.full((50, 1), 0.001, np.float32),
-        "shown": np.zeros((3, 48, 128), np.uint8),
+        "views": np.zeros((3, 48, 128), np.uint8),
         **{f"{kind}{i}": truth for kind in ("y", "truth") for i in (1, 2)},
     }
     wrong = GOOD | {"streams": [0, 2, 1], "policies": ["011", "110", "101"]}

@@ -75,7 +75,7 @@ def run(settings: Settings) -> dict[str, Any]:
         most = oscillatory.MAX_ITERATIONS
         return module_row(run_oscillatory_trial(config, seed=seed, max_iterations=most).modules)
     with contextlib.closing(open_recording(settings["recording"])) as source:
-        return learn_and_judge(source, config, seed, source.frames - icub.HELD_OUT)
+        return learn_and_judge(source, config, seed, source.frames - icub.TEST_FRAMES)
 
 
 def tables(trials: Sequence[Trial]) -> list[Table]:

@@ -1,4 +1,4 @@
-"""The command line: a thin shell over the library."""
+"""The command line: it parses words, calls the library, and prints results."""
 
 from collections.abc import Sequence
 from typing import NoReturn
@@ -6,9 +6,9 @@ from typing import NoReturn
 
 def main() -> NoReturn:
     """Run the command line of this process."""
-    from cdmisfa.cli.interrupts import end_at_once
+    from cdmisfa.cli.interrupts import exit_on_signals
 
-    end_at_once()  # while the rest is imported, too
+    exit_on_signals()  # imports take long enough for a Ctrl-C
     from cdmisfa.cli import app
 
     app.run_process()

@@ -18,7 +18,7 @@ from typing import NoReturn
 
 import click
 
-from cdmisfa.cli.interrupts import end_at_once, ignore_at_the_end, interruptible
+from cdmisfa.cli.interrupts import exit_on_signals, ignore_signals_at_exit, interruptible
 from cdmisfa.cli.options import quiet
 from cdmisfa.cli.printing import Stderr, line
 from cdmisfa.core.errors import CdmisfaError
@@ -105,11 +105,11 @@ def run_process() -> NoReturn:
     _open_standard_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may lack Greek letters
         sys.stdout.reconfigure(errors="replace")
-    ignore_at_the_end()
+    ignore_signals_at_exit()
     code = run(sys.argv[1:])
-    end_at_once(code)
-    # Python remembers an interrupt inside of an exec, as imports have them, until the next exec:
-    # `python -m` would end by SIGINT, whatever the code.
+    exit_on_signals(code)
+    # CPython remembers an interrupt during an exec, as in imports, until the next exec. Without
+    # this one, `python -m cdmisfa` would end by SIGINT, whatever the code.
     exec("")
     sys.exit(code)
 
@@ -120,7 +120,7 @@ def _open_standard_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # the lowest free descriptor is this one
+            # the lowest free descriptor is this one, so it is opened again under its own number
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))

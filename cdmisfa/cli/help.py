@@ -42,7 +42,7 @@ OPTIONS, EXAMPLES = "\n\nOptions:\n", "\n\nExamples:\n"
 
 
 class Command(click.Command):
-    """A command whose docstring is its help page: what it does, its own options, and examples.
+    """A command whose docstring is its help page: purpose, inputs, options and examples.
 
     Attributes:
         examples: the example commands.

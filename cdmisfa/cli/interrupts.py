@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: files are finished on the way out, and the exit code says why."""
+"""Ctrl-C, SIGTERM and SIGHUP: finish files, and exit with the code of the signal."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-# Seconds after which an interrupt that was dropped is sent again.
-_AGAIN = 0.02
+# Seconds after which an interrupt is sent again that Python dropped. Long enough for the destructor
+# that dropped it to return, too short for a person to notice.
+RESEND_DELAY = 0.02
 
 
 class Stop:
-    """Whether a signal has come; callable, as a loop's `stop`.
+    """Request of a signal to stop; callable, as the `stop` of a loop.
 
     Attributes:
         number: number of the last signal, 0 for none.
-        ended: True if the work has finished, so that a further signal has no effect.
+        ended: whether the work has ended, so that a signal changes nothing.
     """
 
     def __init__(self) -> None:
@@ -31,12 +32,12 @@ class Stop:
         self.ended = False
 
     def __call__(self) -> bool:
-        """Whether to stop."""
+        """Return whether a signal has arrived."""
         return self.number != 0
 
     @property
     def exit_code(self) -> int:
-        """Of a stopped command: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
+        """Exit code of a stopped command: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
         return 128 + (self.number or signal.SIGINT)
 
 
@@ -50,50 +51,51 @@ def interruptible() -> Iterator[Stop]:
             stop.number = number
             raise KeyboardInterrupt
 
-    with _handled_by(interrupt), _not_lost(stop):
+    with _handled_by(interrupt), _resending_dropped(stop):
         yield stop
 
 
-def end_at_once(code: int | None = None) -> None:
-    """Make signals end this process at once from now on, where nothing else handles them.
+def exit_on_signals(code: int | None = None) -> None:
+    """Make signals exit this process at once from now on, unless another handler replaces this one.
 
     Args:
-        code: to end with, without a word; None to say so, and end with that of the signal.
+        code: exit code, without a message; None to print "interrupted" and exit with the code of
+            the signal.
     """
 
-    def end(number: int, frame: FrameType | None) -> None:
+    def exit_now(number: int, frame: FrameType | None) -> None:
         if code is None:
             with suppress(OSError):
                 os.write(2, b"cdmisfa: interrupted\n")
         os._exit(128 + number if code is None else code)
 
     for number in {*SIGNALS} - _ignored():
-        signal.signal(number, end)
+        signal.signal(number, exit_now)
 
 
 @contextmanager
-def stoppable(notice: str = "finishing what is begun; again to stop at once\n") -> Iterator[Stop]:
+def stoppable(notice: str = "finishing; press Ctrl-C again to stop at once\n") -> Iterator[Stop]:
     """Let the body finish its step at the first signal, and print `notice`; the second interrupts.
 
     Yields:
-        Becomes true with the first signal.
+        A `Stop` that becomes true with the first signal.
     """
     stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}
 
-    def ask(number: int, frame: FrameType | None) -> None:
+    def request_stop(number: int, frame: FrameType | None) -> None:
         if stop.number:
-            if callable(handle := outer[number]):  # it notes the signal, for the exit code
+            if callable(handle := outer[number]):  # it stores the number, for the exit code
                 handle(number, frame)
             raise KeyboardInterrupt
         stop.number = number
-        # not print: the signal may have come in the middle of one
+        # not print(), which cannot be called while it prints
         os.write(2, notice.encode())
 
-    with _handled_by(ask):
+    with _handled_by(request_stop):
         yield stop
 
 
-def ignore_at_the_end() -> None:
+def ignore_signals_at_exit() -> None:
     """Ignore signals while Python shuts down, so that they cannot change the exit code."""
     for number in SIGNALS:
         atexit.register(signal.signal, number, signal.SIG_IGN)
@@ -102,7 +104,7 @@ def ignore_at_the_end() -> None:
 @contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     def handle(number: int, frame: FrameType | None) -> None:
-        _let_go_of_terminal()
+        _leave_closed_terminal()
         handler(number, frame)
 
     try:
@@ -123,34 +125,34 @@ def _ignored() -> set[signal.Signals]:
 
 
 @contextmanager
-def _not_lost(stop: Stop) -> Iterator[None]:
+def _resending_dropped(stop: Stop) -> Iterator[None]:
     """Send an interrupt again that Python dropped in a destructor or a callback of C.
 
-    Errors of destructors of what an interrupt left unfinished are not shown.
+    Other errors of destructors after an interrupt are not printed: they are its consequences.
     """
     before = sys.unraisablehook
 
-    def dropped(what: Any) -> None:
+    def handle_unraisable(error: Any) -> None:
         if not stop():
-            before(what)
-        elif what.exc_type is KeyboardInterrupt and not stop.ended:
-            again = threading.Timer(_AGAIN, os.kill, (os.getpid(), stop.number))
-            again.daemon = True
-            again.start()
+            before(error)
+        elif error.exc_type is KeyboardInterrupt and not stop.ended:
+            timer = threading.Timer(RESEND_DELAY, os.kill, (os.getpid(), stop.number))
+            timer.daemon = True
+            timer.start()
 
-    sys.unraisablehook = dropped
+    sys.unraisablehook = handle_unraisable
     try:
         yield
     finally:
         sys.unraisablehook = before
 
 
-def _let_go_of_terminal() -> None:
-    """Point stdout and stderr to /dev/null where their terminal was closed: writing there fails."""
+def _leave_closed_terminal() -> None:
+    """Point stdout and stderr to /dev/null if their terminal was closed: writing would fail."""
     for number in (1, 2):
         try:
             os.write(number, b"")
         except OSError:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, number)
-            os.close(nowhere)
+            devnull = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(devnull, number)
+            os.close(devnull)

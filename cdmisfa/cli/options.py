@@ -37,7 +37,7 @@ class LocalPath(click.Path):
 # Type of paths that are written, and of those that are read but cannot be URLs.
 LOCAL = LocalPath(path_type=Path)
 
-# Type of paths, URLs and other words that name a source; a shell completes them as files.
+# Type of paths, URLs and other words that name a source. As a click.Path, a shell completes it.
 WORD = click.Path(readable=False)
 
 
@@ -52,7 +52,7 @@ def log_argument(name: str, metavar: str | None = None) -> Decorator:
     def located(
         ctx: click.Context, param: click.Parameter, words: tuple[str, ...]
     ) -> tuple[Path, ...]:
-        if ctx.resilient_parsing:  # while a shell completes what follows
+        if ctx.resilient_parsing:  # a shell completes the line: the files may not exist yet
             return ()
         from replay.open_sources import locations
 
@@ -214,7 +214,7 @@ def inputs(*names: str) -> Decorator:
             from recorder.images.options import InputOptions
 
             chosen = {name: values.pop(name) for name in names if name != "settings"}
-            if "color" in chosen:  # a run keeps it as a truth value
+            if "color" in chosen:  # a run stores it as a truth value
                 chosen["color"] = {"on": True, "off": False}.get(chosen["color"], chosen["color"])
             sections = parse_settings(input_settings)
             if other := set(sections) - {"input"}:

@@ -153,7 +153,7 @@ def result(run: RunResult, *, as_json: bool) -> None:
     if streams is None and run.undecided:
         line(f"not decided: {', '.join(run.undecided)}")
     if run.held_out:
-        held_out(run.held_out)
+        holdout_slowness(run.held_out)
     line(f"ended after {counted(run.iterations, 'iteration')}: {END_REASONS[run.ended]}")
     line(f"signals sha256 {run.signals_sha256}")
     if run.run is not None:
@@ -194,12 +194,12 @@ def stream_outcome(stream: Mapping[str, Any]) -> None:
     line(f"{stream['stream']}: {outcome_text(*values)}")
 
 
-def held_out(judged: Mapping[str, Any]) -> None:
+def holdout_slowness(result: Mapping[str, Any]) -> None:
     """Print the slowness of modules on held-out frames, beside that of batch SFA."""
-    if not judged["modules"]:
+    if not result["modules"]:
         return
-    start, stop = judged["frames"]
+    start, stop = result["frames"]
     line(f"slowness on the held-out frames {start} to {stop - 1}:")
-    for module in judged["modules"]:
+    for module in result["modules"]:
         online, batch = (slownesses(module[key]) for key in ("slowness", "of_batch"))
         line(f"module {module['module']} of {module['stream']}: {online}; batch SFA: {batch}")

@@ -29,20 +29,20 @@ GIGABYTE = 10**9
 
 
 class Bar:
-    """Progress of a command where no terminal shows it: only messages are printed."""
+    """Progress of a command without a terminal: only messages are printed."""
 
     def update(self, done: float, total: float | None = None, note: str = "") -> None:
-        """Show how much is done, of how much if that is known, and a note below the bar."""
+        """Show the amount of work done, the total if it is known, and a note below the bar."""
 
     def restart(self, title: str, unit: str) -> None:
-        """Show the progress of another step from now on."""
+        """Start the bar again for another step."""
 
     def say(self, line: str) -> None:
         """Print a message above the bar."""
         status(line)
 
     def trials(self, finished: int, failed: int, total: int) -> None:
-        """Show how many trials, or logs, are finished and failed."""
+        """Show the number of finished and failed trials or logs."""
         self.update(finished, total, f"{failed} failed" if failed else "")
 
     def sink(self, spec: SourceSpec, max_iterations: int | None, *, events: bool = True) -> Sink:
@@ -52,7 +52,7 @@ class Bar:
 
 @contextlib.contextmanager
 def bar(title: str, unit: str) -> Iterator[Bar]:
-    """Show progress on a terminal while the body runs; the unit is what is counted."""
+    """Show progress on a terminal while the body runs, counted in `unit`."""
     if Stderr.quiet or not sys.stderr.isatty():
         yield Bar()
         return
@@ -97,10 +97,10 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
 
 @contextlib.contextmanager
 def resumable_bar(out: Path, title: str, unit: str) -> Iterator[Bar]:
-    """Show progress; if a signal interrupts the body, say that the same command continues it."""
+    """Show progress; on a signal, print that the same command continues."""
     try:
-        with bar(title, unit) as shown:
-            yield shown
+        with bar(title, unit) as progress_bar:
+            yield progress_bar
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"finished results are in {out}: run the same command again"
@@ -108,19 +108,19 @@ def resumable_bar(out: Path, title: str, unit: str) -> Iterator[Bar]:
 
 
 class RunProgress(Sink):
-    """Sink that shows the progress of a run: every event once, numbers a few times a second.
+    """Sink that shows the progress of a run: each event once, numbers every `TICK` seconds.
 
     Args:
-        shown: the bar.
+        display: the bar that is updated.
         spec: specification of the source.
-        max_iterations: number of iterations after which the run ends.
-        events: True to also print events, such as the save of a module.
+        max_iterations: limit of the run, if it has one.
+        events: also print events, such as a saved module.
     """
 
     def __init__(
-        self, shown: Bar, spec: SourceSpec, max_iterations: int | None, *, events: bool = True
+        self, display: Bar, spec: SourceSpec, max_iterations: int | None, *, events: bool = True
     ) -> None:
-        self._bar, self._spec, self._events = shown, spec, events
+        self._bar, self._spec, self._events = display, spec, events
         self._max_iterations = max_iterations
         self._next_update = 0.0
         self._hashing = False
@@ -147,7 +147,7 @@ class RunProgress(Sink):
         return total if self._max_iterations is None else min(total, self._max_iterations)
 
     def _note(self, signals: BlockSignals, learner: Learner) -> str:
-        """Return the attended stream, the module saved last, and how much is left to learn."""
+        """Return the attended stream, the last module, and the number of undecided streams."""
         streams, modules = self._spec.streams, learner.modules
         saved = "no module yet"
         if modules:
@@ -178,5 +178,5 @@ class RunProgress(Sink):
 @contextlib.contextmanager
 def learning(spec: SourceSpec, max_iterations: int | None) -> Iterator[tuple[Stop, RunProgress]]:
     """Show the progress of a run while the body runs; the first signal asks it to stop."""
-    with bar("learning", "blocks") as shown, stoppable() as stop:
-        yield stop, RunProgress(shown, spec, max_iterations)
+    with bar("learning", "blocks") as progress_bar, stoppable() as stop:
+        yield stop, RunProgress(progress_bar, spec, max_iterations)

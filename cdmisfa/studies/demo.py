@@ -1,4 +1,4 @@
-"""The demonstration: record the furnished iCub scene, learn from the log, check, and show.
+"""The demo: record the iCub scene in a furnished room, learn from it, check, and write a report.
 
 Without PyBullet it records the scene of oscillatory streams instead.
 """
@@ -25,12 +25,14 @@ from replay.truth_fits import truth_fits
 SCENE, PRESET = "icub", "icub-real"
 
 # Scene that needs no simulator.
-STAND_IN = "oscillatory"
+FALLBACK_SCENE = "oscillatory"
 
-# Length of the stretch on which live and recorded signals are compared.
+# Iterations whose live and recorded signals are compared. They take a few seconds; signals that
+# differ do so from the first block that differs on.
 CHECKED_ITERATIONS = 200
 
-# Frames on which a module's output is compared with the object's true position.
+# Frames on which the output of a module is compared with true positions: 80 s, in which each object
+# crosses its range several times.
 SCORED_FRAMES = 4000
 
 # Opens a stage by its title and the unit that it counts; reports to a `cli.progress.Bar`.
@@ -43,15 +45,15 @@ def demo(
     """Record the scene, learn from the recording, compare with live, write the report.
 
     Args:
-        out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
-        preset: of scene and learner; by default `PRESET`, or that of the stand-in scene.
-        seed: of world and learner.
-        frames: of the recording; the learner starts it again at its end.
-        jobs: processes that render.
-        stage: opens each stage's report of progress.
+        out: folder in which `recordings/demo-icub` and `runs/demo-icub` are written or replaced.
+        preset: preset of scene and learner; by default `PRESET`, or the preset of the fallback.
+        seed: seed of world and learner.
+        frames: length of the recording, which the learner repeats.
+        jobs: number of processes that render.
+        stage: opens the progress display of a stage.
 
     Returns:
-        What `demo --json` prints: files, and each module with the true quantity it follows.
+        The document of `demo --json`: files, and each module with the true position it follows.
 
     Raises:
         CdmisfaError: files cannot be written.
@@ -60,7 +62,7 @@ def demo(
     from recorder.recording import record_scene
 
     missing = [name for name in ("pybullet", "icub_models") if find_spec(name) is None]
-    scene = STAND_IN if missing else SCENE
+    scene = FALLBACK_SCENE if missing else SCENE
     preset = preset or (None if missing else PRESET)
     configuration = configure(scene, Layers.read(preset), seed)
     recording, folder = out / "recordings" / f"demo-{scene}", out / "runs" / f"demo-{scene}"
@@ -116,12 +118,12 @@ def demo(
 def _opened(
     word: str | Path, preset: str | None, seed: int
 ) -> AbstractContextManager[SeekableSource]:
-    loops = isinstance(word, Path)  # a scene has no end
+    loops = isinstance(word, Path)  # a scene does not end, a recording does
     return contextlib.closing(open_source([word], preset=preset, seed=seed, loop=loops)[0])
 
 
 def followed_by(module: Module, source: SeekableSource) -> dict[str, Any]:
-    """Return a module, and what of the truth its first output on its own view follows best."""
+    """Return a module with the true position that its first output on its view follows best."""
     source.seek(0)
     block = source.take(module.stream_index, SCORED_FRAMES)
     y = module.transform(block.frames)[:, 0]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from cdmisfa.experiments.apply import Application, Totals
     from cdmisfa.experiments.apply_logs import AppliedLogs
 
-# Number of warnings and of failed logs that are printed.
+# Largest number of warnings and of failed logs that are printed, to keep the summary on one screen.
 MOST_LINES = 20
 
 FILE_FORMS = ("parquet", "csv", "mcap", "rrd")
@@ -56,7 +56,7 @@ def apply_command(
     retry_failed: bool,
     force: bool,
     as_json: bool,
-    **how: Any,
+    **arguments: Any,
 ) -> int:
     """Compute learned features on other logs or cameras.
 
@@ -100,7 +100,7 @@ def apply_command(
     if output is not None and is_stored and to != STDOUT and (output.is_dir() or not ending):
         from cdmisfa.experiments.apply_logs import apply_to_logs
 
-        with resumable_bar(output, "applying", "logs") as shown:
+        with resumable_bar(output, "applying", "logs") as progress_bar:
             applied = apply_to_logs(
                 run,
                 source,
@@ -111,9 +111,9 @@ def apply_command(
                 scheduler=scheduler,
                 retry_failed=retry_failed,
                 force=force,
-                indexing=shown.update,
-                progress=shown.trials,
-                **how,
+                indexing=progress_bar.update,
+                progress=progress_bar.trials,
+                **arguments,
             )
         _print_applied_logs(run, applied, as_json)
         return applied.exit_code
@@ -129,13 +129,13 @@ def apply_command(
         if len(logs) > 1:
             raise UsageError(f"-o {output} is one file, for {len(logs)} logs: name a folder")
         refuse_taken(output, force=force)
-    return _apply_to_each(run, logs, output, frames, to == STDOUT, as_json, **how)
+    return _apply_to_each(run, logs, output, frames, to == STDOUT, as_json, **arguments)
 
 
 def _logs(source: Sequence[str]) -> list[list[str]]:
-    """Return the words of each log: of each match of a pattern, and of each log of an index.
+    """Return the words of each log: patterns and indexed folders name several.
 
-    Live streams are one log together.
+    Live streams form one log.
     """
     from recorder.cameras.words import is_live
     from recorder.world.scenes import SCENES
@@ -161,11 +161,11 @@ def _apply_to_each(
     frames: int | None,
     as_lines: bool,
     as_json: bool,
-    **how: Any,
+    **arguments: Any,
 ) -> int:
-    """Apply modules to one log after the other and print the results; return the exit code.
+    """Apply modules to each log, print the results, and return the exit code.
 
-    Further arguments are those of `Application.open`.
+    Further arguments go to `Application.open`.
     """
     from cdmisfa.experiments.apply import Application
 
@@ -174,7 +174,7 @@ def _apply_to_each(
     code = 0
     with stoppable() as stop:
         for words in logs:
-            opened = application.open(words, say=printing.status, **how)
+            opened = application.open(words, say=printing.status, **arguments)
             with contextlib.closing(opened) as source:
                 totals = _apply(application, source, output, frames, stop, as_lines)
             error = None if totals.damaged is None else str(totals.damaged)
@@ -211,20 +211,20 @@ def _apply(
         printing.source(source)
     modules, spec = application.modules, source.spec
     totals, sinks = Totals(spec, modules), []
-    with bar("applying", "frames") as shown, contextlib.ExitStack() as stack:
+    with bar("applying", "frames") as progress_bar, contextlib.ExitStack() as stack:
         if output is not None:
             sinks.append(stack.enter_context(written_to(output, spec, modules, force=True)))
         if as_lines:
             sinks.append(lambda block: printing.line(json_line(block, spec, modules)))
         blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))
         total = None if spec.length is None else spec.length * len(spec.streams)
-        follow(blocks, sinks, totals, lambda: shown.update(totals.frames, total))
+        follow(blocks, sinks, totals, lambda: progress_bar.update(totals.frames, total))
     printing.source_changes(source)
     return totals
 
 
 def _print_rows(rows: Sequence[dict[str, Any]]) -> None:
-    """Print for each log how each module fits the frames of each stream."""
+    """Print a table for each log: how each module responds to the frames of each stream."""
     for row in rows:
         if not row["modules"]:
             continue

@@ -1,4 +1,4 @@
-"""`cdmisfa doctor`: check which software this machine has, and say how to install the rest."""
+"""`cdmisfa doctor`: check which software is installed, and print how to install the rest."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cdmisfa.core.errors import CdmisfaError
 
 REQUIRED = ("cdmisfa", "numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow")
 
-# Optional dependencies by the name of the extra: its modules, and what needs them.
+# Optional dependencies by the name of the extra: modules, and features that need them.
 EXTRAS = {
     "video": (("av",), "videos and cameras: learn, record, convert; export --to mp4"),
     "gym": (("gymnasium",), "gym: streams of simulated tasks; WatchEnv"),
@@ -35,7 +35,14 @@ EXTRAS = {
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """The result of a check; `needed_for` is empty if every command needs what is checked."""
+    """Result of checking one component.
+
+    Attributes:
+        what: name of the component.
+        ok: whether it is installed.
+        detail: its version, or the command that installs it.
+        needed_for: features that need it; "" if every command does.
+    """
 
     what: str
     ok: bool
@@ -66,7 +73,7 @@ def doctor_command(files: tuple[str, ...], as_json: bool) -> int:
         printing.document(ok=ok, checks=[asdict(check) for check in checks])
     else:
         rows = [("ok" if c.ok else "missing", c.what, c.detail, c.needed_for) for c in checks]
-        printing.table(("", "what", "detail", "needed for"), rows)
+        printing.table(("", "component", "detail", "needed for"), rows)
     return 0 if ok else 1
 
 

@@ -61,7 +61,7 @@ def learn_command(
     inputs: InputOptions,
     force: bool,
     as_json: bool,
-    **how: Any,
+    **arguments: Any,
 ) -> int:
     """Learn slow features from a scene, logs or live cameras.
 
@@ -105,16 +105,16 @@ def learn_command(
     if resume and (output is None or force):
         raise click.UsageError("--resume needs -o RUN, the run to resume, without --force")
     if not source:
-        return _learn_as_started(ctx, output if resume else None)
+        return _resume_run(ctx, output if resume else None)
     if algorithm is not None:
         settings = (*settings, f"learner.algorithm={algorithm}")
     live = any(map(is_live, source))
-    how |= {"inputs": inputs, "settings": settings, "seed": seed, "resumed": resume}
+    arguments |= {"inputs": inputs, "settings": settings, "seed": seed, "resumed": resume}
     with (
-        _opened(source, output, record_to, force, **how) as (frames, configuration),
+        _opened_source(source, output, record_to, force, **arguments) as (frames, configuration),
         learning(frames.spec, max_iterations) as (stop, progress),
     ):
-        color = getattr(frames, "color", inputs.color)  # the choice of auto is kept
+        color = getattr(frames, "color", inputs.color)  # what --color auto chose
         session = Session(
             frames,
             configuration.learner,
@@ -128,52 +128,52 @@ def learn_command(
             resume=resume,
             hashing=progress.hashing,
         )
-        result = _learned(session, stop, progress, rerun=not no_rerun, live_view=live_view)
+        result = _run_learner(session, stop, progress, rerun=not no_rerun, live_view=live_view)
     code = _print_run(result, stop, can_resume=not live, as_json=as_json)
     return code or (LogDamagedError.exit_code if getattr(frames, "left_out", ()) else 0)
 
 
-def _learn_as_started(ctx: click.Context, run: Path | None) -> int:
-    """Resume a run with its stored source and options; options of the command line come first."""
+def _resume_run(ctx: click.Context, run: Path | None) -> int:
+    """Resume a run with its stored source and options; new options take precedence."""
     from cdmisfa.experiments.run_folder import read_command
 
     if run is None:
         raise click.UsageError("name a SOURCE: a scene, a recording, logs or live streams")
     words, stored = read_command(run)
-    kept = {
+    restored = {
         name: value
         for name, value in stored.items()
         if ctx.get_parameter_source(name) is not click.core.ParameterSource.COMMANDLINE
     }
-    kept["settings"] = (*stored.get("settings", ()), *ctx.params["settings"])
-    code: int = ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
+    restored["settings"] = (*stored.get("settings", ()), *ctx.params["settings"])
+    code: int = ctx.invoke(learn_command, **{**ctx.params, **restored, "source": words})
     return code
 
 
 @contextlib.contextmanager
-def _opened(
-    words: Sequence[str], output: Path | None, record_to: Path | None, force: bool, **how: Any
+def _opened_source(
+    words: Sequence[str], output: Path | None, record_to: Path | None, force: bool, **arguments: Any
 ) -> Iterator[tuple[FrameSource, Configuration]]:
-    """Open a source with arguments of `open_source`; print notes before and after it is read."""
+    """Open a source, with the arguments of `open_source`; print its notes and warnings."""
     from cdmisfa.experiments.holdout import hold_out
     from cdmisfa.experiments.sources import is_scene, open_source
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
 
     live = any(map(is_live, words))
-    if live and how["resumed"]:
+    if live and arguments["resumed"]:
         raise UsageError(f"{words[0]} is a live stream: --resume needs a source that can go back")
     if record_to is not None and not live:
         raise UsageError(f"{words[0]} is no live stream: {are_for(['--record'], 'live streams')}")
     flags = ("--loop", "--skip-damaged", "--episodes")
-    unused = [flag for flag in flags if how[flag.removeprefix("--").replace("-", "_")]]
+    unused = [flag for flag in flags if arguments[flag.removeprefix("--").replace("-", "_")]]
     if unused and (live or is_scene(words)):
         raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
     for folder in filter(None, (output, record_to) if live else ()):
         refuse_existing(folder, force=force, resumable=False)
-    with bar("opening", "logs") as shown:
+    with bar("opening", "logs") as progress_bar:
         frames, configuration = open_source(
-            words, progress=shown.update, say=printing.status, **how
+            words, progress=progress_bar.update, say=printing.status, **arguments
         )
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.closing(frames))
@@ -190,10 +190,10 @@ def _opened(
         yield frames, configuration
 
 
-def _learned(
+def _run_learner(
     session: Session, stop: Stop, progress: RunProgress, *, rerun: bool, live_view: bool = False
 ) -> RunResult:
-    """Learn, on request with a live view, until the run ends or a signal stops it."""
+    """Run the learner, on request with a live view, until the run ends or a signal stops it."""
     viewer = None
     if live_view:
         from replay.viewer import live_window
@@ -220,7 +220,7 @@ def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool
         return 0
     try:
         page = write_report([result.run])
-    except Exception as error:  # the run is complete, whatever makes its report fail
+    except Exception as error:  # the run is complete, even if its report cannot be written
         printing.warning(
             f"no report was written ({one_line(error)}): try again with cdmisfa report {folder}"
         )
@@ -251,7 +251,7 @@ def fork_command(
     max_modules: int | None,
     no_rerun: bool,
     as_json: bool,
-    **how: Any,
+    **arguments: Any,
 ) -> int:
     """Continue a run from an earlier iteration with other settings.
 
@@ -275,10 +275,10 @@ def fork_command(
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
     limits = {name: limit for name, limit in given.items() if limit is not None}
     with (
-        Session.fork(run, iteration, output, limits=limits, **how) as session,
+        Session.fork(run, iteration, output, limits=limits, **arguments) as session,
         learning(session.source.spec, max_iterations) as (stop, progress),
     ):
-        result = _learned(session, stop, progress, rerun=not no_rerun)
+        result = _run_learner(session, stop, progress, rerun=not no_rerun)
     both = f"{printing.quoted(run)} {printing.quoted(output)}"
     printing.status(f"compare both with cdmisfa compare {both} --save both.rrd")
     return _print_run(result, stop, can_resume=True, as_json=as_json)

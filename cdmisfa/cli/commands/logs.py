@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from replay.integrity.report import LogReport, SizeInfo
     from replay.logs.stream import ChannelInfo
 
-# Number of streams of a run that `info` names.
+# Largest number of streams of a run that `info` names, to keep them on one line.
 MOST_STREAMS = 8
 
 
@@ -79,19 +79,19 @@ def _print_info(info: LogReport) -> None:
 
 
 def _print_run(info: LogReport, run: Mapping[str, Any]) -> None:
-    """Print what a run learned, with which learner, and why it ended."""
+    """Print learner, modules, outcomes of streams and end of a run."""
     from cdmisfa.core.outcomes import END_REASONS
 
     streams = run["streams"]
     more = len(streams) - MOST_STREAMS
     names = ", ".join(streams[:MOST_STREAMS]) + (f" and {more} more" if more > 0 else "")
     printing.line(f"learner {run['algorithm']}, {counted(len(streams), 'stream')}: {names}")
-    if info.modules or info.ended is not None:  # else the modules are in the log alone
+    if info.modules or info.ended is not None:  # a run that has not ended has no module file yet
         printing.modules(info.modules, policies=not run["outcomes"])
     for outcome in run["outcomes"]:
         printing.stream_outcome(outcome)
     if info.held_out is not None:
-        printing.held_out(info.held_out)
+        printing.holdout_slowness(info.held_out)
     done = f"{counted(run['iterations'], 'iteration')} of {counted(run['tau'], 'frame')}"
     if info.ended is None:
         printing.line(f"not finished after {done}: it is still learning, or was stopped")
@@ -142,7 +142,7 @@ def _print_channels(channels: Sequence[ChannelInfo]) -> None:
         "schema": [c.schema for c in channels],
         "file": [c.file for c in channels],
     }
-    for name in ("encoding", "file"):  # what all channels share is printed above
+    for name in ("encoding", "file"):  # values that all channels share are printed above
         if len(set(columns[name])) < 2:
             del columns[name]
     printing.table(list(columns), list(zip(*columns.values(), strict=True)))
@@ -236,7 +236,7 @@ def export_command(
     output: Path,
     lossless: bool,
     as_json: bool,
-    **how: Any,
+    **arguments: Any,
 ) -> None:
     """Export signals as a table, or images as PNG, MP4 or LeRobot.
 
@@ -267,7 +267,7 @@ def export_command(
     from replay.export.tables import CSV_LEAVES_OUT, TABLES
 
     form = form or output.suffix.removeprefix(".")
-    rows = export(path, output, form, lossless=lossless, about=printing.source, **how)
+    rows = export(path, output, form, lossless=lossless, about=printing.source, **arguments)
     if form == "csv":
         printing.status(f"CSV leaves out {' and '.join(CSV_LEAVES_OUT)}: Parquet and npz have them")
     videos = output.is_file() or next(output.rglob("*.mp4"), None) is not None
@@ -312,13 +312,13 @@ def index_command(
     """
     from replay.corpus.index import index_logs
 
-    with bar("indexing", "logs") as shown, stoppable() as stop:
+    with bar("indexing", "logs") as progress_bar, stoppable() as stop:
         indexed = index_logs(
             corpus,
             output,
             deep=deep,
             jobs=jobs or os.cpu_count() or 1,
-            progress=shown.update,
+            progress=progress_bar.update,
             stop=stop,
         )
     if as_json:
@@ -334,7 +334,7 @@ def index_command(
 
 
 def _print_index(indexed: Indexed) -> None:
-    """Print what was indexed now, how much there is of each kind of log, and problems."""
+    """Print counts of logs, a table of the kinds of logs, and problems."""
     from rich.filesize import decimal
 
     printing.line(

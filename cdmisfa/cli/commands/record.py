@@ -85,8 +85,8 @@ def record_command(
         given = {"--view": views, "--jobs": jobs > 1, "--resume": resume}
         if options := [name for name, value in given.items() if value]:
             raise UsageError(f"{source[0]} is a live stream: {are_for(options, 'scenes')}")
-        how = {"inputs": inputs, "preset": preset, "settings": settings, "seed": seed or 0}
-        return _record_live(source, output, frames, limit, force, as_json, **how)
+        arguments = {"inputs": inputs, "preset": preset, "settings": settings, "seed": seed or 0}
+        return _record_live(source, output, frames, limit, force, as_json, **arguments)
     if any(w not in SCENES and (Path(w).exists() or set("*?:") & set(w)) for w in source):
         command = f"cdmisfa convert {shlex.join(source)} -o REC"
         raise UsageError(f"{source[0]} is a log, not a scene: convert it with {command}")
@@ -100,7 +100,7 @@ def record_command(
         raise click.UsageError(f"name a scene: {' or '.join(SCENES)}")
     seed = seed if seed is not None else start.seed or 0
     configuration = configure(scene, Layers.read(preset, settings), seed, inputs)
-    with _writing(output, "recording", notice="") as (shown, stop):
+    with _writing(output, "recording", notice="") as (progress_bar, stop):
         files = record_scene(
             scene,
             output,
@@ -112,14 +112,14 @@ def record_command(
             split=limit,
             resume=resume,
             stop=stop,
-            progress=lambda done: shown.update(done, max(done, frames or DEFAULT_FRAMES)),
+            progress=lambda done: progress_bar.update(done, max(done, frames or DEFAULT_FRAMES)),
             force=force,
         )
     return _print_recording(output, files, as_json)
 
 
 def _check_resumable(output: Path, scene: str) -> None:
-    """Refuse to resume a recording of live streams, or a conversion: `record` resumes scenes."""
+    """Raise an error for a recording of live streams and for a conversion."""
     if scene in ("cameras", "gym"):
         raise UsageError(f"{output}: a recording of live streams cannot be resumed")
     if scene == "foreign":
@@ -134,11 +134,11 @@ def _record_live(
     split: float | None,
     force: bool,
     as_json: bool,
-    **how: Any,
+    **arguments: Any,
 ) -> int:
-    """Record live streams until there are enough frames, they end, or Ctrl-C.
+    """Record live streams until they have `frames` frames, they end, or Ctrl-C is pressed.
 
-    Further arguments are those of `open_source`.
+    Further arguments go to `open_source`.
     """
     from cdmisfa.experiments.sources import open_source
     from recorder.live import LiveRecorder, record_live
@@ -146,16 +146,19 @@ def _record_live(
     from recorder.recording import DEFAULT_FRAMES
 
     refuse_existing(output, force=force, resumable=False)
-    source, configuration = open_source(words, say=printing.status, **how)
+    source, configuration = open_source(words, say=printing.status, **arguments)
     notice = "finishing the recording; press Ctrl-C again to stop at once\n"
     with contextlib.closing(source), stoppable(notice) as stop:
         frames = frames or (None if getattr(source, "gaps", False) else DEFAULT_FRAMES)
         recorded = LiveRecorder(
             source, output, settings=configuration.record, split=split, force=force
         )
-        with bar("recording", "frames") as shown:
+        with bar("recording", "frames") as progress_bar:
             record_live(
-                recorded, frames=frames, stop=stop, progress=lambda done: shown.update(done, frames)
+                recorded,
+                frames=frames,
+                stop=stop,
+                progress=lambda done: progress_bar.update(done, frames),
             )
     if recorded.ended and not stop():
         printing.status(f"ended at frame {recorded.t}: {recorded.ended}")
@@ -216,13 +219,13 @@ def convert_command(
     opened = open_external(paths, inputs, skip_damaged=skip_damaged)
     with contextlib.closing(opened) as frames:
         printing.source(frames)
-        with _writing(output, "converting") as (shown, stop):
+        with _writing(output, "converting") as (progress_bar, stop):
             files = record(
                 frames,
                 output,
                 resume=resume,
                 stop=stop,
-                progress=lambda done: shown.update(done, frames.spec.length),
+                progress=lambda done: progress_bar.update(done, frames.spec.length),
                 force=force,
             )
         printing.source_changes(frames)
@@ -235,9 +238,9 @@ def _writing(output: Path, title: str, **notice: str) -> Iterator[tuple[Bar, Sto
     """Show the progress of writing a recording; exit if a signal stops it."""
     from recorder.recording import RecordingStoppedError
 
-    with bar(title, "frames") as shown, stoppable(**notice) as stop:
+    with bar(title, "frames") as progress_bar, stoppable(**notice) as stop:
         try:
-            yield shown, stop
+            yield progress_bar, stop
         except (RecordingStoppedError, KeyboardInterrupt):
             printing.status(
                 f"cdmisfa: interrupted: {output} is not finished: continue with --resume"

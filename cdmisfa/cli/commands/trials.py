@@ -51,7 +51,7 @@ def sweep_command(
     summary: bool,
     csv: bool,
     as_json: bool,
-    **how: Any,
+    **arguments: Any,
 ) -> int:
     """Learn with many settings and seeds, and summarize the results.
 
@@ -90,8 +90,10 @@ def sweep_command(
     from cdmisfa.experiments.sweep import sweep
 
     values, numbers = parse_grid(grid), parse_seeds(seeds)
-    with resumable_bar(output, "sweep", "trials") as shown:
-        report = sweep(source, output, grid=values, seeds=numbers, progress=shown.trials, **how)
+    with resumable_bar(output, "sweep", "trials") as progress_bar:
+        report = sweep(
+            source, output, grid=values, seeds=numbers, progress=progress_bar.trials, **arguments
+        )
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if as_json:
         printing.document(
@@ -181,7 +183,7 @@ def _print_summary(folder: Path, *, as_csv: bool, as_json: bool) -> None:
 @options.as_json
 @options.quiet
 def reproduce_command(
-    name: str, output: Path | None, recording: Path | None, as_json: bool, **how: Any
+    name: str, output: Path | None, recording: Path | None, as_json: bool, **arguments: Any
 ) -> None:
     """Reproduce an experiment of the CD-MISFA paper.
 
@@ -219,9 +221,13 @@ def reproduce_command(
             printing.status(
                 f"icub: the scene is recorded into {root}/icub-recording, if not yet done"
             )
-        with bar(experiment, "trials") as shown:
+        with bar(experiment, "trials") as progress_bar:
             document = reproduce(
-                experiment, root / experiment, recording=recording, progress=shown.update, **how
+                experiment,
+                root / experiment,
+                recording=recording,
+                progress=progress_bar.update,
+                **arguments,
             )
         documents.append(document)
     if as_json:
@@ -278,6 +284,6 @@ def _stage(title: str, unit: str) -> Iterator[Bar]:
     """Print the title of a stage, show its progress, and print how long it took."""
     start = time.monotonic()
     printing.status(title)
-    with bar("", unit) as shown:
-        yield shown
+    with bar("", unit) as progress_bar:
+        yield progress_bar
     printing.status(f"    {time.monotonic() - start:.0f} s")

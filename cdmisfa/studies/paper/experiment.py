@@ -17,7 +17,7 @@ from cdmisfa.modules import Module
 
 Settings = Mapping[str, Any]
 
-# A trial's row, in plain values, and its arrays: curves for the figures.
+# Results of a trial as JSON values, and its arrays: curves for the figures.
 Output = tuple[dict[str, Any], Mapping[str, NDArray[Any]]]
 
 
@@ -26,8 +26,8 @@ class Trial:
     """A finished trial.
 
     Attributes:
-        settings: settings of the trial, with its seed.
-        row: results of the trial, as JSON values.
+        settings: settings of the trial, including its seed.
+        row: results, as JSON values.
         arrays: curves for the figures.
     """
 
@@ -40,11 +40,11 @@ class Findings:
     """The results of an experiment.
 
     Attributes:
-        lines: of its table: the measured quantity, the paper's value as text, "-" where it has
-            none, mean, SD and number of trials, the 95 % interval of a share, decimals to print.
-        tables: other tables, each with head and rows of texts.
-        claims: claims of the paper, and whether each holds: True, False, or None if the trials
-            cannot decide it.
+        lines: rows of the table: the measured quantity, the paper's value as text ("-" if it gives
+            none), mean, SD, number of trials, 95 % interval of a share, decimals to print.
+        tables: further tables, each with its head and rows of texts.
+        claims: statements of the paper, and whether they are reproduced: true, false, or None if
+            that cannot be decided.
         notes: limits and explanations.
     """
 
@@ -67,15 +67,15 @@ class Findings:
         self.lines[-1]["interval"] = wilson(good, n)
 
     def table(self, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Add a table of its own."""
+        """Add a further table."""
         self.tables.append({"head": [*head], "rows": [[*row] for row in rows]})
 
     def claim(self, claim: str, holds: bool | None, detail: str) -> None:
-        """Add a statement of the paper; `holds` is None where it cannot be judged."""
+        """Add a statement of the paper; `holds` is None if it cannot be decided."""
         self.claims.append({"claim": claim, "holds": holds, "detail": detail})
 
     def claim_all(self, claim: str, good: int, n: int) -> None:
-        """Add a statement that holds where all of n trials are good."""
+        """Add a statement that holds if all of n trials are good."""
         self.claim(claim, good == n, f"{good} of {n} trials")
 
     def as_json(self) -> dict[str, Any]:
@@ -93,17 +93,17 @@ class Experiment(ABC):
     """An experiment of the paper.
 
     Attributes:
-        title: title of the tables.
-        trials: trials per condition: the paper's number, and enough to test the claim.
-        sees: True if the experiment needs a recording of the iCub scene.
+        title: title of its tables.
+        trials: trials per condition: the paper's number, and the number of --quick.
+        needs_recording: whether it needs a recording of the iCub scene.
     """
 
     title: str
     trials: tuple[int, int] = (20, 4)
-    sees = False
+    needs_recording = False
 
     def conditions(self, quick: bool, recording: Path | None) -> Sequence[Settings]:
-        """Return what trials differ in beside their seed, as JSON values."""
+        """Return the settings of each condition besides the seed, as JSON values."""
         return [{}]
 
     @abstractmethod
@@ -133,20 +133,20 @@ def groups(trials: Sequence[Trial], *keys: str) -> dict[tuple[Any, ...], list[Tr
 
 
 def of_all(good: int, n: int) -> str:
-    """Return how many of n trials did what they should, bold where some did not."""
+    """Return "k of n" for k good trials, bold if some are not good."""
     return f"{good} of {n}" if good == n else f"**{good} of {n}**"
 
 
 def mean_text(values: ArrayLike, digits: int) -> str:
-    """Return mean and SD as a table has them; "-" where there is no value."""
+    """Return mean and SD as text; "-" without values."""
     result = summary(values)
     spread = f" ± {result.sd:.{digits}f}" if result.n > 1 else ""
     return f"{result.mean:.{digits}f}{spread}" if result.n else "-"
 
 
-def first_above(first: ArrayLike, *others: ArrayLike) -> bool | None:
-    """Tell whether values are above others of the same trials; None where 95 % intervals cannot."""
-    bounds = [mean_interval(np.subtract(first, other)) for other in others]
+def first_above(first: ArrayLike, *rest: ArrayLike) -> bool | None:
+    """Return whether `first` is above the rest on the same trials; None if that is uncertain."""
+    bounds = [mean_interval(np.subtract(first, values)) for values in rest]
     if all(low > 0 for low, _ in bounds):
         return True
     return False if any(high < 0 for _, high in bounds) else None

@@ -74,7 +74,7 @@ def draw_eta_dot(axes: Axes, curves: Curves, delta: float, letter: str) -> None:
     axes.plot(median.filled(np.nan), color=COLOURS[0], linewidth=1.2, label="median of trials")
     axes.axhline(delta, color=COLOURS[1], linestyle="--", linewidth=0.9, label=r"$\delta$")
     axes.set_yscale("log")
-    explain_above(axes)
+    place_legend_above(axes)
     letter_panel(axes, letter, "iteration", "change of slowness, 1/frame")
 
 
@@ -91,7 +91,7 @@ def draw_means(axes: Axes, curves: Curves, letter: str, y: str) -> None:
     low, high = np.nanquantile(settled, (0.001, 0.999))
     if high > low:
         axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
-    explain_above(axes)
+    place_legend_above(axes)
     letter_panel(axes, letter, "iteration", y)
 
 
@@ -107,7 +107,7 @@ def draw_policies(axes: Axes, curves: Curves, letter: str, y: str) -> None:
     letter_panel(axes, letter, "iteration", y)
 
 
-def explain_above(axes: Axes) -> None:
-    """Put a legend above the panel, where it hides nothing."""
-    how: dict[str, Any] = {"fontsize": 8, "ncols": 4, "frameon": False, "borderaxespad": 0.2}
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), **how)
+def place_legend_above(axes: Axes) -> None:
+    """Put a legend above the panel, where it hides no curve."""
+    style: dict[str, Any] = {"fontsize": 8, "ncols": 4, "frameon": False, "borderaxespad": 0.2}
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), **style)

@@ -1,4 +1,4 @@
-"""The vision-enabled iCub: two modules from pixels, and nothing from what cannot be learned."""
+"""The vision-enabled iCub: modules for two objects, none for the third, which jumps at random."""
 
 from __future__ import annotations
 
@@ -44,24 +44,24 @@ from replay.open_sources import open_recording
 # Stream and policy of both modules, as the paper gives them.
 OPTIMAL = ((0, "011"), (2, "110"))
 
-# The second module is saved near 1160; the rest shows that no third one is.
+# The second module is saved near iteration 1160; the others show that no third module follows.
 ITERATIONS = 1400
 
-# Frames before a module is frozen whose output is drawn (paper).
+# Frames before a module is saved whose output is drawn, as in the paper.
 DRAWN = 200
 
-# What each module should encode.
+# True positions that the modules should encode.
 OBJECTS = ("object1_y", "object3_y")
 
-# Frames after those learned from on which modules are judged: 16 times the walk's half range.
-HELD_OUT = 4000
+# Frames after the learned ones on which modules are tested: 16 times the half range of the walk.
+TEST_FRAMES = 4000
 
-# |r| with the position of an object, on held-out frames, from which on a module follows it.
+# Smallest |r| with the position of an object, on the test frames, at which a module follows it.
 FOLLOWS = 0.9
 
 # Algorithm, and threshold of the clustering error of 1.0: that of decision 0014, and a looser one.
 #
-# 1.0 gets the head's positions as labels.
+# 1.0 gets the positions of the head as labels.
 LEARNERS = (("2.0", 0.1), ("1.0", 0.1), ("1.0", 0.6))
 
 
@@ -70,7 +70,7 @@ class Icub(Experiment):
 
     title = "Curiosity-driven, vision-enabled iCub"
     trials = (10, 2)
-    sees = True
+    needs_recording = True
 
     def conditions(self, quick: bool, recording: Path | None) -> list[Settings]:
         """Return each learner, on one recording."""
@@ -85,7 +85,7 @@ class Icub(Experiment):
             return learn_curves(source, paper_config("icub", **keys), settings["seed"])
 
     def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
-        """Object 1, then object 3, with the optimal policies, and no third module; by 2.0 only."""
+        """Check that 2.0 alone learns object 1, then object 3, and no third module."""
         by_learner = groups(trials, "algorithm", "roc_error")
         new, old, loose = (by_learner[which] for which in LEARNERS)
         rows = []
@@ -117,15 +117,15 @@ class Icub(Experiment):
             f"{len(loose)}, where {in_order(loose)} have the paper's order and policies",
         )
         findings.notes.append(
-            f"|r|: the largest of the modules', on {HELD_OUT} frames after those learned from. 1.0 "
-            "is given the head's positions as labels. All seeds learn from one recording."
+            f"|r|: the largest of the modules', on {TEST_FRAMES} frames that are not learned. 1.0 "
+            "gets the positions of the head as labels. All seeds learn from one recording."
         )
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
         """Draw the scene; value function, policy, eta-dot; the modules' outputs and the objects."""
         trials = [t for t in trials if t.settings["algorithm"] == "2.0"]
         scene, axes = figures.new_figure(1, 1)
-        views = np.pad(trials[0].arrays["shown"], ((0, 0), (1, 1), (0, 0)), constant_values=255)
+        views = np.pad(trials[0].arrays["views"], ((0, 0), (1, 1), (0, 0)), constant_values=255)
         axes[0, 0].imshow(np.concatenate(views), cmap="gray", vmin=0, vmax=255)
         axes[0, 0].set(xticks=[], yticks=[])
         figures.letter_panel(axes[0, 0], "a", "views: left, center, right", "")
@@ -146,29 +146,29 @@ class Icub(Experiment):
             figures.letter_panel(axes[i, 1], "bd"[i], f"{name}, m", "")
             axes[i, 1].locator_params(axis="x", nbins=5)
         drawn = {"icub-scene": scene, "icub": figure, "icub-outputs": outputs}
-        return [figures.save_figure(each, folder, name) for name, each in drawn.items()]
+        return [figures.save_figure(fig, folder, name) for name, fig in drawn.items()]
 
 
 def make_recording(folder: Path, seed: int, jobs: int) -> Path:
-    """Return a recording of the scene in a folder; it is made or finished where it is not there."""
+    """Return the folder of a recording of the scene; record or resume it unless it is finished."""
     finished = folder / "finished.json"
     if not finished.exists():
         from recorder.recording import record_scene
 
         scene, resume = IcubConfig(seed=seed), folder.exists()
-        frames = ITERATIONS * paper_config("icub").tau + HELD_OUT
+        frames = ITERATIONS * paper_config("icub").tau + TEST_FRAMES
         views = record_scene("icub", folder, scene, frames=frames, jobs=jobs, resume=resume)
         write_json(finished, {"views": [view.as_json() for view in views]})
     return folder
 
 
 def in_order(trials: Sequence[Trial]) -> int:
-    """Count the trials that began with both modules as they should be."""
+    """Count the trials whose first two modules have the paper's streams and policies."""
     return sum(learned_order(t.row)[:2] == OPTIMAL for t in trials)
 
 
 def follow_both(trials: Sequence[Trial]) -> int:
-    """Count the trials that have a module that follows object 1, and one that follows 3."""
+    """Count the trials with a module that follows object 1 and one that follows object 3."""
     return sum(all(best(t.row, number) >= FOLLOWS for number in (0, 1)) for t in trials)
 
 
@@ -178,10 +178,10 @@ def best(row: Mapping[str, Any], number: int) -> float:
 
 
 class RewardCurves(Sink):
-    """Keeps what the figures show: some signals, and each module's last outputs.
+    """Sink that stores the curves of the figures: some signals, and the last outputs of modules.
 
     Attributes:
-        arrays: by name; of module i its outputs are yi, the truth of its object truthi.
+        arrays: curves by name; for module i the outputs yi and the true positions truthi.
     """
 
     def __init__(self, tau: int, truth: Sequence[str]) -> None:
@@ -212,18 +212,18 @@ class RewardCurves(Sink):
 
 
 def learn_curves(source: LoggedSource, config: LearnerConfig, seed: int) -> Output:
-    """Learn from a recording; return a trial's row, curves, and each module's last outputs.
+    """Learn from a recording; return the row of a trial, curves, and last outputs of modules.
 
-    The last `HELD_OUT` frames judge the modules.
+    The modules are tested on the last `TEST_FRAMES` frames.
 
     Raises:
         LogExhaustedError: the recording has not enough frames for a block.
     """
     curves = RewardCurves(config.tau, source.spec.truth)
-    learner, frames = open_learner(config, source.spec, seed), source.frames - HELD_OUT
+    learner, frames = open_learner(config, source.spec, seed), source.frames - TEST_FRAMES
     iterations = min(ITERATIONS, frames // learner.tau)
     if iterations < 1:
-        raise LogExhaustedError(f"too few frames: {HELD_OUT} are held out, record more than these")
+        raise LogExhaustedError(f"too few frames: record more than {TEST_FRAMES}, the test frames")
     learn_blocks(source, learner, [curves], max_iterations=iterations, max_modules=iterations)
     row = {
         **module_row(learner.modules),
@@ -232,14 +232,14 @@ def learn_curves(source: LoggedSource, config: LearnerConfig, seed: int) -> Outp
         **stay_rewards(curves.arrays, config),
     }
     source.seek(0)
-    shown = [source.take(view, 1).frames[0] for view in range(len(source.spec.streams))]
-    return row, {**curves.arrays, "shown": np.stack(shown)}
+    views = [source.take(view, 1).frames[0] for view in range(len(source.spec.streams))]
+    return row, {**curves.arrays, "views": np.stack(views)}
 
 
 def follows(module: Module, source: SeekableSource, first: int) -> list[float]:
-    """Return |r| of a module's slowest output with each of `OBJECTS`, on `HELD_OUT` frames."""
+    """Return |r| of a module's slowest output with each of `OBJECTS`, on `TEST_FRAMES` frames."""
     source.seek(first)
-    parts = [source.take(module.stream_index, 40) for _ in range(HELD_OUT // 40)]
+    parts = [source.take(module.stream_index, 40) for _ in range(TEST_FRAMES // 40)]
     y = np.concatenate([module.transform(part.frames, 0)[:, 0] for part in parts])
     truth = np.concatenate([part.truth for part in parts])
     columns = [truth[:, source.spec.truth.index(name)] for name in OBJECTS]

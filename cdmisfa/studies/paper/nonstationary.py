@@ -1,4 +1,4 @@
-"""An abrupt change: until which epsilon does the agent still learn the new optimum?"""
+"""Abrupt changes: the epsilon until which the agent still learns the new optimum."""
 
 from __future__ import annotations
 
@@ -43,10 +43,9 @@ QUICK_COLUMNS = {"sigma": {sigma: SIGMAS[sigma] for sigma in (0.008, 0.0009, 0.0
 # Factor of epsilon in every iteration; the paper does not give it, decision 0013.
 DECAY = 0.998
 
-# Rewarded blocks before a change from which on one can speak of following it.
-#
-# With fewer the agent had hardly an optimum to leave.
-REWARDED = 30
+# Smallest mean number of rewarded blocks before a change. With fewer, the agent had hardly found an
+# optimum that it could leave.
+MIN_REWARDED = 30
 
 CONTRADICTION = (
     "The paper's tables contradict each other: sigma = 0.0009, nu = 0.05 and tau = 100 are one "
@@ -57,28 +56,28 @@ CONTRADICTION = (
 
 OLD, NEW = "101", "011"
 
-# The values of sigma that the paper shows a figure of.
-PICTURED = (0.0001, 0.008)
+# Values of sigma in the paper's figure.
+FIGURE_SIGMAS = (0.0001, 0.008)
 
-# Marker, its size and dashes of each stream, which stay apart where they lie on each other.
+# Marker, marker size and dashes of each stream, which stay distinct where curves overlap.
 STYLES = (("o", 7, "-"), ("s", 5, (0, (4, 2))), ("^", 3, (0, (1, 1.5))))
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
-    """Epsilon^d at one value of a key, from the trials that are judged.
+class CriticalPoint:
+    """Epsilon^d at one value of a key.
 
     Attributes:
-        value: the midpoint of "converged to the new optimum"; NaN where no trial did, or each.
-        of_seeds: (seeds,) pseudo-values of the jackknife over seeds, whose mean is `value` and
+        value: the midpoint of "converged to the new optimum"; NaN if no trial or every trial did.
+        pseudo: (seeds,) pseudo-values of the jackknife over seeds, whose mean is `value` and
             whose spread tells how certain it is: trials of a seed are not independent.
-        followed, neither: trials that ended with the new optimum, and with none of the two.
-        n: trials.
-        limit: the largest epsilon^c that is judged.
+        followed, neither: number of trials that ended in the new optimum, and in neither optimum.
+        n: number of trials.
+        limit: the largest epsilon^c with enough rewarded blocks.
     """
 
     value: float
-    of_seeds: FloatArray
+    pseudo: FloatArray
     followed: int
     neither: int
     n: int
@@ -86,7 +85,7 @@ class Turn:
 
     @property
     def rank(self) -> float:
-        """Epsilon^d for comparison; 2 where it lies above every epsilon^c, 0 where below."""
+        """Epsilon^d for comparison; 2 if it is above every epsilon^c, 0 if below."""
         if math.isnan(self.value):
             return 0.0 if self.followed else 2.0
         return self.value
@@ -96,7 +95,7 @@ class Turn:
 
 
 class NonStationary(Experiment):
-    """Late changes must leave the old optimum; epsilon^d must be lower for a smaller sigma."""
+    """Late changes keep the old optimum; epsilon^d is lower for a smaller sigma."""
 
     title = "Non-stationary environments"
     trials = (20, 3)
@@ -129,20 +128,20 @@ class NonStationary(Experiment):
         return {"policy": "".join(map(str, policy)), "rewarded": rewarded}, {}
 
     def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
-        """Judge what of both tables comes out, and what of the text, where that can be judged."""
+        """Compare epsilon^d with both tables and with the statements of the text."""
         judged = _judged(trials)
         limit = max(t.settings["epsilon_c"] for t in judged)
-        turns = {at: _turn(of, limit) for at, of in groups(judged, "key", "value").items()}
+        points = {at: _point(of, limit) for at, of in groups(judged, "key", "value").items()}
         rows = []
-        for (key, value), turn in turns.items():
-            low, high = mean_interval(turn.of_seeds)
-            between = f"{low:.3f} .. {high:.3f}" if turn.value <= limit else "-"
-            paper, ends = f"{COLUMNS[key][value]:g}", f"{turn.n - turn.neither} of {turn.n}"
-            rows.append([f"{key} = {value:g}", paper, str(turn), between, ends])
+        for (key, value), point in points.items():
+            low, high = mean_interval(point.pseudo)
+            between = f"{low:.3f} .. {high:.3f}" if point.value <= limit else "-"
+            paper, ends = f"{COLUMNS[key][value]:g}", f"{point.n - point.neither} of {point.n}"
+            rows.append([f"{key} = {value:g}", paper, str(point), between, ends])
         head = ("at", "paper's epsilon^d", "ours", "95 % interval, by seeds", "old or new optimum")
         findings.table(head, rows)
-        _claim_about_changes(findings, judged, turns)
-        _claim_about_order(findings, turns)
+        _claim_about_changes(findings, judged, points)
+        _claim_about_order(findings, points)
         rewarded = ", ".join(
             f"{epsilon:g}: {_rewarded(group):.0f}"
             for (epsilon,), group in groups(trials, "epsilon_c").items()
@@ -150,18 +149,19 @@ class NonStationary(Experiment):
         )
         note = (
             f"Blocks rewarded before the change, by epsilon^c: {rewarded}. Above {limit:g} they "
-            f"are fewer than {REWARDED}, and the agent has hardly an optimum to leave: changes "
+            f"are fewer than {MIN_REWARDED}, and the agent has hardly an optimum to leave: changes "
             "there are left out, and where epsilon^d lies there it is only said to be above "
             f"{limit:g}."
         )
         findings.notes = [note, CONTRADICTION]
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
-        """Draw policies against epsilon^c for two values of sigma, grey where it is not judged."""
+        """Draw policies against epsilon^c for two values of sigma; grey where rewards are few."""
         of_sigma = {v: of for (k, v), of in groups(trials, "key", "value").items() if k == "sigma"}
-        shown = PICTURED if of_sigma.keys() >= {*PICTURED} else (min(of_sigma), max(of_sigma))
+        both = of_sigma.keys() >= {*FIGURE_SIGMAS}
+        sigmas = FIGURE_SIGMAS if both else (min(of_sigma), max(of_sigma))
         figure, axes = figures.new_figure(1, 2)
-        for panel, sigma, letter in zip(axes[0], shown, "ab", strict=True):
+        for panel, sigma, letter in zip(axes[0], sigmas, "ab", strict=True):
             _draw_policies(panel, of_sigma[sigma])
             axis = rf"$\epsilon$ at the change ($\sigma$ = {sigma:g})"
             figures.letter_panel(panel, letter, axis, "mean final policy")
@@ -176,12 +176,12 @@ def point_of_no_return(trials: Sequence[Trial]) -> float:
     return logistic_midpoint(changes, [_is_new(t) for t in trials])
 
 
-def _turn(trials: Sequence[Trial], limit: float) -> Turn:
+def _point(trials: Sequence[Trial], limit: float) -> CriticalPoint:
     value, seeds = point_of_no_return(trials), sorted({t.settings["seed"] for t in trials})
     without = [point_of_no_return([t for t in trials if t.settings["seed"] != s]) for s in seeds]
-    of_seeds = value + (len(seeds) - 1) * (np.mean(without) - np.array(without))
+    pseudo = value + (len(seeds) - 1) * (np.mean(without) - np.array(without))
     neither = sum(t.row["policy"] not in (OLD, NEW) for t in trials)
-    return Turn(value, of_seeds, sum(map(_is_new, trials)), neither, len(trials), limit)
+    return CriticalPoint(value, pseudo, sum(map(_is_new, trials)), neither, len(trials), limit)
 
 
 def _is_new(trial: Trial) -> bool:
@@ -189,36 +189,42 @@ def _is_new(trial: Trial) -> bool:
 
 
 def _claim_about_changes(
-    findings: Findings, judged: Sequence[Trial], turns: Mapping[tuple[str, float], Turn]
+    findings: Findings,
+    judged: Sequence[Trial],
+    points: Mapping[tuple[str, float], CriticalPoint],
 ) -> None:
-    """Claim that changes are followed early, and not late, and where the others end."""
-    smallest = min(value for key, value in turns if key == "sigma")
+    """Add claims: early changes are followed, late ones are not, and every policy is an optimum."""
+    smallest = min(value for key, value in points if key == "sigma")
     changes = {t.settings["epsilon_c"] for t in judged}
     largest, last = max(changes), min(changes)
     early = groups(judged, "key", "value", "epsilon_c")["sigma", smallest, largest]
     late = groups(judged, "key", "epsilon_c")["sigma", last]
-    followed, kept = sum(map(_is_new, early)), sum(not _is_new(t) for t in late)
+    followed, unchanged = sum(map(_is_new, early)), sum(not _is_new(t) for t in late)
     findings.claim(
-        "a change above epsilon^d is followed (smallest sigma, largest epsilon^c judged)",
+        "a change above epsilon^d is followed (smallest sigma, largest epsilon^c)",
         followed >= 0.8 * len(early),
         f"{followed} of {len(early)} trials with epsilon^c = {largest:g}",
     )
-    detail = f"{kept} of {len(late)} trials with epsilon^c = {last:g}"
-    findings.claim("a change while epsilon is small is not followed", kept == len(late), detail)
-    lost, n = (sum(getattr(t, name) for t in turns.values()) for name in ("neither", "n"))
-    (key, value), worst = max(turns.items(), key=lambda item: item[1].neither / item[1].n)
+    detail = f"{unchanged} of {len(late)} trials with epsilon^c = {last:g}"
+    findings.claim(
+        "a change while epsilon is small is not followed", unchanged == len(late), detail
+    )
+    lost, n = (sum(getattr(t, name) for t in points.values()) for name in ("neither", "n"))
+    (key, value), worst = max(points.items(), key=lambda item: item[1].neither / item[1].n)
     most = f", most at {key} = {value:g} ({worst.neither} of {worst.n})" if lost else ""
     ends = "the policy ends in the old or in the new optimum"
     findings.claim(ends, lost == 0, f"{lost} of {n} trials in neither{most}")
 
 
-def _claim_about_order(findings: Findings, turns: Mapping[tuple[str, float], Turn]) -> None:
-    """Claim how epsilon^d depends on sigma and, where trials vary them, on nu and tau."""
-    columns: dict[str, dict[float, Turn]] = {}
-    for (key, value), turn in sorted(turns.items()):
-        columns.setdefault(key, {})[value] = turn
+def _claim_about_order(
+    findings: Findings, points: Mapping[tuple[str, float], CriticalPoint]
+) -> None:
+    """Add claims about the effect of sigma on epsilon^d and, if they vary, of nu and tau."""
+    columns: dict[str, dict[float, CriticalPoint]] = {}
+    for (key, value), point in sorted(points.items()):
+        columns.setdefault(key, {})[value] = point
     of_sigma = list(columns["sigma"].values())[::-1]
-    order = [min(turn.rank, turn.limit) for turn in of_sigma]
+    order = [min(point.rank, point.limit) for point in of_sigma]
     falls = order == sorted(order, reverse=True) and order[0] > order[-1]
     words = ", ".join(map(str, of_sigma))
     findings.claim("epsilon^d falls with sigma, and nowhere rises", falls, words)
@@ -226,28 +232,28 @@ def _claim_about_order(findings: Findings, turns: Mapping[tuple[str, float], Tur
         ("nu", 0.05, "nu has no significant effect on epsilon^d"),
         ("tau", 100, "tau of 30 and more has none"),
     ):
-        of_key = {v: turn for v, turn in columns.get(key, {}).items() if (key, v) != ("tau", 10)}
+        of_key = {v: point for v, point in columns.get(key, {}).items() if (key, v) != ("tau", 10)}
         if len(of_key) < 2:
             continue
         against = of_key[reference]
-        others = {v: turn.of_seeds for v, turn in of_key.items() if v != reference}
-        differ = {v: mean_interval(seeds - against.of_seeds) for v, seeds in others.items()}
+        rest = {v: point.pseudo for v, point in of_key.items() if v != reference}
+        differ = {v: mean_interval(seeds - against.pseudo) for v, seeds in rest.items()}
         words = ", ".join(f"{v:g}: {low:+.3f} .. {high:+.3f}" for v, (low, high) in differ.items())
         same: bool | None = all(low <= 0 <= high for low, high in differ.values())
-        if same and any(turn.rank > turn.limit for turn in of_key.values()):
+        if same and any(point.rank > point.limit for point in of_key.values()):
             same = None  # where one of them lies cannot be judged
         findings.claim(claim, same, f"against {reference:g}, 95 % intervals: {words}")
     if "tau" in columns:
         shortest, *longer = columns["tau"].values()
         words = ", ".join(map(str, columns["tau"].values()))
-        higher = shortest.rank > max(turn.rank for turn in longer)
+        higher = shortest.rank > max(point.rank for point in longer)
         findings.claim("epsilon^d is higher at tau = 10", higher, words)
 
 
 def _judged(trials: Sequence[Trial]) -> list[Trial]:
-    """Return the trials of those epsilon^c before which enough blocks were rewarded on average."""
+    """Return the trials of each epsilon^c with enough rewarded blocks before the change."""
     by_change = groups(trials, "epsilon_c").values()
-    return [trial for group in by_change if _rewarded(group) >= REWARDED for trial in group]
+    return [trial for group in by_change if _rewarded(group) >= MIN_REWARDED for trial in group]
 
 
 def _rewarded(trials: Sequence[Trial]) -> float:
@@ -269,4 +275,4 @@ def _draw_policies(panel: Any, trials: Sequence[Trial]) -> None:
         panel.axvline(point, color="grey", linestyle="-.", linewidth=1, label=r"$\epsilon^d$")
     least = max(t.settings["epsilon_c"] for t in judged)
     panel.axvspan(least, max(epsilons), color="grey", alpha=0.15, linewidth=0)
-    figures.explain_above(panel)
+    figures.place_legend_above(panel)

@@ -35,10 +35,10 @@ MAX_ITERATIONS = 10_000
 
 ALGORITHMS = ("1.0", "2.0")
 
-# About 200 of exploration and 1000 after epsilon is set to 0.
+# About 200 iterations of exploration, and 1000 after epsilon is set to 0.
 ITERATIONS = 1200
 
-# Thresholds under which no module is saved, so that the policy alone is on trial.
+# Thresholds at which no module is saved, so that only the policy is tested.
 NEVER = {"delta": 1e-12, "roc_error": 0.0}
 
 
@@ -49,17 +49,17 @@ def slowness_on(module: Module) -> float:
 
 
 def stay_rewards(curves: Mapping[str, Any], config: LearnerConfig) -> dict[str, list[float]]:
-    """Return what staying in each of three streams earns on average while the agent explores.
+    """Return the mean reward for staying in each of three streams while the agent explores.
 
-    That is what the paper's agent itself goes by: the easier a stream, the faster the weights
-    settle there. Once epsilon is below its knee the agent mostly stays in its preferred stream.
+    The agent of the paper chooses by this reward: the easier a stream, the faster its weights
+    settle. When epsilon is below its knee, the agent mostly stays in its preferred stream.
 
     Args:
         curves: (N,) `stream`, `epsilon`, `curiosity` and `reward` of the iterations.
-        config: the learner's.
+        config: configuration of the learner.
 
     Returns:
-        Of `curiosity`, its part, and of the whole `reward`: (3,), NaN of a stream without one.
+        Means of `curiosity`, a part of the reward, and of `reward`: (3,), NaN for a stream without.
     """
     streams, epsilon = np.asarray(curves["stream"]).astype(int), np.asarray(curves["epsilon"])
     end = int(np.argmax(epsilon < config.epsilon_knee)) or len(epsilon)
@@ -132,7 +132,7 @@ GAIN = "advantage of staying"
 
 
 def gains(Q: figures.Curves) -> figures.Curves:
-    """Return by how much staying is worth more than switching, of Q (N, S, 2) a trial."""
+    """Return the advantage of staying over switching, from Q (N, S, 2) of each trial."""
     return [curve[:, :, 0] - curve[:, :, 1] for curve in Q]
 
 
@@ -169,7 +169,7 @@ class FiveStreams(Experiment):
 
 
 class Stability(Experiment):
-    """Whose policy stays once nothing is explored any more?"""
+    """Stability of the policies of 1.0 and 2.0 after exploration has ended."""
 
     title = "CD-MISFA 1.0 against 2.0"
     trials = (20, 3)
@@ -195,17 +195,17 @@ class Stability(Experiment):
         return row, {name: curves[name] for name in ("R", "policy")}
 
     def evaluate(self, trials: Sequence[Trial], findings: Findings) -> None:
-        """2.0 must never change its policy, 1.0 at least once in every trial."""
+        """Check that 2.0 never changes its policy, and 1.0 at least once in every trial."""
         old, new = (groups(trials, "algorithm")[a,] for a in ALGORITHMS)
         changes, n = [t.row["changes"] for t in old], len(new)
         unstable = sum(c > 0 for c in changes)
         stable = sum(t.row["changes"] == 0 for t in new)
         optimal = sum(t.row["after"] == "011" for t in new)
-        changed, seen = "1.0: changes of policy after epsilon = 0", "all (figure)"
-        findings.share("2.0: trials without a change of policy", seen, stable, n)
-        findings.share("1.0: trials with a change of policy", seen, unstable, n)
+        changed, paper = "1.0: changes of policy after epsilon = 0", "all (figure)"
+        findings.share("2.0: trials without a change of policy", paper, stable, n)
+        findings.share("1.0: trials with a change of policy", paper, unstable, n)
         findings.measured(changed, changes, ">= 1 (figure)", digits=1)
-        findings.share("2.0: trials that end with [0,1,1]", seen, optimal, n)
+        findings.share("2.0: trials that end with [0,1,1]", paper, optimal, n)
         findings.claim_all("2.0 keeps its policy after epsilon = 0", stable, n)
         findings.claim_all("1.0 changes its policy after epsilon = 0", unstable, n)
 

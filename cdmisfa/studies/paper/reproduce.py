@@ -1,4 +1,4 @@
-"""Reproduce the paper: run the missing trials of an experiment, judge, tabulate, draw.
+"""Reproduce the paper: run missing trials of an experiment, evaluate, tabulate, draw.
 
 DIR/rows.jsonl holds each finished trial, DIR/results.json and the figures the results of all. A
 trial is identified by its settings and the code that ran it: a stopped reproduction resumes, and a
@@ -86,7 +86,7 @@ def reproduce(
     experiment = load(name)
     if find_spec("matplotlib") is None:
         raise UsageError("reproduce draws figures: pip install 'cdmisfa[paper]'")
-    if experiment.sees and recording is None:
+    if experiment.needs_recording and recording is None:
         recording = make_recording(folder.parent / "icub-recording", FIRST_SEED, jobs)
     tasks = []
     for condition in experiment.conditions(quick, recording):
@@ -104,7 +104,9 @@ def reproduce(
         progress=lambda done, failed, total: progress(done, total),
     )
     for row in report.failed:
-        raise CdmisfaError(f"{name} trial {row['point']}: {row['error']}; the others are kept")
+        raise CdmisfaError(
+            f"{name} trial {row['point']}: {row['error']}; finished trials are stored"
+        )
     rows = {row["id"]: row for row in read_trial_rows(folder)}
     finished = [_finished(folder, rows[task.id]) for task in tasks]
     findings = Findings()
@@ -154,7 +156,7 @@ def check_claims(document: Mapping[str, Any]) -> None:
     failed = [c for c in document["claims"] if c["holds"] is False]
     if failed:
         words = "; ".join(f"{c['claim']} ({c['detail']})" for c in failed)
-        raise NotReproducedError(f"{document['experiment']} did not come out: {words}")
+        raise NotReproducedError(f"{document['experiment']} is not reproduced: {words}")
 
 
 # Header of the table that compares quantities with the paper.
@@ -175,5 +177,5 @@ def markdown_tables(document: Mapping[str, Any]) -> str:
     tables = [markdown(HEAD, rows)] if rows else []
     tables += [markdown(table["head"], table["rows"]) for table in document["tables"]]
     claims = [(c["claim"], VERDICTS[c["holds"]], c["detail"]) for c in document["claims"]]
-    tables.append(markdown(("statement", "so here", "measured"), claims))
+    tables.append(markdown(("statement", "reproduced", "measured"), claims))
     return "\n\n".join([*tables, *document["notes"]]) + "\n"
