@@ -7,6 +7,7 @@ or Rerun.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import gc
 import importlib
 import io
@@ -172,6 +173,10 @@ def _explain(error: Exception) -> int:
             click.echo(error.format_message(), err=True)
             return error.exit_code
         case click.UsageError():
+            if isinstance(error, click.NoSuchOption):  # click suggests options that differ a lot
+                name, names = error.option_name, error.possibilities or ()
+                near = difflib.get_close_matches(name, names, 1, 0.8)
+                error = click.NoSuchOption(name, possibilities=near, ctx=error.ctx)
             command = error.ctx.command_path if error.ctx else "cdmisfa"
             message = error.format_message().rstrip(".")
             message = message[:1].lower() + message[1:]

@@ -141,7 +141,7 @@ INPUTS: dict[str, Decorator] = {
     "topics": option(
         "--topic TOPIC",
         "Read this topic of a log, or all that match a pattern such as '/cam*'; each becomes a "
-        "stream. Repeatable. [default: the only one with images; apply, view and export: all]",
+        "stream. Repeatable. [default: the only one with images]",
         name="topics",
         multiple=True,
     ),
@@ -195,7 +195,7 @@ INPUTS: dict[str, Decorator] = {
     ),
     "settings": option(
         "--set KEY=VALUE",
-        "Set a configuration key input.*, such as input.fit=pad. Repeatable.",
+        "Set a key input.* of docs/reference/configuration.md, such as input.fit=pad. Repeatable.",
         name="input_settings",
         multiple=True,
     ),
@@ -234,19 +234,19 @@ def inputs(*names: str) -> Decorator:
 
 
 def settings(
-    help: str = "Set a configuration key, such as learner.nu=0.02. Repeatable.",
+    help: str = "Set a key of docs/reference/configuration.md, as learner.nu=0.02. Repeatable.",
 ) -> Decorator:
     """Return the option `--set`."""
     return click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help=help)
 
 
 max_iterations = option(
-    "--max-iterations N", "Stop after this number of iterations. [default: no limit; fork: as RUN]"
+    "--max-iterations N", "Stop after this number of iterations. [default: no limit]"
 )
 max_modules = option(
     "--max-modules N",
     "Stop after this number of modules. [default: no limit; learners 2.0 and 1.0: number of "
-    "streams; fork: as RUN]",
+    "streams]",
 )
 seed = option("--seed N", "Seed of every random choice.", type=SEED, default=0, show_default=True)
 preset = option(
@@ -262,7 +262,8 @@ source = option(
 
 loop = option("--loop", "Start a recording or log again when it ends.")
 skip_damaged = option(
-    "--skip-damaged", "Skip damaged parts and images of a log, instead of stopping with an error."
+    "--skip-damaged",
+    "Skip damage inside a log, and damaged images, instead of stopping with an error.",
 )
 force = option("--force", "Overwrite existing files.")
 no_rerun = option("--no-rerun", "Do not write the Rerun view run.rrd.")

@@ -61,7 +61,7 @@ def apply_command(
     """Compute learned features on other logs or cameras.
 
     For each frame, the result has the outputs of every module of RUN (a module is a learned slow
-    feature). For each block of 40 frames it has their slowness, whether the module responds as on
+    feature). For each block of frames it has their slowness, whether the module responds as on
     the frames that it learned from (alive), and the novelty: above 1 the block is unknown to the
     module.
 
@@ -81,6 +81,8 @@ def apply_command(
         {live}
 
     Options:
+        --topic TOPIC: Read this topic of a log, or all that match a pattern such as '/cam*'; each
+            becomes a stream. Repeatable. [default: all with images]
         --to FORMAT: Format of the files in the folder -o: parquet, csv, mcap or rrd. stdout writes
             no file: it prints a JSON line for each block as soon as the block is complete.
             [default: parquet]

@@ -68,7 +68,7 @@ def learn_command(
     With -o, the command writes a run: a folder with the learned features, every value that the
     learner computed, a report (report.html) and a view for Rerun (run.rrd). It stops when each
     stream is learned, explained by an earlier module, or rejected because nothing in it is slow;
-    when SOURCE ends; or with Ctrl-C.
+    when SOURCE ends; or with Ctrl-C. A log that is cut short is read to its end, with a warning.
 
     SOURCE is one of:
         {scene}
@@ -80,9 +80,10 @@ def learn_command(
 
     Words:
         stream     the images of one camera, or the numbers of one topic
-        block      40 frames of one stream; each iteration learns from one block
+        block      a number of frames of one stream: 40, scene oscillatory: 100
+        iteration  learning from one block
         module     a slow feature that is learned and no longer changes
-        gap        a pause of a stream of more than ten frames; no block crosses it
+        gap        a pause of more than ten frames in a stream; no block crosses it
         preset     a named set of configuration values
 
     Options:
@@ -138,7 +139,9 @@ def _resume_run(ctx: click.Context, run: Path | None) -> int:
     from cdmisfa.experiments.run_folder import read_command
 
     if run is None:
-        raise click.UsageError("name a SOURCE: a scene, a recording, logs or live streams")
+        raise click.UsageError(
+            "name a SOURCE, such as left.mcap, or a run to resume with --resume -o RUN"
+        )
     words, stored = read_command(run)
     restored = {
         name: value
@@ -262,6 +265,8 @@ def fork_command(
         {run}
 
     Options:
+        --max-iterations N: Stop after this number of iterations. [default: limit of RUN]
+        --max-modules N: Stop after this number of modules. [default: limit of RUN]
         --iteration K: Begin with the first K iterations of RUN.
         --seed N: Seed of every random choice from iteration K on. [default: the seed of RUN]
 

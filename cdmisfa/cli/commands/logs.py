@@ -32,8 +32,8 @@ def info_command(path: tuple[str, ...], as_json: bool) -> int:
     """Show what a log, recording or run contains.
 
     The command prints topics, times and sizes, and for a run its modules and the result of each
-    stream. The exit code is 3 if a file is damaged or cut short, else 2 if one of several is no
-    log. Contents that only cdmisfa verify reads are called unchecked.
+    stream. The exit code is 2 if a path is no log, and 3 if a log is damaged or cut short (3
+    wins). Contents that only cdmisfa verify reads are called unchecked.
 
     PATH is one of:
         {run}
@@ -155,7 +155,7 @@ def verify_command(path: tuple[str, ...], as_json: bool) -> int:
     """Verify that logs are complete and undamaged.
 
     The command reads every byte, compares checksums, and decodes every image of a log that has no
-    checksums. The exit code is 3 if anything is wrong, else 2 if one of several is no log.
+    checksums. The exit code is 2 if a path is no log, and 3 if a log is damaged (3 wins).
 
     PATH is one of:
         {run}
@@ -252,6 +252,8 @@ def export_command(
         {url}
 
     Options:
+        --topic TOPIC: Read this topic of a log, or all that match a pattern such as '/cam*'; each
+            becomes a stream. Repeatable. [default: all with images]
         --to FORMAT: Format to write: parquet, csv, npz, images, mp4 or lerobot. [default: the
             ending of -o]
         --lossless: Encode videos without changing any pixel; they become larger.

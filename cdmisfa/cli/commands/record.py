@@ -65,6 +65,8 @@ def record_command(
         --seed N: Seed of every random choice. [default: 0; with --resume: as before]
         --view NAME: Record only this view (stream) of the scene. Repeatable. [default: all]
         --resume: Continue the interrupted recording in the folder -o.
+        --field FIELD: Read these numbers of the messages of a foxglove:// stream, such as
+            pose.position.x or ranges[0:100]. Repeatable; several form one vector. [default: images]
         --split TIME: Begin a new file for each stream after this time, such as 90s or 10min.
             [default: one file; with --resume: as before]
 

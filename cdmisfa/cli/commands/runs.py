@@ -27,7 +27,8 @@ def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_j
 
     Signals are the values that the learner computed in each iteration. For two runs, the command
     prints where their signals first differ and which settings and results differ; if any signal
-    differs, the exit code is 4. For more runs, it prints a table that compares each with the first.
+    differs, the exit code is 4. For more runs, it prints a table that compares each with the
+    first; the exit code is then 0.
 
     RUN is one of:
         {run}
@@ -142,7 +143,7 @@ def inspect_command(run: Path, iterations: int, source: tuple[str, ...], as_json
     """Print the state of the learner after an iteration of a run.
 
     The command loads the last state that the run stores before that iteration, and learns the rest
-    again from the source of the run. One iteration is one block of 40 frames. --json prints the
+    again from the source of the run. One iteration is one block of frames. --json prints the
     values of all arrays.
 
     RUN is:

@@ -45,6 +45,8 @@ def view_command(
         {view}
 
     Options:
+        --topic TOPIC: Read this topic of a log, or all that match a pattern such as '/cam*'; each
+            becomes a stream. Repeatable. [default: all with images]
         --save F.rrd: Write the view to this file.
         --web: Show the view in a browser on this machine.
         --screenshot F.png: Draw the view into this image file; needs no screen.
