@@ -64,7 +64,7 @@ STYLES = (("o", 7, "-"), ("s", 5, (0, (4, 2))), ("^", 3, (0, (1, 1.5))))
 
 
 @dataclass(frozen=True, slots=True)
-class CriticalPoint:
+class Point:
     """Epsilon^d at one value of a key.
 
     Attributes:
@@ -176,12 +176,12 @@ def point_of_no_return(trials: Sequence[Trial]) -> float:
     return logistic_midpoint(changes, [_is_new(t) for t in trials])
 
 
-def _point(trials: Sequence[Trial], limit: float) -> CriticalPoint:
+def _point(trials: Sequence[Trial], limit: float) -> Point:
     value, seeds = point_of_no_return(trials), sorted({t.settings["seed"] for t in trials})
     without = [point_of_no_return([t for t in trials if t.settings["seed"] != s]) for s in seeds]
     pseudo = value + (len(seeds) - 1) * (np.mean(without) - np.array(without))
     neither = sum(t.row["policy"] not in (OLD, NEW) for t in trials)
-    return CriticalPoint(value, pseudo, sum(map(_is_new, trials)), neither, len(trials), limit)
+    return Point(value, pseudo, sum(map(_is_new, trials)), neither, len(trials), limit)
 
 
 def _is_new(trial: Trial) -> bool:
@@ -189,9 +189,7 @@ def _is_new(trial: Trial) -> bool:
 
 
 def _claim_about_changes(
-    findings: Findings,
-    judged: Sequence[Trial],
-    points: Mapping[tuple[str, float], CriticalPoint],
+    findings: Findings, judged: Sequence[Trial], points: Mapping[tuple[str, float], Point]
 ) -> None:
     """Add claims: early changes are followed, late ones are not, and every policy is an optimum."""
     smallest = min(value for key, value in points if key == "sigma")
@@ -199,16 +197,14 @@ def _claim_about_changes(
     largest, last = max(changes), min(changes)
     early = groups(judged, "key", "value", "epsilon_c")["sigma", smallest, largest]
     late = groups(judged, "key", "epsilon_c")["sigma", last]
-    followed, unchanged = sum(map(_is_new, early)), sum(not _is_new(t) for t in late)
+    followed, stayed = sum(map(_is_new, early)), sum(not _is_new(t) for t in late)
     findings.claim(
         "a change above epsilon^d is followed (smallest sigma, largest epsilon^c)",
         followed >= 0.8 * len(early),
         f"{followed} of {len(early)} trials with epsilon^c = {largest:g}",
     )
-    detail = f"{unchanged} of {len(late)} trials with epsilon^c = {last:g}"
-    findings.claim(
-        "a change while epsilon is small is not followed", unchanged == len(late), detail
-    )
+    detail = f"{stayed} of {len(late)} trials with epsilon^c = {last:g}"
+    findings.claim("a change while epsilon is small is not followed", stayed == len(late), detail)
     lost, n = (sum(getattr(t, name) for t in points.values()) for name in ("neither", "n"))
     (key, value), worst = max(points.items(), key=lambda item: item[1].neither / item[1].n)
     most = f", most at {key} = {value:g} ({worst.neither} of {worst.n})" if lost else ""
@@ -216,11 +212,9 @@ def _claim_about_changes(
     findings.claim(ends, lost == 0, f"{lost} of {n} trials in neither{most}")
 
 
-def _claim_about_order(
-    findings: Findings, points: Mapping[tuple[str, float], CriticalPoint]
-) -> None:
+def _claim_about_order(findings: Findings, points: Mapping[tuple[str, float], Point]) -> None:
     """Add claims about the effect of sigma on epsilon^d and, if they vary, of nu and tau."""
-    columns: dict[str, dict[float, CriticalPoint]] = {}
+    columns: dict[str, dict[float, Point]] = {}
     for (key, value), point in sorted(points.items()):
         columns.setdefault(key, {})[value] = point
     of_sigma = list(columns["sigma"].values())[::-1]

@@ -104,9 +104,7 @@ def reproduce(
         progress=lambda done, failed, total: progress(done, total),
     )
     for row in report.failed:
-        raise CdmisfaError(
-            f"{name} trial {row['point']}: {row['error']}; finished trials are stored"
-        )
+        raise CdmisfaError(f"{name} trial {row['point']}: {row['error']}; the others are stored")
     rows = {row["id"]: row for row in read_trial_rows(folder)}
     finished = [_finished(folder, rows[task.id]) for task in tasks]
     findings = Findings()
