@@ -124,10 +124,7 @@ def record(
     if not resume:
         refuse_existing(folder, force=force)
     elif force or not holds_recording(folder):
-        raise UsageError(
-            f"{folder} has no recording to resume, or --force is given: choose another "
-            "folder, or leave out --force or --resume"
-        )
+        raise UsageError(f"{folder} has no recording to resume, or --force is given as well")
     recording = recording_spec(source, settings, scene)
     streams = recording.spec.streams
     if unknown := [view for view in views or () if view not in streams]:

@@ -282,8 +282,8 @@ class StoredSource(ClockedSource):
         unbroken = " without a gap" if self.gaps else ""
         reserved = f", before {self.held_out} held-out frames" if self.held_out else ""
         return LogExhaustedError(
-            f"{self._name()}: {left} frames are left at frame {self._t}{reserved}, but {n} "
-            f"are needed{unbroken}; {self.more}repeat it with --loop"
+            f"{self._name()}: {left} frames are left at frame {self._t}{reserved}, but a block "
+            f"has {n}{unbroken}; {self.more}repeat it with --loop"
         )
 
 

@@ -89,7 +89,7 @@ class TestJson:
         said = cdmisfa("info", log).out
         statistics = summary.statistics
         seconds = (statistics.message_end_time - statistics.message_start_time) / 1e9
-        assert f"{statistics.message_count} protobuf messages, {seconds:.3f} s" in said
+        assert f"{statistics.message_count} messages (protobuf), {seconds:.3f} s" in said
         assert f"{chunks['zstd']} zstd chunks, " in said
         assert f"({1 - stored / whole:.0%} saved)" in said
         assert re.search(r"/view/x1 +2000 +50 +0.000 +39.980", said)
@@ -178,7 +178,7 @@ class TestRuns:
     ) -> None:
         cdmisfa("record", "oscillatory", "-o", tmp_path / "short", "--frames", 80)
         done = cdmisfa("learn", tmp_path / "short")
-        assert_one_line(done, 1, "80 frames are left at frame 0, but 100 are needed", "--loop")
+        assert_one_line(done, 1, "80 frames are left at frame 0, but a block has 100", "--loop")
 
 
 class TestErrors:

@@ -65,7 +65,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "sweep taken --summary --seeds 0": ("--summary only prints results: leave out --seeds",),
     "sweep taken RUN --summary": ("--summary takes the folder of one sweep",),
     "sweep taken --summary --csv --json": ("choose one of --csv and --json",),
-    "sweep taken --summary": ("taken has no sweep",),
+    "sweep taken --summary": ("taken is not a sweep",),
     "doctor left.mcap": ("check files with cdmisfa verify left.mcap",),
     # a fork that cannot be
     "fork RUN --iteration 3 -o x --set learner.tau=20": ("learner.tau cannot change in a fork",),

@@ -71,11 +71,11 @@ DAMAGES: dict[str, Damage] = {
 """Given the bytes, and of an MCAP file its last chunk but one and the place of its summary."""
 
 EMPTY, NO_MCAP = "it is empty: record or copy it again", "not an MCAP file"
-WITHIN = "cut short: the file ends within a record"
+WITHIN = "cut short: the file ends within the record"
 NO_END = "cut short: the end of the file and its index are missing"
 ALL_THERE = "cut short: part of its summary is missing, but no message is"
 BAD = "its CRC does not match"
-FEW = "cut short: the file ends within a record|no message can be recovered"
+FEW = "cut short: the file ends within the record|no message can be recovered"
 BARE = "it has no checksums, so that changed bytes cannot be noticed"
 HEAD = "it is not the chunk in the summary|the length of a chunk contradicts its data"
 NO_PNG = "its JPEG or PNG is damaged|it does not begin as a PNG|its PNG is cut short"

@@ -70,7 +70,7 @@ def test_a_run_is_whole_wherever_it_lies(copy: Path) -> None:
     result = check_log(copy)
     assert result.ok, result.problems
     (note,) = result.notes
-    assert note.startswith(f"{copy / 'run.rrd'} is not verified: write it again with cdmisfa view")
+    assert note.startswith(f"{copy / 'run.rrd'} was not checked: it has no checksum")
     assert check_log(copy / "run.mcap").ok
 
 

@@ -24,6 +24,7 @@ from video_packets import cdr as ros2
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.compressed import compressed_image
+from recorder.images.framing import fitted
 from recorder.images.messages import MessageKind, decoder_of, stated_format
 from recorder.images.options import InputOptions
 from recorder.images.pixels import DISTANCES, ENCODINGS, MalformedImage, raw_image, shrink
@@ -212,8 +213,8 @@ def test_an_image_is_averaged_over_areas() -> None:
     image = RANDOM.integers(0, 256, (96, 256), np.uint8)
     expected = image.reshape(48, 2, 128, 2).mean(axis=(1, 3))
     assert abs(shrink(image, 48, 128) - expected).max() <= 1
-    with pytest.raises(UsageError, match="smaller than 128x100: choose a smaller --size"):
-        shrink(image, 100, 128)
+    with pytest.raises(UsageError, match="256x96 is smaller than 128x100: reduce --size"):
+        fitted(image, (100, 128), "crop")
 
 
 def write(path: Path, streams: dict[str, tuple[int, int]], *, broken_from: int = 999) -> None:
@@ -271,7 +272,7 @@ def test_topics_are_named_where_they_are_wrong(tmp_path: Path) -> None:
 def test_a_message_that_is_no_image_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, {"/left": (3, 20)})
-    with pytest.raises(UsageError, match=r"a\.mcap: .* 8x6 is smaller than 80x60: .* images$"):
+    with pytest.raises(UsageError, match=r"a\.mcap: .* 8x6 is smaller than 80x60: reduce --size$"):
         external(path, size=(60, 80))
     write(path, {"/left": (3, 20)}, broken_from=0)
     with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1000000000 ns"):

@@ -230,7 +230,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ({}, "set --rate in frames per second, or the column of times.* --set input.time"),
+        ({}, "set --rate in frames per second, or name the column of times.* --set input.time"),
         ({"fields": ["z"], "rate": 5}, "no column z; it has s, a, word"),
         ({"fields": ["word"], "rate": 5}, "t.csv: --field word: it is not a number but a text"),
         ({"time": "word"}, r"word \(string\) has no times after 1970"),

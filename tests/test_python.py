@@ -110,7 +110,7 @@ def test_pictures_of_any_type_are_the_same_frames() -> None:
         (np.zeros((0, 3)), "shape .0, 3. of float64 is not supported: use"),
         ({"a": numbers(), "b": pictures(4, 5)}, "the streams have 3 numbers and images"),
         ("nowhere.npz", "no such file"),
-        (numbers()[:10], "10 frames are left at frame 0, but 40 are needed"),
+        (numbers()[:10], "10 frames are left at frame 0, but a block has 40"),
     ],
 )
 def test_what_cannot_be_learned_from_is_one_line(

@@ -30,6 +30,11 @@ def counted(number: int, noun: str, form: str = "") -> str:
     return f"{number:{form}} {noun}{'' if number == 1 else 's'}"
 
 
+def kind_of_frames(shape: tuple[int, ...]) -> str:
+    """Return what frames of a shape are, such as "2 numbers" or "images of 80x60"."""
+    return counted(shape[0], "number") if len(shape) < 2 else f"images of {shape[1]}x{shape[0]}"
+
+
 def duration_text(seconds: float | None) -> str:
     """Return a duration such as "1:02:03", or "-" for None."""
     return "-" if seconds is None else str(timedelta(seconds=round(seconds)))

@@ -28,7 +28,7 @@ INTERRUPTED: Final = "interrupted"
 
 # Descriptions of the reasons for which a run ends.
 END_REASONS: Mapping[str, str] = {
-    "max_modules": "the requested number of modules was learned",
+    "max_modules": "the limit on modules was reached (by default as many as streams)",
     "max_iterations": "the requested number of iterations was done",
     "nothing_left": "no module was saved for a long time after exploration ended",
     "all_decided": "each stream is learned, explained or rejected",

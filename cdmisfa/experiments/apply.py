@@ -24,6 +24,7 @@ from cdmisfa.agents.progress.decisions import CHANGED_SLOWNESS_LOG, MODULE_VARIA
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, unbroken
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.core.names import kind_of_frames
 from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, open_logs
 from cdmisfa.modules import Module, Stack, columns_of
@@ -126,9 +127,9 @@ class Application:
         if source.spec.frame_shape != self.recipe.shape:
             source.close()
             raise UsageError(
-                f"frames of {words[0]} have the shape {source.spec.frame_shape}, but the modules "
-                f"learned from {self.recipe.shape}: choose streams with --topic, or values with "
-                "--field"
+                f"{words[0]} has {kind_of_frames(source.spec.frame_shape)}, but the run learned "
+                f"from {kind_of_frames(self.recipe.shape)}: name a log with such frames, or choose "
+                "streams with --topic or numbers with --field"
             )
         return centre_as(self.recipe.centre, source, words[0])
 

@@ -60,8 +60,8 @@ def hold_out(source: FrameSource, configuration: Configuration) -> None:
     if count >= MIN_HELD_OUT:
         source.hold_out(count)
     else:
-        note = f"{count} of {source.frames} frames are too few to evaluate on: none are held out"
-        source.notes = (*source.notes, f"{note} (input.holdout)")
+        part = f"{count} of {source.frames} frames would be held out"
+        source.notes = (*source.notes, f"too short to test on unseen frames ({part})")
 
 
 def evaluate(

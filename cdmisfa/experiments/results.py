@@ -190,8 +190,8 @@ def results(folder: str | Path) -> list[PointResult]:
         LogDamagedError: its files are damaged.
     """
     folder = Path(folder)
-    if folder.is_dir() and not (folder / REQUEST).exists():
-        raise UsageError(f"{folder} has no sweep: name a folder that cdmisfa sweep -o wrote")
+    if not (folder / REQUEST).exists():
+        raise UsageError(f"{folder} is not a sweep: name a folder that cdmisfa sweep -o wrote")
     trials = read_request(folder)
     rows = {row["id"]: row for row in read_trial_rows(folder)}
     points: dict[str, tuple[dict[str, Any], list[Any]]] = {}

@@ -255,7 +255,7 @@ class Recomputation:
             if both := [d for d in (in_signals, in_keyframe) if d is not None]:
                 return at, min(both, key=lambda difference: difference.iteration)
         if stop is not None and at != stop:
-            raise UsageError(f"{self.log} has {at} iterations: choose one of these")
+            raise UsageError(f"{self.log} has {at} iterations: choose a number from 0 to {at}")
         return at, None
 
     def _logged(self, stop: int | None) -> Iterator[SignalColumns]:
@@ -330,13 +330,14 @@ class Checked:
     """Result of computing the iterations [start, stop) of a run again.
 
     `difference` is the first difference from the log, `other_files` are files of the source that
-    changed since the run learned from them.
+    changed since the run learned from them, `asked` is the first iteration of interest.
     """
 
     start: int
     stop: int
     difference: Difference | None
-    other_files: tuple[str, ...] = ()
+    other_files: tuple[str, ...]
+    asked: int
 
     @property
     def holds(self) -> bool:
@@ -358,8 +359,9 @@ class Checked:
         files = ", ".join(self.other_files)
         other = f"{files}: no longer what the run learned from" if files else ""
         if self.difference is None:
-            span = f"iterations {self.start} to {self.stop - 1}"
-            identical = f"{span}: learned again, they are identical, bit for bit"
+            span = f"iterations {self.asked} to {self.stop - 1}: learned again"
+            begin = f" from iteration {self.start}" if self.start < self.asked else ""
+            identical = f"{span}{begin}, they are identical, bit for bit"
             return f"{identical}; but {other}" if other else identical
         return f"{self.difference} when learned again{other and f': {other}'}"
 
@@ -381,5 +383,5 @@ def check_run(
         at, difference = recomputation.compare(stop, read_keyframes(recomputation.log, first))
         changed = tuple(recomputation.other_files())
         if difference is None and 0 < at <= start:
-            recomputation.compare(start + 1)  # raises the error of a log that ends before
-    return Checked(first, at, difference, changed)
+            raise UsageError(f"{recomputation.log} has {at} iterations: FIRST must be below {at}")
+    return Checked(first, at, difference, changed, start)

@@ -126,7 +126,8 @@ def log_to_resume(run: Path) -> Path:
     for log in (run / SET_ASIDE, partial_path(finished), finished):
         if log.is_file():
             return log
-    raise UsageError(f"{run} has no {RUN_FILE} to resume: start the run with --force")
+    command = f"cdmisfa learn SOURCE -o {run}{' --force' if run.exists() else ''}"
+    raise UsageError(f"{run}: there is no run to resume: start one with {command}")
 
 
 def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:

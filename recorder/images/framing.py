@@ -161,13 +161,16 @@ def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> 
     """
     if image.shape == size:
         return image
+    whole = size_of(image)
     if fit == "crop":
-        image = _middle(image, _largest_within(size_of(image), size))
-    if fit != "pad":
-        return shrink(image, *size, enlarge=enlarge)
-    inner = _largest_within(size, size_of(image))
+        image = _middle(image, _largest_within(whole, size))
+    inner = _largest_within(size, whole) if fit == "pad" else size
+    if not enlarge and (image.shape[0] < inner[0] or image.shape[1] < inner[1]):
+        raise UsageError(
+            f"an image of {_size_text(whole)} is smaller than {_size_text(size)}: reduce --size"
+        )
     frame = np.zeros(size, np.uint8)
-    _middle(frame, inner)[:] = shrink(image, *inner, enlarge=enlarge)
+    _middle(frame, inner)[:] = shrink(image, *inner)
     return frame
 
 

@@ -164,24 +164,15 @@ def _depth_gray(values: NDArray[Any], metres: float, depth: Depth) -> FloatArray
     return np.floor((np.clip(distances, near, far) - near) * (255 / (far - near)) + 0.5)
 
 
-def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) -> ByteArray:
-    """Shrink a gray image by averaging areas.
+def shrink(image: ByteArray, height: int, width: int) -> ByteArray:
+    """Shrink a gray image by averaging areas; repeat the pixels of a smaller one.
 
     Args:
         image: (rows, columns) uint8.
         height: height of the result.
         width: width of the result.
-        enlarge: True to repeat the pixels of a smaller image instead of raising an error.
-
-    Raises:
-        UsageError: the image is smaller than the result.
     """
     if image.shape == (height, width):
         return image
-    if not enlarge and (image.shape[0] < height or image.shape[1] < width):
-        raise UsageError(
-            f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
-            "choose a smaller --size, or larger images"
-        )
     small = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
     return np.asarray(small, np.uint8)

@@ -231,10 +231,7 @@ class LogStructure:
         if end > limit:
             if opcode == Opcode.CHUNK and self._limit is None:
                 self.torn = cut_chunk(self.file, content, length, limit)
-            return self._cut(
-                f"the file ends within a record at byte {self._at}, of which it has "
-                f"{limit - self._at} bytes"
-            )
+            return self._cut(f"the file ends within the record at byte {self._at}")
         if self._at == len(MAGIC) and opcode != Opcode.HEADER:
             raise MalformedRecord("the file does not begin with a header record")
         if self.skip_damaged and self.summary and opcode != Opcode.CHUNK:
@@ -352,7 +349,7 @@ class LogStructure:
             raise MalformedRecord("the data section has no end record before the summary")
         self.missing = f"cut short: {fact}"
         if self.torn is not None and self.torn.crc and not self.skip_damaged:
-            self.missing += "; recover can save part of the last chunk, unverified"
+            self.missing += "; cdmisfa recover can save part of the last chunk"
         return False
 
     def _resume_after(self) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.names import counted
+from cdmisfa.core.names import counted, kind_of_frames
 from recorder.images.options import InputOptions
 from replay.corpus.episode import (
     Episode,
@@ -149,7 +149,7 @@ class EpisodeSource(StoredSource):
             if not are_alike(episode.spec, first.spec):
                 yield (
                     f"{episode.name} is skipped: it has {_described(episode.spec)}, but the first "
-                    f"log, {first.name}, has {_described(first.spec)}; choose --size and --rate"
+                    f"log, {first.name}, has {_described(first.spec)}"
                 )
 
     def pixels(self, stream: int) -> str:
@@ -300,8 +300,9 @@ class EpisodeSource(StoredSource):
 
 
 def _described(spec: SourceSpec) -> str:
-    """Return shape, type and rate of the frames of a log as text."""
-    return f"frames of {'x'.join(map(str, spec.frame_shape))} {spec.dtype} at {spec.fps:g} Hz"
+    """Return kind, rate and ground truth of the frames of a log as text."""
+    truth = f" with ground truth {', '.join(spec.truth)}" if spec.truth else ""
+    return f"{kind_of_frames(spec.frame_shape)} at {spec.fps:g} Hz{truth}"
 
 
 def _few(lines: Sequence[str]) -> Sequence[str]:

@@ -252,12 +252,13 @@ class _RunContent(_Content):
             yield as_problem(modules, error)
         view = self._folder / VIEW_FILE
         if self._final.get("view") == json.dumps(True) and not view.is_file():
-            yield Problem(str(view), f"is missing; {view_again(self._folder)}")
+            command = shlex.join(("cdmisfa", "view", str(self._folder), "--save", str(view)))
+            yield Problem(str(view), f"is missing; write it again with {command}")
 
     def notes(self) -> Iterator[str]:
         """Yield a note for each file that cannot be verified."""
         if self._folder is not None and (view := self._folder / VIEW_FILE).is_file():
-            yield f"{view} is not verified: {view_again(self._folder)}"
+            yield f"{view} was not checked: it has no checksum"
         if self._final is None:
             yield f"{self.path} has no final record: the other files of the run cannot be verified"
 
@@ -268,12 +269,6 @@ class _RunContent(_Content):
                 self._problems.append(Problem(str(self.path), what))
             self._next = signals.iteration + 1
             self._hash.add(signals)
-
-
-def view_again(run: Path) -> str:
-    """Return the command that builds the view of a run, which holds nothing beyond its log."""
-    command = ("cdmisfa", "view", str(run), "--save", str(run / VIEW_FILE), "--force")
-    return f"write it again with {shlex.join(command)}"
 
 
 def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Problem]:

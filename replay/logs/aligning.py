@@ -73,10 +73,9 @@ def _rate(streams: Sequence[LogStream]) -> float:
     timed = next((stream for stream in streams if stream.times is not None), streams[0])
     step = float("nan") if timed.times is None else clocks.step_of(timed.times)
     if not (step > 0 and (timed.read is None or 1 / step <= RECORDED_FPS[1])):
-        column = (
-            ", or the column of times and its unit (s, ms, us, ns) with --set input.time=COLUMN:s"
-        )
-        hint = column if timed.read is not None else ""
+        column = next((n for n in timed.fields if n in ("time", "timestamp", "stamp")), "COLUMN")
+        name = f", or name the column of times and its unit with --set input.time={column}:s"
+        hint = name if timed.read is not None else ""
         raise UsageError(f"{timed.path} has no frame rate: set --rate in frames per second{hint}")
     return float(f"{1 / step:.6g}")
 
@@ -88,6 +87,8 @@ def _excerpt(stream: LogStream, options: InputOptions, zero: int) -> LogStream:
         len(times) if at is None else int(np.searchsorted(times, zero + round(at * NANOSECONDS)))
         for at in (options.start, options.end)
     )
+    if options.end is not None and options.end < options.start:
+        raise UsageError(f"--end {options.end:g} is before --start {options.start:g}")
     if low >= high:
         lasts = (int(times[-1]) - zero) / NANOSECONDS
         raise UsageError(

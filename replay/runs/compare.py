@@ -54,8 +54,12 @@ class Difference:
     )
 
     def __str__(self) -> str:
+        return self.text("the first run", "the other one")
+
+    def text(self, first: str, second: str) -> str:
+        """Return the place and both values as text, with the names of the runs."""
         if not self.signal:
-            return f"iteration {self.iteration}: the first {self.first}, the second {self.second}"
+            return f"iteration {self.iteration}: {first} {self.first}, {second} {self.second}"
         place = f"[{', '.join(map(str, self.place))}]" if self.place else ""
         where = f"iteration {self.iteration}: {self.signal}{place}"
         return f"{where} differs: {self.first} and {self.second}"

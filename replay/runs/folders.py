@@ -50,8 +50,8 @@ def run_log(path: Path) -> Path:
             check_regular(candidate)
             return candidate
     if path.is_dir():
-        raise UsageError(f"{path} has no {RUN_FILE}: give the folder of a run")
-    raise no_such(path, remedy=f"give the folder of a run or its {RUN_FILE}")
+        raise UsageError(f"{path} is not a run (no {RUN_FILE}): name one that cdmisfa learn wrote")
+    raise no_such(path, remedy=f"name the folder of a run or its {RUN_FILE}")
 
 
 def is_run(path: Path) -> bool:

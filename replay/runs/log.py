@@ -112,7 +112,7 @@ def header_in(reader: LogReader) -> RunHeader:
     metadata = next((r.metadata for r in reader.metadata if r.name == RUN_METADATA), None)
     if metadata is None:
         raise UsageError(
-            f"{log} is not the log of a run: give the folder of a run or its {RUN_FILE}"
+            f"{log} is not a run: name a folder that cdmisfa learn wrote, or its {RUN_FILE}"
         )
     schema = metadata.get("schema", "")[:20]
     if not (schema.isascii() and schema.isdigit() and 0 < int(schema) < 10**9):

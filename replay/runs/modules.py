@@ -58,7 +58,7 @@ def load_modules(path: Path) -> tuple[Module, ...]:
     try:
         return tuple(_modules(read_arrays(path)))
     except FileNotFoundError as error:
-        raise UsageError(f"{path} does not exist: give the folder of a run") from error
+        raise UsageError(f"{path} does not exist: name the folder of a run") from error
     except (OSError, ValueError, KeyError, TypeError, OverflowError, SystemError) as error:
         raise LogDamagedError(f"{path} is not a file of modules ({one_line(error)})") from error
 

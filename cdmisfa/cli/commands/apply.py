@@ -230,7 +230,7 @@ def _print_rows(rows: Sequence[dict[str, Any]]) -> None:
     for row in rows:
         if not row["modules"]:
             continue
-        printing.line(f"{row['log']}: {counted(row['frames'], 'frame')}")
+        printing.line(f"{row['log']}: {counted(row['frames'], 'frame')} in all streams")
         cells = []
         for module in row["modules"]:
             slowness = "-" if module["slowness"] is None else f"{module['slowness']:.4f}"

@@ -63,8 +63,9 @@ def _print_info(info: LogReport) -> None:
     for part in [info] if together else info.files:
         words: list[str] = [part.state]
         if part.state != "not read":
-            state = part.state.replace("unchecked", "contents unchecked")
-            words = [part.kind.replace("foreign", "external"), state, f"checksums {part.crc}"]
+            state = part.state.replace("unchecked", "contents not checked")
+            crc = f"checksums {part.crc}".replace("checksums absent", "no checksums")
+            words = [part.kind.replace("foreign", "external log"), state, crc]
             words += [] if part.seed is None else [f"seed {part.seed}"]
         printing.line(f"{part.path}: {', '.join(words)}")
     for line in (*(f"{p.where}: {p.what}" for p in info.problems), *info.notes):
@@ -105,10 +106,10 @@ def _length(info: LogReport, start: int, end: int) -> str:
 
     seconds = (end - start) / 1e9
     encodings = {channel.encoding for channel in info.channels}
-    shared = f"{encodings.pop()} " if len(encodings) == 1 else ""
+    shared = f" ({encodings.pop()})" if len(encodings) == 1 else ""
     first, last = (f"{np.datetime64(ns // 10**6, 'ms')}Z".replace("T", " ") for ns in (start, end))
-    messages = counted(info.messages, f"{shared}message")
-    return f"{messages}, {seconds:.3f} s, from {first} to {last}"
+    times = "" if first.startswith("1970") else f", from {first} to {last}"  # a clock without date
+    return f"{counted(info.messages, 'message')}{shared}, {seconds:.3f} s{times}"
 
 
 def _storage(size: SizeInfo, library: str) -> Iterator[str]:

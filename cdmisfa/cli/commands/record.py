@@ -99,7 +99,8 @@ def record_command(
         printing.status(f"{output} is complete: there is nothing to resume")
         return _print_recording(output, files, as_json)
     if not scene:
-        raise click.UsageError(f"name a scene: {' or '.join(SCENES)}")
+        why = f"{output}: there is no recording to resume: " if resume else ""
+        raise click.UsageError(f"{why}name a scene: {' or '.join(SCENES)}")
     seed = seed if seed is not None else start.seed or 0
     configuration = configure(scene, Layers.read(preset, settings), seed, inputs)
     with _writing(output, "recording", notice="") as (progress_bar, stop):

@@ -81,7 +81,7 @@ def _print_comparison(rows: Sequence[ComparedRun]) -> None:
         if outcomes := differing_outcomes(first.outline, second.outline):
             printing.table(("", *names), outcomes)
         if second.difference is not None:
-            printing.line(f"first difference: {second.difference}")
+            printing.line(f"first difference: {second.difference.text(*names)}")
     for explanation in filter(None, (row.explanation() for row in rows)):
         printing.text(explanation)
     if len(rows) == 2 and second.difference and second.difference.signal:
@@ -94,10 +94,10 @@ def _iterations(
 ) -> tuple[int, int | None]:
     """Parse FIRST:END; without END as (FIRST, None)."""
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", value or ":", re.ASCII)
-    if match is None:
-        raise click.BadParameter(f"{value!r} is no range: write FIRST:END, such as 100:200")
-    first, end = match.groups()
-    return int(first or 0), int(end) if end else None
+    if match is None or (match[2] and int(match[2]) <= int(match[1] or 0)):
+        what = "END must be greater than FIRST, such as 10:30"
+        raise click.BadParameter(f"{value!r} is not a range FIRST:END: {what}")
+    return int(match[1] or 0), int(match[2]) if match[2] else None
 
 
 @options.command("check")
