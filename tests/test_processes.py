@@ -90,7 +90,7 @@ def killed_while_sending(size: int, seconds: float) -> None:
     ("size", "seconds"), [(100, 0.0), (3000, 1e-4), (60_000, 1e-3), (1 << 29, 0.1), (1 << 29, 0.3)]
 )
 def test_one_that_is_killed_while_it_sends_ends_the_work(size: int, seconds: float) -> None:
-    with pytest.raises(WorkersError, match="a worker process was killed"):
+    with pytest.raises(WorkersError, match="a worker was killed"):
         killed_while_sending(size, seconds)
 
 
